@@ -1,0 +1,1 @@
+"""The measurement: arrays and frozen options in, frozen results out."""

@@ -1,0 +1,1 @@
+"""Frame grabbers and stages: two protocols, one adapter a device family."""

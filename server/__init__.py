@@ -1,0 +1,1 @@
+"""The service: rig orchestration, store, jobs, HTTP API and command line."""

@@ -1,0 +1,44 @@
+"""Entry point: picks the subcommand, turns every expected error into one line and an exit status."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from core.errors import Cancelled, StereorigError
+
+# name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
+# and is imported only when it is asked for, so that `--help` and errors in one do not wait for the others
+COMMANDS: dict[str, tuple[str, str]] = {
+    "serve": ("server.cli.serve", "start the service"),
+    "demo": ("server.cli.demo", "run one of the paper's experiments on the simulated rig, over HTTP"),
+    "calibrate": ("server.cli.calibrate", "calibrate a pair of cameras from grid images"),
+    "measure": ("server.cli.measure", "measure shape and displacement from image files"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 130 interrupted)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(prog="stereorig", description="Stereo measurement of shape and displacement.")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, (module, text) in COMMANDS.items():
+        sub = subparsers.add_parser(name, help=text, description=text)
+        if arguments and arguments[0] == name:
+            command = importlib.import_module(module)
+            command.add_arguments(sub)
+            sub.set_defaults(run=command.run)
+    args = parser.parse_args(arguments)
+    try:
+        return int(args.run(args))
+    except Cancelled as error:
+        print(f"stereorig: {error}", file=sys.stderr)
+        return 130
+    except StereorigError as error:
+        print(f"stereorig: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("stereorig: interrupted", file=sys.stderr)
+        return 130

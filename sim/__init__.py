@@ -1,0 +1,1 @@
+"""A simulated rig: scenes, renderer, cameras and stage controllers."""
