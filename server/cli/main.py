@@ -32,7 +32,7 @@ class _OneLineParser(argparse.ArgumentParser):
 
 
 def _joined(arguments: Sequence[str]) -> list[str]:
-    """Join ``--roi -5,0,10,10`` to ``--roi=-5,0,10,10``: argparse takes a list that starts with a minus for an option."""
+    """Join ``--roi -5,0,9,9`` to ``--roi=-5,0,9,9``: argparse takes a list that starts with a minus for an option."""
     result: list[str] = []
     for argument in arguments:
         if result and result[-1].startswith("--") and "=" not in result[-1] and _NEGATIVE_LIST.match(argument):

@@ -143,8 +143,8 @@ def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] |
     seeds = np.array([_numbers("--seed", text, 2) for text in texts])
     for text, (x, y) in zip(texts, seeds, strict=True):
         if not (x0 <= x <= x1 and y0 <= y <= y1):
-            raise RegionError(f"--seed {text} lies outside the region {x0:g},{y0:g},{x1:g},{y1:g}.",
-                              code="seed_outside", remedy="Give a seed inside the region, in camera 1's image.")  # fmt: skip
+            cause = f"--seed {text} lies outside the region {x0:g},{y0:g},{x1:g},{y1:g}."
+            raise RegionError(cause, code="seed_outside", remedy="Give a seed inside the region, in camera 1's image.")
         if mask is not None and not mask[min(round(y), mask.shape[0] - 1), min(round(x), mask.shape[1] - 1)]:
             raise RegionError(f"--seed {text} lies where the mask is black.",
                               code="seed_outside", remedy="Give a seed where the mask is white.")  # fmt: skip

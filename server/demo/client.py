@@ -107,7 +107,9 @@ class ServiceClient:
 
     def capture(self, test_id: str, label: str, *, load_n: float | None = None) -> dict[str, Any]:
         """Capture one step; return its record."""
-        step: dict[str, Any] = self.call("POST", f"/tests/{test_id}/steps", json={"label": label, "load_n": load_n}).json()
+        step: dict[str, Any] = self.call(
+            "POST", f"/tests/{test_id}/steps", json={"label": label, "load_n": load_n}
+        ).json()
         return step
 
     def analyse(self, test_id: str, kind: str, rectangle_px: Sequence[float], **settings: Any) -> AnalysisHandle:
@@ -152,8 +154,9 @@ class ServiceClient:
             time.sleep(_POLL_S)
         if job["state"] != "succeeded":
             problem = job.get("problem") or {}
+            reason = problem.get("cause", problem.get("detail", "no reason given"))
             raise MeasurementError(
-                f"The {job['kind']} job {job_id} ended as {job['state']}: {problem.get('cause', problem.get('detail', 'no reason given'))}",
+                f"The {job['kind']} job {job_id} ended as {job['state']}: {reason}",
                 code=str(problem.get("code", "job_failed")),
                 remedy=str(problem.get("remedy", "Look at the service's log.")),
             )

@@ -1,12 +1,14 @@
 """Result files: one field, one NetCDF-4 file (classic model: xarray, MATLAB and ncdump all open it).
 
-Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` that says why. The file is put together in
-memory and written aside, so that a half-written one cannot be met.
+Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` that says why. Files are written aside, so
+that a half-written one cannot be met.
 """
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,9 +22,10 @@ from numpy.typing import NDArray
 from core.errors import FileFormatError
 from core.field.result import Field
 from core.status import STATUS_MEANINGS, PointStatus
-from server.io.files import write_bytes
+from server.io.files import written_aside
 
 FORMAT_VERSION = 1
+_NEARLY_FULL_BYTES = 1 << 20
 COMPARISONS = ("cam1_t0__cam2_t0", "cam1_t0__cam1_t", "cam1_t0__cam2_t")
 COVARIANCE_NAMES = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
 _FRAMES = {
@@ -55,6 +58,7 @@ _SHAPE = (
     _Variable("phi_rad", "phi_rad", None, "rad", "angle of the patch's normal to Y_cam1, Eq. (12)"),
     _Variable("zp_mm", "zp_mm", None, "mm", "where camera 1's axis meets the patch's plane, Eq. (12)"),
     _Variable("epipolar_px", "epipolar_px", None, "pixel", "offset across the epipolar line in camera 2", "f4"),
+    _Variable("noise_grey", "noise_grey", None, "count", "noise of the reference image, from the residuals", "f4"),
 )
 _MOTION = (
     _Variable("u_mm", "uvw_mm", 0, "mm", "displacement from the reference, X_sys component"),
@@ -101,9 +105,7 @@ def _put(
     dataset: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], *, units: str, long_name: str, dtype: str
 ) -> None:
     fill = np.nan if dtype.startswith("f") else False
-    variable = dataset.createVariable(
-        name, dtype, dims, compression="zlib", complevel=1, shuffle=True, fill_value=fill
-    )
+    variable = dataset.createVariable(name, dtype, dims, compression="zlib", complevel=1, shuffle=True, fill_value=fill)
     variable.setncatts({"units": units, "long_name": long_name})
     variable[...] = values
 
@@ -119,49 +121,35 @@ def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
     )
 
 
-def encode_field(result: Field, provenance: Provenance) -> bytes:
-    """Return the bytes of one result file.
-
-    Parameters
-    ----------
-    result
-        A shape (no ``uvw_mm``) or a displacement field, arrays (row, col, ...).
-    provenance
-        What it was made from and how.
-    """
-    rows, cols = result.status.shape
-    moved = result.uvw_mm is not None
-    dataset = netCDF4.Dataset("result.nc", "w", format="NETCDF4_CLASSIC", memory=1 << 16)
+def _fill(dataset: Any, result: Field, provenance: Provenance) -> None:
     dataset.set_fill_off()
+    rows, cols = result.shape
     for name, size in (("row", rows), ("col", cols), ("comparison", result.zncc.shape[-1])):
         dataset.createDimension(name, size)
-    for v in _SHAPE + (_MOTION if moved else ()):
+    for v in _SHAPE + (_MOTION if result.has_motion else ()):
         values = getattr(result, v.attribute)
-        if values is None:
-            continue
         if v.component is not None:
             values = values[..., v.component]
         _put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=v.long_name, dtype=v.dtype)
     _put_status(dataset, result.status)
-    _put(dataset, "iterations", result.iterations, ("row", "col"), units="1", long_name="iterations of the fit", dtype="i2")
+    _put(dataset, "iterations", result.iterations, ("row", "col"), units="1",
+         long_name="iterations of the fit", dtype="i4")  # fmt: skip
     _put(dataset, "zncc", result.zncc, ("row", "col", "comparison"), units="1",
          long_name="zero-mean normalised correlation of each comparison", dtype="f4")  # fmt: skip
     dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
-    _put_covariance(dataset, result.covariance)
-    dataset.setncatts(_attributes(provenance, moved=moved))
-    return bytes(dataset.close())
+    _put_covariance(dataset, result)
+    dataset.setncatts(_attributes(provenance, moved=result.has_motion))
 
 
-def _put_covariance(dataset: Any, covariance: NDArray[np.float64]) -> None:
-    n = covariance.shape[-1]
+def _put_covariance(dataset: Any, result: Field) -> None:
+    n = result.covariance.shape[-1]
     names = COVARIANCE_NAMES[:n]
     dataset.createDimension("i", n)
     dataset.createDimension("j", n)
-    _put(dataset, "covariance", covariance, ("row", "col", "i", "j"), units="mm2",
+    _put(dataset, "covariance", result.covariance, ("row", "col", "i", "j"), units="mm2",
          long_name="covariance of " + ", ".join(names), dtype="f4")  # fmt: skip
     dataset.variables["covariance"].components = " ".join(names)
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    sigma = result.sigma_mm
     for k, name in enumerate(names):
         _put(dataset, f"sigma_{name}", sigma[..., k], ("row", "col"), units="mm",
              long_name=f"standard deviation of {name}", dtype="f4")  # fmt: skip
@@ -187,12 +175,27 @@ def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
 def write_field(path: str | Path, result: Field, provenance: Provenance) -> None:
     """Write one result file: aside, synced, renamed.
 
+    Parameters
+    ----------
+    path
+        Of the file; its folder must exist.
+    result
+        A shape (no ``uvw_mm``) or a displacement field.
+    provenance
+        What it was made from and how.
+
     Raises
     ------
     StorageError
         ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
     """
-    write_bytes(Path(path), encode_field(result, provenance))
+    with written_aside(Path(path)) as aside:
+        try:
+            with netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
+                _fill(dataset, result, provenance)
+        except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
+            full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
+            raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
 
 
 def _open(path: Path) -> Any:
@@ -241,7 +244,7 @@ def read_field(path: str | Path) -> Field:
         return Field(
             **arrays,
             status=np.asarray(variables["status"][...], dtype=np.int8),
-            iterations=np.asarray(variables["iterations"][...]),
+            iterations=np.asarray(variables["iterations"][...], dtype=np.int32),
             zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
             covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
         )

@@ -13,8 +13,6 @@ from core.field.result import Field
 from core.status import PointStatus
 from server.io.netcdf import COMPARISONS
 
-_HAVE_NUMBERS = (PointStatus.OK, PointStatus.EXTRAPOLATED)
-
 
 def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Signed distances (n,) of points (n, 3) from their best-fit plane (least squares of the normal distances)."""
@@ -39,14 +37,13 @@ def summarise(result: Field) -> dict[str, Any]:
         told is None.
     """
     status = result.status
-    valid = np.isin(status, [s.value for s in _HAVE_NUMBERS])
+    valid = result.valid
     points = int((status != PointStatus.MASKED).sum())
     n = int(valid.sum())
     epipolar = result.epipolar_px[valid]
-    moved = result.uvw_mm is not None
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
     summary: dict[str, Any] = {
-        "kind": "displacement" if moved else "shape",
+        "kind": "displacement" if result.has_motion else "shape",
         "points": points,
         "valid": n,
         "valid_fraction": n / points if points else None,
