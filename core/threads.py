@@ -18,7 +18,7 @@ kernel_lock = threading.RLock()
 
 def available_threads() -> int:
     """Return the largest number :func:`set_threads` takes in this process."""
-    return int(numba.config.NUMBA_NUM_THREADS)
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]  # set while numba is imported
 
 
 def threads() -> int:

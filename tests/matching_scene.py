@@ -25,7 +25,8 @@ def paper_pair(*, size: int = SIZE, kappa: float = 1e-9, cy2_error: float = 0.0)
     def camera(gamma_deg: float, beta: float, dcy: float, x0: float) -> Camera:
         return Camera.from_paper(
             phd_px=12000.0, cx_px=0.5 * size + 3.0, cy_px=0.5 * size - 2.0 + dcy, kappa_per_px2=kappa, aspect=0.9617,
-            alpha_rad=np.deg2rad(45.0), beta_rad=beta, gamma_rad=np.deg2rad(gamma_deg), x0_mm=x0, y0_mm=0.03, z0_mm=400.0,
+            alpha_rad=np.deg2rad(45.0), beta_rad=beta, gamma_rad=np.deg2rad(gamma_deg),
+            x0_mm=x0, y0_mm=0.03, z0_mm=400.0,
         )  # fmt: skip
 
     return StereoPair(camera(-30.0, 0.004, 0.0, 0.02), camera(30.0, -0.003, cy2_error, -0.05))
@@ -98,7 +99,7 @@ def _blob_sum(ab, blobs, scale):
 
 @dataclass(frozen=True)
 class Plane:
-    """Material point (a, b) lies at ``origin + basis (a, b)`` in the system frame; basis (3, 2) may turn and stretch."""
+    """Material point (a, b) lies at ``origin + basis (a, b)`` in sys; basis (3, 2) may turn and stretch."""
 
     origin: NDArray = field(default_factory=lambda: np.zeros(3))
     basis: NDArray = field(default_factory=lambda: np.eye(3)[:, :2])
@@ -137,7 +138,7 @@ def true_w(camera: Camera, plane: Plane, xy: NDArray) -> NDArray:
     return np.stack([rays @ n / d, np.full(len(rays), n[0] / d), np.full(len(rays), n[1] / d)], -1)
 
 
-def true_G(camera: Camera, before: Plane, after: Plane, xy: NDArray) -> NDArray:
+def true_g(camera: Camera, before: Plane, after: Plane, xy: NDArray) -> NDArray:
     """G (N, 3, 3) of the motion from one plane to the other."""
     w = true_w(camera, before, xy)
     rays = camera.rays_cam(xy).xyz_mm

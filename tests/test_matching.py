@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from matching_scene import Plane, Texture, digitise, grid, paper_pair, render, true_G, true_w
+from matching_scene import Plane, Texture, digitise, grid, paper_pair, render, true_g, true_w
 from scipy.spatial.transform import Rotation
 
 from core.matching import MatchOptions, fit_motion, fit_shape, prepare
@@ -34,7 +34,7 @@ def noisy(name, noise, rng):
 
 def starts(name):
     pair = paper_pair()
-    w, G = true_w(pair.cam1, PLANES["rest"], XY), true_G(pair.cam1, PLANES["rest"], PLANES[name], XY)
+    w, G = true_w(pair.cam1, PLANES["rest"], XY), true_g(pair.cam1, PLANES["rest"], PLANES[name], XY)
     G = G.copy()
     G[:, :2, 0] += np.array([3e-5, -3e-5])  # 0.36 px off
     return w * np.array([1.00003, 1.0, 1.0]), G

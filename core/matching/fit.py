@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from core.camera import Camera
 from core.errors import ImageError, InputError
 from core.lens import Float
-from core.matching._drivers import motion_points, shape_points
-from core.matching._motion import N_MOTION_OUT
-from core.matching._shape import N_SHAPE_OUT
 from core.matching.image import PAD, ImageData, prepare
+from core.matching.kernels.drivers import motion_points, shape_points
+from core.matching.kernels.motion import N_MOTION_OUT
+from core.matching.kernels.shape import N_SHAPE_OUT
 from core.matching.options import SPLINE_ORDER, MatchOptions
 from core.stereo import StereoPair
 from core.threads import apply_threads, kernel_lock

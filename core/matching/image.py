@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,7 +86,7 @@ def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "cubic"
         raise InputError(
             f"interpolation is {interpolation!r}, it must be 'cubic' or 'quintic'.", code="option_out_of_range"
         )
-    order = SPLINE_ORDER[interpolation]
+    order: Literal[3, 5] = 3 if interpolation == "cubic" else 5
     if isinstance(image, ImageData):
         if image.order != order:
             raise InputError(
@@ -101,6 +102,6 @@ def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "cubic"
         raise ImageError(f"an image of type {pixels.dtype} has no grey levels.")
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         raise ImageError("the image holds NaN or infinite grey levels.")
-    coefficients = ndimage.spline_filter(pixels, order=order, output=np.float64, mode="mirror")
+    coefficients = ndimage.spline_filter(pixels.astype(np.float64), order=order, output=np.float64, mode="mirror")
     padded = np.pad(coefficients, PAD, mode="reflect").astype(np.float32)
     return ImageData(padded, np.array(pixels, dtype=np.float32, order="C"), order)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from numba import njit, prange
 
-from core.matching._motion import motion_point
-from core.matching._point import work_space
-from core.matching._shape import shape_point
+from core.matching.kernels.motion import motion_point
+from core.matching.kernels.point import work_space
+from core.matching.kernels.shape import shape_point
 
 CHUNK = 64
 

@@ -134,8 +134,8 @@ def gradient(weights, blocks, offsets, rhs, images, out):
     for k in range(images):
         for r in range(9):
             s = 0.0
-            for l in range(images):
-                s += weights[k, l] * rhs[l, r]
+            for o in range(images):
+                s += weights[k, o] * rhs[o, r]
             a, j = divmod(r, 3)
             for i in range(4):
                 out[4 * j + i] += blocks[k, a, i] * s

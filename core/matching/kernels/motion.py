@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from core.matching._linear import assemble, factor, gradient, solve
-from core.matching._point import (
+from core.matching.kernels.linear import assemble, factor, gradient, solve
+from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -26,7 +26,7 @@ from core.matching._point import (
     settled,
     too_rough,
 )
-from core.matching._reference import reference_sums, set_up_reference
+from core.matching.kernels.reference import reference_sums, set_up_reference
 
 N_MOTION_OUT = 42
 N_RIGID = 10
@@ -159,8 +159,8 @@ def _reduce(normal, chain, rigid, half, reduced):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
-                 out):  # fmt: skip
+def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
+                 space, out):  # fmt: skip
     """Fit one point. ``out``: w (3), G (9), e, zncc (3), noise, covariance (25) of (w0, G00, G10, G20, e).
 
     Returns status and iterations.

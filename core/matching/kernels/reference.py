@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.matching._loops import FAST
-from core.matching._warp import lens_jacobian, undistort
+from core.matching.kernels.loops import FAST
+from core.matching.kernels.warp import lens_jacobian, undistort
 
 N_REFERENCE = 11
 # rows of the reference: X, Y, f, fX, fY, fX X, fX Y, fY X, fY Y, q X, q Y

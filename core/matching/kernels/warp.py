@@ -164,7 +164,7 @@ def set_up_warp(lens, m, box, rows, cols, stride, lead, p):
         and r2_max < lens[11]
     ):  # fmt: skip
         return -1
-    ix, iy = int(math.floor(x)), int(math.floor(y))
+    ix, iy = math.floor(x), math.floor(y)
     p[0], p[1], p[2], p[3], p[4], p[5] = d1, d2, a11, a12, a21, a22
     p[6], p[7], p[8], p[9], p[10] = 2.0 * u0, 2.0 * v0, l1, l2, l3
     p[11], p[12], p[13], p[14], p[15] = u0, v0, h11, h12, h22

@@ -3,7 +3,7 @@
 Everything per pixel, image and iteration happens in one loop that stores nothing: warp, interpolation and eleven sums.
 Without stores the compiler needs no aliasing promise and vectorises, with gathers for the taps. The warp is relative
 to the image of the subset's centre, which is set up in double precision outside, so single precision is exact to about
-2e-6 px. No bounds are tested here: :func:`core.matching._warp.set_up_warp` proves beforehand that every tap lies
+2e-6 px. No bounds are tested here: :func:`core.matching.kernels.warp.set_up_warp` proves beforehand that every tap lies
 inside the padded image.
 """
 
@@ -187,7 +187,7 @@ def sums_cubic(c, base, stride, p, ref, n, sums):
     stride
         int32 row length of ``c``.
     p
-        (25,) float32 warp, see :func:`core.matching._warp.set_up_warp`; the last two scale and shift grey levels.
+        (25,) float32 warp of :func:`core.matching.kernels.warp.set_up_warp`; the last two scale and shift grey levels.
     ref
         (5, n_max) float32: X, Y, reference grey level (mean taken out), its derivatives with respect to X and Y.
     n
@@ -245,7 +245,7 @@ def sums_quintic(c, base, stride, p, ref, n, sums):
     stride
         int32 row length of ``c``.
     p
-        (25,) float32 warp, see :func:`core.matching._warp.set_up_warp`; the last two scale and shift grey levels.
+        (25,) float32 warp of :func:`core.matching.kernels.warp.set_up_warp`; the last two scale and shift grey levels.
     ref
         (5, n_max) float32: X, Y, reference grey level (mean taken out), its derivatives with respect to X and Y.
     n

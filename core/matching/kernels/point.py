@@ -17,10 +17,10 @@ import math
 import numpy as np
 from numba import njit
 
-from core.matching._linear import invert3
-from core.matching._loops import N_SUMS, sums_cubic, sums_quintic
-from core.matching._reference import N_REFERENCE, nine_from_eight
-from core.matching._warp import N_WARP, lens_jacobian, set_up_warp
+from core.matching.kernels.linear import invert3
+from core.matching.kernels.loops import N_SUMS, sums_cubic, sums_quintic
+from core.matching.kernels.reference import N_REFERENCE, nine_from_eight
+from core.matching.kernels.warp import N_WARP, lens_jacobian, set_up_warp
 from core.status import PointStatus
 
 OK = int(PointStatus.OK)
@@ -148,7 +148,7 @@ def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, images, M):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def jacobian_blocks(R, t, e, nu_x, nu_y, images, M, inverse, blocks, offsets):
-    """``M^-1 dM`` per unknown, see :func:`core.matching._linear.assemble`; False if an M is singular."""
+    """``M^-1 dM`` per unknown, see :func:`core.matching.kernels.linear.assemble`; False if an M is singular."""
     for k in range(images):
         if not invert3(M[k], inverse):
             return False
@@ -184,9 +184,9 @@ def joint_weights(levels, images, weights):
         total += s * s
     for k in range(images):
         a = min(max(levels[k, 3], 0.05), 20.0) ** 2
-        for l in range(images):
-            b = min(max(levels[l, 3], 0.05), 20.0) ** 2
-            weights[k, l] = (a if k == l else 0.0) - a * b / total
+        for o in range(images):
+            b = min(max(levels[o, 3], 0.05), 20.0) ** 2
+            weights[k, o] = (a if k == o else 0.0) - a * b / total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

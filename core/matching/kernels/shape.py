@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from core.matching._linear import assemble, factor, gradient, solve
-from core.matching._point import (
+from core.matching.kernels.linear import assemble, factor, gradient, solve
+from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -26,7 +26,7 @@ from core.matching._point import (
     settled,
     too_rough,
 )
-from core.matching._reference import reference_sums, set_up_reference
+from core.matching.kernels.reference import reference_sums, set_up_reference
 
 N_SHAPE_OUT = 9
 
