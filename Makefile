@@ -1,0 +1,58 @@
+# Everything a newcomer needs. `make demo` and `make test` are the two that matter.
+# Each target sets up .venv by itself; it is made anew when pyproject.toml changes.
+
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+ARGS ?=
+
+.PHONY: help demo test serve check bench format accuracy clean
+
+help:
+	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
+	@echo "make test    run every test"
+	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
+	@echo "make check   lint, format check, types, import walls"
+	@echo "make bench   time the matching on this machine"
+	@echo "make accuracy   measure every figure of docs/accuracy.md again (about ten minutes)"
+
+$(STAMP): pyproject.toml
+	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "stereorig needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) -V 2>&1). Name another: make PYTHON=python3.12 ..."; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "Python's venv module is missing. Install it: apt-get install python3-venv"; exit 1; }
+	@rm -rf $(VENV)
+	@echo "Setting up $(VENV) (once) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; rm -rf $(VENV); exit 1; }
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/stereorig demo $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(ARGS)
+
+serve: $(STAMP)
+	$(BIN)/stereorig serve $(ARGS)
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(STAMP)
+	$(BIN)/python -m docs.scripts.bench $(ARGS)
+
+accuracy: $(STAMP)
+	$(BIN)/python -m docs.scripts.accuracy $(ARGS)
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

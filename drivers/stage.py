@@ -1,0 +1,179 @@
+"""What every stage driver promises: the stage protocol, its options and its results.
+
+A stage is one controller, or one chain of controllers on one serial line, with numbered axes. Positions are in
+millimetres in the controller's own coordinates, whose zero homing defines. Whatever enters a computation is a position
+that was read back, never one that was commanded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal, Protocol, runtime_checkable
+
+
+class AxisState(StrEnum):
+    """What an axis is doing or lacks."""
+
+    NOT_HOMED = "not_homed"  # its position means nothing yet
+    MOTOR_OFF = "motor_off"
+    HOMING = "homing"
+    MOVING = "moving"
+    READY = "ready"
+    FAULT = "fault"
+    CONFIGURATION = "configuration"  # the SMC100's configuration mode, in which it refuses to move
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisOptions:
+    """How one axis is used; comes from the rig file.
+
+    Parameters
+    ----------
+    soft_limits_mm
+        (low, high); can only tighten the controller's own travel limits.
+    velocity_mm_s, acceleration_mm_s2
+        Set when the stage is opened and read back; ``None`` leaves the controller's.
+    backlash_mm
+        Every move ends with at least this much travel in the direction that ``approach_from`` gives; 0 switches it off.
+    approach_from
+        Side from which every position is arrived at: ``below`` means by moving in the positive direction.
+    settle_ms
+        Wait between the end of motion and the reading of the position.
+    tolerance_mm
+        A read-back position further from the target than this is a fault.
+    assume_homed
+        Trust the controller's position although this driver did not home it. The ESP301 cannot say whether it was
+        homed, so the user must.
+    """
+
+    soft_limits_mm: tuple[float, float] | None = None
+    velocity_mm_s: float | None = None
+    acceleration_mm_s2: float | None = None
+    backlash_mm: float = 0.0
+    approach_from: Literal["below", "above"] = "below"
+    settle_ms: float = 0.0
+    tolerance_mm: float = 0.002
+    assume_homed: bool = False
+
+
+@dataclass(frozen=True)
+class AxisIdentity:
+    """What is connected to one axis, in the controller's words."""
+
+    axis: int
+    model: str
+    serial: str = ""
+    units: str = "mm"
+
+
+@dataclass(frozen=True)
+class StageIdentity:
+    """Who the controller is."""
+
+    driver: str
+    model: str
+    firmware: str
+    url: str
+    axes: tuple[AxisIdentity, ...]
+
+
+@dataclass(frozen=True)
+class AxisLimits:
+    """Where an axis may go: the controller's travel and the tighter of that and the rig file's soft limits."""
+
+    low_mm: float
+    high_mm: float
+    controller_low_mm: float
+    controller_high_mm: float
+
+
+@dataclass(frozen=True)
+class AxisStatus:
+    """State of one axis, all read from the controller in one go except ``homed`` where it cannot say."""
+
+    axis: int
+    state: AxisState
+    position_mm: float
+    motor_on: bool
+    homed: bool
+    moving: bool
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class ControllerMessage:
+    """One entry of a controller's error queue."""
+
+    code: str
+    text: str
+    axis: int | None = None
+
+
+@dataclass(frozen=True)
+class MoveResult:
+    """Where an axis was sent and where it stands, read back after settling."""
+
+    axis: int
+    target_mm: float
+    position_mm: float
+    duration_s: float
+
+
+@runtime_checkable
+class Stage(Protocol):
+    """A stage with numbered axes. Every call may come from any thread; motion calls are serialised, `stop` never waits.
+
+    Errors are `core.errors.StageError` with one of these codes: ``out_of_limits`` (also NaN and infinite targets: no
+    byte went out), ``not_homed``, ``motor_off``, ``motion_fault`` (limit switch, stall, following error, position not
+    reached: the axis was stopped), ``stage_stopped`` (somebody called `stop` during or before the motion),
+    ``stage_lost`` (silence or garbage: the position is unknown), ``stage_refused`` (the controller's own error),
+    ``invalid_axis``.
+    """
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Axis numbers, as the controller counts them."""
+
+    def open(self) -> None:
+        """Connect, identify, read units and limits, set and read back velocities. Moves nothing."""
+
+    def close(self) -> None:
+        """Release the line; an axis that this driver is moving is stopped first. Safe to call twice."""
+
+    def identify(self) -> StageIdentity:
+        """Say who answers, for example ``ESP301 Version 3.09``."""
+
+    def enable(self, axis: int) -> None:
+        """Switch the motor on."""
+
+    def disable(self, axis: int) -> None:
+        """Switch the motor off."""
+
+    def home(self, axis: int, *, timeout_s: float = 120.0) -> float:
+        """Search home, wait until it is found, and return the position read back in mm."""
+
+    def move_to(self, axis: int, position_mm: float) -> MoveResult:
+        """Move, arrive from the configured side, settle, and return the position read back."""
+
+    def move_by(self, axis: int, distance_mm: float) -> MoveResult:
+        """As `move_to`, from the position that is read back at the start."""
+
+    def move_many(self, targets_mm: Mapping[int, float]) -> dict[int, MoveResult]:
+        """Move several axes at the same time; all targets are checked before any axis starts."""
+
+    def stop(self, axis: int | None = None) -> None:
+        """Stop one axis or all, at once: never waits for a lock, never queued; motions waiting their turn are void."""
+
+    def position(self, axis: int) -> float:
+        """Read the position in mm; works while another thread waits in a move."""
+
+    def state(self, axis: int) -> AxisStatus:
+        """Read the state; works while another thread waits in a move."""
+
+    def limits(self, axis: int) -> AxisLimits:
+        """Where the axis may go."""
+
+    def errors(self) -> tuple[ControllerMessage, ...]:
+        """Empty the controller's error queue and return it, together with what earlier calls took from it unread."""
