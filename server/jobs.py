@@ -359,6 +359,9 @@ class JobManager:
             self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
             return False
         except Exception as error:  # noqa: BLE001 - the job's failure, not the service's
+            if job.cancelled and isinstance(error, StereorigError) and error.code == "stage_stopped":
+                self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
+                return False
             if not isinstance(error, StereorigError):
                 _log.exception("job %s (%s) failed", job.id, job.kind)
             self._end(job, "failed", error)

@@ -20,10 +20,11 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from core.errors import Cancelled, MeasurementError
-from core.progress import Progress
 from server.worker_process import serve
 
 _log = logging.getLogger("stereorig.worker")
+
+Progress = Callable[[str, int, int], None]
 
 
 class WorkerDiedError(MeasurementError):

@@ -5,24 +5,14 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import tifffile
-from numpy.typing import NDArray
-
 from server.errors import NotFoundError
-from server.store.durable import make_folder, read_json, sha256_of, write_bytes, write_json
+from server.io.files import sha256_of
+from server.io.images import GrayImage, encode_tiff
+from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
-
-
-def tiff_bytes(image: NDArray[Any]) -> bytes:
-    """Return a grey image as TIFF, as the camera gave it (8 or 16 bit, no compression)."""
-    buffer = io.BytesIO()
-    tifffile.imwrite(buffer, np.ascontiguousarray(image), photometric="minisblack")
-    return buffer.getvalue()
 
 
 class CalibrationStore:
@@ -58,10 +48,10 @@ class CalibrationStore:
         write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
         return calibration_id
 
-    def put_view(self, calibration_id: str, index: int, cam: str, image: NDArray[Any]) -> dict[str, str]:
+    def put_view(self, calibration_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
         """Store one view; return its file name and checksum."""
         name = f"{index:03d}_{cam}.tif"
-        digest = write_bytes(self.path(calibration_id) / "views" / name, tiff_bytes(image))
+        digest = write_bytes(self.path(calibration_id) / "views" / name, encode_tiff(image))
         return {"file": f"views/{name}", "sha256": digest}
 
     def put_views_done(self, calibration_id: str, views: list[dict[str, Any]]) -> None:

@@ -1,37 +1,20 @@
 """Files that survive a kill at any instant.
 
-Every file of the data folder comes into being here: written under a temporary name in its own folder, fsynced, renamed, and the folder
-fsynced. Whoever finds a file under its real name finds all of it.
+Every document of the data folder comes into being here: written aside in its own folder, fsynced, renamed, and the folder fsynced
+(:mod:`server.io.files`). Whoever finds a file under its real name finds all of it.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
 import os
-import secrets
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from core.errors import FileFormatError, StorageError
-
-TEMPORARY_SUFFIX = ".tmp"
-_FULL = (errno.ENOSPC, errno.EDQUOT)
-
-
-def storage_error(error: OSError, path: Path) -> StorageError:
-    """Turn an operating system error into ``storage_full`` or ``storage_failed``."""
-    if error.errno in _FULL:
-        return StorageError(
-            f"No space left to write {path.name}: {error.strerror}.",
-            code="storage_full",
-            remedy="Free space on the data folder's disk; what was not acknowledged was not kept.",
-            file=path.name,
-        )
-    return StorageError(f"Writing {path.name} failed: {error.strerror or error}.", file=path.name)
+from core.errors import FileFormatError
+from server.io.files import storage_error, written_aside
 
 
 def fsync_folder(folder: Path) -> None:
@@ -58,38 +41,10 @@ def make_folder(folder: Path) -> None:
         raise storage_error(error, folder) from error
 
 
-def publish(path: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` produce a temporary file beside ``path``, then make it durable under its real name.
-
-    Raises
-    ------
-    StorageError
-        If any step fails; nothing is then visible under ``path``.
-    """
-    # the name ends as the real one does, for writers that look at it
-    temporary = path.with_name(f".{secrets.token_hex(4)}{TEMPORARY_SUFFIX}.{path.name}")
-    try:
-        write(temporary)
-        descriptor = os.open(temporary, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        os.replace(temporary, path)
-        fsync_folder(path.parent)
-    except OSError as error:
-        raise storage_error(error, path) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_bytes(path: Path, data: bytes) -> str:
     """Write ``data`` durably; return its SHA-256 in hex."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(data)
-
-    publish(path, write)
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
     return hashlib.sha256(data).hexdigest()
 
 
@@ -116,12 +71,6 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise FileFormatError(f"{path.name} holds {type(document).__name__}, not an object.", file=path.name)
     return document
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def without_nan(value: Any) -> Any:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import IO
 
 from core.errors import FileFormatError, StateError, StorageError
-from server.store.durable import TEMPORARY_SUFFIX, read_json, storage_error, write_bytes, write_json
+from server.io.files import storage_error
+from server.store.durable import read_json, write_bytes, write_json
 
 FORMAT = 1
 _ID = re.compile(r"[a-z]\d{6}-[0-9a-f]{6}")
@@ -137,8 +138,8 @@ class DataFolder:
             )
 
     def _remove_temporaries(self) -> None:
-        # what a kill left half written; only names that `durable.publish` makes
-        for path in self.root.rglob(f".*{TEMPORARY_SUFFIX}.*"):
+        # what a kill left half written; only names that `written_aside` makes
+        for path in self.root.rglob(".*.part"):
             path.unlink(missing_ok=True)
 
     def close(self) -> None:

@@ -14,7 +14,8 @@ from typing import Any
 
 from core.errors import FileFormatError, StateError, StorageError
 from server.errors import NotFoundError
-from server.store.durable import make_folder, read_json, sha256_of, write_bytes, write_json
+from server.io.files import sha256_of
+from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
 CAMERAS = ("cam1", "cam2")
