@@ -1,0 +1,153 @@
+"""What grid detection takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from core.lens import Bool, Float
+from core.target import GridTarget
+
+Localiser = Literal["profile", "paper"]
+LineModel = Literal["straight", "parabola", "local"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridOptions:
+    """How to look for the grid.
+
+    Parameters
+    ----------
+    line_model
+        What joins a line's pieces. ``straight``: all lines are straight but for one common lens distortion, found from the
+        lines themselves; it averages the maker's node errors best. ``parabola``: one non-oblique parabola a line,
+        as in the paper. ``local``: each intersection from the pieces beside it only, which keeps the node errors
+        visible to an adjustment that solves for them. None takes ``straight`` for the profile localiser, ``parabola`` for the paper's.
+    saturation
+        Grey level at which the sensor saturates; None finds it from the type and the image itself.
+    max_bad_fraction
+        Part of all line pieces that dirt or glare may spoil.
+    max_bad_on_line
+        Part of one line's pieces that may be spoilt.
+    max_rotation_rad
+        Largest departure of the grid's rotation from 45 degrees: 20 degrees and a little for the estimate's own error.
+    """
+
+    line_model: LineModel | None = None
+    saturation: float | None = None
+    max_bad_fraction: float = 0.15
+    max_bad_on_line: float = 0.4
+    max_rotation_rad: float = float(np.radians(22.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridView:
+    """The grid as one image shows it.
+
+    A grid without marks looks the same after a turn by 90 or 180 degrees, and in a mirror: no single image tells them apart. The
+    indices here follow the image (X_sys right and down, Y_sys left and down), so both cameras give the same
+    physical corner the same index as long as both images stand upright. A turned or mirrored image shows itself in the calibration,
+    whose angles then disagree with the nominal rig.
+
+    Parameters
+    ----------
+    target
+        The description it was found by.
+    xy_px
+        (n_a - 2, n_b - 2, 2) inner intersections, indexed [i along X_sys, j along Y_sys].
+    covariance_px2
+        (n_a - 2, n_b - 2, 2, 2) of each intersection, from the image's own noise; without the maker's node errors.
+    localiser, line_model
+        How they were found.
+    image_size_px
+        Columns, rows.
+    noise
+        Grey levels, standard deviation of what the line profiles leave.
+    contrast
+        Grey levels, median depth of a line of full width against its ground.
+    background
+        Grey levels, median of the ground beside the lines.
+    blur_px
+        Median standard deviation of lens blur and line edge, without the pixel's own integration.
+    line_width_px
+        Median width of a line, across it.
+    pitch_px
+        Median distance of neighbouring intersections.
+    threshold
+        Part of the local contrast at which the image was made binary.
+    rotation_rad
+        Rotation of the grid in the image, near alpha of Eq. (1).
+    fit_rms_px
+        What the line pieces leave across the lines after the line model's fit.
+    pieces_px
+        (n, 2, 2) end points of the line pieces used, for pictures.
+    pieces_used
+        (n,) False for a piece that dirt or glare spoilt.
+    """
+
+    target: GridTarget
+    xy_px: Float
+    covariance_px2: Float
+    localiser: Localiser
+    line_model: LineModel
+    image_size_px: tuple[int, int]
+    noise: float
+    contrast: float
+    background: float
+    blur_px: float
+    line_width_px: float
+    pitch_px: float
+    threshold: float
+    rotation_rad: float
+    fit_rms_px: float
+    pieces_px: Float
+    pieces_used: Bool
+
+    @property
+    def sigma_px(self) -> Float:
+        """Standard deviation of each intersection per axis, (n_a - 2, n_b - 2, 2)."""
+        return np.sqrt(np.stack([self.covariance_px2[..., 0, 0], self.covariance_px2[..., 1, 1]], axis=-1))
+
+    @property
+    def object_points_mm(self) -> Float:
+        """Nominal places of the intersections, (n_a - 2, n_b - 2, 2) X_sys, Y_sys."""
+        return self.target.inner_points_mm()
+
+    def overlay(self) -> GridOverlay:
+        """Return what a picture of the detection needs."""
+        return GridOverlay(
+            pieces_px=self.pieces_px,
+            pieces_used=self.pieces_used,
+            line_a_px=tuple(self.xy_px[i] for i in range(self.xy_px.shape[0])),
+            line_b_px=tuple(self.xy_px[:, j] for j in range(self.xy_px.shape[1])),
+            origin_px=self.xy_px[0, 0],
+            x_axis_px=np.stack([self.xy_px[0, 0], self.xy_px[-1, 0]]),
+            y_axis_px=np.stack([self.xy_px[0, 0], self.xy_px[0, -1]]),
+        )
+
+
+@dataclass(frozen=True)
+class GridOverlay:
+    """Polylines to lay over the image.
+
+    Parameters
+    ----------
+    pieces_px, pieces_used
+        (n, 2, 2) line pieces, and whether each was used.
+    line_a_px, line_b_px
+        Polylines (m, 2) of the inner lines of each family.
+    origin_px
+        (2,) intersection [0, 0].
+    x_axis_px, y_axis_px
+        (2, 2) from intersection [0, 0] to the last one along X_sys and along Y_sys.
+    """
+
+    pieces_px: Float
+    pieces_used: Bool
+    line_a_px: tuple[Float, ...]
+    line_b_px: tuple[Float, ...]
+    origin_px: Float
+    x_axis_px: Float
+    y_axis_px: Float

@@ -1,0 +1,95 @@
+"""The calibration target: a precision grid of two families of equidistant lines.
+
+Index and frame conventions, the same for every camera: ``lines = (n_a, n_b)``. Walking along X_sys, which in the image goes right and
+down, one crosses the ``n_a`` lines of family a; walking along Y_sys, left and down, the ``n_b`` lines of family b. The
+origin is the centre of the full set of lines, Z_sys = 0 is the plane of the grid at the first position. Only inner intersections
+are used: the outermost lines end at their crossings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.errors import TargetError
+from core.lens import Float
+
+_LEAST_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridTarget:
+    """What is known of the grid before the first image.
+
+    Parameters
+    ----------
+    pitch_mm
+        Distance of neighbouring lines.
+    lines
+        (n_a, n_b) lines crossed walking along X_sys and along Y_sys.
+    line_width_mm
+        Width of a line.
+    node_tolerance_mm
+        The maker's bound on the error of an intersection's place, per axis; 0 for an exact grid.
+    dark_lines
+        Dark lines on bright ground, or bright lines on dark ground.
+
+    Raises
+    ------
+    TargetError
+        Code ``target_invalid``, if a number makes no grid.
+    """
+
+    pitch_mm: float
+    lines: tuple[int, int]
+    line_width_mm: float
+    node_tolerance_mm: float = 0.0
+    dark_lines: bool = True
+
+    def __post_init__(self) -> None:
+        lines = tuple(self.lines)
+        if len(lines) != 2 or any(isinstance(n, bool) or int(n) != n for n in lines):
+            raise _invalid(f"lines must be two whole numbers, got {self.lines!r}")
+        object.__setattr__(self, "lines", (int(lines[0]), int(lines[1])))
+        if min(self.lines) < _LEAST_LINES:
+            raise _invalid(f"a grid needs at least {_LEAST_LINES} lines each way, got {list(self.lines)}")
+        if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
+            raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")
+        if not (0.0 < self.line_width_mm < 0.5 * self.pitch_mm):
+            raise _invalid(
+                f"line_width_mm must lie between 0 and half of the pitch ({0.5 * self.pitch_mm:g} mm),"
+                f" got {self.line_width_mm!r}"
+            )
+        if not (0.0 <= self.node_tolerance_mm < 0.25 * self.pitch_mm):
+            raise _invalid(
+                f"node_tolerance_mm must lie between 0 and a quarter of the pitch ({0.25 * self.pitch_mm:g} mm),"
+                f" got {self.node_tolerance_mm!r}"
+            )
+
+    @property
+    def inner_shape(self) -> tuple[int, int]:
+        """Number of usable intersections along X_sys and along Y_sys."""
+        return self.lines[0] - 2, self.lines[1] - 2
+
+    def inner_points_mm(self) -> Float:
+        """Return the nominal places of the inner intersections in the system frame.
+
+        Returns
+        -------
+        Float
+            (n_a - 2, n_b - 2, 2) X_sys, Y_sys in mm, indexed [i along X_sys, j along Y_sys]. Z_sys is 0.
+        """
+        return self._points(1)
+
+    def all_points_mm(self) -> Float:
+        """Return the nominal places of all intersections, the outermost ones too, (n_a, n_b, 2) in mm."""
+        return self._points(0)
+
+    def _points(self, margin: int) -> Float:
+        x, y = ((np.arange(margin, n - margin, dtype=np.float64) - 0.5 * (n - 1)) * self.pitch_mm for n in self.lines)
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+
+
+def _invalid(cause: str) -> TargetError:
+    return TargetError(cause, code="target_invalid", remedy="Correct the target's description.")

@@ -1,0 +1,125 @@
+"""Whatever calibration file a user has: recognised by its content, read, and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.camera import Camera
+from core.errors import FileFormatError
+from core.stereo import StereoPair
+from server.io.dice_xml import looks_like_dice, parse_dice_xml
+from server.io.imported_pair import invalid, unreadable
+from server.io.opencv_yaml import looks_like_opencv, parse_opencv
+
+PARAMETER_NAMES = (
+    "phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect",
+    "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm",
+)  # fmt: skip
+_MAX_BYTES = 64 << 20
+_LEAST_BASELINE = 1e-6  # of the stand-off
+
+
+@dataclass(frozen=True)
+class LoadedCalibration:
+    """A pair of cameras and where it came from.
+
+    Attributes
+    ----------
+    pair
+        The cameras; the system frame is the target's for a calibration.json, camera 1's own for the imports.
+    image_size1_px, image_size2_px
+        (width, height) the calibration was made for, None where the file does not say.
+    source
+        ``calibration_json``, ``dice_xml`` or ``opencv_yaml``.
+    sha256
+        Of the file's bytes.
+    details
+        The whole content of a calibration.json, empty for the imports.
+    """
+
+    pair: StereoPair
+    image_size1_px: tuple[int, int] | None
+    image_size2_px: tuple[int, int] | None
+    source: str
+    sha256: str
+    details: dict[str, Any]
+
+
+def _camera(name: str, which: str, content: Any) -> Camera:
+    if not isinstance(content, dict):
+        raise unreadable(name, f"{which} is missing" if content is None else f"{which} is not an object")
+    missing = [key for key in PARAMETER_NAMES if key not in content]
+    if missing:
+        raise unreadable(name, f"{which} lacks {', '.join(missing)}")
+    values: dict[str, float] = {}
+    for key in PARAMETER_NAMES:
+        value = content[key]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise unreadable(name, f"{key} of {which} is {value!r}, not a number")
+        if not np.isfinite(value):
+            raise invalid(name, f"{key} of {which} is {value}")
+        values[key] = float(value)
+    for key in ("phd_px", "aspect", "z0_mm"):
+        if values[key] <= 0.0:
+            raise invalid(name, f"{key} of {which} is {values[key]:g}, not positive")
+    return Camera.from_paper(**values)
+
+
+def _size(content: Any) -> tuple[int, int] | None:
+    size = content.get("image_size_px") if isinstance(content, dict) else None
+    if isinstance(size, list) and len(size) == 2 and all(isinstance(v, int) and v > 0 for v in size):
+        return size[0], size[1]
+    return None
+
+
+def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
+    """Recognise and read the bytes of a calibration file, see :func:`load_calibration`."""
+    digest = hashlib.sha256(data).hexdigest()
+    if looks_like_dice(data):
+        pair, size1, size2 = parse_dice_xml(data, name=name)
+        return LoadedCalibration(pair, size1, size2, "dice_xml", digest, {})
+    if looks_like_opencv(data):
+        pair, size = parse_opencv(data, name=name)
+        return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {})
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise unreadable(name, "it is none of the known kinds") from error
+    if not isinstance(content, dict) or not {"cam1", "cam2"} & content.keys():
+        raise unreadable(name, "it is JSON, but has no cam1 and cam2")
+    cam1, cam2 = (_camera(name, which, content.get(which)) for which in ("cam1", "cam2"))
+    pair = StereoPair(cam1, cam2)
+    if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
+        raise invalid(name, "both cameras stand at the same place")
+    sizes = [_size(content.get(which)) for which in ("cam1", "cam2")]
+    return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
+
+
+def load_calibration(path: str | Path) -> LoadedCalibration:
+    """Read a calibration.json, a DICe XML camera system or an OpenCV stereo calibration.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``; ``calibration_unreadable`` (unknown kind, damaged, something missing);
+        ``calibration_unsupported`` (a lens model that cannot be carried over exactly);
+        ``calibration_invalid`` (NaN, no rotation, no baseline).
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise unreadable(str(path), f"it has {path.stat().st_size} bytes, far more than a calibration")
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileFormatError(
+            f"The calibration {path} does not exist.", code="file_missing", remedy="Check the path."
+        ) from error
+    except OSError as error:
+        raise unreadable(str(path), error.strerror or str(error)) from error
+    return parse_calibration(data, name=str(path))
