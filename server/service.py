@@ -62,12 +62,24 @@ class Service:
         # stopping must not wait behind forty slow requests
         self.stop_thread = ThreadPoolExecutor(max_workers=2, thread_name_prefix="stop")
         self.started_monotonic = time.monotonic()
+        self.closing = False
         self._key_locks: dict[tuple[str, str], threading.Lock] = {}
         self._key_guard = threading.Lock()
         self.gate.start(self.rig.open)
 
+    def stop_if_moving(self) -> None:
+        """Stop the stage if a motion runs; for cancelled jobs that may or may not be moving."""
+        if self.rig.fault is None and self.gate.holder is not None:
+            self.rig.stop()
+
+    def stop_streams(self) -> None:
+        """End live views and event streams, which would otherwise outlast every shutdown."""
+        self.closing = True
+        self.hub.close()
+
     def close(self) -> None:
         """Stop the stage first, then jobs, worker, rig and files."""
+        self.stop_streams()
         if self.rig.fault is None:
             try:
                 self.rig.stop()
@@ -77,7 +89,6 @@ class Service:
         self.worker.shutdown()
         self.gate.close()
         self.rig.close()
-        self.hub.close()
         self.stop_thread.shutdown(wait=False)
         self.catalog.close()
         self.folder.close()

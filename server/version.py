@@ -1,15 +1,18 @@
-"""The software's version, as results carry it."""
+"""The version that results and the service report."""
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
+import functools
+import tomllib
+from importlib import metadata
+from pathlib import Path
 
 
-def _version() -> str:
+@functools.cache
+def software_version() -> str:
+    """Return the installed distribution's version, or that of the source tree it runs from."""
     try:
-        return version("stereorig")
-    except PackageNotFoundError:  # run from a checkout that was not installed
-        return "0.1.0+checkout"
-
-
-VERSION = _version()
+        return metadata.version("stereorig")
+    except metadata.PackageNotFoundError:
+        project = Path(__file__).resolve().parent.parent / "pyproject.toml"
+        return str(tomllib.loads(project.read_text())["project"]["version"])

@@ -17,7 +17,7 @@ from server.errors import NotFoundError
 from server.jobs import Job, Phase
 from server.service import Service
 from server.store.index import analysis_entry
-from server.version import VERSION
+from server.version import software_version
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
 
@@ -42,7 +42,7 @@ def create_analysis(service: ServiceDep, test_id: TestId, body: AnalysisRequest,
             "label": body.label,
             "settings": settings,
             "steps": steps,
-            "software": VERSION,
+            "software": software_version(),
             "inputs": analyses.inputs_of(service, test_id, steps, calibration),
             **request.document(),
         }

@@ -14,7 +14,7 @@ from fastapi.responses import HTMLResponse
 from server.api import analyses, calibrations, jobs, problems, results, rig, stage, system, tests
 from server.api.guard import LOOPBACK_NAMES, Guard
 from server.service import Service
-from server.version import VERSION
+from server.version import software_version
 
 PREFIX = "/api/v1"
 _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
@@ -42,7 +42,7 @@ def create_app(service: Service, *, hosts: frozenset[str] = LOOPBACK_NAMES, clos
 
     app = FastAPI(
         title="stereorig",
-        version=VERSION.split("+")[0],
+        version=software_version().split("+")[0],
         description=_DESCRIPTION,
         lifespan=lifespan,
         openapi_url=f"{PREFIX}/openapi.json",
@@ -98,7 +98,7 @@ def _page(app: FastAPI) -> str:
     return (
         "<!doctype html><meta charset=utf-8><title>stereorig</title><style>body{font:15px system-ui,sans-serif;margin:2em;"
         "max-width:72em;color-scheme:light dark}td{padding:.3em .8em .3em 0;vertical-align:top}</style>"
-        f"<h1>stereorig {html.escape(VERSION)}</h1><p>Every operation of the API; its full description is "
+        f"<h1>stereorig {html.escape(software_version())}</h1><p>Every operation of the API; its full description is "
         f'<a href="{PREFIX}/openapi.json">openapi.json</a>. The rig is at <a href="{PREFIX}/rig">{PREFIX}/rig</a>.'
         f"<table>{''.join(rows)}</table>"
     )

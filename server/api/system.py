@@ -11,7 +11,7 @@ from fastapi.responses import PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.api.dependencies import ServiceDep
-from server.version import VERSION
+from server.version import software_version
 
 router = APIRouter(tags=["system"])
 LastEventId = Annotated[
@@ -25,7 +25,7 @@ def healthz(service: ServiceDep) -> dict[str, Any]:
     """Answer quickly, whatever else is going on; says what is not well."""
     return {
         "status": "ok",
-        "version": VERSION,
+        "version": software_version(),
         "uptime_s": round(time.monotonic() - service.started_monotonic, 1),
         "rig": "fault" if service.rig.fault else "ok",
         "worker": "ready" if service.worker.ready.is_set() else "starting",

@@ -101,9 +101,17 @@ def run(args: argparse.Namespace) -> int:
     app = create_app(service)
     name = f"[{args.host}]" if ":" in args.host else args.host
     url = f"http://{name}:{listener.getsockname()[1]}"
-    server = _AnnouncingServer(
-        uvicorn.Config(app, log_level=args.log_level, access_log=False, timeout_graceful_shutdown=3, lifespan="on"),
-        f"stereorig serves {config.rig.name} on {url} (data in {service.folder.root})",
-    )
-    server.run(sockets=[listener])
+
+    class AnnouncingServer(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets=sockets)
+            if self.started:
+                print(f"stereorig serves the {config.rig.name} on {url} (data in {service.folder.root})", flush=True)
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            service.stop_streams()  # or the server would wait for them
+            await super().shutdown(sockets=sockets)
+
+    settings = uvicorn.Config(app, log_level=args.log_level, access_log=False, timeout_graceful_shutdown=3, lifespan="on")
+    AnnouncingServer(settings).run(sockets=[listener])
     return 0
