@@ -60,7 +60,12 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
             kind="shape" if index == 0 or measured is None else "motion",
             n=n,
             reference=steps[0] if measured is not None else n,
-            images={"ref1": str(reference.cam1), "ref2": str(reference.cam2), "cur1": str(step.cam1), "cur2": str(step.cam2)},
+            images={
+                "ref1": str(reference.cam1),
+                "ref2": str(reference.cam2),
+                "cur1": str(step.cam1),
+                "cur2": str(step.cam2),
+            },
             previous=steps[index - 1] if index > 0 else None,
             settings=settings,
             provenance={

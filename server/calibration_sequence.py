@@ -1,7 +1,8 @@
 """The calibration sequence: move, settle, average, read back; return to zero and look whether the grid is where it was.
 
-Each camera travels along its own optical axis. Every position is arrived at from one side (the stage driver takes up backlash), positions that enter the computation are
-read back. The fit runs in the worker once the hardware is free again.
+Each camera travels along its own optical axis. Every position is arrived at from one side (the stage driver takes up
+backlash), positions that enter the computation are read back. The fit runs in the worker once the hardware is free
+again.
 """
 
 from __future__ import annotations
@@ -123,7 +124,9 @@ def fit(service: Service, job: Job, calibration_id: str) -> dict[str, Any]:
     """Compute phase: find the grid in every view, adjust, check; ``calibration.json`` is there when this returns."""
     from server.calibration_task import fit_calibration
 
-    summary = run_task(service.worker, job, fit_calibration, str(service.calibrations.path(calibration_id)), rig_facts(service.config))
+    summary = run_task(
+        service.worker, job, fit_calibration, str(service.calibrations.path(calibration_id)), rig_facts(service.config)
+    )
     return dict(summary)
 
 

@@ -76,7 +76,9 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
         "quality": pair_quality(*(image_quality(images[cam], depth[cam]) for cam in CAMERAS)),
         "image_size_px": {cam: [images[cam].shape[1], images[cam].shape[0]] for cam in CAMERAS},
     }
-    return _announce(service, service.tests.add_step(test_id, {cam: encode_tiff(images[cam]) for cam in CAMERAS}, document))
+    return _announce(
+        service, service.tests.add_step(test_id, {cam: encode_tiff(images[cam]) for cam in CAMERAS}, document)
+    )
 
 
 def _announce(service: Service, step: dict[str, Any]) -> dict[str, Any]:

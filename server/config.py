@@ -1,7 +1,7 @@
 """The rig file: one closed model, with a description on every field.
 
-The same TOML file serves ``stereorig serve`` and, as far as the nominal camera data go, ``stereorig calibrate``. A key that is not known is an error, not a
-silent nothing; errors are one line that names the field.
+The same TOML file serves ``stereorig serve`` and, as far as the nominal camera data go, ``stereorig calibrate``. A
+key that is not known is an error, not a silent nothing; errors are one line that names the field.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ class CameraSection(_Closed):
     driver: Literal["sim", "aravis", "v4l2"] = Field("sim", description="Frame grabber driver.")
     device: str | None = Field(None, description="The driver's name of the device; the simulated rig needs none.")
     stage_axis: int = Field(1, ge=1, le=6, description="Stage axis that moves this camera along its optical axis.")
-    stage_sign: Literal[-1, 1] = Field(1, description="dZ = sign * (position - zero), dZ positive away from the target.")
+    stage_sign: Literal[-1, 1] = Field(
+        1, description="dZ = sign * (position - zero), dZ positive away from the target."
+    )
     exposure_ms: Positive | None = Field(None, description="Exposure set when the camera is opened.")
     gain_db: Finite | None = Field(None, description="Gain set when the camera is opened.")
 
@@ -60,7 +62,9 @@ class StageSection(_Closed):
     velocity_mm_s: Positive | None = Field(None, description="Velocity set when the stage is opened.")
     acceleration_mm_s2: Positive | None = Field(None, description="Acceleration set when the stage is opened.")
     backlash_mm: Annotated[float, Field(ge=0.0)] = Field(0.0, description="Every move arrives with this much travel.")
-    approach_from: Literal["below", "above"] = Field("below", description="Side that every position is arrived at from.")
+    approach_from: Literal["below", "above"] = Field(
+        "below", description="Side that every position is arrived at from."
+    )
     settle_ms: Annotated[float, Field(ge=0.0, le=60000.0)] = Field(0.0, description="Wait after the end of motion.")
     tolerance_mm: Positive = Field(0.002, description="A position read back further from its target is a fault.")
     zero_mm: Finite = Field(0.0, description="Stage position of dZ = 0, where the cameras measure.")
@@ -99,7 +103,9 @@ class ServiceSection(_Closed):
     """[service]: limits of the service itself."""
 
     compute_queue: int = Field(16, ge=1, le=1000, description="Computations that may wait; beyond it 503.")
-    kernel_threads: int | None = Field(None, ge=1, le=256, description="Kernel threads of the worker; all cores if left out.")
+    kernel_threads: int | None = Field(
+        None, ge=1, le=256, description="Kernel threads of the worker; all cores if left out."
+    )
 
 
 class RigConfig(_Closed):

@@ -1,6 +1,7 @@
 """What happens in the service, as a numbered stream that readers can resume.
 
-Events live in a bounded ring. A slow reader loses the oldest ones and can see that it did (numbers jump); it never holds up a writer.
+Events live in a bounded ring. A slow reader loses the oldest ones and can see that it did (numbers jump); it never
+holds up a writer.
 """
 
 from __future__ import annotations

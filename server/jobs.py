@@ -1,8 +1,9 @@
 """Jobs: anything that takes longer than a request.
 
-A job goes through phases, each on a lane: ``hardware`` (exclusive, never queued) or ``compute`` (queued, bounded, one at a time). Its states are ``queued running
-cancelling succeeded failed cancelled interrupted``. A job is in the catalogue before it is acknowledged; what was not finished when the service ended
-reads ``interrupted`` after the next start.
+A job goes through phases, each on a lane: ``hardware`` (exclusive, never queued) or ``compute`` (queued, bounded, one
+at a time). Its states are ``queued running cancelling succeeded failed cancelled interrupted``. A job is in the
+catalogue before it is acknowledged; what was not finished when the service ended reads ``interrupted`` after the next
+start.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Quality of a captured image, before anyone relies on it.
 
-Figures are cheap and plain: mean grey level, share of saturated pixels, gradient (texture) and how much of it survives at the pixel scale (focus). A code names what is wrong
-with an image that cannot be measured on.
+Figures are cheap and plain: mean grey level, share of saturated pixels, gradient (texture) and how much of it
+survives at the pixel scale (focus). A code names what is wrong with an image that cannot be measured on.
 """
 
 from __future__ import annotations

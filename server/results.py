@@ -60,7 +60,9 @@ def read_variable(path: Path, name: str) -> Variable:
                 available=sorted(data.variables),
             )
         variable = data.variables[name]
-        return Variable(_values(variable), str(getattr(variable, "units", "1")), str(getattr(variable, "long_name", "")))
+        return Variable(
+            _values(variable), str(getattr(variable, "units", "1")), str(getattr(variable, "long_name", ""))
+        )
 
 
 def probe_result(path: Path, x_px: float, y_px: float) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The compute worker as a ``concurrent.futures.Executor``: one process, restarted when it dies.
 
-Kernels never run in the service's own process: in a thread there they would delay the event loop by tens of milliseconds. A task function finds its channel for
-progress and cancellation with :func:`server.worker_process.current_task`, so the same function runs under any other executor.
+Kernels never run in the service's own process: in a thread there they would delay the event loop by tens of
+milliseconds. A task function finds its channel for progress and cancellation with
+:func:`server.worker_process.current_task`, so the same function runs under any other executor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The compute worker's side: one process, spawned, with warm kernels.
 
-Imports nothing heavy before the thread counts are pinned, since the numerical libraries read them once, when they are loaded.
+Imports nothing heavy before the thread counts are pinned, since the numerical libraries read them once, when they are
+loaded.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from server.api.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, m
 from server.api.models import AnalysisAccepted, AnalysisReply, AnalysisRequest
 from server.api.problems import errors
 from server.errors import NotFoundError
-from server.jobs import Job, Phase
+from server.jobs import Phase
 from server.service import Service
 from server.store.index import analysis_entry
 from server.version import software_version
@@ -23,9 +23,15 @@ router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
 
 
 @router.post(
-    "", summary="Measure a test's steps", response_model=AnalysisAccepted, status_code=202, responses=errors(404, 409, 422, 503, 507)
+    "",
+    summary="Measure a test's steps",
+    response_model=AnalysisAccepted,
+    status_code=202,
+    responses=errors(404, 409, 422, 503, 507),
 )
-def create_analysis(service: ServiceDep, test_id: TestId, body: AnalysisRequest, key: KeyHeader = None) -> dict[str, Any]:
+def create_analysis(
+    service: ServiceDep, test_id: TestId, body: AnalysisRequest, key: KeyHeader = None
+) -> dict[str, Any]:
     """Compute shape and displacement over a region; results can be read step by step as they are finished."""
     calibration = service.tests.calibration_file(test_id)
     steps = analyses.steps_to_measure(service, test_id, body.reference, body.steps)
@@ -61,7 +67,9 @@ def create_analysis(service: ServiceDep, test_id: TestId, body: AnalysisRequest,
             on_end=lambda job, state: analyses.close(service, job, test_id, made["analysis_id"], state),
         )
         stored = service.tests.analysis(test_id, made["analysis_id"])
-        service.catalog.put_entry("analysis", test_id, made["analysis_id"], analysis_entry({**stored, "job_id": job.id}))
+        service.catalog.put_entry(
+            "analysis", test_id, made["analysis_id"], analysis_entry({**stored, "job_id": job.id})
+        )
         return {**made, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
@@ -75,7 +83,9 @@ def _mask_bytes(body: AnalysisRequest) -> bytes | None:
     try:
         return base64.b64decode(text, validate=True)
     except binascii.Error as error:
-        raise RegionError(f"The mask is no base64: {error}.", code="mask_unreadable", remedy="Send a PNG in base64.") from error
+        raise RegionError(
+            f"The mask is no base64: {error}.", code="mask_unreadable", remedy="Send a PNG in base64."
+        ) from error
 
 
 def analysis_reply(service: Service, test_id: str, analysis_id: str) -> dict[str, Any]:

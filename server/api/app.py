@@ -19,7 +19,8 @@ from server.version import software_version
 PREFIX = "/api/v1"
 _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
 
-Anything that takes long answers 202 with a job; follow it at `/jobs/{id}` or `/jobs/{id}/events`. Errors are problem+json (RFC 9457) with a stable `code`, the cause in
+Anything that takes long answers 202 with a job; follow it at `/jobs/{id}` or `/jobs/{id}/events`. Errors are
+problem+json (RFC 9457) with a stable `code`, the cause in
 `detail` and a `remedy`. POSTs that make something take an `Idempotency-Key`. Lengths are in millimetres in the calibration target's frame unless a name says otherwise."""
 
 

@@ -22,9 +22,15 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 
 @router.post(
-    "", summary="Calibrate the pair", response_model=CalibrationAccepted, status_code=202, responses=errors(409, 422, 503, 507)
+    "",
+    summary="Calibrate the pair",
+    response_model=CalibrationAccepted,
+    status_code=202,
+    responses=errors(409, 422, 503, 507),
 )
-def create_calibration(service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None) -> dict[str, Any]:
+def create_calibration(
+    service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None
+) -> dict[str, Any]:
     """Move both cameras through the plan's positions before the grid, then fit; the rig file's plan where the body gives none."""
     body = body or CalibrationRequest()
     usual = service.config.calibration
@@ -44,7 +50,9 @@ def create_calibration(service: ServiceDep, body: CalibrationRequest | None = No
 
         def prepare() -> dict[str, Any]:
             document = plan_document(plan, service.config) | request.document()
-            made["calibration_id"] = service.calibrations.create(document, service.config.target.model_dump(mode="json"))
+            made["calibration_id"] = service.calibrations.create(
+                document, service.config.target.model_dump(mode="json")
+            )
             return dict(made)
 
         def hardware(job: Job) -> dict[str, Any]:
@@ -97,7 +105,12 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[st
     return read_json(_complete(service, calibration_id) / "residuals.json")
 
 
-@router.get("/{calibration_id}/file", summary="calibration.json as stored", response_class=FileResponse, responses=errors(404, 409))
+@router.get(
+    "/{calibration_id}/file",
+    summary="calibration.json as stored",
+    response_class=FileResponse,
+    responses=errors(404, 409),
+)
 def get_file(service: ServiceDep, calibration_id: CalibrationId) -> FileResponse:
     """Return the file, which `stereorig measure` reads."""
     return FileResponse(_complete(service, calibration_id) / "calibration.json", media_type="application/json")

@@ -25,7 +25,8 @@ def host_name(value: str) -> str | None:
 class Guard:
     """Refuse requests that come by a foreign name or from a foreign page, and bodies without end.
 
-    A page of another site can reach a service on loopback through the user's browser; its Origin (or, after DNS rebinding, the Host) gives it away.
+    A page of another site can reach a service on loopback through the user's browser; its Origin (or, after DNS
+    rebinding, the Host) gives it away.
     """
 
     def __init__(self, app: ASGIApp, allowed: frozenset[str] = LOOPBACK_NAMES) -> None:

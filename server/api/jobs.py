@@ -34,7 +34,9 @@ def get_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
     return service.jobs.document(job_id)
 
 
-@router.post("/{job_id}/cancel", summary="Cancel a job", response_model=JobReply, status_code=202, responses=errors(404, 409))
+@router.post(
+    "/{job_id}/cancel", summary="Cancel a job", response_model=JobReply, status_code=202, responses=errors(404, 409)
+)
 def cancel_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
     """Ask the job to stop; it does within a second, and keeps what was finished."""
     return service.jobs.cancel(job_id)

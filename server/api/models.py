@@ -139,7 +139,9 @@ class CalibrationRequest(Request):
     positions_mm: list[Number] | None = Field(
         None, description="dZ of the positions that are fitted.", min_length=1, max_length=100
     )
-    held_out_mm: list[Number] | None = Field(None, description="dZ of the positions kept for the check.", max_length=100)
+    held_out_mm: list[Number] | None = Field(
+        None, description="dZ of the positions kept for the check.", max_length=100
+    )
     frames: Annotated[int, Field(ge=1, le=256)] | None = Field(None, description="Frames averaged at each position.")
     localiser: Literal["profile", "paper"] | None = Field(None, description="Grid line localiser.")
     label: Label = Field("", description="Free text.")
@@ -176,7 +178,9 @@ class TestRequest(Request):
     __test__ = False
 
     name: Annotated[str, StringConstraints(min_length=1, max_length=300)] = Field(description="Name, any characters.")
-    calibration_id: str | None = Field(None, description="Calibration to measure with; copied into the test.", max_length=40)
+    calibration_id: str | None = Field(
+        None, description="Calibration to measure with; copied into the test.", max_length=40
+    )
     specimen: Label = Field("", description="The specimen, for people.")
     notes: Annotated[str, StringConstraints(max_length=20000)] = Field("", description="Free text.")
 
@@ -223,7 +227,9 @@ class StepRequest(Request):
     channels: dict[Annotated[str, StringConstraints(min_length=1, max_length=100)], Number] = Field(
         default_factory=dict, description="Any further scalar readings.", max_length=50
     )
-    frames: Annotated[int, Field(ge=1, le=256)] = Field(1, description="Frames averaged; 1 stores the frame as it came.")
+    frames: Annotated[int, Field(ge=1, le=256)] = Field(
+        1, description="Frames averaged; 1 stores the frame as it came."
+    )
 
 
 class StepReply(Reply):
@@ -266,7 +272,9 @@ class Region(Request):
 class AnalysisRequest(Request):
     """What to compute over a test's steps."""
 
-    kind: Literal["profile", "displacement"] = Field("displacement", description="Shape only, or shape and displacement.")
+    kind: Literal["profile", "displacement"] = Field(
+        "displacement", description="Shape only, or shape and displacement."
+    )
     region: Region = Field(description="Where points may lie.")
     subset_px: Annotated[int, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
     step_px: Annotated[int, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")

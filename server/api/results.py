@@ -57,7 +57,9 @@ def get_field(
     })  # fmt: skip
 
 
-@router.get("/probe", summary="The measurement point nearest to a pixel", response_model=ProbeReply, responses=errors(404, 422))
+@router.get(
+    "/probe", summary="The measurement point nearest to a pixel", response_model=ProbeReply, responses=errors(404, 422)
+)
 def get_probe(
     service: ServiceDep,
     test_id: TestId,

@@ -34,7 +34,13 @@ def get_rig(service: ServiceDep) -> dict[str, Any]:
     return service.rig.describe()
 
 
-@router.post("/rig/reconnect", summary="Open cameras and stage again", response_model=Accepted, status_code=202, responses=errors(409, 503))
+@router.post(
+    "/rig/reconnect",
+    summary="Open cameras and stage again",
+    response_model=Accepted,
+    status_code=202,
+    responses=errors(409, 503),
+)
 def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
     """Close and open every device; settings are pushed and read back."""
 
@@ -44,7 +50,9 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
         return {"rig": service.rig.describe()["name"]}
 
     def make() -> dict[str, Any]:
-        return {"job_id": service.jobs.submit("reconnect", "a reconnection of the rig", {}, [Phase("hardware", run)]).id}
+        return {
+            "job_id": service.jobs.submit("reconnect", "a reconnection of the rig", {}, [Phase("hardware", run)]).id
+        }
 
     request = mark("reconnect", key, None)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
@@ -87,18 +95,28 @@ def patch_camera(service: ServiceDep, cam: CameraName, body: SettingsPatch) -> d
     responses=errors(409, 422, 503) | {200: {"content": {"image/png": {}, "image/tiff": {}}}},
 )
 def get_frame(
-    service: ServiceDep, cam: CameraName, format: Annotated[Literal["png", "tiff"], Query()] = "png"  # noqa: A002
+    service: ServiceDep,
+    cam: CameraName,
+    format: Annotated[Literal["png", "tiff"], Query()] = "png",  # noqa: A002
 ) -> Response:
     """Return the newest frame, with every grey level as the camera gave it."""
     frame = service.rig.pair.live(cam, max_age_s=0.1)
-    headers = {"X-Frame-Sequence": str(frame.sequence), "X-Bit-Depth": str(frame.bit_depth), "Cache-Control": "no-store"}
+    headers = {
+        "X-Frame-Sequence": str(frame.sequence),
+        "X-Bit-Depth": str(frame.bit_depth),
+        "Cache-Control": "no-store",
+    }
     if format == "tiff":
         return Response(encode_tiff(frame.pixels), media_type="image/tiff", headers=headers)
     _, data = cv2.imencode(".png", frame.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return Response(data.tobytes(), media_type="image/png", headers=headers)
 
 
-@router.get("/cameras/{cam}/stats", summary="What became of a camera's frames, and the newest one's quality", responses=errors(409, 422, 503))
+@router.get(
+    "/cameras/{cam}/stats",
+    summary="What became of a camera's frames, and the newest one's quality",
+    responses=errors(409, 422, 503),
+)
 def get_stats(service: ServiceDep, cam: CameraName) -> dict[str, Any]:
     """Return counters, mean grey level, saturation, texture, focus and histogram."""
     frame = service.rig.pair.live(cam, max_age_s=0.2)

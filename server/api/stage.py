@@ -47,9 +47,15 @@ def move(service: ServiceDep, body: MoveRequest, key: KeyHeader = None) -> dict[
             job.check()
             moved = rig.move(wanted)
             job.progress("moving", 1, 1)
-            return {"axes": {str(a): {"target_mm": r.target_mm, "position_mm": r.position_mm} for a, r in moved.items()}}
+            return {
+                "axes": {str(a): {"target_mm": r.target_mm, "position_mm": r.position_mm} for a, r in moved.items()}
+            }
 
-        return {"job_id": _motion(service, "move", f"a move to {wanted}", {"targets_mm": {str(a): t for a, t in wanted.items()}}, run)}
+        return {
+            "job_id": _motion(
+                service, "move", f"a move to {wanted}", {"targets_mm": {str(a): t for a, t in wanted.items()}}, run
+            )
+        }
 
     request = mark("moves", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, make)

@@ -10,7 +10,17 @@ from fastapi.responses import Response
 
 from core.errors import StateError
 from server.api.dependencies import KeyHeader, ServiceDep, StepNumber, TestId, mark
-from server.api.models import CameraName, Label, Number, StepReply, StepRequest, TestList, TestPatch, TestReply, TestRequest
+from server.api.models import (
+    CameraName,
+    Label,
+    Number,
+    StepReply,
+    StepRequest,
+    TestList,
+    TestPatch,
+    TestReply,
+    TestRequest,
+)
 from server.api.problems import errors
 from server.capture import capture_step, import_step
 from server.io.images import read_image
@@ -68,7 +78,12 @@ def get_test(service: ServiceDep, test_id: TestId) -> dict[str, Any]:
     return _reply(service, test_id)
 
 
-@router.patch("/{test_id}", summary="Change a test's name, specimen or notes", response_model=TestReply, responses=errors(404, 422, 507))
+@router.patch(
+    "/{test_id}",
+    summary="Change a test's name, specimen or notes",
+    response_model=TestReply,
+    responses=errors(404, 422, 507),
+)
 def patch_test(service: ServiceDep, test_id: TestId, body: TestPatch) -> dict[str, Any]:
     """Change what is given."""
     changes = {k: v for k, v in body.model_dump(exclude_unset=True).items() if v is not None}
@@ -78,7 +93,11 @@ def patch_test(service: ServiceDep, test_id: TestId, body: TestPatch) -> dict[st
 
 
 @router.post(
-    "/{test_id}/steps", summary="Capture a step", response_model=StepReply, status_code=201, responses=errors(404, 409, 422, 503, 507)
+    "/{test_id}/steps",
+    summary="Capture a step",
+    response_model=StepReply,
+    status_code=201,
+    responses=errors(404, 409, 422, 503, 507),
 )
 def create_step(service: ServiceDep, test_id: TestId, body: StepRequest, key: KeyHeader = None) -> dict[str, Any]:
     """Capture a synchronised pair. When this answers, both images and `step.json` are durable on disk."""
@@ -112,7 +131,9 @@ def import_images(
     """Store two images as a step. File names are not used; the pixels are kept to the bit."""
     service.tests.path(test_id)
     data = {"cam1": cam1.file.read(), "cam2": cam2.file.read()}
-    request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], f"{label}\n{load_n}".encode())
+    request = mark(
+        f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], f"{label}\n{load_n}".encode()
+    )
 
     def make() -> dict[str, Any]:
         facts = {"label": label, "load_n": load_n, "channels": {}, **request.document()}

@@ -21,7 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help=f"port, 0 for any (default: {DEFAULT_PORT})")
     parser.add_argument("--data", type=Path, default=Path("data"), help="data folder (default: ./data)")
-    parser.add_argument("--log-level", default="warning", choices=["debug", "info", "warning", "error"], help="log level")
+    parser.add_argument(
+        "--log-level", default="warning", choices=["debug", "info", "warning", "error"], help="log level"
+    )
 
 
 def default_config() -> Path:
@@ -76,7 +78,9 @@ def _listen(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listener.close()
         raise InputError(
-            f"Port {port} of {host} cannot be used: {error}.", code="port_unusable", remedy="Give another --port; 0 takes any."
+            f"Port {port} of {host} cannot be used: {error}.",
+            code="port_unusable",
+            remedy="Give another --port; 0 takes any.",
         ) from error
     return listener
 
@@ -112,6 +116,8 @@ def run(args: argparse.Namespace) -> int:
             service.stop_streams()  # or the server would wait for them
             await super().shutdown(sockets=sockets)
 
-    settings = uvicorn.Config(app, log_level=args.log_level, access_log=False, timeout_graceful_shutdown=3, lifespan="on")
+    settings = uvicorn.Config(
+        app, log_level=args.log_level, access_log=False, timeout_graceful_shutdown=3, lifespan="on"
+    )
     AnnouncingServer(settings).run(sockets=[listener])
     return 0

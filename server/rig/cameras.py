@@ -1,7 +1,7 @@
 """Both cameras together: synchronised captures, averages, live frames.
 
-Cameras wait for software triggers. A capture fires both and takes the frames that carry those trigger numbers. Live views use the same way when nobody captures, and
-otherwise show what the captures brought: recording comes first.
+Cameras wait for software triggers. A capture fires both and takes the frames that carry those trigger numbers. Live
+views use the same way when nobody captures, and otherwise show what the captures brought: recording comes first.
 """
 
 from __future__ import annotations
@@ -120,9 +120,7 @@ class CameraPair:
         number1, number2 = a.grabber.trigger(), b.grabber.trigger()
         return a.wait_for(number1), b.wait_for(number2)
 
-    def shoot(
-        self, frames: int, *, max_skew_ms: float, check: Callable[[], None] | None = None
-    ) -> PairShot:
+    def shoot(self, frames: int, *, max_skew_ms: float, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs and average each camera's.
 
         Raises

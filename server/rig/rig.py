@@ -1,6 +1,7 @@
 """The rig as the service uses it: captures, moves, settings, state.
 
-Everything that makes the hardware do something runs on its one owner thread (:class:`server.hardware.HardwareGate`); reading the stage's state and stopping it do not.
+Everything that makes the hardware do something runs on its one owner thread (:class:`server.hardware.HardwareGate`);
+reading the stage's state and stopping it do not.
 """
 
 from __future__ import annotations
@@ -118,7 +119,12 @@ class Rig:
     def describe_camera(self, cam: CameraName) -> dict[str, Any]:
         """Nominal data, the device's own description, and the settings it has."""
         section = self.config.camera(cam)
-        shown: dict[str, Any] = {"name": cam, "nominal": section.model_dump(mode="json"), "device": None, "settings": None}
+        shown: dict[str, Any] = {
+            "name": cam,
+            "nominal": section.model_dump(mode="json"),
+            "device": None,
+            "settings": None,
+        }
         if self._devices is not None:
             unit = self._devices.pair.units[cam]
             shown["device"] = asdict(unit.description)

@@ -1,6 +1,7 @@
 """Calibrations on disk: the plan, the views as taken, the result.
 
-``plan.json`` is written first, ``view.json`` when every view is there, ``calibration.json`` last: only a folder that holds it is a calibration.
+``plan.json`` is written first, ``view.json`` when every view is there, ``calibration.json`` last: only a folder that
+holds it is a calibration.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class CalibrationStore:
 
     def ids(self) -> list[str]:
         """Ids of all calibrations, finished or not, in the order of their making."""
-        return sorted(p.parent.name for p in self._folder.calibrations.glob("c*/plan.json") if is_id(p.parent.name, "c"))
+        return sorted(
+            p.parent.name for p in self._folder.calibrations.glob("c*/plan.json") if is_id(p.parent.name, "c")
+        )
 
     def create(self, plan: dict[str, Any], target: dict[str, Any]) -> str:
         """Make the folder of a new calibration and return its id."""

@@ -1,7 +1,7 @@
 """The catalogue: an index of the data folder and the table of jobs, in SQLite.
 
-One thread writes, everyone else asks it. WAL and ``synchronous=FULL``: a job that was acknowledged is on disk. The index of calibrations, tests,
-steps and analyses can be lost at any time; it is rebuilt from the folders.
+One thread writes, everyone else asks it. WAL and ``synchronous=FULL``: a job that was acknowledged is on disk. The
+index of calibrations, tests, steps and analyses can be lost at any time; it is rebuilt from the folders.
 """
 
 from __future__ import annotations
@@ -117,7 +117,9 @@ class Catalog:
         """Insert or update a job."""
         text = json.dumps(document)
         self.transact(
-            lambda c: c.execute("INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job_id, state, text))
+            lambda c: c.execute(
+                "INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job_id, state, text)
+            )
         )
 
     def jobs(self, *, states: tuple[str, ...] | None = None, limit: int | None = None) -> list[dict[str, Any]]:
@@ -161,7 +163,9 @@ class Catalog:
         def write(c: sqlite3.Connection) -> list[str]:
             rows = c.execute("SELECT kind, parent, id, document FROM entries").fetchall()
             had = {(k, p, i): d for k, p, i, d in rows}
-            differences = [f"{k} {p + '/' if p else ''}{i} was not in the catalogue" for k, p, i in wanted.keys() - had.keys()]
+            differences = [
+                f"{k} {p + '/' if p else ''}{i} was not in the catalogue" for k, p, i in wanted.keys() - had.keys()
+            ]
             differences += [f"{k} {p + '/' if p else ''}{i} has no folder" for k, p, i in had.keys() - wanted.keys()]
             c.execute("DELETE FROM entries")
             c.executemany("INSERT INTO entries VALUES (?, ?, ?, ?)", [(*key, text) for key, text in wanted.items()])

@@ -1,7 +1,7 @@
 """Files that survive a kill at any instant.
 
-Every document of the data folder comes into being here: written aside in its own folder, fsynced, renamed, and the folder fsynced
-(:mod:`server.io.files`). Whoever finds a file under its real name finds all of it.
+Every document of the data folder comes into being here: written aside in its own folder, fsynced, renamed, and the
+folder fsynced (:mod:`server.io.files`). Whoever finds a file under its real name finds all of it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Tests on disk: steps and analyses.
 
-A step's folder is a step only once it holds ``step.json``, which is written last and carries the checksums of both images. What a kill left without
-it is listed as incomplete and never read.
+A step's folder is a step only once it holds ``step.json``, which is written last and carries the checksums of both
+images. What a kill left without it is listed as incomplete and never read.
 """
 
 from __future__ import annotations
@@ -224,5 +224,3 @@ class TestStore:
         """Return ``summary.json``, or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
         return read_json(path) if path.exists() else None
-
-
