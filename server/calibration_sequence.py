@@ -19,6 +19,7 @@ from server.jobs import Job
 from server.rig.cameras import CAMERAS
 from server.service import Service
 from server.store.index import calibration_entry
+from server.tasks import FitTask, fit_calibration
 
 SAME_POSITION_MM = 1e-6
 
@@ -57,8 +58,8 @@ def check_plan(plan: CalibrationPlan) -> None:
     fitted = np.unique(np.asarray(plan.positions_mm))
     if fitted.size < 2 or np.ptp(fitted) < SAME_POSITION_MM:
         raise CalibrationInputError(
-            f"The plan has {fitted.size} different position to fit ({', '.join(f'{p:g} mm' for p in fitted)}); a camera's pinhole "
-            "distance cannot be told from its distance with one.",
+            f"The plan fits {fitted.size} position ({', '.join(f'{p:g} mm' for p in fitted)}); with one, a camera's "
+            "pinhole distance cannot be told from its distance to the target.",
             remedy="Give two or more positions that lie millimetres apart.",
         )
     both = set(plan.positions_mm) & set(plan.held_out_mm)
@@ -103,7 +104,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
                 "axis": axis,
                 "position_mm": moved[axis].position_mm,
                 "frames": shot.frames,
-                "grey_scale": shot.scale,
+                "full_scale": (2 ** shot.bit_depth[cam] - 1) * shot.scale,
                 "skew_ms": shot.skew_ms,
             }
             views.append(view | service.calibrations.put_view(calibration_id, index, cam, shot.pixels[cam]))
@@ -122,12 +123,9 @@ def _role(plan: CalibrationPlan, dz: float, *, last: bool) -> str:
 
 def fit(service: Service, job: Job, calibration_id: str) -> dict[str, Any]:
     """Compute phase: find the grid in every view, adjust, check; ``calibration.json`` is there when this returns."""
-    from server.calibration_task import fit_calibration
-
-    summary = run_task(
-        service.worker, job, fit_calibration, str(service.calibrations.path(calibration_id)), rig_facts(service.config)
-    )
-    return dict(summary)
+    document = service.calibrations.read(calibration_id)
+    task = FitTask(str(service.calibrations.path(calibration_id)), document["plan"], document["views"])
+    return dict(run_task(service.worker, job, fit_calibration, task))
 
 
 def rig_facts(config: RigConfig) -> dict[str, Any]:

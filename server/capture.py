@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from core.errors import ImageError
-from server.io.images import decode_image, encode_tiff
+from server.io.images import GrayImage, decode_image, encode_tiff
 from server.quality import image_quality, pair_quality
 from server.rig.cameras import CAMERAS
 from server.service import Service
@@ -41,7 +41,7 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
             "quality": quality,
             "image_size_px": {cam: [shot.pixels[cam].shape[1], shot.pixels[cam].shape[0]] for cam in CAMERAS},
         }
-        images = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
+        images: dict[str, bytes] = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
         step = service.tests.add_step(test_id, images, document)
     return _announce(service, step)
 
@@ -54,7 +54,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
     ImageError
         A file is no gray image, or its size is not that of the test's other images.
     """
-    images = {cam: decode_image(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
+    images: dict[str, GrayImage] = {cam: decode_image(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
     numbers = service.tests.step_numbers(test_id)
     if numbers:
         known = service.tests.step(test_id, numbers[0]).document.get("image_size_px", {})
@@ -62,7 +62,8 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
             size = [images[cam].shape[1], images[cam].shape[0]]
             if known.get(cam, size) != size:
                 raise ImageError(
-                    f"The image of {cam} is {size[0]} x {size[1]} px, the test's others are {known[cam][0]} x {known[cam][1]} px.",
+                    f"The image of {cam} is {size[0]} x {size[1]} px, the test's others are "
+                    f"{known[cam][0]} x {known[cam][1]} px.",
                     code="image_size",
                     remedy="Import images of the same cameras, unscaled.",
                 )
@@ -76,9 +77,8 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
         "quality": pair_quality(*(image_quality(images[cam], depth[cam]) for cam in CAMERAS)),
         "image_size_px": {cam: [images[cam].shape[1], images[cam].shape[0]] for cam in CAMERAS},
     }
-    return _announce(
-        service, service.tests.add_step(test_id, {cam: encode_tiff(images[cam]) for cam in CAMERAS}, document)
-    )
+    data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
+    return _announce(service, service.tests.add_step(test_id, data, document))
 
 
 def _announce(service: Service, step: dict[str, Any]) -> dict[str, Any]:

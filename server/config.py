@@ -135,7 +135,7 @@ class RigConfig(_Closed):
 
     @property
     def home_at_start(self) -> bool:
-        """Whether the stage is homed when the rig is opened: nothing moves by itself unless it is simulated or asked to."""
+        """Whether opening homes the stage: nothing moves by itself unless it is simulated or the file says so."""
         wanted = self.stage.home_at_start
         return self.rig.kind == "simulated" if wanted is None else wanted
 

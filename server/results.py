@@ -35,7 +35,7 @@ def _open(path: Path) -> netCDF4.Dataset:
         raise FileFormatError(f"{path.name} cannot be read: {error}.", file=path.name) from error
 
 
-def _values(variable: netCDF4.Variable) -> NDArray[Any]:
+def _values(variable: Any) -> NDArray[Any]:
     values = variable[:]
     if np.ma.isMaskedArray(values):
         filled = values.filled(np.nan) if np.issubdtype(values.dtype, np.floating) else values.filled()

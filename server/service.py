@@ -55,7 +55,7 @@ class Service:
         self.jobs = JobManager(
             self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
         )
-        self.worker = ComputeWorker(threads=config.service.kernel_threads, warm_up="server.worker_tasks:warm_up")
+        self.worker = ComputeWorker(threads=config.service.kernel_threads, warm_up="server.tasks:warm_up")
         self.rig = Rig(config, self.gate)
         # stopping must not wait behind forty slow requests
         self.stop_thread = ThreadPoolExecutor(max_workers=2, thread_name_prefix="stop")

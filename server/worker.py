@@ -25,6 +25,7 @@ from server.worker_process import serve
 
 _log = logging.getLogger("stereorig.worker")
 
+_RESTART_PAUSE_S = 5.0
 Progress = Callable[[str, int, int], None]
 
 
@@ -82,6 +83,7 @@ class ComputeWorker(Executor):
         self._state_lock = threading.Lock()
         self._process: multiprocessing.process.BaseProcess | None = None
         self._connection: Connection | None = None
+        self._restart_at = 0.0
         self.starts = 0
         self.ready = threading.Event()
         self._thread = threading.Thread(target=self._run, name="compute-worker", daemon=True)
@@ -103,8 +105,8 @@ class ComputeWorker(Executor):
             self._tasks.put(_Task(self._next_id, future, fn, args, kwargs))
         return future
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the process; a running task is cancelled."""
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
+        """End the process; running and waiting tasks are cancelled, whatever ``cancel_futures`` says."""
         with self._state_lock:
             self._closing.set()
             self._tasks.put(None)
@@ -136,7 +138,10 @@ class ComputeWorker(Executor):
             with contextlib.suppress(queue.Empty):
                 return self._tasks.get(timeout=0.2)
             self._drain_idle()
-            if self._process is not None and not self._process.is_alive():
+            now = time.monotonic()
+            if self._process is not None and not self._process.is_alive() and now > self._restart_at:
+                # one that cannot even start must not be started five times a second
+                self._restart_at = now + _RESTART_PAUSE_S
                 _log.warning("the idle compute worker ended (exit code %s); starting it again", self._process.exitcode)
                 self._start()
 

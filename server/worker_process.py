@@ -7,6 +7,7 @@ loaded.
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import signal
 import threading
@@ -16,6 +17,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from typing import Any
 
+_log = logging.getLogger("stereorig.worker")
 _current: TaskChannel | None = None
 
 
@@ -65,7 +67,10 @@ def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | No
 
     if warm_up is not None:
         module, name = warm_up.split(":")
-        getattr(importlib.import_module(module), name)(threads)
+        try:
+            getattr(importlib.import_module(module), name)(threads)
+        except Exception:  # noqa: BLE001 - the first task will say what is wrong to somebody who asked
+            _log.exception("warming up failed")
     send(("ready",))
     while True:
         try:

@@ -20,8 +20,8 @@ PREFIX = "/api/v1"
 _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
 
 Anything that takes long answers 202 with a job; follow it at `/jobs/{id}` or `/jobs/{id}/events`. Errors are
-problem+json (RFC 9457) with a stable `code`, the cause in
-`detail` and a `remedy`. POSTs that make something take an `Idempotency-Key`. Lengths are in millimetres in the calibration target's frame unless a name says otherwise."""
+problem+json (RFC 9457) with a stable `code`, the cause in `detail` and a `remedy`. POSTs that make something take an
+`Idempotency-Key`. Lengths are in millimetres in the calibration target's frame unless a name says otherwise."""
 
 
 def create_app(service: Service, *, hosts: frozenset[str] = LOOPBACK_NAMES, close_service: bool = True) -> FastAPI:
@@ -97,8 +97,8 @@ def _page(app: FastAPI) -> str:
                 f"<td><b>{summary}</b><br><small>{text}</small>"
             )
     return (
-        "<!doctype html><meta charset=utf-8><title>stereorig</title><style>body{font:15px system-ui,sans-serif;margin:2em;"
-        "max-width:72em;color-scheme:light dark}td{padding:.3em .8em .3em 0;vertical-align:top}</style>"
+        "<!doctype html><meta charset=utf-8><title>stereorig</title><style>body{font:15px system-ui,sans-serif;"
+        "margin:2em;max-width:72em;color-scheme:light dark}td{padding:.3em .8em .3em 0;vertical-align:top}</style>"
         f"<h1>stereorig {html.escape(software_version())}</h1><p>Every operation of the API; its full description is "
         f'<a href="{PREFIX}/openapi.json">openapi.json</a>. The rig is at <a href="{PREFIX}/rig">{PREFIX}/rig</a>.'
         f"<table>{''.join(rows)}</table>"

@@ -31,8 +31,8 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 def create_calibration(
     service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None
 ) -> dict[str, Any]:
-    """Move both cameras through the plan's positions before the grid, then fit; the rig file's plan where the body gives none."""
-    body = body or CalibrationRequest()
+    """Move both cameras through the plan before the grid, then fit; the rig file gives what the body leaves out."""
+    body = body or CalibrationRequest.model_validate({})
     usual = service.config.calibration
     plan = CalibrationPlan(
         positions_mm=tuple(usual.positions_mm if body.positions_mm is None else body.positions_mm),

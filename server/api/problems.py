@@ -139,7 +139,8 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
     texts = {
         403: "Foreign Host or Origin", 404: "No such thing", 409: "Wrong moment: busy hardware or wrong state",
         413: "Body or image too large", 415: "Not a form this operation reads", 422: "Invalid input",
-        503: "Device fault, or too many computations waiting; see Retry-After", 507: "The disk did not keep its promise",
+        503: "Device fault, or too many computations waiting; see Retry-After",
+        507: "The disk did not keep its promise",
     }  # fmt: skip
     return {
         s: {"description": texts[s], "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}}

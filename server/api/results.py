@@ -78,7 +78,7 @@ def export(
     test_id: TestId,
     analysis_id: AnalysisId,
     step: Annotated[int, Query(ge=0, le=9999)],
-    format: Annotated[Literal["nc"], Query()] = "nc",  # noqa: A002
+    format: Annotated[Literal["nc"], Query()] = "nc",  # noqa: A002, ARG001 - one format so far
 ) -> FileResponse:
     """Return the step's NetCDF-4 file as stored."""
     path = service.tests.result_file(test_id, analysis_id, step)

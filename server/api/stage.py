@@ -25,7 +25,7 @@ def get_stage(service: ServiceDep) -> dict[str, Any]:
 
 @router.post("/moves", summary="Move axes", response_model=Accepted, status_code=202, responses=errors(409, 422, 503))
 def move(service: ServiceDep, body: MoveRequest, key: KeyHeader = None) -> dict[str, Any]:
-    """Start a move; the job's result holds the positions read back. Targets are checked before any byte of the motion goes out."""
+    """Start a move; its job's result holds positions read back. Targets are checked before any byte goes out."""
     rig = service.rig
 
     def targets() -> dict[int, float]:

@@ -98,7 +98,7 @@ class CameraUnit:
             self.latest = frame
             return frame
         self.timeouts += 1
-        raise CameraError(f"{self.name} sent no frame within {self.timeout_s:g} s of its trigger.", code="camera_silent",
+        raise CameraError(f"{self.name} sent no frame in {self.timeout_s:g} s after its trigger.", code="camera_silent",
                           remedy="Check power and cable, then POST /rig/reconnect.", camera=self.name)  # fmt: skip
 
     def counters(self) -> dict[str, int]:

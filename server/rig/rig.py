@@ -219,7 +219,7 @@ class Rig:
             limits = stage.limits(axis)
             if not limits.low_mm <= target <= limits.high_mm:
                 raise StageError(
-                    f"Axis {axis} cannot go to {target:g} mm: its limits are {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                    f"Axis {axis} cannot go to {target:g} mm: limits {limits.low_mm:g} to {limits.high_mm:g} mm.",
                     code="out_of_limits",
                     remedy="Stay inside the limits that GET /stage shows.",
                     axis=axis,
