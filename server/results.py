@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +64,18 @@ def read_variable(path: Path, name: str) -> Variable:
         return Variable(
             _values(variable), str(getattr(variable, "units", "1")), str(getattr(variable, "long_name", ""))
         )
+
+
+def read_residuals(path: Path) -> dict[str, Any]:
+    """Return a calibration's residuals: for each view its facts, and lists of found places and residuals."""
+    with _library, _open(path) as data:
+        found, residual = _values(data.variables["found_px"]), _values(data.variables["residual_px"])
+        facts = json.loads(data.getncattr("views"))
+    views = [
+        {**fact, "found_px": _number(xy), "residual_px": _number(r)}
+        for fact, xy, r in zip(facts, found, residual, strict=True)
+    ]
+    return {"views": views}
 
 
 def probe_result(path: Path, x_px: float, y_px: float) -> dict[str, Any]:

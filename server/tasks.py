@@ -5,6 +5,7 @@ The functions import the numerical modules when they are called, so that only th
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -69,20 +70,20 @@ class FitTask:
 
 def warm_up(threads: int) -> None:
     """Load and compile every kernel once, before the first task needs them."""
-    from server.measuring import warm_up as warm
-
-    warm(threads)
+    _heavy("server.measuring").warm_up(threads)
 
 
 def measure_step(task: StepTask) -> dict[str, Any]:
     """Measure one step; its result file is readable when this returns. Returns the step's summary."""
-    from server.measuring import measure_step as measure
-
-    return measure(task)
+    summary: dict[str, Any] = _heavy("server.measuring").measure_step(task)
+    return summary
 
 
 def fit_calibration(task: FitTask) -> dict[str, Any]:
     """Find the grid in every view and fit both cameras; ``calibration.json`` is there when this returns."""
-    from server.calibrating import fit_calibration as fit
+    summary: dict[str, Any] = _heavy("server.calibrating").fit_calibration(task)
+    return summary
 
-    return fit(task)
+
+def _heavy(module: str) -> Any:
+    return importlib.import_module(module)

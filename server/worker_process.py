@@ -17,6 +17,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from typing import Any
 
+from core.errors import Cancelled
+
 _log = logging.getLogger("stereorig.worker")
 _current: TaskChannel | None = None
 
@@ -33,6 +35,11 @@ class TaskChannel:
     def cancelled(self) -> bool:
         """Whether the task should stop."""
         return self._cancel is not None and self._cancel.is_set()
+
+    def check(self) -> None:
+        """Raise :class:`core.errors.Cancelled` if the task should stop."""
+        if self.cancelled:
+            raise Cancelled("The computation was cancelled.")
 
     def progress(self, stage: str, done: int, total: int) -> None:
         """Report progress."""

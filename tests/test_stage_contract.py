@@ -225,8 +225,7 @@ def test_a_stop_voids_a_motion_that_still_waits_for_its_turn(kind: tuple[str, Tr
 
 def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Transport]) -> None:
     with bench(*kind, time_scale=1.0, start_mm=30.0) as stand:
-        if stand.driver == "esp301":
-            stand.stage.enable(1)
+        stand.stage.enable(1)
         thread, errors = in_thread(lambda: stand.stage.home(1))
         wait_until(lambda: stand.axis(1).velocity_now_mm_s != 0)
         stand.stage.stop(1)
@@ -382,6 +381,7 @@ def test_a_line_that_breaks_is_lost_and_can_be_opened_again(driver: str) -> None
 
 def test_velocities_are_set_and_refusals_named(kind: tuple[str, Transport]) -> None:
     with bench(*kind, options={1: AxisOptions(velocity_mm_s=2.5, acceleration_mm_s2=12.0)}) as stand:
+        stand.ready(1)
         assert stand.axis(1).velocity_mm_s == pytest.approx(2.5)
         assert stand.axis(1).acceleration_mm_s2 == pytest.approx(12.0)
         with pytest.raises(StageError, match="velocity") as caught:

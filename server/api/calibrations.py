@@ -16,7 +16,7 @@ from server.api.problems import errors
 from server.calibration_sequence import CalibrationPlan, check_plan, close, fit, plan_document, take_views, targets_of
 from server.io.images import read_image
 from server.jobs import Job, Phase
-from server.store.durable import read_json
+from server.results import read_residuals
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -102,7 +102,7 @@ def _complete(service: ServiceDep, calibration_id: str) -> Path:
 @router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))
 def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
     """Return, for each view, where every intersection was found and by how much the model misses it."""
-    return read_json(_complete(service, calibration_id) / "residuals.json")
+    return read_residuals(_complete(service, calibration_id) / "residuals.nc")
 
 
 @router.get(
