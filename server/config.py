@@ -133,6 +133,12 @@ class RigConfig(_Closed):
         """Section of one camera."""
         return self.cam1 if cam == "cam1" else self.cam2
 
+    @model_validator(mode="after")
+    def _axes_exist(self) -> Self:
+        if self.stage.driver == "esp301" and max(self.axes) > 3:
+            raise ValueError(f"an ESP301 has axes 1 to 3, the cameras name {list(self.axes)}")
+        return self
+
     @property
     def home_at_start(self) -> bool:
         """Whether opening homes the stage: nothing moves by itself unless it is simulated or the file says so."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ from server.config import CameraName, RigConfig
 from server.rig.cameras import CAMERAS, CameraPair, CameraUnit
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.server import ControllerServer
+from sim.controllers.smc100 import SimSMC100
 from sim.grabber import SimFrameGrabber
 from sim.rig import SimRig
 from sim.world import SimWorld
@@ -27,7 +27,7 @@ class Devices:
     pair: CameraPair
     stage: Stage
     world: SimWorld | None
-    controller: Any
+    controller: SimESP301 | SimSMC100 | None
     _exit: contextlib.ExitStack
 
     def close(self) -> None:
@@ -45,12 +45,12 @@ def open_devices(config: RigConfig) -> Devices:
     """
     with contextlib.ExitStack() as stack:
         world: SimWorld | None = None
-        controller: Any = None
+        controller: SimESP301 | SimSMC100 | None = None
         url = config.stage.url
         if config.rig.kind == "simulated":
             controller = _simulated_controller(config)
             url = stack.enter_context(ControllerServer(controller)).url
-            world = SimWorld(SimRig.from_dict(config.model_dump(mode="python")), controller.true_position_mm, threads=2)
+            world = SimWorld(SimRig.from_dict(_tables(config)), controller.true_position_mm)
         units = []
         for cam in CAMERAS:
             section = config.camera(cam)
@@ -84,14 +84,21 @@ def _axis_options(config: RigConfig) -> dict[int, AxisOptions]:
     return dict.fromkeys(config.axes, options)
 
 
-def _simulated_controller(config: RigConfig) -> Any:
+def _tables(config: RigConfig) -> dict[str, Any]:
+    tables = config.model_dump(mode="python", exclude_none=True)
+    for cam in CAMERAS:
+        tables[cam]["stage_zero_mm"] = config.stage.zero_mm
+    return tables
+
+
+def _simulated_controller(config: RigConfig) -> SimESP301 | SimSMC100:
     # room beyond the soft limits, as on a real stage
     low, high = config.stage.soft_limits_mm
     travel = (low - 5.0, high + 5.0)
-    make: dict[str, Callable[[], Any]] = {
-        "esp301": lambda: SimESP301(axes=max(config.axes), travel_mm=travel),
-    }
-    return make[config.stage.driver]()
+    time_scale = float((config.sim or {}).get("time_scale", 1.0))
+    if config.stage.driver == "smc100":
+        return SimSMC100(addresses=config.axes, travel_mm=travel, time_scale=time_scale)
+    return SimESP301(axes=max(config.axes), travel_mm=travel, time_scale=time_scale)
 
 
 def _grabber(config: RigConfig, cam: CameraName, world: SimWorld | None) -> FrameGrabber:

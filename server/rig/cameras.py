@@ -63,6 +63,7 @@ class CameraUnit:
         """Connect, push settings, arm for software triggers."""
         self.grabber.open()
         self.description = self.grabber.describe()
+        self.timeout_s += self.description.latency_s
         self.settings = self.grabber.configure(settings)
         self.grabber.arm()
 
