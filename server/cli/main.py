@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from core.errors import Cancelled, StereorigError
+from server.version import software_version
 
 # name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
 # and is imported only when it is asked for, so that `--help` and errors in one do not wait for the others
@@ -18,11 +21,32 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "measure": ("server.cli.measure", "measure shape and displacement from image files"),
 }
 
+_NEGATIVE_LIST = re.compile(r"-[\d.]+(e[-+]?\d+)?,")
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    """A parser whose complaints have the form of every other error: code, cause, remedy in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"stereorig: wrong_usage: {message}. Remedy: see {self.prog} --help\n")
+
+
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """Join ``--roi -5,0,9,9`` to ``--roi=-5,0,9,9``: argparse takes a list that starts with a minus for an option."""
+    result: list[str] = []
+    for argument in arguments:
+        if result and result[-1].startswith("--") and "=" not in result[-1] and _NEGATIVE_LIST.match(argument):
+            result[-1] += f"={argument}"
+        else:
+            result.append(argument)
+    return result
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 130 interrupted)."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(prog="stereorig", description="Stereo measurement of shape and displacement.")
+    arguments = _joined(sys.argv[1:] if argv is None else argv)
+    parser = _OneLineParser(prog="stereorig", description="Stereo measurement of shape and displacement.")
+    parser.add_argument("--version", action="version", version=f"stereorig {software_version()}")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (module, text) in COMMANDS.items():
         sub = subparsers.add_parser(name, help=text, description=text)

@@ -1,0 +1,1 @@
+"""The full field: region, seeds, growth, gates."""

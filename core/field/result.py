@@ -1,0 +1,87 @@
+"""The result over the grid of measurement points of one step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.status import PointStatus
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Field:
+    """Shape, and where a motion was measured displacement, at (r, c) points.
+
+    A point whose status is neither ``OK`` nor ``EXTRAPOLATED`` has NaN in every number but ``x_px, y_px``.
+
+    Attributes
+    ----------
+    x_px, y_px
+        (r, c) where the points lie in camera 1's reference image.
+    status
+        (r, c) int8, :class:`core.status.PointStatus`.
+    xyz_mm
+        (r, c, 3) surface point at the reference, system frame.
+    normal_sys
+        (r, c, 3) unit normal of the patch, system frame.
+    theta_rad, phi_rad, zp_mm
+        (r, c) the plane of Eq. (12), camera 1's frame.
+    zncc
+        (r, c, k) zero-mean normalised correlation; k = 1 for shape (camera 2 at t0), k = 3 for motion (camera 2 at t0,
+        camera 1 at t, camera 2 at t).
+    epipolar_px
+        (r, c) offset across the epipolar line in camera 2.
+    iterations
+        (r, c) int32.
+    noise_grey
+        (r, c) noise sd in grey levels of the reference image, estimated from the point's own residuals.
+    covariance
+        (r, c, 3, 3) of X, Y, Z, or (r, c, 6, 6) of X, Y, Z, U, V, W; mm^2, system frame.
+    uvw_mm
+        (r, c, 3) displacement since the reference, or None for a shape.
+    rotation_rad
+        (r, c, 3) rotation vector of the patch, system frame, or None.
+    stretch
+        (r, c, 3) in-plane stretch e11, e22, e12 in the patch's tangent frame, or None.
+    """
+
+    x_px: Float
+    y_px: Float
+    status: NDArray[np.int8]
+    xyz_mm: Float
+    normal_sys: Float
+    theta_rad: Float
+    phi_rad: Float
+    zp_mm: Float
+    zncc: Float
+    epipolar_px: Float
+    iterations: NDArray[np.int32]
+    noise_grey: Float
+    covariance: Float
+    uvw_mm: Float | None = None
+    rotation_rad: Float | None = None
+    stretch: Float | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid of points."""
+        return self.x_px.shape[0], self.x_px.shape[1]
+
+    @property
+    def has_motion(self) -> bool:
+        """True if displacements were measured."""
+        return self.uvw_mm is not None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(r, c) True where the point has numbers."""
+        return np.isin(self.status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
+
+    @property
+    def sigma_mm(self) -> Float:
+        """(r, c, 3 or 6) standard deviations, the root of the covariance's diagonal."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))

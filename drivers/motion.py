@@ -1,0 +1,419 @@
+"""What all serial stage drivers have in common: checks before a byte goes out, one-sided arrival, waiting, stopping.
+
+A driver adds only its controller's words, as the methods that begin with an underscore at the end of `SerialStage`.
+
+A stop takes no lock. It counts up a number that every motion notes when it is asked for, and then writes. A motion
+looks at the number again after each command that starts movement: whichever of the two was first on the wire, the axis
+stands still afterwards, and a motion that was still waiting for its turn never starts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from core.errors import StageError
+from drivers.serial_line import SerialLine
+from drivers.stage import (
+    AxisLimits,
+    AxisOptions,
+    AxisState,
+    AxisStatus,
+    ControllerMessage,
+    MoveResult,
+    StageIdentity,
+)
+
+_POLL_S = 0.02
+# An axis that says it moves and stays where it is for this long has jammed
+_JAM_S = 1.0
+# Added to the computed travel time before a motion counts as overdue
+_MARGIN_S = 5.0
+# How long an axis may take to come to rest after a stop
+_REST_S = 3.0
+
+
+class SerialStage(ABC):
+    """Base of the stage drivers; see `drivers.stage.Stage` for what callers may expect."""
+
+    def __init__(self, line: SerialLine, options: Mapping[int, AxisOptions]) -> None:
+        self._line = line
+        self._options = dict(options)
+        self._limits: dict[int, AxisLimits] = {}
+        self._velocity_mm_s: dict[int, float] = {}
+        self._acceleration_mm_s2: dict[int, float] = {}
+        self._messages: list[ControllerMessage] = []
+        self._motion_lock = threading.RLock()
+        self._stop_numbers = itertools.count(1)
+        self._stops = 0
+        self._moving: set[int] = set()
+        self._identity: StageIdentity | None = None
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Axis numbers that the rig uses."""
+        return tuple(sorted(self._options))
+
+    def open(self) -> None:
+        """Connect, identify, read limits, set and read back velocities. Moves nothing."""
+        with self._motion_lock:
+            self._line.open()
+            try:
+                self._identity = self._connect()
+                for axis in self.axes:
+                    self._limits[axis] = self._tighten(axis, *self._read_travel_mm(axis))
+                    self._velocity_mm_s[axis], self._acceleration_mm_s2[axis] = self._set_dynamics(axis)
+            except BaseException:
+                self._line.close()
+                raise
+
+    def close(self) -> None:
+        """Release the line; what this driver is moving is stopped first."""
+        if self._line.is_open:
+            try:
+                if self._moving:
+                    self.stop()
+            finally:
+                self._line.close()
+
+    def identify(self) -> StageIdentity:
+        """Say who answers, as read when the stage was opened."""
+        if self._identity is None:
+            raise StageError(
+                f"The stage on {self._line.url} was not opened.", code="stage_lost", remedy="Connect the stage first."
+            )
+        return self._identity
+
+    def limits(self, axis: int) -> AxisLimits:
+        """Where the axis may go."""
+        self._check_axis(axis)
+        if axis not in self._limits:
+            self.identify()
+        return self._limits[axis]
+
+    def position(self, axis: int) -> float:
+        """Read the position in mm."""
+        self._check_axis(axis)
+        return self._read_position_mm(axis)
+
+    def state(self, axis: int) -> AxisStatus:
+        """Read the state."""
+        self._check_axis(axis)
+        return self._read_status(axis)
+
+    def errors(self) -> tuple[ControllerMessage, ...]:
+        """Empty the controller's error queue."""
+        fresh = self._drain_errors()
+        old, self._messages = self._messages, []
+        return (*old, *fresh)
+
+    def stop(self, axis: int | None = None) -> None:
+        """Stop one axis or all, at once; takes no lock."""
+        if axis is not None:
+            self._check_axis(axis)
+        self._stops = next(self._stop_numbers)
+        self._line.urgent(self._stop_text(axis))
+
+    def enable(self, axis: int) -> None:
+        """Switch the motor on."""
+        self._check_axis(axis)
+        with self._motion_lock:
+            self._switch_motor(axis, on=True)
+
+    def disable(self, axis: int) -> None:
+        """Switch the motor off."""
+        self._check_axis(axis)
+        with self._motion_lock:
+            self._switch_motor(axis, on=False)
+
+    def home(self, axis: int, *, timeout_s: float = 120.0) -> float:
+        """Search home and return the position read back in mm."""
+        self._check_axis(axis)
+        noted = self._stops
+        with self._motion_lock:
+            self._check_not_stopped(noted, (axis,))
+            with self._stopped_on_error((axis,)):
+                self._start_homing(axis)
+                self._check_not_stopped(noted, (axis,))
+                self._wait((axis,), noted, time.monotonic() + timeout_s, watch_jam=False)
+                self._finish_homing(axis)
+            return self._read_position_mm(axis)
+
+    def move_to(self, axis: int, position_mm: float) -> MoveResult:
+        """Move, arrive from the configured side, settle, read back."""
+        return self.move_many({axis: position_mm})[axis]
+
+    def move_by(self, axis: int, distance_mm: float) -> MoveResult:
+        """As `move_to`, from the position read back at the start."""
+        self._check_axis(axis)
+        self._check_number(axis, distance_mm)
+        noted = self._stops
+        with self._motion_lock:
+            return self._move({axis: self._read_position_mm(axis) + distance_mm}, noted)[axis]
+
+    def move_many(self, targets_mm: Mapping[int, float]) -> dict[int, MoveResult]:
+        """Move several axes at the same time."""
+        noted = self._stops
+        for axis, target in targets_mm.items():
+            self._check_axis(axis)
+            self._check_target(axis, target)
+        with self._motion_lock:
+            return self._move(targets_mm, noted)
+
+    def _move(self, targets_mm: Mapping[int, float], noted: int) -> dict[int, MoveResult]:
+        axes = tuple(targets_mm)
+        start = time.monotonic()
+        goals = {axis: self._check_target(axis, target) for axis, target in targets_mm.items()}
+        self._check_not_stopped(noted, axes, write=False)
+        here = {axis: self._check_ready(axis).position_mm for axis in axes}
+        detours = {axis: mm for axis in axes if (mm := self._detour(axis, here[axis], goals[axis])) is not None}
+        self._messages += self._drain_errors()  # what is found afterwards was caused by this motion
+        with self._stopped_on_error(axes):
+            if detours:
+                self._leg(here, detours, noted)
+            self._leg({**here, **detours}, goals, noted)
+            time.sleep(max(self._options[axis].settle_ms for axis in axes) / 1000)
+            self._check_not_stopped(noted, axes)
+            results = {}
+            for axis, goal in goals.items():
+                there = self._read_position_mm(axis)
+                if abs(there - goal) > self._options[axis].tolerance_mm:
+                    raise self._fault(axis, f"stands at {there:.5f} mm instead of {goal:.5f} mm")
+                results[axis] = MoveResult(axis, goal, there, time.monotonic() - start)
+        return results
+
+    def _leg(self, here: Mapping[int, float], goals: Mapping[int, float], noted: int) -> None:
+        longest = 0.0
+        for axis, goal in goals.items():
+            self._check_not_stopped(noted, tuple(goals))
+            self._send_move(axis, goal)
+            self._check_not_stopped(noted, tuple(goals))
+            self._raise_refusal(tuple(goals), f"move to {goal:.5f} mm")
+            speed, ramp = self._velocity_mm_s[axis], self._acceleration_mm_s2[axis]
+            longest = max(longest, abs(goal - here[axis]) / speed + speed / ramp)
+        self._wait(tuple(goals), noted, time.monotonic() + 1.5 * longest + _MARGIN_S)
+
+    def _wait(self, axes: tuple[int, ...], noted: int, deadline: float, *, watch_jam: bool = True) -> None:
+        waiting = set(axes)
+        last: dict[int, tuple[float, float]] = {}
+        while waiting:
+            for axis in sorted(waiting):
+                self._check_not_stopped(noted, axes)
+                status = self._read_status(axis)
+                if status.state is AxisState.FAULT or (watch_jam and status.state is AxisState.MOTOR_OFF):
+                    raise self._fault(axis, status.detail or "switched its motor off")
+                if not status.moving:
+                    if watch_jam and status.state is not AxisState.READY:
+                        raise self._fault(axis, f"ended in the state {status.state} {status.detail}".rstrip())
+                    waiting.discard(axis)
+                    continue
+                now = time.monotonic()
+                mm, since = last.get(axis, (math.inf, now))
+                if abs(status.position_mm - mm) > self._options[axis].tolerance_mm / 2:
+                    last[axis] = (status.position_mm, now)
+                elif watch_jam and now - since > _JAM_S:
+                    raise self._fault(axis, f"has stood at {status.position_mm:.5f} mm for {now - since:.1f} s")
+                if now > deadline:
+                    raise self._fault(axis, f"did not come to rest in time, it is at {status.position_mm:.5f} mm")
+            if waiting:
+                time.sleep(_POLL_S)
+        # Once every axis rests, what went wrong on the way stands in the error queue
+        bad = self._new_errors(axes)
+        if bad:
+            raise self._fault(bad[0].axis or axes[0], "; ".join(f"{message.text} ({message.code})" for message in bad))
+
+    def _check_axis(self, axis: int) -> None:
+        if axis not in self._options:
+            raise StageError(
+                f"There is no axis {axis!r} on {self._line.url}, only {', '.join(map(str, self.axes))}.",
+                code="invalid_axis",
+                remedy="Name one of the axes above.",
+                axis=axis,
+            )
+
+    def _check_number(self, axis: int, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise StageError(
+                f"Axis {axis} cannot move to {value!r}: not a finite number.",
+                code="out_of_limits",
+                remedy="Give a target in millimetres inside the limits.",
+                axis=axis,
+            )
+        return float(value)
+
+    def _check_target(self, axis: int, target: object) -> float:
+        goal = self._check_number(axis, target)
+        limits = self.limits(axis)
+        if not limits.low_mm <= goal <= limits.high_mm:
+            raise StageError(
+                f"Axis {axis} cannot move to {goal:g} mm: outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                code="out_of_limits",
+                remedy="Give a target inside the limits, or widen the soft limits in the rig file.",
+                axis=axis,
+                target_mm=goal,
+                low_mm=limits.low_mm,
+                high_mm=limits.high_mm,
+            )
+        return goal
+
+    def _check_ready(self, axis: int) -> AxisStatus:
+        status = self._read_status(axis)
+        if not status.homed:
+            raise StageError(
+                f"Axis {axis} was not homed, its position {status.position_mm:g} mm means nothing.",
+                code="not_homed",
+                remedy="Home the axis first.",
+                axis=axis,
+            )
+        if status.state is AxisState.MOTOR_OFF:
+            raise StageError(
+                f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis
+            )
+        if status.state is not AxisState.READY:
+            raise self._fault(axis, f"is not ready to move: {status.state} {status.detail}".rstrip())
+        return status
+
+    def _detour(self, axis: int, here_mm: float, goal_mm: float) -> float | None:
+        """Where to go first so that the last stretch takes up the backlash; ``None`` when the way there does it."""
+        option = self._options[axis]
+        sign = 1.0 if option.approach_from == "below" else -1.0
+        if option.backlash_mm == 0 or sign * (goal_mm - here_mm) >= option.backlash_mm:
+            return None
+        turn = goal_mm - sign * option.backlash_mm
+        limits = self.limits(axis)
+        if not limits.low_mm <= turn <= limits.high_mm:
+            raise StageError(
+                f"Axis {axis} cannot arrive at {goal_mm:g} mm from {option.approach_from}: it would have to turn at "
+                f"{turn:g} mm, outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                code="out_of_limits",
+                remedy=f"Stay at least the backlash ({option.backlash_mm:g} mm) inside the limit.",
+                axis=axis,
+                target_mm=goal_mm,
+            )
+        return turn
+
+    def _tighten(self, axis: int, low_mm: float, high_mm: float) -> AxisLimits:
+        soft = self._options[axis].soft_limits_mm
+        low, high = (low_mm, high_mm) if soft is None else (max(low_mm, soft[0]), min(high_mm, soft[1]))
+        if not low < high:
+            raise StageError(
+                f"The soft limits {soft} mm of axis {axis} leave nothing of its travel {low_mm:g} to {high_mm:g} mm.",
+                code="out_of_limits",
+                remedy="Correct soft_limits_mm in the rig file.",
+                axis=axis,
+            )
+        return AxisLimits(low, high, low_mm, high_mm)
+
+    def _check_not_stopped(self, noted: int, axes: tuple[int, ...], *, write: bool = True) -> None:
+        if self._stops == noted:
+            return
+        if write:
+            # The stop may have been on the wire before the command that started this motion
+            for axis in axes:
+                self._line.urgent(self._stop_text(axis))
+            rest = time.monotonic() + _REST_S
+            while any(self._read_status(axis).moving for axis in axes) and time.monotonic() < rest:
+                time.sleep(_POLL_S)
+        raise StageError(
+            f"A stop ended the motion of axis {', '.join(map(str, axes))}.",
+            code="stage_stopped",
+            remedy="Read the position back, then move again when it is safe.",
+            axes=list(axes),
+        )
+
+    @contextmanager
+    def _stopped_on_error(self, axes: tuple[int, ...]) -> Iterator[None]:
+        self._moving.update(axes)
+        try:
+            yield
+        except BaseException as error:
+            if not (isinstance(error, StageError) and error.code == "stage_stopped") and self._line.is_open:
+                for axis in axes:
+                    try:
+                        self._line.urgent(self._stop_text(axis))
+                    except StageError as lost:
+                        error.add_note(f"The stop of axis {axis} could not be written either: {lost.cause}")
+            raise
+        finally:
+            self._moving.difference_update(axes)
+
+    def _new_errors(self, axes: tuple[int, ...]) -> list[ControllerMessage]:
+        """Empty the error queue into `errors`, and return what concerns these axes or no axis in particular."""
+        found = [message for axis in axes for message in self._drain_errors(axis)]
+        self._messages += found
+        return [message for message in found if message.axis is None or message.axis in axes]
+
+    def _raise_refusal(self, axes: tuple[int, ...], what: str) -> None:
+        bad = self._new_errors(axes)
+        if bad:
+            raise self._refusal(bad[0].axis or axes[0], what, bad)
+
+    def _refusal(self, axis: int, what: str, messages: list[ControllerMessage]) -> StageError:
+        text = "; ".join(f"{message.text} ({message.code})" for message in messages)
+        return StageError(
+            f"The controller refused for axis {axis} the {what}: {text}.",
+            code=next((code for message in messages if (code := self._code_of(message)) is not None), "stage_refused"),
+            remedy="Correct what the controller names, then try again.",
+            axis=axis,
+        )
+
+    def _fault(self, axis: int, what: str) -> StageError:
+        return StageError(
+            f"Axis {axis} {what}.",
+            code="motion_fault",
+            remedy="Check the stage for an obstacle or a limit switch, enable and home it, then move again.",
+            axis=axis,
+        )
+
+    @abstractmethod
+    def _connect(self) -> StageIdentity:
+        """Find out who answers; called with the line open."""
+
+    @abstractmethod
+    def _read_travel_mm(self, axis: int) -> tuple[float, float]:
+        """Read the controller's own software limits."""
+
+    @abstractmethod
+    def _set_dynamics(self, axis: int) -> tuple[float, float]:
+        """Set velocity and acceleration where the options give them; return both as read back."""
+
+    @abstractmethod
+    def _read_position_mm(self, axis: int) -> float:
+        """Read where the axis is."""
+
+    @abstractmethod
+    def _read_status(self, axis: int) -> AxisStatus:
+        """Read what the axis does."""
+
+    @abstractmethod
+    def _switch_motor(self, axis: int, *, on: bool) -> None:
+        """Switch the motor, and check that it is."""
+
+    @abstractmethod
+    def _start_homing(self, axis: int) -> None:
+        """Write the homing command, once, and raise what the controller has against it."""
+
+    @abstractmethod
+    def _finish_homing(self, axis: int) -> None:
+        """Check that homing ended well; called when the axis rests."""
+
+    @abstractmethod
+    def _send_move(self, axis: int, position_mm: float) -> None:
+        """Write the motion command, once."""
+
+    @abstractmethod
+    def _stop_text(self, axis: int | None) -> str:
+        """Give the stop command for one axis or all."""
+
+    @abstractmethod
+    def _drain_errors(self, axis: int | None = None) -> list[ControllerMessage]:
+        """Read and clear the controller's errors (of one axis where it keeps them apart)."""
+
+    @abstractmethod
+    def _code_of(self, message: ControllerMessage) -> str | None:
+        """Map a controller's error to one of the codes of `Stage`, if one fits."""

@@ -1,0 +1,151 @@
+"""The region to measure, the mask, the seeds: read from the command line and checked against the image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError, RegionError
+from server.io.images import read_mask
+
+Rectangle = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class RegionRequest:
+    """What ``--roi``, ``--mask`` and ``--seed`` say, checked.
+
+    Attributes
+    ----------
+    rectangle_px
+        (X0, Y0, X1, Y1), points lie at X0 + i step and Y0 + j step up to X1, Y1.
+    mask
+        (rows, cols) of camera 1's image, True where points may lie; None = everywhere.
+    seeds_px
+        (n, 2) in camera 1's reference image; None = found by the program.
+    """
+
+    rectangle_px: Rectangle
+    mask: NDArray[np.bool_] | None
+    seeds_px: NDArray[np.float64] | None
+
+
+def _numbers(option: str, text: str, count: int) -> list[float]:
+    parts = text.split(",")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError as error:
+        raise _bad(option, text, "is not a list of numbers", count) from error
+    if len(numbers) != count:
+        raise _bad(option, text, f"has {len(numbers)} numbers", count)
+    if not all(math.isfinite(v) for v in numbers):
+        raise _bad(option, text, "holds a number that is not finite", count)
+    return numbers
+
+
+def _bad(option: str, text: str, why: str, count: int) -> RegionError:
+    form = "X0,Y0,X1,Y1" if count == 4 else "X,Y"
+    return RegionError(f"{option} {text!r} {why}.", remedy=f"Give {option} {form} in pixels of camera 1's image.")
+
+
+def parse_rectangle(text: str) -> Rectangle:
+    """Read ``X0,Y0,X1,Y1``.
+
+    Raises
+    ------
+    RegionError
+        If it is not four finite numbers in order.
+    """
+    x0, y0, x1, y1 = _numbers("--roi", text, 4)
+    if x1 <= x0 or y1 <= y0:
+        raise RegionError(f"--roi {text} is empty: from {x0:g} to {x1:g} by {y0:g} to {y1:g}.",
+                          remedy="Give the upper left corner first, then the lower right one.")  # fmt: skip
+    return x0, y0, x1, y1
+
+
+def check_odd(option: str, text: str, *, low: int, high: int, odd: bool) -> int:
+    """Read a whole number in a range, odd where it must be.
+
+    Raises
+    ------
+    InputError
+        ``option_out_of_range``.
+    """
+    kind = "an odd whole number" if odd else "a whole number"
+    try:
+        value = int(text)
+    except ValueError:
+        value = low - 1
+    if not low <= value <= high or (odd and value % 2 == 0):
+        raise InputError(f"{option} is {text}; it must be {kind} from {low} to {high}.", code="option_out_of_range",
+                         remedy=f"Give {option} {33 if odd else 10}, for example.")  # fmt: skip
+    return value
+
+
+def check_region(
+    rectangle: Rectangle,
+    *,
+    image_shape: tuple[int, int],
+    subset_px: int,
+    step_px: int,
+    mask_path: Path | None,
+    seeds: Sequence[str],
+) -> RegionRequest:
+    """Check region, mask and seeds against camera 1's image.
+
+    Raises
+    ------
+    RegionError
+        ``region_unusable``: outside the image, smaller than a subset, no white pixel under any point;
+        ``mask_size_mismatch``; ``seed_outside``.
+    ImageError
+        If the mask cannot be read.
+    """
+    rows, cols = image_shape
+    x0, y0, x1, y1 = rectangle
+    text = f"{x0:g},{y0:g},{x1:g},{y1:g}"
+    if x0 < 0 or y0 < 0 or x1 > cols or y1 > rows:
+        raise RegionError(f"--roi {text} does not lie in camera 1's image of {cols} x {rows} px.",
+                          remedy="Give a region inside camera 1's image.")  # fmt: skip
+    if min(x1 - x0, y1 - y0) + 1 < subset_px:
+        raise RegionError(
+            f"--roi {text} is {x1 - x0 + 1:g} x {y1 - y0 + 1:g} px, smaller than one subset of {subset_px} px.",
+            remedy="Give a larger region or a smaller --subset.",
+        )
+    mask = None
+    if mask_path is not None:
+        mask = read_mask(mask_path)
+        if mask.shape != image_shape:
+            raise RegionError(
+                f"The mask {mask_path} is {mask.shape[1]} x {mask.shape[0]} px, camera 1's image {cols} x {rows} px.",
+                code="mask_size_mismatch",
+                remedy="Draw the mask over camera 1's first image.",
+            )
+        points_x = np.minimum(np.rint(np.arange(x0, x1 + 1e-9, step_px)).astype(int), cols - 1)
+        points_y = np.minimum(np.rint(np.arange(y0, y1 + 1e-9, step_px)).astype(int), rows - 1)
+        if not mask[np.ix_(points_y, points_x)].any():
+            raise RegionError(
+                f"The mask {mask_path} leaves no point of --roi {text} ({100 * mask.mean():.3g} % of it is white).",
+                remedy="Paint white where points may lie.",
+            )
+    return RegionRequest(rectangle, mask, _seeds(seeds, rectangle, mask))
+
+
+def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> NDArray[np.float64] | None:
+    if not texts:
+        return None
+    x0, y0, x1, y1 = rectangle
+    seeds = np.array([_numbers("--seed", text, 2) for text in texts])
+    for text, (x, y) in zip(texts, seeds, strict=True):
+        if not (x0 <= x <= x1 and y0 <= y <= y1):
+            cause = f"--seed {text} lies outside the region {x0:g},{y0:g},{x1:g},{y1:g}."
+            raise RegionError(cause, code="seed_outside", remedy="Give a seed inside the region, in camera 1's image.")
+        if mask is not None and not mask[min(round(y), mask.shape[0] - 1), min(round(x), mask.shape[1] - 1)]:
+            raise RegionError(f"--seed {text} lies where the mask is black.",
+                              code="seed_outside", remedy="Give a seed where the mask is white.")  # fmt: skip
+    return seeds

@@ -1,0 +1,68 @@
+"""Progress on the terminal: one line that is rewritten, or a line now and then where nobody watches."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+_REDRAW_S = 0.2
+_QUIET_S = 15.0
+
+
+def duration(seconds: float) -> str:
+    """Write a duration as a person would: ``8 s``, ``2 min 05 s``, ``1 h 10 min``."""
+    s = round(seconds)
+    if s < 60:
+        return f"{s} s"
+    if s < 3600:
+        return f"{s // 60} min {s % 60:02d} s"
+    return f"{s // 3600} h {s % 3600 // 60:02d} min"
+
+
+class ProgressLine:
+    """Shows how far the work is and an estimate of the time left, on stderr.
+
+    Parameters
+    ----------
+    stream
+        Where to write; stderr when left out.
+    """
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._live = self._stream.isatty()
+        self._start = self._last = time.monotonic()
+        self._width = 0
+
+    def note(self, text: str) -> None:
+        """Write a line that stays."""
+        self._clear()
+        self._stream.write(f"{text}\n")
+        self._stream.flush()
+
+    def show(self, text: str, fraction: float) -> None:
+        """Say where the work is; ``fraction`` of all of it is done."""
+        now = time.monotonic()
+        if now - self._last < (_REDRAW_S if self._live else _QUIET_S):
+            return
+        self._last = now
+        line = f"{text}, {100 * fraction:.0f} % of all"
+        if fraction > 0.02:
+            line += f", about {duration((now - self._start) * (1 - fraction) / fraction)} left"
+        if not self._live:
+            self.note(line)
+            return
+        self._stream.write("\r" + line.ljust(self._width))
+        self._stream.flush()
+        self._width = len(line)
+
+    def close(self) -> None:
+        """Leave the terminal clean."""
+        self._clear()
+
+    def _clear(self) -> None:
+        if self._live and self._width:
+            self._stream.write("\r" + " " * self._width + "\r")
+            self._stream.flush()
+            self._width = 0

@@ -1,0 +1,163 @@
+"""A client of the service: everything the demo does with the rig goes through here, over HTTP."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import MeasurementError, StateError, StorageError
+
+Float = NDArray[np.float64]
+OnProgress = Callable[[str, int, int, float | None], None]
+
+_POLL_S = 0.25
+_REQUEST_TIMEOUT_S = 60.0
+_ENDED = ("succeeded", "failed", "cancelled", "interrupted")
+
+
+@dataclass(frozen=True)
+class AnalysisHandle:
+    """An analysis that has ended."""
+
+    test_id: str
+    analysis_id: str
+    job: dict[str, Any]
+
+
+class ServiceClient:
+    """Drives one service.
+
+    Parameters
+    ----------
+    base_url
+        ``http://127.0.0.1:port``.
+    on_progress
+        Called with (stage, done, total, seconds left or None) while a job runs.
+    """
+
+    def __init__(self, base_url: str, on_progress: OnProgress | None = None) -> None:
+        self._http = httpx.Client(base_url=f"{base_url}/api/v1", timeout=_REQUEST_TIMEOUT_S, trust_env=False)
+        self._on_progress = on_progress
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def __enter__(self) -> ServiceClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Make one request; a problem comes back as the project's own error.
+
+        Raises
+        ------
+        StateError
+            With the service's code, cause and remedy, for any answer that is not a success.
+        """
+        try:
+            response = self._http.request(method, path, **options)
+        except httpx.TransportError as error:
+            raise StateError(f"{method} {path} got no answer ({type(error).__name__}).", code="service_lost",
+                             remedy="Look at the service's log.") from error  # fmt: skip
+        if response.is_success:
+            return response
+        try:
+            problem = response.json()
+        except ValueError:
+            problem = {}
+        raise StateError(
+            f"{method} {path} was answered {response.status_code}: {problem.get('detail', response.text[:200])}",
+            code=str(problem.get("code", "http_error")),
+            remedy=str(problem.get("remedy", "Look at the service's log.")),
+        )
+
+    def get(self, path: str, **params: Any) -> Any:
+        """GET a JSON document."""
+        return self.call("GET", path, params=params).json()
+
+    def set_scene(self, scene: str, load: float = 0.0, **params: Any) -> None:
+        """Put a scene before the simulated cameras; load in kPa (plate) or kN (panel)."""
+        body: dict[str, Any] = {"scene": scene, "load": load}
+        if params:
+            body["params"] = params
+        self.call("PUT", "/sim/scene", json=body)
+
+    def calibrate(self, **plan: Any) -> dict[str, Any]:
+        """Run the calibration sequence; return what ``GET /calibrations/{id}`` then says."""
+        accepted = self.call("POST", "/calibrations", json=plan).json()
+        self.wait(accepted["job"]["id"])
+        document: dict[str, Any] = self.get(f"/calibrations/{accepted['calibration_id']}")
+        document.setdefault("id", accepted["calibration_id"])
+        return document
+
+    def create_test(self, name: str, calibration_id: str, specimen: str = "") -> str:
+        """Make a test; return its id."""
+        body = {"name": name, "calibration_id": calibration_id, "specimen": specimen}
+        return str(self.call("POST", "/tests", json=body).json()["id"])
+
+    def capture(self, test_id: str, label: str, *, load_n: float | None = None) -> dict[str, Any]:
+        """Capture one step; return its record."""
+        step: dict[str, Any] = self.call(
+            "POST", f"/tests/{test_id}/steps", json={"label": label, "load_n": load_n}
+        ).json()
+        return step
+
+    def analyse(self, test_id: str, kind: str, rectangle_px: Sequence[float], **settings: Any) -> AnalysisHandle:
+        """Run an analysis to its end."""
+        body = {"kind": kind, "region": {"rectangle": list(rectangle_px)}, **settings}
+        accepted = self.call("POST", f"/tests/{test_id}/analyses", json=body).json()
+        job = self.wait(accepted["job"]["id"])
+        return AnalysisHandle(test_id, str(accepted["analysis_id"]), job)
+
+    def field(self, analysis: AnalysisHandle, step: int, name: str) -> Float:
+        """Fetch one variable of one step."""
+        path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/steps/{step}/fields/{name}"
+        data = self.call("GET", path, params={"format": "npy"}).content
+        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
+
+    def export(self, analysis: AnalysisHandle, step: int) -> bytes:
+        """Fetch the result file of one step."""
+        path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/export"
+        data = self.call("GET", path, params={"format": "nc", "step": step}).content
+        if not data:
+            raise StorageError(f"The export of step {step} came back empty.")
+        return data
+
+    def wait(self, job_id: str) -> dict[str, Any]:
+        """Wait for a job's end and return it.
+
+        Raises
+        ------
+        MeasurementError
+            With the job's problem, if it did not succeed.
+        """
+        while True:
+            job: dict[str, Any] = self.get(f"/jobs/{job_id}")
+            progress = job.get("progress") or {}
+            if self._on_progress is not None:
+                self._on_progress(
+                    str(progress.get("stage", job["state"])), int(progress.get("done") or 0),
+                    int(progress.get("total") or 0), progress.get("eta_s"),
+                )  # fmt: skip
+            if job["state"] in _ENDED:
+                break
+            time.sleep(_POLL_S)
+        if job["state"] != "succeeded":
+            problem = job.get("problem") or {}
+            reason = problem.get("cause", problem.get("detail", "no reason given"))
+            raise MeasurementError(
+                f"The {job['kind']} job {job_id} ended as {job['state']}: {reason}",
+                code=str(problem.get("code", "job_failed")),
+                remedy=str(problem.get("remedy", "Look at the service's log.")),
+            )
+        return job

@@ -1,0 +1,84 @@
+"""What one field comes to in a few numbers, for ``summary.json`` and the API."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.field.result import Field
+from core.status import PointStatus
+from server.io.netcdf import COMPARISONS
+
+
+def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Signed distances (n,) of points (n, 3) from their best-fit plane (least squares of the normal distances)."""
+    centred = points_mm - points_mm.mean(axis=0)
+    normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+    return np.asarray(centred @ normal)
+
+
+def _rms(values: NDArray[np.float64]) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+def summarise(result: Field) -> dict[str, Any]:
+    """Summarise one field.
+
+    Returns
+    -------
+    dict
+        ``points`` (in the region), ``valid``, ``valid_fraction``, ``status`` (counts by name), ``epipolar_mean_px``,
+        ``epipolar_rms_px``, ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
+        ``sigma_median_mm``, for displacements also ``displacement_mm`` (mean, min, max of u, v, w). What cannot be
+        told is None.
+    """
+    status = result.status
+    valid = result.valid
+    points = int((status != PointStatus.MASKED).sum())
+    n = int(valid.sum())
+    epipolar = result.epipolar_px[valid]
+    names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
+    summary: dict[str, Any] = {
+        "kind": "displacement" if result.has_motion else "shape",
+        "points": points,
+        "valid": n,
+        "valid_fraction": n / points if points else None,
+        "status": {s.name.lower(): int((status == s).sum()) for s in PointStatus if (status == s).any()},
+        "epipolar_mean_px": float(epipolar.mean()) if n else None,
+        "epipolar_rms_px": _rms(epipolar),
+        "plane_residual_rms_mm": _rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
+        "zncc_median": {
+            name: float(np.median(result.zncc[valid][:, k])) if n else None
+            for k, name in enumerate(COMPARISONS[: result.zncc.shape[-1]])
+        },
+        "sigma_median_mm": {
+            name: float(np.sqrt(np.median(result.covariance[valid][:, k, k]))) if n else None
+            for k, name in enumerate(names)
+        },
+    }
+    if result.uvw_mm is not None:
+        uvw = result.uvw_mm[valid]
+        summary["displacement_mm"] = {
+            name: {"mean": float(a.mean()), "min": float(a.min()), "max": float(a.max())} if n else None
+            for name, a in zip(("u", "v", "w"), uvw.T, strict=True)
+        }
+    return summary
+
+
+def to_json(document: Any) -> bytes:
+    """Return a document as JSON text; numbers that are not finite become null."""
+    return (json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return value

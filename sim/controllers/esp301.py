@@ -1,0 +1,326 @@
+"""A simulated ESP301: three axes, its words, its error queue, on three `SimAxis`.
+
+It knows what the driver and the usual third-party drivers say: identification, motor power, homing, moves, stop, abort,
+velocities, limits, units and errors. Commands may be joined by semicolons; each query has a reply of its own, ended by
+CR LF. The list of error texts is the manual's (appendix A).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sim.controllers.axis import SimAxis, SimClock, Trouble
+from sim.controllers.wire import WireController
+
+_COMMAND = re.compile(r"(\d*)([A-Z]{2})(.*)")
+_TICK_S = 400e-6  # one servo cycle, the unit of the time stamps in the error queue
+
+_TEXTS = {
+    0: "NO ERROR DETECTED",
+    4: "EMERGENCY STOP ACTIVATED",
+    6: "COMMAND DOES NOT EXIST",
+    7: "PARAMETER OUT OF RANGE",
+    9: "AXIS NUMBER OUT OF RANGE",
+    27: "COMMAND NOT ALLOWED",
+    37: "AXIS NUMBER MISSING",
+    38: "COMMAND PARAMETER MISSING",
+}
+_AXIS_TEXTS = {
+    1: "PARAMETER OUT OF RANGE",
+    3: "FOLLOWING ERROR THRESHOLD EXCEEDED",
+    4: "POSITIVE HARDWARE LIMIT DETECTED",
+    5: "NEGATIVE HARDWARE LIMIT DETECTED",
+    6: "POSITIVE SOFTWARE LIMIT DETECTED",
+    7: "NEGATIVE SOFTWARE LIMIT DETECTED",
+    10: "MAXIMUM VELOCITY EXCEEDED",
+    11: "MAXIMUM ACCELERATION EXCEEDED",
+    13: "MOTOR NOT ENABLED",
+    20: "HOMING ABORTED",
+    30: "COMMAND NOT ALLOWED DURING HOMING",
+}
+_TROUBLE_CODES: dict[Trouble, int] = {"following_error": 3, "positive_limit": 4, "negative_limit": 5}
+
+
+class _Refusal(Exception):
+    """A command that ends in the error queue instead of being carried out."""
+
+    def __init__(self, code: int, axis: int | None = None) -> None:
+        super().__init__(code, axis)
+        self.code = code
+        self.axis = axis
+
+
+@dataclass
+class _Axis:
+    motor: SimAxis
+    low_mm: float
+    high_mm: float
+    max_velocity_mm_s: float
+    power: bool = False
+    homing: bool = False
+    unit: int = 2
+    deceleration_mm_s2: float = 40.0
+    home_mode: int = 1
+
+
+class SimESP301(WireController):
+    """The simulated controller.
+
+    Parameters
+    ----------
+    axes
+        How many axes, 1 to 3.
+    travel_mm
+        (low, high) software limits that it reports, measured from home.
+    velocity_mm_s, acceleration_mm_s2
+        Power-on values.
+    time_scale
+        How many times faster than real its axes run; the speeds that it reports stay those of the stage.
+    start_mm
+        Where the axes stand at power-on, from home.
+    """
+
+    terminator = b"\r"
+
+    def __init__(
+        self,
+        *,
+        axes: int = 3,
+        travel_mm: tuple[float, float] = (-50.0, 50.0),
+        velocity_mm_s: float = 10.0,
+        acceleration_mm_s2: float = 40.0,
+        time_scale: float = 1.0,
+        start_mm: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if not 1 <= axes <= 3:
+            raise ValueError(f"an ESP301 has 1 to 3 axes, not {axes}")
+        self.clock = SimClock(time_scale)
+        self._axes = {
+            number: _Axis(
+                SimAxis(
+                    self.clock,
+                    velocity_mm_s=velocity_mm_s,
+                    acceleration_mm_s2=acceleration_mm_s2,
+                    start_mm=start_mm,
+                ),
+                travel_mm[0],
+                travel_mm[1],
+                max_velocity_mm_s=4 * velocity_mm_s,
+            )
+            for number in range(1, axes + 1)
+        }
+        self._queue: deque[tuple[int, int]] = deque(maxlen=10)
+        self._words: dict[str, Callable[[int, _Axis, str], str | None]] = {
+            "PA": self._pa,
+            "PR": self._pr,
+            "TP": lambda _n, axis, _p: f"{axis.motor.encoder_mm:.4f}",
+            "DP": lambda _n, axis, _p: f"{axis.motor.goal_mm:.4f}",
+            "TV": lambda _n, axis, _p: f"{axis.motor.velocity_now_mm_s:.4f}",
+            "MD": lambda _n, axis, _p: "0" if axis.motor.moving else "1",
+            "MO": self._mo,
+            "MF": self._mf,
+            "OR": self._or,
+            "DH": self._dh,
+            "ST": self._st,
+            "VA": self._va,
+            "VU": lambda _n, axis, p: f"{axis.max_velocity_mm_s:.4f}" if p == "?" else None,
+            "AC": self._ac,
+            "AG": self._ag,
+            "SL": self._sl,
+            "SR": self._sr,
+            "SN": self._sn,
+            "ID": lambda number, _a, _p: f"SIM-LTA-HS, SN{number:04d}",
+        }
+
+    def axis(self, number: int) -> SimAxis:
+        """Give access to an axis and its faults."""
+        return self._axes[number].motor
+
+    def true_position_mm(self, axis: int) -> float:
+        """Where the load of an axis really is along its axis, in mm from home."""
+        return self._axes[axis].motor.true_position_mm()
+
+    def true_displacement_mm(self, axis: int) -> tuple[float, float, float]:
+        """Where the load of an axis really is: across, across, along the axis, in mm from home."""
+        return self._axes[axis].motor.true_displacement_mm()
+
+    def _execute(self, text: str) -> bytes:
+        self._update()
+        replies = []
+        for part in text.replace(" ", "").upper().split(";"):
+            if part:
+                try:
+                    reply = self._one(part)
+                except _Refusal as refusal:
+                    self._error(refusal.code, refusal.axis)
+                    continue
+                if reply is not None:
+                    replies.append(reply.encode("ascii") + b"\r\n")
+        return b"".join(replies)
+
+    def _one(self, text: str) -> str | None:
+        match = _COMMAND.fullmatch(text)
+        if match is None:
+            raise _Refusal(6)
+        number, word, parameter = match.groups()
+        if word in ("VE", "TE", "TB", "AB") or (word == "ST" and not number):
+            return self._general(word)
+        if word not in self._words:
+            raise _Refusal(6)
+        if not number:
+            raise _Refusal(37)
+        axis = self._axes.get(int(number))
+        if axis is None:
+            raise _Refusal(9)
+        try:
+            return self._words[word](int(number), axis, parameter)
+        except ValueError as error:
+            raise _Refusal(7) from error
+
+    def _general(self, word: str) -> str | None:
+        if word == "VE":
+            return "ESP301 Version 3.09 08/01/15"
+        if word == "TE":
+            return str(self._queue.popleft()[0] if self._queue else 0)
+        if word == "TB":
+            code, stamp = self._queue.popleft() if self._queue else (0, int(self.clock.now() / _TICK_S))
+            return f"{code}, {stamp}, {_TEXTS[code] if code < 100 else _AXIS_TEXTS[code % 100]}"
+        for number, axis in self._axes.items():
+            if word == "ST":
+                self._st(number, axis, "")
+            else:
+                self._mf(number, axis, "")
+        if word == "AB":
+            self._error(4)
+        return None
+
+    def _error(self, code: int, axis: int | None = None) -> None:
+        number = code if axis is None else 100 * axis + code
+        self._queue.append((number, int(self.clock.now() / _TICK_S)))
+
+    def _update(self) -> None:
+        for number, axis in self._axes.items():
+            trouble = axis.motor.take_trouble()
+            if trouble is not None:
+                self._error(_TROUBLE_CODES[trouble], number)
+                if axis.homing:
+                    axis.homing = False
+                    self._error(20, number)
+                if trouble == "following_error":
+                    axis.power = False
+            if axis.homing and not axis.motor.moving:
+                axis.homing = False
+                axis.motor.set_home()
+
+    def _start(self, number: int, axis: _Axis, target_mm: float) -> None:
+        if axis.homing:
+            raise _Refusal(30, number)
+        if not axis.power:
+            raise _Refusal(13, number)
+        if target_mm > axis.high_mm:
+            raise _Refusal(6, number)
+        if target_mm < axis.low_mm:
+            raise _Refusal(7, number)
+        axis.motor.move_to(target_mm)
+        return
+
+    def _pa(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return f"{axis.motor.goal_mm:.4f}"
+        if not parameter:
+            raise _Refusal(38)
+        self._start(number, axis, float(parameter))
+        return None
+
+    def _pr(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if not parameter:
+            raise _Refusal(38)
+        self._start(number, axis, axis.motor.goal_mm + float(parameter))
+        return None
+
+    def _mo(self, _number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return "1" if axis.power else "0"
+        axis.power = True
+        return None
+
+    def _mf(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return "0" if axis.power else "1"
+        axis.motor.cut()
+        if axis.homing:
+            axis.homing = False
+            self._error(20, number)
+        axis.power = False
+        return None
+
+    def _or(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        mode = int(parameter) if parameter else axis.home_mode
+        if not 0 <= mode <= 6:
+            raise _Refusal(1, number)
+        if not axis.power:
+            raise _Refusal(13, number)
+        axis.homing = True
+        axis.motor.move_home()
+        return None
+
+    def _dh(self, _number: int, axis: _Axis, parameter: str) -> str | None:
+        axis.motor.define_position(float(parameter) if parameter else 0.0)
+        return None
+
+    def _st(self, number: int, axis: _Axis, _parameter: str) -> str | None:
+        axis.motor.stop()
+        if axis.homing:
+            axis.homing = False
+            self._error(20, number)
+        return None
+
+    def _va(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return f"{axis.motor.velocity_mm_s:.4f}"
+        value = float(parameter)
+        if not 0 < value <= axis.max_velocity_mm_s:
+            raise _Refusal(10, number)
+        axis.motor.velocity_mm_s = value
+        return None
+
+    def _ac(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return f"{axis.motor.acceleration_mm_s2:.4f}"
+        value = float(parameter)
+        if not value > 0:
+            raise _Refusal(11, number)
+        axis.motor.acceleration_mm_s2 = value
+        return None
+
+    def _ag(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return f"{axis.deceleration_mm_s2:.4f}"
+        value = float(parameter)
+        if not value > 0:
+            raise _Refusal(11, number)
+        axis.deceleration_mm_s2 = value
+        return None
+
+    def _sl(self, _number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return f"{axis.low_mm:.4f}"
+        axis.low_mm = float(parameter)
+        return None
+
+    def _sr(self, _number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return f"{axis.high_mm:.4f}"
+        axis.high_mm = float(parameter)
+        return None
+
+    def _sn(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return str(axis.unit)
+        if int(parameter) != 2:
+            raise _Refusal(1, number)  # this one knows millimetres only
+        return None

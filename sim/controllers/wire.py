@@ -1,0 +1,98 @@
+"""The wire side of a simulated controller: command lines in, replies out, a log of what came, and line faults."""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+
+@dataclass
+class LineFaults:
+    """What is wrong with the line; every value may be set while it runs.
+
+    Parameters
+    ----------
+    silent
+        Commands are carried out, replies never come.
+    deaf
+        Nothing arrives and nothing comes back, as with the power or the cable gone.
+    lose_replies
+        So many of the next replies are lost.
+    halve_replies
+        So many of the next replies break off in the middle, without their end.
+    garble_replies
+        So many of the next replies arrive as noise.
+    stray
+        Bytes sent before the next reply.
+    delay_s
+        Wait before each reply.
+    """
+
+    silent: bool = False
+    deaf: bool = False
+    lose_replies: int = 0
+    halve_replies: int = 0
+    garble_replies: int = 0
+    stray: bytes = b""
+    delay_s: float = 0.0
+
+    def apply(self, reply: bytes) -> bytes:
+        """Return what of a reply really goes out."""
+        if not reply or self.silent or self.deaf:
+            return b""
+        if self.lose_replies > 0:
+            self.lose_replies -= 1
+            return b""
+        if self.halve_replies > 0:
+            self.halve_replies -= 1
+            return reply[: max(1, (len(reply) - 1) // 2)]
+        if self.garble_replies > 0:
+            self.garble_replies -= 1
+            return b"\xff\x80" + bytes(byte ^ 0x55 for byte in reply.strip()) + b"\r\n"
+        stray, self.stray = self.stray, b""
+        return stray + reply
+
+
+@dataclass(frozen=True)
+class Received:
+    """One command line as it came in, and when by the host's monotonic clock."""
+
+    at_s: float
+    text: str
+
+
+class WireController(ABC):
+    """Base of the simulated controllers. One instance may serve several connections; calls are serialised."""
+
+    terminator: bytes
+
+    def __init__(self) -> None:
+        self.line_faults = LineFaults()
+        self.received: list[Received] = []
+        self._lock = threading.RLock()
+
+    def take_line(self, line: bytes) -> bytes:
+        """Carry out one command line, without its terminator, and return the bytes to send."""
+        if self.line_faults.deaf:
+            return b""
+        text = line.decode("ascii", errors="replace").strip("\r\n")
+        with self._lock:
+            self.received.append(Received(time.monotonic(), text))
+            reply = self.line_faults.apply(self._execute(text))
+        if reply and self.line_faults.delay_s > 0:
+            time.sleep(self.line_faults.delay_s)
+        return reply
+
+    def commands(self, word: str) -> list[str]:
+        """Return every command line that came in and contains ``word``."""
+        return [entry.text for entry in self.received if word in entry.text]
+
+    @abstractmethod
+    def _execute(self, text: str) -> bytes:
+        """Carry out a command line."""
+
+    @abstractmethod
+    def true_position_mm(self, axis: int) -> float:
+        """Where the load of an axis really is along its axis, in mm from home."""

@@ -1,0 +1,95 @@
+"""The clamped circular plate under pressure, Eq. (18), with the large-deflection term where it is wanted.
+
+Deflection w(r) = w0 (1 - (r/a)^2)^2 towards the cameras (-z). Linear theory: w0 = q a^4 / (64 D), D = E t^3 / (12 (1
+- nu^2)).
+
+The camera sees the face, half a thickness in front of the mid-plane. It moves in the plane by half the thickness
+times the slope: u_r = (t/2) (-dw/dr), outwards where the plate bulges (Kirchhoff).
+
+Large deflection: with w's shape kept, the mid-plane's radial displacement solves the in-plane equilibrium exactly,
+
+    u = (w0^2 / a) (c1 p + c3 p^3 + c5 p^5 + c7 p^7),  p = r / a,
+    c3 = -(3 - nu), c5 = (10 - 2 nu) / 3, c7 = -(7 - nu) / 6, c1 = (5 - 3 nu) / 6   (edge held),
+
+and minimum energy gives w0 (1 + k (w0/t)^2) = q a^4 / (64 D), where k is 0.488 for nu = 0.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from sim.surface import PLATE, Surface
+
+Float = NDArray[np.float64]
+
+PAPER_PRESSURES_KPA = tuple(round(68.9 * n, 1) for n in range(1, 11))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CircularPlate:
+    """The plate's dimensions and material; the paper's by default.
+
+    Parameters
+    ----------
+    radius_mm, thickness_mm
+        Clamped radius a and thickness t.
+    youngs_modulus_mpa, poisson
+        E in N/mm^2, nu.
+    large_deflection
+        Whether the membrane carries its share.
+    """
+
+    radius_mm: float = 13.385
+    thickness_mm: float = 0.762
+    youngs_modulus_mpa: float = 71.0e3
+    poisson: float = 0.334
+    large_deflection: bool = False
+
+    @property
+    def bending_stiffness_nmm(self) -> float:
+        """D in N mm."""
+        return self.youngs_modulus_mpa * self.thickness_mm**3 / (12.0 * (1.0 - self.poisson**2))
+
+    @property
+    def membrane_coefficients(self) -> tuple[float, float, float, float]:
+        """(c1, c3, c5, c7) of the mid-plane's radial displacement."""
+        nu = self.poisson
+        return (5.0 - 3.0 * nu) / 6.0, -(3.0 - nu), (10.0 - 2.0 * nu) / 3.0, -(7.0 - nu) / 6.0
+
+    @property
+    def stiffening(self) -> float:
+        """The factor k in ``w0 (1 + k (w0/t)^2)``, from the membrane's energy."""
+        x, weight = leggauss(16)  # exact: the integrand is a polynomial of degree 15
+        p, weight = 0.5 * (x + 1.0), 0.5 * weight
+        c1, c3, c5, c7 = self.membrane_coefficients
+        slope = -4.0 * p * (1.0 - p**2)
+        radial = c1 + 3.0 * c3 * p**2 + 5.0 * c5 * p**4 + 7.0 * c7 * p**6 + 0.5 * slope**2
+        hoop = c1 + c3 * p**2 + c5 * p**4 + c7 * p**6
+        energy = np.sum(weight * p * (radial**2 + hoop**2 + 2.0 * self.poisson * radial * hoop))
+        # d/dw0 of [membrane: pi E t / (1 - nu^2) energy w0^4 / a^2] against [bending: 32 pi D w0^2 / (3 a^2)]
+        return float(4.0 * energy * 3.0 * 12.0 / 64.0)
+
+    def centre_deflection_mm(self, pressure_kpa: float) -> float:
+        """w0 at a pressure; negative pressures push the other way."""
+        linear = pressure_kpa * 1e-3 * self.radius_mm**4 / (64.0 * self.bending_stiffness_nmm)
+        if not self.large_deflection or linear == 0.0:
+            return linear
+        k = self.stiffening / self.thickness_mm**2
+        size = brentq(lambda w: w * (1.0 + k * w * w) - abs(linear), 0.0, abs(linear), xtol=1e-15)
+        return float(np.copysign(size, linear))
+
+    def deflection_mm(self, r_mm: ArrayLike, pressure_kpa: float) -> Float:
+        """w(r), towards the cameras, zero beyond the clamping."""
+        q = np.minimum((np.asarray(r_mm, dtype=np.float64) / self.radius_mm) ** 2, 1.0)
+        return np.asarray(self.centre_deflection_mm(pressure_kpa) * (1.0 - q) ** 2)
+
+    def surface(self, pressure_kpa: float) -> Surface:
+        """Return the face of the plate at a pressure; (s, t) are measured from its centre on the flat plate."""
+        membrane = self.membrane_coefficients if self.large_deflection else (0.0, 0.0, 0.0, 0.0)
+        w0 = self.centre_deflection_mm(pressure_kpa)
+        return Surface(kind=PLATE, parameters=np.array([self.radius_mm, w0, 0.5 * self.thickness_mm, *membrane]))

@@ -1,0 +1,188 @@
+"""What a simulated rig is made of, read from a rig file's tables.
+
+The rig file says what its user knows under ``[cam1]`` and ``[cam2]`` and what is true under ``[sim]``. This module
+takes the plain tables, as ``tomllib`` gives them, and makes frozen descriptions; it does not care for the parts that
+it does not need.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from core.camera import Camera, RigidTransform
+from core.errors import InputError
+from sim.sensor import Lighting, Sensor
+
+CameraName = Literal["cam1", "cam2"]
+CAMERA_NAMES: tuple[CameraName, CameraName] = ("cam1", "cam2")
+_PARAMETERS = (
+    "phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect",
+    "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimCamera:
+    """One true camera with its sensor, its light and its stage axis.
+
+    Parameters
+    ----------
+    camera
+        The true camera at dz = 0.
+    size_px
+        Columns and rows.
+    sensor, lighting
+        See there.
+    exposure_ms
+        Exposure at which brightness 1 is full scale.
+    stage_axis, stage_sign, stage_zero_mm
+        ``dz = stage_sign * (position - zero)`` of that axis.
+    axis_tilt_rad
+        True direction of the travel: turned about the camera's x and y from its optical axis.
+    """
+
+    camera: Camera
+    size_px: tuple[int, int]
+    sensor: Sensor
+    lighting: Lighting
+    exposure_ms: float = 10.0
+    stage_axis: int = 1
+    stage_sign: int = 1
+    stage_zero_mm: float = 0.0
+    axis_tilt_rad: tuple[float, float] = (0.0, 0.0)
+
+    def at(self, position_mm: float) -> Camera:
+        """Return the true camera when its stage axis truly stands at ``position_mm``."""
+        dz = self.stage_sign * (position_mm - self.stage_zero_mm)
+        about_x, about_y = self.axis_tilt_rad
+        direction = np.array([np.sin(about_y), -np.sin(about_x) * np.cos(about_y), np.cos(about_x) * np.cos(about_y)])
+        pose = self.camera.cam_from_sys
+        return Camera(self.camera.lens, RigidTransform(pose.rotation, pose.translation_mm + dz * direction))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimTarget:
+    """The calibration target's description, as in the rig file's ``[target]``."""
+
+    pitch_mm: float
+    lines: tuple[int, int]
+    line_width_mm: float
+    node_tolerance_mm: float = 0.0
+    dark_lines: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimRig:
+    """Everything true about a simulated rig.
+
+    Parameters
+    ----------
+    name
+        From ``[rig]``.
+    cam1, cam2
+        The cameras.
+    target
+        Its nominal description; the maker's errors follow from the seed.
+    seed
+        Of the target's errors, the speckle and the steel's roughness: the same seed is the same laboratory.
+    speckle_mm
+        Mean diameter of the specimens' speckles.
+    blur_px
+        Lens blur.
+    """
+
+    name: str
+    cam1: SimCamera
+    cam2: SimCamera
+    target: SimTarget
+    seed: int = 0
+    speckle_mm: float = 0.135
+    blur_px: float = 0.55
+
+    def camera(self, name: CameraName) -> SimCamera:
+        """Return one of the two by name."""
+        if name not in CAMERA_NAMES:
+            raise InputError(f"There is no camera {name!r}.", code="unknown_camera", remedy="Use cam1 or cam2.")
+        return self.cam1 if name == "cam1" else self.cam2
+
+    @staticmethod
+    def from_dict(tables: Mapping[str, Any]) -> SimRig:
+        """Read a rig file's tables: ``rig``, ``cam1``, ``cam2``, ``target`` and ``sim`` with ``sim.cam1``,
+        ``sim.cam2``.
+
+        Raises
+        ------
+        InputError
+            ``rig_invalid`` when something is missing or is no number.
+        """
+        try:
+            return _rig(tables)
+        except KeyError as error:
+            raise InputError(
+                f"The simulated rig's description lacks {error.args[0]!r}.",
+                code="rig_invalid",
+                remedy="Compare with config/sim_paper.toml.",
+            ) from error
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"The simulated rig's description is not usable: {error}.",
+                code="rig_invalid",
+                remedy="Compare with config/sim_paper.toml.",
+            ) from error
+
+    @staticmethod
+    def from_toml(path: str | Path) -> SimRig:
+        """Read a rig file."""
+        with Path(path).open("rb") as file:
+            return SimRig.from_dict(tomllib.load(file))
+
+
+def _rig(tables: Mapping[str, Any]) -> SimRig:
+    sim, target = tables["sim"], tables["target"]
+    lines = tuple(int(n) for n in target["lines"])
+    if len(lines) != 2:
+        raise ValueError(f"target.lines must be two numbers, got {target['lines']}")
+    return SimRig(
+        name=str(tables.get("rig", {}).get("name", "simulated rig")),
+        cam1=_camera(tables["cam1"], sim["cam1"], sim.get("noise", {})),
+        cam2=_camera(tables["cam2"], sim["cam2"], sim.get("noise", {})),
+        target=SimTarget(
+            pitch_mm=float(target["pitch_mm"]),
+            lines=(lines[0], lines[1]),
+            line_width_mm=float(target["line_width_mm"]),
+            node_tolerance_mm=float(target.get("node_tolerance_mm", 0.0)),
+            dark_lines=bool(target.get("dark_lines", True)),
+        ),
+        seed=int(sim.get("seed", 0)),
+        speckle_mm=float(sim["speckle_mm"]),
+        blur_px=float(sim.get("blur_px", 0.55)),
+    )
+
+
+def _camera(known: Mapping[str, Any], true: Mapping[str, Any], noise: Mapping[str, Any]) -> SimCamera:
+    columns, rows = (int(n) for n in known["image_size_px"])
+    tilt_x, tilt_y = (float(a) for a in true.get("axis_tilt_rad", (0.0, 0.0)))
+    right, down = (float(g) for g in true.get("gradient", (0.0, 0.0)))
+    sensor = Sensor(bit_depth=int(known.get("bit_depth", 8)), **{k: float(v) for k, v in noise.items()})
+    return SimCamera(
+        camera=Camera.from_paper(**{name: float(true[name]) for name in _PARAMETERS}),
+        size_px=(columns, rows),
+        sensor=sensor,
+        lighting=Lighting(
+            gain=float(true.get("gain", 1.0)),
+            vignetting=float(true.get("vignetting", 0.0)),
+            gradient=(right, down),
+            ambient=float(true.get("ambient", 0.0)),
+        ),
+        exposure_ms=float(known.get("exposure_ms", 10.0)),
+        stage_axis=int(known.get("stage_axis", 1)),
+        stage_sign=int(known.get("stage_sign", 1)),
+        stage_zero_mm=float(known.get("stage_zero_mm", 0.0)),
+        axis_tilt_rad=(tilt_x, tilt_y),
+    )

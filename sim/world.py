@@ -1,0 +1,135 @@
+"""The simulated world: cameras on their stages before a scene, exposed whenever somebody asks.
+
+Grabbers and controllers meet here. The world asks where the stages truly stand, renders what each camera would see
+from there, and adds fresh noise to every exposure. Brightness is kept per camera, scene and position, so that averaging
+frames or looking at a resting rig costs noise only.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.camera import Camera
+from core.errors import InputError
+from core.stereo import StereoPair
+from sim.render import RenderOptions, render
+from sim.rig import CAMERA_NAMES, CameraName, SimCamera, SimRig
+from sim.scene import Scene
+from sim.scenes import make_scene
+from sim.truth import Truth, truth_at
+
+_KEY_MM = 1e-7  # positions closer than this are one: a ten-thousandth of a micrometre
+_CACHE_BYTES = 256 << 20
+
+
+class SimWorld:
+    """A rig's surroundings; every method may be called from any thread.
+
+    >>> world = SimWorld(SimRig.from_toml("config/sim_paper.toml"), lambda axis: 0.0)
+    >>> world.set_scene("plate", load=689.0)
+    >>> image = world.expose("cam1", exposure_ms=10.0, gain_db=0.0, rng=np.random.default_rng(1))
+
+    Parameters
+    ----------
+    rig
+        The truth.
+    position_mm
+        True position of a stage axis by its number.
+    threads
+        Threads that one rendering may use.
+    """
+
+    def __init__(self, rig: SimRig, position_mm: Callable[[int], float], *, threads: int = 1) -> None:
+        self._rig = rig
+        self._position_mm = position_mm
+        self._options = RenderOptions(blur_px=rig.blur_px, threads=threads)
+        self._state = threading.Lock()  # scene, tilts and cache; never held while rendering
+        self._rendering = {name: threading.Lock() for name in CAMERA_NAMES}  # so that nobody renders the same twice
+        self._scene = make_scene(rig, "grid")
+        self._version = 0
+        self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERA_NAMES}
+        self._cache: OrderedDict[tuple[Any, ...], NDArray[np.float32]] = OrderedDict()
+
+    @property
+    def rig(self) -> SimRig:
+        """What the world was made from."""
+        return self._rig
+
+    @property
+    def scene(self) -> Scene:
+        """What stands before the cameras now."""
+        with self._state:
+            return self._scene
+
+    def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> None:
+        """Put another scene, or another state of it, before the cameras; see :func:`sim.scenes.make_scene`."""
+        scene = make_scene(self._rig, name, load=load, **params)
+        with self._state:
+            self._scene = scene
+            self._version += 1
+
+    def set_axis_tilt(self, cam: CameraName, tilt_rad: tuple[float, float]) -> None:
+        """Misalign a camera's stage axis: turned about the camera's x and y from the optical axis."""
+        with self._state:
+            self._cameras[cam] = replace(self._cameras[cam], axis_tilt_rad=tilt_rad)
+
+    def true_camera(self, cam: CameraName) -> Camera:
+        """Return the camera where its stage now stands."""
+        with self._state:
+            sim = self._sim_camera(cam)
+        return sim.at(self._position_mm(sim.stage_axis))
+
+    def true_pair(self) -> StereoPair:
+        """Return the true pair with both stages at their zero: what a calibration ought to find."""
+        return StereoPair(*(self._rig.camera(name).camera for name in CAMERA_NAMES))
+
+    def truth(
+        self, xy_px: ArrayLike, name: str, *, load: float = 0.0, reference_load: float = 0.0, **params: Any
+    ) -> Truth:
+        """Return the truth at camera 1's pixels (..., 2) for a scene's motion between two loads, stages at zero."""
+        reference = make_scene(self._rig, name, load=reference_load, **params)
+        now = make_scene(self._rig, name, load=load, **params)
+        return truth_at(reference, self._rig.cam1.camera, xy_px, now=now)
+
+    def expose(
+        self, cam: CameraName, *, exposure_ms: float, gain_db: float = 0.0, rng: np.random.Generator | None
+    ) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """Take an image now: scene and stage as they are, noise anew; without noise when ``rng`` is None."""
+        brightness, sim = self._brightness(cam)
+        return sim.sensor.expose(brightness, rng, exposure=exposure_ms / sim.exposure_ms, gain_db=gain_db)
+
+    def _sim_camera(self, cam: CameraName) -> SimCamera:
+        if cam not in self._cameras:
+            raise InputError(f"There is no camera {cam!r}.", code="unknown_camera", remedy="Use cam1 or cam2.")
+        return self._cameras[cam]
+
+    def _brightness(self, cam: CameraName) -> tuple[NDArray[np.float32], SimCamera]:
+        with self._state:
+            sim = self._sim_camera(cam)
+        with self._rendering[cam]:
+            with self._state:
+                scene, version, sim = self._scene, self._version, self._sim_camera(cam)
+            position = self._position_mm(sim.stage_axis)
+            key = (cam, version, round(position / _KEY_MM), sim.axis_tilt_rad)
+            with self._state:
+                known = self._cache.get(key)
+                if known is not None:
+                    self._cache.move_to_end(key)
+            if known is None:
+                known = sim.lighting.apply(render(scene, sim.at(position), sim.size_px, options=self._options))
+                known.setflags(write=False)
+                self._remember(key, known)
+        return known, sim
+
+    def _remember(self, key: tuple[Any, ...], brightness: NDArray[np.float32]) -> None:
+        with self._state:
+            self._cache[key] = brightness
+            while len(self._cache) > 2 and sum(a.nbytes for a in self._cache.values()) > _CACHE_BYTES:
+                self._cache.popitem(last=False)
