@@ -137,8 +137,8 @@ def grid_image(camera: Camera, target: GridTarget = PAPER_TARGET, *, noise: floa
 
 
 @njit(cache=True, nogil=True)
-def _under_family(nodes: Float, axis: int, across: float, along: float, pitch: float, half: float, over: float) ->
-bool:
+def _under_family(nodes: Float, axis: int, across: float, along: float, pitch: float, half: float,
+                  over: float) -> bool:  # fmt: skip
     n = nodes.shape[axis]
     m = nodes.shape[1 - axis]
     k = int(np.floor(across / pitch + 0.5 * (n - 1) + 0.5))
@@ -183,8 +183,7 @@ def _render(width: int, height: int, samples: int, pad: int, weight: Float, lens
                 w = h[2, 0] * u + h[2, 1] * v + h[2, 2]
                 X = (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / w
                 Y = (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / w
-                if _under_family(nodes, 0, X, Y, pitch, half, over) or _under_family(nodes, 1, Y, X, pitch, half,
-                over):
+                if _under_family(nodes, 0, X, Y, pitch, half, over) or _under_family(nodes, 1, Y, X, pitch, half, over):
                     value = 1.0
                 for e in range(extra.shape[0]):
                     a, b = (X, Y) if extra[e, 0] == 0.0 else (Y, X)

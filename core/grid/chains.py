@@ -154,8 +154,8 @@ def _crossing(line: CoarseLine, point: Float, direction: Float) -> float:
 
 
 def _follow(u: Float, a: int, b: int) -> list[tuple[int, int]]:
-    """Walk both ways from two neighbours; return (number, index) of the lines met, at most one number missing in a
-    row.""" members = [(0, a), (1, b)]
+    """Walk both ways from two neighbours; return (number, index) of the lines met, passing over one missing line."""
+    members = [(0, a), (1, b)]
     for sign, start in ((1, b), (-1, a)):
         number = 1 if sign > 0 else 0
         last, step, growth = float(u[start]), float(u[b] - u[a]), 1.0

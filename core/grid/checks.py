@@ -36,7 +36,7 @@ def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]
     segments = polylines(lattice.nodes_px)
     if abs(rotation_deg - 45.0) > np.degrees(options.max_rotation_rad):
         raise TargetError(
-            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 are needed to tell its axes apart",
+            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 tell its axes apart",
             code="target_rotated",
             remedy="Turn the grid (or the camera) until its lines run at about 45 degrees to the rows.",
             rotation_deg=rotation_deg,
@@ -186,8 +186,8 @@ def check_coverage(table: PieceTable, good: Bool, cause: NDArray[np.str_], optio
     name = f"line {worst} of family a" if worst < na else f"line {worst - na} of family b"
     what = "is glaring (saturated or without contrast)" if glare else "is covered, dirty or unsharp"
     raise TargetError(
-        f"{np.count_nonzero(bad)} of {len(bad)} pieces of lines cannot be used (at most {options.max_bad_fraction:.0%}),"
-        f" {per_line[worst]:.0%} of {name} (at most {options.max_bad_on_line:.0%}); most of it {what}",
+        f"{np.count_nonzero(bad)} of {len(bad)} pieces of lines cannot be used (at most"
+        f" {options.max_bad_fraction:.0%}), {per_line[worst]:.0%} of {name} (at most {options.max_bad_on_line:.0%}); most of it {what}",
         code="target_glare" if glare else "target_dirty",
         remedy="Take the reflection or the overexposure away: light the grid from behind, close the aperture."
         if glare

@@ -119,8 +119,7 @@ def _try_pair(
     y_dir = np.array([np.cos(along_y), np.sin(along_y)])
     if x_dir.sum() < 0.0:
         x_dir = -x_dir
-    if x_dir[0] * y_dir[1] - x_dir[1] * y_dir[0] < 0.0:  # right-handed with y down: from X to Y clockwise on the
-    screen
+    if x_dir[0] * y_dir[1] - x_dir[1] * y_dir[0] < 0.0:  # right-handed, y down: clockwise from X to Y
         y_dir = -y_dir
     chain_a = order(link(pieces_a), centre, x_dir)
     chain_b = order(link(pieces_b), centre, y_dir)
@@ -211,8 +210,8 @@ def crossing(first: CoarseLine, second: CoarseLine) -> Float:
 
 
 def homography(plane: Float, image: Float, weights: Float | None = None) -> Float:
-    """Least-squares homography (3, 3) from plane points (n, 2) to image points (n, 2), by the normalised linear
-    method.""" Tp, p = _normalise(plane)
+    """Least-squares homography (3, 3) from plane points (n, 2) to image points (n, 2), normalised, linear."""
+    Tp, p = _normalise(plane)
     Ti, q = _normalise(image)
     n = len(p)
     A = np.zeros((2 * n, 9))
