@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from starlette.testclient import TestClient
+import httpx
+import uvicorn
 
+from server.api.app import create_app
 from server.config import RigConfig, parse_config
+from server.service import Service
 
 TINY = """
 [rig]
@@ -93,7 +100,27 @@ def tiny_config(**replacements: str) -> RigConfig:
     return parse_config("\n".join(lines))
 
 
-def wait_for_rig(client: TestClient, seconds: float = 60.0) -> None:
+@contextlib.contextmanager
+def served(service: Service) -> Iterator[httpx.Client]:
+    """Serve on a free loopback port in a thread of this process; yields a client."""
+    listener = socket.socket()
+    listener.bind(("127.0.0.1", 0))
+    settings = uvicorn.Config(create_app(service, close_service=False), log_level="error", timeout_graceful_shutdown=2)
+    server = uvicorn.Server(settings)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    try:
+        with httpx.Client(base_url=url, timeout=60.0, trust_env=False) as client:
+            yield client
+    finally:
+        service.stop_streams()
+        server.should_exit = True
+        thread.join(timeout=10.0)
+        listener.close()
+
+
+def wait_for_rig(client: httpx.Client, seconds: float = 60.0) -> None:
     """Wait until the stage is homed."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -105,7 +132,7 @@ def wait_for_rig(client: TestClient, seconds: float = 60.0) -> None:
     raise AssertionError("the rig did not come up")
 
 
-def wait_for_job(client: TestClient, job: dict[str, Any], seconds: float = 120.0) -> dict[str, Any]:
+def wait_for_job(client: httpx.Client, job: dict[str, Any], seconds: float = 120.0) -> dict[str, Any]:
     """Poll a job until it has ended."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -116,7 +143,7 @@ def wait_for_job(client: TestClient, job: dict[str, Any], seconds: float = 120.0
     raise AssertionError(f"job {job['id']} did not end: {document}")
 
 
-def new_test(client: TestClient, **body: Any) -> str:
+def new_test(client: httpx.Client, **body: Any) -> str:
     """Make a test without a calibration."""
     answer = client.post("/api/v1/tests", json={"name": "a test", **body})
     assert answer.status_code == 201, answer.text
