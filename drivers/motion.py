@@ -208,6 +208,8 @@ class SerialStage(ABC):
                 if status.state is AxisState.FAULT or (watch_jam and status.state is AxisState.MOTOR_OFF):
                     raise self._fault(axis, status.detail or "switched its motor off")
                 if not status.moving:
+                    if watch_jam and status.state is not AxisState.READY:
+                        raise self._fault(axis, f"ended in the state {status.state} {status.detail}".rstrip())
                     waiting.discard(axis)
                     continue
                 now = time.monotonic()

@@ -8,9 +8,10 @@ from pathlib import Path
 from core.errors import StageError
 from drivers.esp301 import ESP301Stage
 from drivers.motion import SerialStage
+from drivers.smc100 import SMC100Stage
 from drivers.stage import AxisOptions
 
-STAGE_DRIVERS: dict[str, Callable[..., SerialStage]] = {"esp301": ESP301Stage}
+STAGE_DRIVERS: dict[str, Callable[..., SerialStage]] = {"esp301": ESP301Stage, "smc100": SMC100Stage}
 
 
 def open_stage(

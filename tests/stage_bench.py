@@ -14,9 +14,10 @@ from drivers.stage import AxisOptions
 from sim.controllers.axis import SimAxis
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.server import ControllerServer
+from sim.controllers.smc100 import SimSMC100
 
 Transport = Literal["socket", "pty"]
-CONTROLLERS: dict[str, Callable[..., Any]] = {"esp301": SimESP301}
+CONTROLLERS: dict[str, Callable[..., Any]] = {"esp301": SimESP301, "smc100": SimSMC100}
 # the words that start a motion, by which the tests count what was sent
 MOVE_WORD = "PA"
 
@@ -38,8 +39,7 @@ class Bench:
     def ready(self, *axes: int) -> None:
         """Enable and home."""
         for axis in axes:
-            if self.driver == "esp301":
-                self.stage.enable(axis)
+            self.stage.enable(axis)
             self.stage.home(axis)
 
     def another(self, options: dict[int, AxisOptions]) -> SerialStage:

@@ -225,8 +225,7 @@ def test_a_stop_voids_a_motion_that_still_waits_for_its_turn(kind: tuple[str, Tr
 
 def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Transport]) -> None:
     with bench(*kind, time_scale=1.0, start_mm=30.0) as stand:
-        if stand.driver == "esp301":
-            stand.stage.enable(1)
+        stand.stage.enable(1)
         thread, errors = in_thread(lambda: stand.stage.home(1))
         wait_until(lambda: stand.axis(1).velocity_now_mm_s != 0)
         stand.stage.stop(1)
@@ -235,6 +234,7 @@ def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Tran
         assert not stand.stage.state(1).homed
 
 
+@pytest.mark.fault(25)
 @pytest.mark.parametrize(
     "fault",
     [
@@ -257,6 +257,7 @@ def test_a_disturbed_reply_is_flushed_and_asked_for_once_more(homed: Bench, faul
     assert homed.stage.state(1).state is AxisState.READY
 
 
+@pytest.mark.fault(25)
 def test_a_late_reply_is_not_taken_for_the_next_answer(homed: Bench) -> None:
     homed.stage.move_many({1: 7.25, 2: -3.5})
     homed.controller.line_faults.delay_s = 0.35  # longer than the driver waits
@@ -267,6 +268,7 @@ def test_a_late_reply_is_not_taken_for_the_next_answer(homed: Bench) -> None:
     assert (first, second) == pytest.approx((7.25, -3.5), abs=1e-4)
 
 
+@pytest.mark.fault(25)
 def test_a_silent_controller_is_lost_within_two_seconds_and_found_again(homed: Bench) -> None:
     homed.controller.line_faults.deaf = True
     start = time.monotonic()
@@ -278,6 +280,7 @@ def test_a_silent_controller_is_lost_within_two_seconds_and_found_again(homed: B
     assert homed.stage.position(1) == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.fault(25)
 @pytest.mark.parametrize("fault", ["deaf", "silent"])
 def test_a_move_is_never_sent_again(homed: Bench, fault: str) -> None:
     homed.axis(1).velocity_mm_s = 0.5  # 50 times real time: 40 mm take 1.6 s
@@ -293,6 +296,7 @@ def test_a_move_is_never_sent_again(homed: Bench, fault: str) -> None:
         assert homed.controller.true_position_mm(1) < 39.0
 
 
+@pytest.mark.fault(25)
 @pytest.mark.parametrize("loss", ["lose_replies", "halve_replies", "garble_replies"])
 def test_a_move_survives_single_lost_replies_and_is_sent_once(homed: Bench, loss: str) -> None:
     for at in range(1, 4):
@@ -382,6 +386,7 @@ def test_a_line_that_breaks_is_lost_and_can_be_opened_again(driver: str) -> None
 
 def test_velocities_are_set_and_refusals_named(kind: tuple[str, Transport]) -> None:
     with bench(*kind, options={1: AxisOptions(velocity_mm_s=2.5, acceleration_mm_s2=12.0)}) as stand:
+        stand.ready(1)
         assert stand.axis(1).velocity_mm_s == pytest.approx(2.5)
         assert stand.axis(1).acceleration_mm_s2 == pytest.approx(12.0)
         with pytest.raises(StageError, match="velocity") as caught:

@@ -1,0 +1,31 @@
+"""Calibration of the pair from views of the grid: ten parameters a camera, checks, verdict."""
+
+from core.calibration.distance import DistanceCheck, check_known_distance
+from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, TargetLike, inner_nodes_mm
+from core.calibration.measures import CheckMeasures, Measures, measure_points
+from core.calibration.prepare import predict_uncertainty
+from core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
+from core.calibration.solve import calibrate
+from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
+
+__all__ = [
+    "COVARIANCE_NAMES",
+    "CalibrationOptions",
+    "CalibrationResult",
+    "CalibrationView",
+    "CheckDone",
+    "CheckMeasures",
+    "DistanceCheck",
+    "Measures",
+    "NominalCamera",
+    "TargetLike",
+    "Verdict",
+    "ViewResult",
+    "VolumeUncertainty",
+    "calibrate",
+    "check_known_distance",
+    "inner_nodes_mm",
+    "measure_points",
+    "predict_uncertainty",
+    "volume_uncertainty",
+]

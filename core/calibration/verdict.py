@@ -1,0 +1,111 @@
+"""What to make of a calibration: the bands, the worst views, what could not be checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from core.calibration.inputs import CalibrationOptions
+from core.calibration.measures import CheckMeasures
+from core.calibration.result import CheckDone, Level, Verdict, ViewResult
+from core.calibration.uncertainty import VolumeUncertainty
+from core.lens import Float
+
+GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
+_ORDER: tuple[Level, Level, Level] = ("good", "warning", "failed")
+
+
+def worst(a: Level, b: Level) -> Level:
+    """Return the worse of two levels."""
+    return max(a, b, key=_ORDER.index)
+
+
+def band(rbe_px: float) -> Level:
+    """Level of an RBE; NaN fails."""
+    if rbe_px <= GOOD_RBE_PX:
+        return "good"
+    return "warning" if rbe_px <= USABLE_RBE_PX else "failed"
+
+
+def judge(
+    *,
+    fitted: CheckMeasures,
+    held_out: CheckMeasures | None,
+    views: Sequence[ViewResult],
+    uncertainty: VolumeUncertainty,
+    node_corrections_mm: Float | None,
+    node_tolerance_mm: float,
+    options: CalibrationOptions,
+) -> Verdict:
+    """Judge by the held-out RBE of each camera, the predicted uncertainty and the node corrections."""
+    level: Level = "good"
+    reasons: list[str] = []
+    if held_out is None:
+        level = "warning"
+        reasons.append(
+            f"No position was held out, so that nothing independent confirms the calibration; fitted RBE "
+            f"{fitted.mean.rbe_px:.4f} px."
+        )
+        judged, word = fitted, "Fitted"
+    else:
+        judged, word = held_out, "Held-out"
+    for name, part in zip(("cam1", "cam2"), judged.per_camera, strict=True):
+        this = band(part.rbe_px)
+        level = worst(level, this)
+        limit = GOOD_RBE_PX if this in ("good", "warning") else USABLE_RBE_PX
+        relation = "within" if this == "good" else "above"
+        reasons.append(f"{word} RBE of {name} {part.rbe_px:.4f} px is {relation} {limit:g} px.")
+    if held_out is not None and (fitted_level := band(max(p.rbe_px for p in fitted.per_camera))) != "good":
+        level = worst(level, fitted_level)
+        reasons.append(f"Fitted RBE {fitted.mean.rbe_px:.4f} px is above {GOOD_RBE_PX:g} px.")
+    typical = float(np.median([v.rbe_px for v in views]))
+    ranked = sorted(views, key=lambda v: -v.rbe_px)
+    bad = [v for v in ranked[:3] if v.rbe_px > max(2.0 * typical, 0.02) or v.rbe_px > GOOD_RBE_PX]
+    if bad:
+        reasons.append("Worst views: " + ", ".join(f"{v.name} {v.rbe_px:.3f} px" for v in bad) + ".")
+        level = worst(level, band(bad[0].rbe_px))
+    if not uncertainty.relative_shape <= options.max_shape_uncertainty:
+        level = "failed"
+        reasons.append(
+            f"Predicted shape uncertainty {1e3 * uncertainty.shape_rms_mm:.2f} um is above "
+            f"{1e3 * uncertainty.shape_rms_mm / uncertainty.relative_shape * options.max_shape_uncertainty:.2f} um."
+        )
+    if node_corrections_mm is not None:
+        largest = float(np.abs(node_corrections_mm).max())
+        # a bound is a bound; half as much again leaves room for the estimate's own noise
+        if largest > 1.5 * node_tolerance_mm:
+            level = worst(level, "warning")
+            reasons.append(
+                f"Node corrections reach {1e3 * largest:.1f} um against a tolerance of {1e3 * node_tolerance_mm:.1f} "
+                "um: the target, its tolerance or the aspect ratio may be wrong."
+            )
+    return Verdict(level, tuple(reasons))
+
+
+def checks_made(*, held_out: CheckMeasures | None, options: CalibrationOptions) -> tuple[CheckDone, ...]:
+    """List what was checked and what was not, as the residuals alone can hide a wrong scale or a tilted axis."""
+    if held_out is None:
+        held = CheckDone("held_out", False, "No position was held out.")
+    else:
+        where = sorted({round(p, 3) for c in held_out.positions_mm for p in c})
+        held = CheckDone("held_out", True, f"Held-out positions {where} mm: RBE {held_out.mean.rbe_px:.4f} px.")
+    tilt = options.axis_tilt_sigma_rad
+    return (
+        held,
+        CheckDone("positions", True, "Order, sign, unit and spacing of the positions agree with the images' scale."),
+        CheckDone("angles", True, "The viewing angles agree with the nominal ones and between the cameras."),
+        CheckDone(
+            "known_distance",
+            False,
+            "A wrong pitch cannot be seen in the residuals: measure a known distance with both cameras.",
+        ),
+        CheckDone(
+            "stage_axis",
+            tilt > 0.0,
+            f"A tilt of the stage axis cannot be seen in the residuals; {1e3 * tilt:g} mrad are in the covariance."
+            if tilt > 0.0
+            else "A tilt of the stage axis cannot be seen in the residuals; none was declared.",
+        ),
+        CheckDone("aspect", False, "The aspect ratio was taken as given."),
+    )

@@ -1,0 +1,179 @@
+"""Calibration from intersections made by an independent projection."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from core.calibration import (
+    CalibrationOptions,
+    CalibrationResult,
+    CalibrationView,
+    NominalCamera,
+    calibrate,
+)
+from core.errors import CalibrationError, CalibrationInputError, StereorigError
+from tests.calibration_truth import PAPER, Array, Grid, nodes, project
+
+NOISE_PX = 0.0022
+NOMINAL = (
+    NominalCamera((512, 480), 12000.0, 400.0, -30.0, 0.9617),
+    NominalCamera((512, 480), 12000.0, 400.0, 30.0, 0.9617),
+)
+HELD = CalibrationOptions(held_out_mm=(2.0, 4.0))
+
+
+def make_views(
+    positions: Sequence[float] = (0.0, 2.0, 4.0, 5.0),
+    *,
+    grid: Grid | None = None,
+    noise: float = NOISE_PX,
+    seed: int = 0,
+    error_mm: Array | None = None,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    declared: Callable[[float], float] = lambda dz: dz,
+    cameras: Sequence[dict[str, float]] = PAPER,
+) -> list[CalibrationView]:
+    rng = np.random.default_rng(seed)
+    X, Y = nodes(grid or Grid())
+    if error_mm is not None:
+        X, Y = X + error_mm[..., 0], Y + error_mm[..., 1]
+    views = []
+    for name, camera in zip(("cam1", "cam2"), cameras, strict=True):
+        for dz in positions:
+            xy = project(camera, X, Y, dz, tilt=tilt)
+            views.append(CalibrationView(name, declared(dz), xy + noise * rng.standard_normal(xy.shape)))  # type: ignore[arg-type]
+    return views
+
+
+def shape_error_um(result: CalibrationResult) -> float:
+    """RMS error of points in the target's volume, seen by the true cameras, after the best rigid alignment."""
+    X, Y, Z = (a.ravel() for a in np.meshgrid(*[np.linspace(-4, 4, 5)] * 2, [-1.0, 0.0, 1.0]))
+    found = result.pair.triangulate(*(project(c, X, Y, 0.0, Z) for c in PAPER)).xyz_mm
+    truth = np.column_stack([X, Y, Z])
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return float(1e3 * np.sqrt(np.mean((a @ u @ vt - b) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("phd", "standoff", "angle"),
+    [(1.0, 1.0, 0.0), (1.2, 0.8, 8.0), (0.8, 1.2, -8.0), (1.2, 1.2, -8.0), (0.8, 0.8, 8.0)],
+)
+def test_finds_the_cameras_from_poor_nominal_values(phd: float, standoff: float, angle: float) -> None:
+    nominal = tuple(
+        dataclasses.replace(
+            n, phd_px=n.phd_px * phd, standoff_mm=n.standoff_mm * standoff, angle_deg=n.angle_deg + angle
+        )
+        for n in NOMINAL
+    )
+    result = calibrate(make_views(noise=0.0), Grid(), (nominal[0], nominal[1]), HELD)
+    for camera, truth in zip((result.pair.cam1, result.pair.cam2), PAPER, strict=True):
+        got = camera.paper_parameters()
+        for key, value in got.items():
+            name = key.replace("_per_px2", "").rsplit("_", 1)[0] if key != "kappa_per_px2" else "kappa"
+            # noise-free; what is left is the weak prior on the centre against rounding
+            assert value == pytest.approx(truth[name], rel=1e-4, abs=1e-5), key
+    assert result.held_out is not None
+    assert result.held_out.mean.rbe_px < 1e-4
+    assert shape_error_um(result) < 1e-3
+
+
+def test_exact_grid_reaches_the_noise_in_held_out_positions() -> None:
+    result = calibrate(make_views(), Grid(), NOMINAL, HELD)
+    assert result.held_out is not None
+    # mean distance of isotropic noise is 1.253 sigma = 0.00276
+    assert result.held_out.mean.rbe_px < 0.0035
+    assert result.fitted.mean.rbe_px < 0.0030
+    np.testing.assert_allclose(result.noise_px, NOISE_PX, rtol=0.1)
+    assert result.verdict.level == "good"
+    assert shape_error_um(result) < 0.05
+    assert result.node_corrections_mm is None
+
+
+def test_toleranced_grid_is_corrected_from_both_cameras() -> None:
+    grid = Grid(node_tolerance_mm=0.004)
+    error = np.random.default_rng(3).uniform(-0.004, 0.004, (9, 9, 2))
+    views = make_views(grid=grid, error_mm=error)
+    result = calibrate(views, grid, NOMINAL, HELD)
+    held_fixed = calibrate(views, grid, NOMINAL, dataclasses.replace(HELD, estimate_nodes=False))
+    assert result.held_out is not None
+    assert held_fixed.held_out is not None
+    assert result.held_out.mean.rbe_px < 0.0045
+    # 4 um in a box leave 0.087 px against the nominal grid at 33 um/px; this figure must not hide
+    assert 0.06 < result.held_out.nominal_mean.rbe_px < 0.11
+    assert 0.06 < held_fixed.held_out.mean.rbe_px < 0.11
+    assert shape_error_um(result) < 0.75
+    assert shape_error_um(result) < shape_error_um(held_fixed)
+
+
+@pytest.mark.fault(30)
+@pytest.mark.parametrize(
+    ("positions", "code"),
+    [((0.0,), "calibration_one_position"), ((2.0, 2.0, 2.0), "calibration_one_position"),
+     ((0.0, 0.002), "calibration_dz_too_small"), ((0.0, 0.1), "calibration_dz_too_small")],
+)  # fmt: skip
+def test_too_little_travel_is_refused_with_the_predicted_uncertainty(positions: tuple[float, ...], code: str) -> None:
+    with pytest.raises(CalibrationInputError, match=r"predicted uncertainty .* um rms of shape") as caught:
+        calibrate(make_views(positions), Grid(), NOMINAL)
+    assert caught.value.code == code
+    assert caught.value.context["predicted_shape"] > 0.0
+
+
+@pytest.mark.fault(31)
+@pytest.mark.parametrize(
+    ("declared", "code", "says"),
+    [
+        (lambda dz: -dz, "positions_sign_reversed", "sign"),
+        (lambda dz: 1000.0 * dz, "positions_unit", "micrometres for millimetres"),
+        (lambda dz: dz / 25.4, "positions_unit", "inches"),
+        (lambda dz: {0.0: 4.0, 2.0: 2.0, 4.0: 0.0, 5.0: 5.0}[dz], "positions_permuted", "seem exchanged"),
+        (lambda dz: {0.0: 0.0, 2.0: 4.0, 4.0: 2.0, 5.0: 5.0}[dz], "positions_permuted", "seem exchanged"),
+        (lambda dz: {0.0: 0.0, 2.0: 2.5, 4.0: 4.0, 5.0: 5.0}[dz], "position_wrong", r"worst is cam1 at \+2.500"),
+    ],
+)
+def test_wrong_positions_are_refused_with_the_cause(declared: Callable[[float], float], code: str, says: str) -> None:
+    with pytest.raises(CalibrationInputError, match=says) as caught:
+        calibrate(make_views(declared=declared), Grid(), NOMINAL)
+    assert caught.value.code == code
+
+
+def changed(views: list[CalibrationView], camera: str, change: Callable[[Array], Array]) -> list[CalibrationView]:
+    return [dataclasses.replace(v, xy_px=change(v.xy_px)) if v.camera == camera else v for v in views]
+
+
+def mirrored(xy: Array) -> Array:
+    # seen in a mirror, the family that runs right-and-down is the other one
+    return np.swapaxes(np.stack([511.0 - xy[..., 0], xy[..., 1]], -1), 0, 1)[::-1, ::-1][::-1, ::-1]
+
+
+@pytest.mark.fault(29)
+def test_swapped_cameras_are_named() -> None:
+    views = [dataclasses.replace(v, camera="cam2" if v.camera == "cam1" else "cam1") for v in make_views()]
+    with pytest.raises(CalibrationInputError, match="swapped") as caught:
+        calibrate(views, Grid(), NOMINAL)
+    assert caught.value.code == "cameras_swapped"
+
+
+@pytest.mark.fault(29)
+@pytest.mark.parametrize("camera", ["cam1", "cam2"])
+def test_a_mirrored_image_is_named(camera: str) -> None:
+    with pytest.raises(CalibrationInputError, match=f"{camera} is tilted to the other side") as caught:
+        calibrate(changed(make_views(), camera, mirrored), Grid(), NOMINAL)
+    assert caught.value.code == "image_mirrored"
+
+
+@pytest.mark.fault(33)
+def test_nothing_usable_comes_from_numbers_that_are_not() -> None:
+    views = make_views()
+    bad = [dataclasses.replace(views[0], dz_mm=float("nan")), *views[1:]]
+    with pytest.raises(CalibrationInputError) as caught:
+        calibrate(bad, Grid(), NOMINAL)
+    assert caught.value.code == "view_not_finite"
+    collapsed = [dataclasses.replace(v, xy_px=np.full_like(v.xy_px, 200.0)) for v in views]
+    with pytest.raises((CalibrationError, CalibrationInputError)) as other:
+        calibrate(collapsed, Grid(), NOMINAL)
+    assert isinstance(other.value, StereorigError)
