@@ -23,7 +23,7 @@ from core.matching.kernels.shape import shape_point
 
 def _stamp() -> str:
     here = Path(__file__).parent
-    sources = sorted(here.glob("*.py")) + [here.parent / "image.py", here.parents[1] / "status.py"]
+    sources = [*sorted(here.glob("*.py")), here.parent / "image.py", here.parents[1] / "status.py"]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
