@@ -71,8 +71,9 @@ def _camera(name: str, which: str, content: Any) -> Camera:
     return Camera.from_paper(**values)
 
 
-def _size(content: Any) -> tuple[int, int] | None:
-    size = content.get("image_size_px") if isinstance(content, dict) else None
+def _size(content: dict[str, Any], which: str) -> tuple[int, int] | None:
+    sizes = content.get("image_size_px")
+    size = sizes.get(which) if isinstance(sizes, dict) else None
     if isinstance(size, list) and len(size) == 2 and all(isinstance(v, int) and v > 0 for v in size):
         return size[0], size[1]
     return None
@@ -97,8 +98,7 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     pair = StereoPair(cam1, cam2)
     if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
         raise invalid(name, "both cameras stand at the same place")
-    sizes = [_size(content.get(which)) for which in ("cam1", "cam2")]
-    return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
+    return LoadedCalibration(pair, _size(content, "cam1"), _size(content, "cam2"), "calibration_json", digest, content)
 
 
 def load_calibration(path: str | Path) -> LoadedCalibration:
