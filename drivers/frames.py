@@ -85,7 +85,8 @@ class CameraSettings:
 class CameraDescription:
     """Who the camera is and what it can do.
 
-    Ranges are (lowest, highest) as the device reports them.
+    Ranges are (lowest, highest) as the device reports them. ``latency_s`` is what a frame may take beyond its period
+    before it arrives, for the watchdog: zero but for cameras that render.
     """
 
     model: str
@@ -98,6 +99,7 @@ class CameraDescription:
     frame_rate_range_hz: tuple[float, float]
     driver: str
     firmware: str = ""
+    latency_s: float = 0.0
     extra: Mapping[str, str] = field(default_factory=dict)
 
 

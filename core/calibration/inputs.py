@@ -179,7 +179,7 @@ def check_view(view: CalibrationView, target: TargetLike, nominal: NominalCamera
             view=view.label,
         )
     found = view.found
-    if found.sum() < max(12, found.size // 4):
+    if found.sum() < max(6, found.size // 4):
         raise CalibrationInputError(
             f"{view.label} has {int(found.sum())} of {found.size} intersections.",
             code="view_incomplete",

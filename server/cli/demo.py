@@ -101,7 +101,8 @@ def _finish(out: Path, experiment: str, title: str, outcome: Outcome, seconds: f
     print(f"{met} of {len(outcome.checks)} figures within their limits, in {duration(seconds)}")
     for check in missed:
         true = "" if check.true is None else f", true {check.true:.4g}"
-        cause = f"{check.name}: found {check.found:.4g} {check.unit}{true}, error {check.error:+.4g}, limit {check.limit:g}."
+        found = f"found {check.found:.4g} {check.unit}{true}"
+        cause = f"{check.name}: {found}, error {check.error:+.4g}, limit {check.limit:g}."
         print(f"stereorig: limit_missed: {cause} Remedy: see {out / 'report.json'}.", file=sys.stderr)
     return 1 if missed else 0
 

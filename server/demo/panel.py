@@ -94,7 +94,7 @@ def _judge(
     first, *_, last = (-f.uvw_mm[f.valid, 2].mean() for f in fields if f.uvw_mm is not None)
     outcome.lines += [
         "",
-        f"mean displacement towards the cameras: {first:+.3f} mm at {loads[0]:g} kN, {last:+.3f} mm at {loads[-1]:g} kN",
+        f"mean w towards the cameras: {first:+.3f} mm at {loads[0]:g} kN, {last:+.3f} mm at {loads[-1]:g} kN",
         f"wrong points among {int(shape.valid.sum()) + sum(int(f.valid.sum()) for f in fields)} valid ones: {wrong}",
     ]
     outcome.data = {"mean_w_mm": {"first": first, "last": last},

@@ -72,8 +72,8 @@ def _camera(name: str, which: str, content: Any) -> Camera:
 
 
 def _size(content: dict[str, Any], which: str) -> tuple[int, int] | None:
-    sizes = content.get("image_size_px")
-    size = sizes.get(which) if isinstance(sizes, dict) else None
+    sizes = content.get("image_size_px", content[which])  # our own files keep it beside the cameras
+    size = sizes.get(which, sizes.get("image_size_px")) if isinstance(sizes, dict) else None
     if isinstance(size, list) and len(size) == 2 and all(isinstance(v, int) and v > 0 for v in size):
         return size[0], size[1]
     return None
@@ -98,7 +98,8 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     pair = StereoPair(cam1, cam2)
     if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
         raise invalid(name, "both cameras stand at the same place")
-    return LoadedCalibration(pair, _size(content, "cam1"), _size(content, "cam2"), "calibration_json", digest, content)
+    sizes = [_size(content, which) for which in ("cam1", "cam2")]
+    return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
 
 
 def load_calibration(path: str | Path) -> LoadedCalibration:

@@ -1,0 +1,198 @@
+"""From the matcher's unknowns to lengths and angles, and the covariances that go with them.
+
+Camera 1's frame is ``cam1``; results are in the system frame unless a name says otherwise. All arrays run over N
+points; NaN in gives NaN out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.lens import Float
+from core.stereo import StereoPair
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeGeometry:
+    """Shape at N points.
+
+    Attributes
+    ----------
+    xyz_mm
+        (N, 3) surface points, system frame.
+    normal_sys
+        (N, 3) unit normals, system frame, pointing away from camera 1 (+Z_sys on the target).
+    theta_rad, phi_rad, zp_mm
+        (N,) the plane of Eq. (12) in camera 1's frame: angles of its normal with X and Y, and where the optic axis
+        meets it; ``zp_mm`` is negative or infinite where the axis does not meet the plane before the camera.
+    """
+
+    xyz_mm: Float
+    normal_sys: Float
+    theta_rad: Float
+    phi_rad: Float
+    zp_mm: Float
+
+
+@dataclass(frozen=True, eq=False)
+class MotionGeometry:
+    """Motion at N points, system frame.
+
+    Attributes
+    ----------
+    uvw_mm
+        (N, 3) displacement.
+    rotation_rad
+        (N, 3) rotation vector of the patch (axis times angle).
+    stretch
+        (N, 3) in-plane stretch minus one (Biot strain) e11, e22, e12 in the patch's tangent frame: axis 1 is X_sys
+        projected on the reference patch, axis 2 completes it with the normal.
+    """
+
+    uvw_mm: Float
+    rotation_rad: Float
+    stretch: Float
+
+
+def shape_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> ShapeGeometry:
+    """Surface points, normals and Eq. (12)'s angles.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    xy_px
+        (N, 2) points in camera 1.
+    w
+        (N, 3) inverse depth, 1/mm, and its slopes.
+    """
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    plane = _plane(ray, np.asarray(w, dtype=np.float64))
+    xyz = pair.cam1.sys_from_cam.apply(ray / np.asarray(w)[..., :1])
+    length = np.linalg.norm(plane, axis=-1)
+    normal = plane / length[..., None]
+    # Eq. (12) takes the normal with cos(xi) >= 0
+    upward = np.where(normal[..., 2:] < 0.0, -normal, normal)
+    with np.errstate(divide="ignore"):
+        zp = 1.0 / plane[..., 2]
+    return ShapeGeometry(
+        xyz_mm=xyz,
+        normal_sys=normal @ pair.cam1.cam_from_sys.rotation,
+        theta_rad=np.arccos(upward[..., 0]),
+        phi_rad=np.arccos(upward[..., 1]),
+        zp_mm=zp,
+    )
+
+
+def plane_from_angles(
+    pair: StereoPair, xy_px: ArrayLike, theta_rad: ArrayLike, phi_rad: ArrayLike, zp_mm: ArrayLike
+) -> Float:
+    """Return ``w`` (N, 3) of the plane that Eq. (12) gives; the inverse of :func:`shape_geometry`."""
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    a, b = np.cos(theta_rad), np.cos(phi_rad)
+    c = np.sqrt(1.0 - a**2 - b**2)
+    plane = np.stack([a, b, c], axis=-1) / (np.asarray(zp_mm) * c)[..., None]
+    return np.stack([(ray * plane).sum(-1), plane[..., 0], plane[..., 1]], axis=-1)
+
+
+def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLike) -> MotionGeometry:
+    """Displacement, rotation and in-plane stretch of the patches.
+
+    Parameters
+    ----------
+    pair, xy_px, w
+        As in :func:`shape_geometry`.
+    G
+        (N, 3, 3), see :class:`core.matching.MotionFit`.
+    """
+    w, G = np.asarray(w, dtype=np.float64), np.asarray(G, dtype=np.float64)
+    R = pair.cam1.cam_from_sys.rotation
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    uvw = ((G[..., :, 0] - ray) / w[..., :1]) @ R
+    basis = np.zeros_like(G)
+    basis[..., 0] = ray
+    basis[..., 0, 1] = basis[..., 1, 2] = 1.0
+    slopes = w[..., None, 1:] / w[..., None, :1]
+    # rows of R^T: tangents in the system frame, (N, 3, 2), both in units of 1 / w0
+    before = np.einsum("ji,njk->nik", R, basis[..., 1:] - basis[..., :1] * slopes)
+    after = np.einsum("ji,njk->nik", R, G[..., 1:] - G[..., :1] * slopes)
+    frame = _tangent_frames(_plane(ray, w) @ R)
+    coordinates = np.swapaxes(frame[..., :2], -1, -2) @ before
+    gradient = after @ _inverse2(coordinates)  # (N, 3, 2): tangent coordinates -> deformed tangents
+    right = _root2(np.swapaxes(gradient, -1, -2) @ gradient)
+    axes = gradient @ _inverse2(right)
+    turned = np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], axis=-1)
+    rotation = turned @ np.swapaxes(frame, -1, -2)
+    stretch = np.stack([right[..., 0, 0] - 1.0, right[..., 1, 1] - 1.0, right[..., 0, 1]], axis=-1)
+    return MotionGeometry(uvw_mm=uvw, rotation_rad=_rotation_vectors(rotation), stretch=stretch)
+
+
+def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance: ArrayLike) -> Float:
+    """Covariance (N, 3, 3) of XYZ in mm^2, system frame, from a shape fit's (N, 2, 2) of (w0, epipolar offset).
+
+    The pixel is exact by definition, so the point can only move along its ray: the matrix has rank one.
+    """
+    J = _xyz_jacobian(pair, xy_px, np.asarray(w, dtype=np.float64))
+    return np.asarray(J[..., :, None] * J[..., None, :] * np.asarray(covariance)[..., :1, :1])
+
+
+def covariance_xyzuvw(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLike, covariance: ArrayLike) -> Float:
+    """Covariance (N, 6, 6) of X Y Z u v w in mm^2, system frame, from a motion fit's (N, 5, 5)."""
+    w, G = np.asarray(w, dtype=np.float64), np.asarray(G, dtype=np.float64)
+    R = pair.cam1.cam_from_sys.rotation
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    J = np.zeros((*w.shape[:-1], 6, 4))
+    J[..., :3, 0] = _xyz_jacobian(pair, xy_px, w)
+    J[..., 3:, 0] = -((G[..., :, 0] - ray) / w[..., :1] ** 2) @ R
+    J[..., 3:, 1:] = R.T / w[..., :1, None]
+    return np.asarray(J @ np.asarray(covariance)[..., :4, :4] @ np.swapaxes(J, -1, -2))
+
+
+def _xyz_jacobian(pair: StereoPair, xy_px: ArrayLike, w: Float) -> Float:
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    return np.asarray(-(ray / w[..., :1] ** 2) @ pair.cam1.cam_from_sys.rotation)
+
+
+def _plane(ray: Float, w: Float) -> Float:
+    """Vector n with n . P = 1 on the plane, camera 1's frame."""
+    return np.stack([w[..., 1], w[..., 2], w[..., 0] - w[..., 1] * ray[..., 0] - w[..., 2] * ray[..., 1]], axis=-1)
+
+
+def _tangent_frames(normals: Float) -> Float:
+    """Columns: X_sys projected on the patch (Y_sys where the patch is normal to X_sys), its partner, the normal."""
+    n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    steep = np.abs(n[..., :1]) > 0.999
+    axis = np.where(steep, np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    a = axis - n * (axis * n).sum(-1, keepdims=True)
+    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+    return np.stack([a, np.cross(n, a), n], axis=-1)
+
+
+def _inverse2(m: Float) -> Float:
+    det = m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]
+    out = np.empty_like(m)
+    out[..., 0, 0], out[..., 1, 1] = m[..., 1, 1], m[..., 0, 0]
+    out[..., 0, 1], out[..., 1, 0] = -m[..., 0, 1], -m[..., 1, 0]
+    return np.asarray(out / det[..., None, None])
+
+
+def _root2(m: Float) -> Float:
+    """Square root of symmetric positive 2 x 2 matrices (Cayley-Hamilton)."""
+    s = np.sqrt(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
+    trace = np.sqrt(m[..., 0, 0] + m[..., 1, 1] + 2.0 * s)
+    return np.asarray((m + s[..., None, None] * np.eye(2)) / trace[..., None, None])
+
+
+def _rotation_vectors(rotation: NDArray[np.float64]) -> Float:
+    """Axis times angle, through the quaternion, which keeps its digits at small and at large angles."""
+    r = rotation
+    skew = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1)
+    trace = np.trace(r, axis1=-2, axis2=-1)
+    sine = 0.5 * np.linalg.norm(skew, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (trace - 1.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(sine > 1e-8, 0.5 * angle / sine, 0.5)
+    return np.asarray(skew * factor[..., None])

@@ -1,0 +1,130 @@
+"""Gauss-Newton for the shape at one point: inverse depth, two slopes and the epipolar offset from one comparison."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from core.matching.kernels.linear import assemble, factor, gradient, solve
+from core.matching.kernels.point import (
+    LOW_TEXTURE,
+    NOT_CONVERGED,
+    NOT_SEEDED,
+    OK,
+    OUTSIDE_IMAGE,
+    REFREEZE_PX,
+    SINGULAR,
+    compare,
+    corner_motion,
+    epipolar_shift,
+    image_matrices,
+    jacobian_blocks,
+    joint_weights,
+    residual_variance,
+    settled,
+    too_rough,
+)
+from core.matching.kernels.reference import reference_sums, set_up_reference
+
+N_SHAPE_OUT = 9
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shape_normal(weights, blocks, offsets, hessian, normal, half, reduced):
+    """Normal equations of shape: w0, w1, w2, e out of the thirteen."""
+    assemble(weights, blocks, offsets, hessian, 1, normal, half)
+    for i in range(4):
+        for j in range(4):
+            reduced[i, j] = normal[4 * i, 4 * j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, setting, space, out):
+    """Fit w0, w1, w2 and e of one point. ``out``: w (3), e, zncc, noise, cov(w0, e) (3), see ``fit.py``.
+
+    Returns status and iterations.
+    """
+    subset, order, max_iterations, tolerance, max_sigma, max_step = setting
+    (ref, p, sums, box, poly, work, sum_both, hessian, rhs, levels, weights, M, blocks, offsets, normal, half, vectors,
+     reduced, _, inverse, G, _) = space  # fmt: skip
+    n = subset * subset
+    grad_x, grad_y = gradients
+    inside, xc, yc, f2 = set_up_reference(reference, grad_x, grad_y, lens1, xy[0], xy[1], subset, ref, box, poly)
+    if not inside:
+        return OUTSIDE_IMAGE, 0
+    sum_j, sum_fj = sum_both[0], sum_both[1]
+    if not f2 > 0.0:
+        return LOW_TEXTURE, 0
+    reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
+    if too_rough(hessian, lens1, xc, yc, f2):
+        return LOW_TEXTURE, 0
+    w = vectors[0]
+    w[0], w[1], w[2] = start[0], start[1], start[2]
+    if not np.isfinite(w[0] + w[1] + w[2]):
+        return NOT_SEEDED, 0
+    nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
+    if not along > 0.0:
+        return SINGULAR, 0
+    e = 0.0
+    levels[0, 0], levels[0, 1] = 1.0, 0.0
+    step, rhs13 = vectors[1], vectors[2]
+    moved, previous = np.inf, 0.0
+    status = NOT_CONVERGED
+    iterations = 0
+    while iterations < max_iterations:
+        image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
+        if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
+            return OUTSIDE_IMAGE, iterations
+        iterations += 1
+        if levels[0, 3] == 0.0:
+            return LOW_TEXTURE, iterations
+        if moved > REFREEZE_PX:
+            joint_weights(levels, 1, weights)
+            if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
+                return SINGULAR, iterations
+            shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
+            if not factor(reduced, 4):
+                return LOW_TEXTURE, iterations
+            moved = 0.0
+        gradient(weights, blocks, offsets, rhs, 1, rhs13)
+        small = vectors[3]
+        small[0], small[1], small[2], small[3] = -rhs13[0], -rhs13[4], -rhs13[8], -rhs13[12]
+        solve(reduced, small, 4)
+        step[:] = 0.0
+        step[0], step[4], step[8], step[12] = small[0], small[1], small[2], small[3]
+        motion = corner_motion(blocks, offsets, step, 1, box, lens1[1], lens1[2])
+        cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
+        w[0] += cut * step[0]
+        w[1] += cut * step[4]
+        w[2] += cut * step[8]
+        e += cut * step[12]
+        motion *= cut
+        moved += motion
+        if settled(motion, previous, tolerance):
+            status = OK
+            break
+        previous = motion
+    image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
+    if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
+        return OUTSIDE_IMAGE, iterations
+    out[0], out[1], out[2], out[3], out[4] = w[0], w[1], w[2], e, levels[0, 2]
+    variance = residual_variance(levels, 1, n, f2, 4.0)
+    joint_weights(levels, 1, weights)
+    if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
+        return SINGULAR, iterations
+    shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
+    if not factor(reduced, 4):
+        return LOW_TEXTURE, iterations
+    column = vectors[3]
+    column[0], column[1], column[2], column[3] = 1.0, 0.0, 0.0, 0.0
+    solve(reduced, column, 4)
+    c00, c01 = column[0] * variance, column[3] * variance
+    column[0], column[1], column[2], column[3] = 0.0, 0.0, 0.0, 1.0
+    solve(reduced, column, 4)
+    out[5] = math.sqrt(max(variance, 0.0))
+    out[6], out[7], out[8] = c00, c01, column[3] * variance
+    if status == OK and math.sqrt(c00) * along > max_sigma:
+        status = LOW_TEXTURE
+    return status, iterations

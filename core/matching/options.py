@@ -1,0 +1,64 @@
+"""What the matcher can be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from core.errors import InputError
+
+Interpolation = Literal["cubic", "quintic"]
+Patch = Literal["rigid", "stretch"]
+
+SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchOptions:
+    """Options of :func:`core.matching.fit_shape` and :func:`core.matching.fit_motion`.
+
+    Parameters
+    ----------
+    subset_px
+        Width and height of the square subset in camera 1, px.
+    patch
+        ``stretch`` (12 unknowns, the default) or ``rigid`` (the paper's 9). Shape does not use it.
+    interpolation
+        Spline that the images were prepared with; ``quintic`` for sharp speckle at low noise.
+    max_iterations
+        Gauss-Newton steps before a point counts as not converged. Points inside the basin need 2 to 8.
+    tolerance_px
+        Motion of the subset's corners that may remain unmade when the iteration stops, px. Its own noise is some ten
+        times larger at the default.
+    max_sigma_px
+        Points whose match is predicted to scatter more than this (standard deviation of camera 2's position, px)
+        have too little texture.
+    max_step_px
+        A Gauss-Newton step that moves a corner of the subset further is cut down to this, px.
+    """
+
+    subset_px: int = 33
+    patch: Patch = "stretch"
+    interpolation: Interpolation = "cubic"
+    max_iterations: int = 30
+    tolerance_px: float = 1e-3
+    max_sigma_px: float = 0.25
+    max_step_px: float = 4.0
+
+    def __post_init__(self) -> None:
+        if not 5 <= self.subset_px <= 401:
+            raise InputError(f"subset_px is {self.subset_px}, it must lie in 5 to 401.", code="option_out_of_range")
+        if self.patch not in ("rigid", "stretch"):
+            raise InputError(f"patch is {self.patch!r}, it must be 'rigid' or 'stretch'.", code="option_out_of_range")
+        if self.interpolation not in SPLINE_ORDER:
+            raise InputError(
+                f"interpolation is {self.interpolation!r}, it must be 'cubic' or 'quintic'.", code="option_out_of_range"
+            )
+        if self.max_iterations < 1:
+            raise InputError(
+                f"max_iterations is {self.max_iterations}, it must be 1 or more.", code="option_out_of_range"
+            )
+        for name in ("tolerance_px", "max_sigma_px", "max_step_px"):
+            value = getattr(self, name)
+            if not 0.0 < value < float("inf"):
+                raise InputError(f"{name} is {value}, it must be positive and finite.", code="option_out_of_range")

@@ -1,0 +1,362 @@
+"""Simulated cameras: frame grabbers over the simulated world, with one trigger line and settable faults."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import threading
+import time
+import weakref
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from core.errors import CameraError
+from drivers.frames import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
+
+CameraName = Literal["cam1", "cam2"]
+
+# A trigger call within this time of another camera's belongs to the same pulse
+_SAME_PULSE_S = 1.0
+# Frames that wait for somebody to take them; a real grabber's ring is as short
+_RING = 16
+
+
+class Exposer(Protocol):
+    """What a simulated camera needs of the world; `sim.world.SimWorld` is one."""
+
+    def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
+        """Return the digitised image of this moment."""
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """One pulse on the trigger line."""
+
+    number: int
+    at_ns: int
+
+
+class TriggerLine:
+    """One line to all cameras of a rig: the first camera's software trigger makes the pulse, the others join it.
+
+    So the exposures of a pair begin at the same instant, however late the second call comes.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest = Pulse(0, 0)
+        self._last_of: dict[str, int] = {}
+
+    def fire(self, cam: str) -> Pulse:
+        """Join the newest pulse if this camera has not seen it yet, else make one."""
+        with self._lock:
+            now = time.monotonic_ns()
+            pulse = self._newest
+            if self._last_of.get(cam, 0) >= pulse.number or now - pulse.at_ns > _SAME_PULSE_S * 1e9:
+                pulse = self._newest = Pulse(pulse.number + 1, now)
+            self._last_of[cam] = pulse.number
+            return pulse
+
+
+@dataclass
+class GrabberFaults:
+    """What is wrong with a camera; every value may be set while it runs.
+
+    Parameters
+    ----------
+    drop
+        So many of the next frames never arrive, though they were counted.
+    duplicate
+        So many of the next frames arrive twice.
+    incomplete
+        So many of the next frames lack their lower half.
+    silent
+        Nothing arrives, and no error either.
+    busy
+        Opening fails, as when another program holds the camera.
+    gone
+        The camera says that it is gone, and cannot be opened.
+    skew_ms
+        Delay of this camera's exposures.
+    """
+
+    drop: int = 0
+    duplicate: int = 0
+    incomplete: int = 0
+    silent: bool = False
+    busy: bool = False
+    gone: bool = False
+    skew_ms: float = 0.0
+
+
+_lines: weakref.WeakKeyDictionary[Any, TriggerLine] = weakref.WeakKeyDictionary()
+_lines_lock = threading.Lock()
+
+
+def _line_of(world: Exposer) -> TriggerLine:
+    with _lines_lock:
+        return _lines.setdefault(world, TriggerLine())
+
+
+class SimFrameGrabber:
+    """A simulated camera; see `drivers.frames.FrameGrabber`.
+
+    Parameters
+    ----------
+    world
+        Who makes the images. Cameras of one world hang on one trigger line.
+    cam
+        Which of its cameras.
+    image_size_px, bit_depth
+        Width and height, and significant bits; taken from the world's rig when left out.
+    line
+        Another trigger line than the world's own.
+    seed
+        Of the noise; each camera draws its own.
+    sequence_bits, first_sequence
+        Width of the frame counter and where it starts, to meet its wrap.
+    latency_s
+        How long rendering may take: the watchdog must allow for it.
+    """
+
+    def __init__(
+        self,
+        world: Exposer,
+        cam: CameraName,
+        *,
+        image_size_px: tuple[int, int] | None = None,
+        bit_depth: int | None = None,
+        line: TriggerLine | None = None,
+        seed: int = 0,
+        sequence_bits: int = 16,
+        first_sequence: int = 0,
+        latency_s: float = 30.0,
+    ) -> None:
+        if image_size_px is None or bit_depth is None:
+            known = world.rig.camera(cam)  # type: ignore[attr-defined]  # a bare Exposer must be described by the caller
+            image_size_px = image_size_px or known.size_px
+            bit_depth = bit_depth or known.sensor.bit_depth
+        self.faults = GrabberFaults()
+        self._world = world
+        self._cam: CameraName = cam
+        self._line = line if line is not None else _line_of(world)
+        self._rng = np.random.default_rng([seed, int(cam[-1])])
+        self._sequence_bits = sequence_bits
+        self._counter = itertools.count(first_sequence)
+        self._description = CameraDescription(
+            model="simulated camera",
+            serial=f"SIM-{cam}",
+            image_size_px=image_size_px,
+            bit_depths=(bit_depth,),
+            trigger_modes=("free", "software"),
+            exposure_range_ms=(0.01, 1000.0),
+            gain_range_db=(0.0, 24.0),
+            frame_rate_range_hz=(0.1, 100.0),
+            driver="sim",
+            latency_s=latency_s,
+        )
+        self._settings = CameraSettings(
+            exposure_ms=10.0,
+            gain_db=0.0,
+            frame_rate_hz=10.0,
+            bit_depth=bit_depth,
+            trigger="software",
+            region_px=(0, 0, *image_size_px),
+        )
+        self._open = False
+        self._orders: queue.SimpleQueue[Pulse | None] = queue.SimpleQueue()
+        self._frames: queue.Queue[Frame | CameraError] = queue.Queue(_RING)
+        self._thread: threading.Thread | None = None
+        self._ending = threading.Event()
+
+    def open(self) -> None:
+        """Connect."""
+        if self.faults.busy:
+            raise CameraError(
+                f"Another program holds {self._cam}.",
+                code="camera_busy",
+                remedy="Close the other program, then reconnect.",
+                camera=self._cam,
+            )
+        self._check_there()
+        self._open = True
+
+    def describe(self) -> CameraDescription:
+        """Say who the camera is."""
+        self._check_there()
+        return self._description
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        """Set what is not ``None``; refuse all of it when one value cannot be had."""
+        self._check_open()
+        here = self._description
+        for name, value, (low, high) in (
+            ("exposure_ms", settings.exposure_ms, here.exposure_range_ms),
+            ("gain_db", settings.gain_db, here.gain_range_db),
+            ("frame_rate_hz", settings.frame_rate_hz, here.frame_rate_range_hz),
+        ):
+            if value is not None and not low <= value <= high:  # NaN is in no range
+                raise self._out_of_range(name, value, f"{low:g} to {high:g}")
+        if settings.bit_depth is not None and settings.bit_depth not in here.bit_depths:
+            raise self._out_of_range("bit_depth", settings.bit_depth, f"{here.bit_depths}")
+        if settings.trigger is not None and settings.trigger not in here.trigger_modes:
+            raise self._out_of_range("trigger", settings.trigger, f"{here.trigger_modes}")
+        whole = (0, 0, *here.image_size_px)
+        if settings.region_px is not None and tuple(settings.region_px) != whole:
+            raise self._out_of_range("region_px", settings.region_px, f"{whole}")
+        given = {name: value for name, value in vars(settings).items() if value is not None}
+        self._settings = replace(self._settings, **given)
+        return self._settings
+
+    def arm(self) -> None:
+        """Start delivering."""
+        self._check_open()
+        if self._thread is not None:
+            return
+        self._ending = threading.Event()
+        self._orders = queue.SimpleQueue()
+        self._frames = queue.Queue(_RING)
+        self._thread = threading.Thread(target=self._run, name=f"simulated {self._cam}", daemon=True)
+        self._thread.start()
+
+    def disarm(self) -> None:
+        """Stop delivering; an exposure in progress is finished and thrown away."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            self._ending.set()
+            self._orders.put(None)
+            thread.join()
+
+    def trigger(self) -> int | None:
+        """Fire the common trigger line; returns the number of the pulse."""
+        self._check_open()
+        if self._settings.trigger != "software":
+            raise CameraError(
+                f"{self._cam} is in trigger mode {self._settings.trigger!r}, not 'software'.",
+                code="wrong_trigger",
+                remedy="Set trigger to 'software' first.",
+                camera=self._cam,
+            )
+        if self._thread is None:
+            raise CameraError(
+                f"{self._cam} is not armed.",
+                code="not_armed",
+                remedy="Arm it before it is triggered.",
+                camera=self._cam,
+            )
+        pulse = self._line.fire(self._cam)
+        self._orders.put(pulse)
+        return pulse.number
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        """Wait for the next frame."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._check_open()
+            left = deadline - time.monotonic()
+            try:
+                item = self._frames.get(timeout=min(max(left, 0.0), 0.05))
+            except queue.Empty:
+                if left <= 0:
+                    return None
+                continue
+            if isinstance(item, CameraError):
+                raise item
+            return item
+
+    def close(self) -> None:
+        """Release the camera."""
+        self._open = False
+        self.disarm()
+
+    def _run(self) -> None:
+        ending, orders, frames = self._ending, self._orders, self._frames
+        number = itertools.count(1)
+        due = time.monotonic()
+        while not ending.is_set():
+            if self._settings.trigger == "software":
+                order = orders.get()
+                if order is None:
+                    return
+                pulse, trigger = order, order.number
+            else:
+                due = max(due + 1.0 / (self._settings.frame_rate_hz or 10.0), time.monotonic())
+                if ending.wait(max(0.0, due - time.monotonic())):
+                    return
+                pulse, trigger = Pulse(next(number), time.monotonic_ns()), None
+            if not self.faults.gone:
+                self._expose(pulse, trigger, ending, frames)
+
+    def _expose(
+        self, pulse: Pulse, trigger: int | None, ending: threading.Event, frames: queue.Queue[Frame | CameraError]
+    ) -> None:
+        sequence = next(self._counter) % 2**self._sequence_bits
+        if self.faults.drop > 0:
+            self.faults.drop -= 1
+            return
+        try:
+            pixels = self._world.expose(
+                self._cam,
+                exposure_ms=self._settings.exposure_ms or 10.0,
+                gain_db=self._settings.gain_db or 0.0,
+                rng=self._rng,
+            )
+        except Exception as error:  # noqa: BLE001  # the thread's owner is told, whatever it was
+            fault = CameraError(f"{self._cam} made no image: {error}", remedy="Check the simulated scene.")
+            fault.__cause__ = error
+            self._put(fault, frames)
+            return
+        if ending.is_set() or self.faults.silent:
+            return
+        status = FrameStatus.OK
+        if self.faults.incomplete > 0:
+            self.faults.incomplete -= 1
+            status = FrameStatus.INCOMPLETE
+            pixels = pixels.copy()
+            pixels[pixels.shape[0] // 2 :] = 0
+        device_ns = pulse.at_ns + round(self.faults.skew_ms * 1e6)
+        frame = Frame(
+            pixels, self._description.bit_depths[0], sequence, device_ns, time.monotonic_ns(), status, trigger
+        )
+        self._put(frame, frames)
+        if self.faults.duplicate > 0:
+            self.faults.duplicate -= 1
+            self._put(replace(frame, host_ns=time.monotonic_ns()), frames)
+
+    @staticmethod
+    def _put(item: Frame | CameraError, frames: queue.Queue[Frame | CameraError]) -> None:
+        while True:
+            try:
+                frames.put_nowait(item)
+            except queue.Full:
+                # the ring runs over: the oldest is lost, which the gap in the frame numbers shows
+                try:
+                    frames.get_nowait()
+                except queue.Empty:
+                    continue
+            else:
+                return
+
+    def _check_there(self) -> None:
+        if self.faults.gone:
+            raise CameraError(
+                f"{self._cam} is gone.", code="camera_lost", remedy="Check its cable, then reconnect.", camera=self._cam
+            )
+
+    def _check_open(self) -> None:
+        self._check_there()
+        if not self._open:
+            raise CameraError(
+                f"{self._cam} is not open.", code="camera_lost", remedy="Connect the camera first.", camera=self._cam
+            )
+
+    def _out_of_range(self, name: str, value: object, allowed: str) -> CameraError:
+        return CameraError(
+            f"{self._cam} cannot set {name} to {value!r}, only {allowed}.",
+            code="out_of_range",
+            remedy="Give a value in the range above.",
+            camera=self._cam,
+            setting=name,
+        )
