@@ -54,7 +54,8 @@ def _map(axis: Any, result: Field, values: Float, title: str, unit: str, **optio
     axis.set_title(title)
     axis.set_xticks([])
     axis.set_yticks([])
-    bar = axis.figure.colorbar(drawn, ax=axis, fraction=0.046, pad=0.03)
+    rows, columns = values.shape
+    bar = axis.figure.colorbar(drawn, ax=axis, fraction=0.046 * min(1.0, rows / columns), pad=0.03)
     bar.set_label(unit)
     bar.outline.set_visible(False)
 
@@ -67,8 +68,8 @@ def region(out: Path, image: NDArray[Any], roi_px: Sequence[float], result: Fiel
         x0, y0, x1, y1 = roi_px
         axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color="#ffb000", linewidth=1.5))
         ok = result.valid
-        axis.plot(result.x_px[ok], result.y_px[ok], ".", color="#00d0a0", markersize=1.5)
-        axis.plot(result.x_px[~ok], result.y_px[~ok], "x", color="#ff4060", markersize=2.5)
+        axis.plot(result.x_px[ok], result.y_px[ok], ".", color="#00ffb0", markersize=3.0)
+        axis.plot(result.x_px[~ok], result.y_px[~ok], "x", color="#ff4060", markersize=4.0)
         axis.set_title(f"{title}: camera 1, step 0. Green: measured ({int(ok.sum())}), red: not ({int((~ok).sum())})")
         axis.set_xlabel("x, px")
         axis.set_ylabel("y, px")
@@ -104,9 +105,9 @@ def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
             axis.set_aspect("equal")
             axis.set_title(f"{view['title']}\nRBE {view['rbe_px']:.4f} px{', held out' if view['held_out'] else ''}")
             axis.tick_params(labelsize=7)
-        axes[0, 0].quiverkey(arrows, 0.0, -0.16, scale, f"{scale:.3f} px", coordinates="axes", labelpos="E")
         figure.suptitle("Grid intersections: measured minus projected (blue fitted, red held out)", x=0.02, ha="left")
         figure.tight_layout()
+        axes[0, 0].quiverkey(arrows, 0.85, 0.975, scale, f"{scale:.3f} px", coordinates="figure", labelpos="E")
         _save(figure, out / "calibration_residuals.png")
     return {"calibration_residuals.png": "what the calibration leaves unexplained at every grid intersection"}
 
