@@ -34,6 +34,8 @@ _MIX_B: Final = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_C: Final = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S21, _S42 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(21), np.uint64(42)
 _MASK21: Final = np.uint64((1 << 21) - 1)
+_EDGE_REACH_SD: Final = 6.0  # a line's soft edge ends here, with 1e-9 left
+_FAR_MM: Final = 1e9  # beyond it a cell's index is no whole number any more
 _UNIT: Final = 1.0 / float(1 << 21)
 
 
@@ -58,13 +60,22 @@ class Texture:
     nodes_mm: Float
     finest_mm: float
 
+    def paint(self, s_mm: Float, t_mm: Float, out: Float) -> None:
+        """Write the brightness of material points into ``out`` (n,), which stays as it is where they are NaN."""
+        if self.kind == SPECKLE:
+            _speckle(self.parameters, s_mm, t_mm, out)
+        elif self.kind == GRID:
+            _grid(self.parameters, self.nodes_mm, s_mm, t_mm, out)
+        else:
+            _dots(self.parameters, s_mm, t_mm, out)
+
     def value(self, st_mm: ArrayLike) -> Float:
         """Brightness (...) in [0, 1] at material points (..., 2) in mm."""
-        st = np.ascontiguousarray(st_mm, dtype=np.float64)
-        flat = st.reshape(-1, 2)
-        out = np.empty(len(flat))
-        _values(self.kind, self.parameters, self.nodes_mm, flat, out)
-        return out.reshape(st.shape[:-1])
+        st = np.asarray(st_mm, dtype=np.float64)
+        out = np.full(st.shape[:-1], np.nan)
+        flat = out.reshape(-1)
+        self.paint(np.ascontiguousarray(st[..., 0]).reshape(-1), np.ascontiguousarray(st[..., 1]).reshape(-1), flat)
+        return flat.reshape(st.shape[:-1])
 
 
 def speckle(
@@ -79,12 +90,12 @@ def speckle(
     seed
         Names the pattern; the same seed is the same specimen.
     rim_mm
-        Width over which a disc's rim goes from bright to dark; a quarter of the diameter by default, like sprayed
+        Width over which a disc's rim goes from bright to dark; a third of the diameter by default, like sprayed
         paint.
     dark, bright
         Brightness of disc and ground.
     """
-    rim = 0.25 * diameter_mm if rim_mm is None else rim_mm
+    rim = 0.35 * diameter_mm if rim_mm is None else rim_mm
     if not 0.0 < rim <= 0.5 * diameter_mm:
         raise ValueError(f"rim_mm must lie in (0, {0.5 * diameter_mm:g}], got {rim:g}")
     cell = _CELL_PER_DIAMETER * diameter_mm
@@ -132,11 +143,12 @@ def line_grid(
         raise ValueError(f"a grid needs two lines each way, got {lines}")
     x = (np.arange(n_a) - 0.5 * (n_a - 1)) * pitch_mm
     y = (np.arange(n_b) - 0.5 * (n_b - 1)) * pitch_mm
-    nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    nodes = nodes + np.random.default_rng(seed).uniform(-node_tolerance_mm, node_tolerance_mm, nodes.shape)
+    ideal = np.stack(np.meshgrid(x, y), axis=-1)
+    nodes = ideal + np.random.default_rng(seed).uniform(-node_tolerance_mm, node_tolerance_mm, ideal.shape)
     edge = line_width_mm / 12.0 if edge_sd_mm is None else edge_sd_mm
     line, ground = (dark, bright) if dark_lines else (bright, dark)
-    par = np.array([pitch_mm, 0.5 * line_width_mm, edge, line, ground])
+    worst = float(np.abs(nodes - ideal).max())
+    par = np.array([pitch_mm, 0.5 * line_width_mm, edge, line, ground, worst])
     return Texture(kind=GRID, parameters=par, nodes_mm=nodes, finest_mm=edge)
 
 
@@ -146,7 +158,7 @@ def dots(*, pitch_mm: float, diameter_mm: float, rim_mm: float, dark: float = 0.
     return Texture(kind=DOTS, parameters=par, nodes_mm=_NO_NODES, finest_mm=0.2 * rim_mm)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mix(z: np.uint64) -> np.uint64:
     # splitmix64's finaliser: every input bit reaches every output bit
     z = (z ^ (z >> _S30)) * _MIX_B
@@ -154,7 +166,7 @@ def _mix(z: np.uint64) -> np.uint64:
     return z ^ (z >> _S31)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fill_discs(i: int, j: int, par: Float, discs: Float) -> None:
     """Write centre and radius of the discs of the 3 x 3 cells around (i, j) into ``discs`` (9, 3), nearest first."""
     cell, radius, rim, seed = par[0], par[1], par[2], np.uint64(np.int64(par[5]))
@@ -172,49 +184,73 @@ def fill_discs(i: int, j: int, par: Float, discs: Float) -> None:
         discs[k, 2] = min(r, largest)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _rim_step(u: float) -> float:
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
-@njit(cache=True, nogil=True)
-def texture_value(
-    kind: int, par: Float, nodes: Float, s: float, t: float, cell_index: NDArray[np.int64], discs: Float
-) -> float:
-    """Brightness at one material point; ``cell_index`` (2,) and ``discs`` (9, 3) remember the last cell looked at."""
-    v = 1.0  # share of the brighter of the two
-    if kind == SPECKLE:
-        i = int(np.floor(s / par[0]))
-        j = int(np.floor(t / par[0]))
-        if i != cell_index[0] or j != cell_index[1]:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _speckle(par: Float, s: Float, t: Float, out: Float) -> None:
+    discs = np.empty((9, 3))
+    cell, e, dark, contrast = par[0], par[2], par[3], par[4] - par[3]
+    last_i, last_j = 0, 0
+    fill_discs(0, 0, par, discs)
+    for k in range(s.size):
+        sk, tk = s[k], t[k]
+        if not (abs(sk) < _FAR_MM and abs(tk) < _FAR_MM):
+            continue  # nothing hit
+        # the points come in rows, so the cell is mostly the last one
+        i, j = int(np.floor(sk / cell)), int(np.floor(tk / cell))
+        if i != last_i or j != last_j:
             fill_discs(i, j, par, discs)
-            cell_index[0] = i
-            cell_index[1] = j
-        e = par[2]
-        for k in range(9):
-            dx = s - discs[k, 0]
-            dy = t - discs[k, 1]
+            last_i, last_j = i, j
+        v = 1.0  # share of the ground
+        for n in range(9):
+            dx = sk - discs[n, 0]
+            dy = tk - discs[n, 1]
             d2 = dx * dx + dy * dy
-            outer = discs[k, 2] + e
+            outer = discs[n, 2] + e
             if d2 < outer * outer:
-                inner = discs[k, 2] - e
+                inner = discs[n, 2] - e
                 if d2 <= inner * inner:
                     v = 0.0
                     break
                 v *= _rim_step((np.sqrt(d2) - inner) / (2.0 * e))
-    elif kind == GRID:
-        a = _line_cover(par, nodes, s, t, 0)
-        b = _line_cover(par, nodes, t, s, 1)
-        v = (1.0 - a) * (1.0 - b)
-    else:
-        dx = s - np.floor(s / par[0] + 0.5) * par[0]
-        dy = t - np.floor(t / par[0] + 0.5) * par[0]
-        u = (np.sqrt(dx * dx + dy * dy) - (par[1] - par[2])) / (2.0 * par[2])
-        v = _rim_step(min(max(u, 0.0), 1.0))
-    return float(par[3] + (par[4] - par[3]) * v)
+        out[k] = dark + contrast * v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _grid(par: Float, nodes: Float, s: Float, t: Float, out: Float) -> None:
+    per_mm = 1.0 / par[0]
+    n_b, n_a = nodes.shape[:2]
+    centre_a, centre_b = 0.5 * (n_a - 1) + 0.5, 0.5 * (n_b - 1) + 0.5
+    # no line is nearer to a point than its nominal distance less the worst node's error
+    reach = par[1] + _EDGE_REACH_SD * par[2] + par[5]
+    near = reach * per_mm
+    for k in range(s.size):
+        if not (abs(s[k]) < _FAR_MM and abs(t[k]) < _FAR_MM):
+            continue
+        a, b = s[k] * per_mm + centre_a, t[k] * per_mm + centre_b
+        line_a, line_b = np.floor(a), np.floor(b)
+        v = 1.0  # share of the ground
+        if abs(a - line_a - 0.5) < near and 0 <= line_a < n_a:
+            v -= _line_cover(par, nodes, s[k], t[k], 0)
+        if abs(b - line_b - 0.5) < near and 0 <= line_b < n_b:
+            v *= 1.0 - _line_cover(par, nodes, t[k], s[k], 1)
+        out[k] = par[4] + (par[3] - par[4]) * (1.0 - v)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _dots(par: Float, s: Float, t: Float, out: Float) -> None:
+    for k in range(s.size):
+        if abs(s[k]) < _FAR_MM and abs(t[k]) < _FAR_MM:
+            dx = s[k] - np.floor(s[k] / par[0] + 0.5) * par[0]
+            dy = t[k] - np.floor(t[k] / par[0] + 0.5) * par[0]
+            u = (np.sqrt(dx * dx + dy * dy) - (par[1] - par[2])) / (2.0 * par[2])
+            out[k] = par[3] + (par[4] - par[3]) * _rim_step(min(max(u, 0.0), 1.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _line_cover(par: Float, nodes: Float, across: float, along: float, family: int) -> float:
     """How far the point lies under a line of family 0 (they cross s) or 1 (they cross t): 0 outside, 1 inside."""
     pitch, half, sd = par[0], par[1], par[2]
@@ -236,29 +272,20 @@ def _line_cover(par: Float, nodes: Float, across: float, along: float, family: i
     l1 = _node(nodes, line, seg + 1, family, other)
     slope = (c1 - c0) / (l1 - l0)
     off = (across - (c0 + slope * (along - l0))) / np.sqrt(1.0 + slope * slope)
-    reach = half + 6.0 * sd
-    if abs(off) > reach:
+    if abs(off) > half + _EDGE_REACH_SD * sd:
         return 0.0
     root = 1.0 / (1.4142135623730951 * sd)
     cover: float = 0.5 * (erf((half - off) * root) + erf((half + off) * root))
     # lines end half a line width behind the outermost crossings, so that the corners are square
     start = _node(nodes, line, 0, family, other) - half
     end = _node(nodes, line, n_along - 1, family, other) + half
-    if along < start + 6.0 * sd:
+    if along < start + _EDGE_REACH_SD * sd:
         cover *= 0.5 * (1.0 + erf((along - start) * root))
-    if along > end - 6.0 * sd:
+    if along > end - _EDGE_REACH_SD * sd:
         cover *= 0.5 * (1.0 + erf((end - along) * root))
     return float(cover)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _node(nodes: Float, line: int, along: int, family: int, axis: int) -> float:
     return float(nodes[along, line, axis] if family == 0 else nodes[line, along, axis])
-
-
-@njit(cache=True, nogil=True)
-def _values(kind: int, par: Float, nodes: Float, st: Float, out: Float) -> None:
-    cell_index = np.full(2, np.iinfo(np.int64).min, dtype=np.int64)
-    discs = np.empty((9, 3))
-    for k in range(st.shape[0]):
-        out[k] = texture_value(kind, par, nodes, st[k, 0], st[k, 1], cell_index, discs)
