@@ -234,6 +234,7 @@ def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Tran
         assert not stand.stage.state(1).homed
 
 
+@pytest.mark.fault(25)
 @pytest.mark.parametrize(
     "fault",
     [
@@ -256,6 +257,7 @@ def test_a_disturbed_reply_is_flushed_and_asked_for_once_more(homed: Bench, faul
     assert homed.stage.state(1).state is AxisState.READY
 
 
+@pytest.mark.fault(25)
 def test_a_late_reply_is_not_taken_for_the_next_answer(homed: Bench) -> None:
     homed.stage.move_many({1: 7.25, 2: -3.5})
     homed.controller.line_faults.delay_s = 0.35  # longer than the driver waits
@@ -266,6 +268,7 @@ def test_a_late_reply_is_not_taken_for_the_next_answer(homed: Bench) -> None:
     assert (first, second) == pytest.approx((7.25, -3.5), abs=1e-4)
 
 
+@pytest.mark.fault(25)
 def test_a_silent_controller_is_lost_within_two_seconds_and_found_again(homed: Bench) -> None:
     homed.controller.line_faults.deaf = True
     start = time.monotonic()
@@ -277,6 +280,7 @@ def test_a_silent_controller_is_lost_within_two_seconds_and_found_again(homed: B
     assert homed.stage.position(1) == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.fault(25)
 @pytest.mark.parametrize("fault", ["deaf", "silent"])
 def test_a_move_is_never_sent_again(homed: Bench, fault: str) -> None:
     homed.axis(1).velocity_mm_s = 0.5  # 50 times real time: 40 mm take 1.6 s
@@ -292,6 +296,7 @@ def test_a_move_is_never_sent_again(homed: Bench, fault: str) -> None:
         assert homed.controller.true_position_mm(1) < 39.0
 
 
+@pytest.mark.fault(25)
 @pytest.mark.parametrize("loss", ["lose_replies", "halve_replies", "garble_replies"])
 def test_a_move_survives_single_lost_replies_and_is_sent_once(homed: Bench, loss: str) -> None:
     for at in range(1, 4):

@@ -1,5 +1,7 @@
-"""Grid detection from nothing but the target's description (section 3.2.2's image processing, and a better localiser)."""
+"""Grid detection from nothing but the target's description: section 3.2.2's image processing, and a better
+localiser."""
 
+from core.grid.detect import detect_grid
 from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, Localiser
 
-__all__ = ["GridOptions", "GridOverlay", "GridView", "LineModel", "Localiser"]
+__all__ = ["GridOptions", "GridOverlay", "GridView", "LineModel", "Localiser", "detect_grid"]

@@ -21,10 +21,11 @@ class GridOptions:
     Parameters
     ----------
     line_model
-        What joins a line's pieces. ``straight``: all lines are straight but for one common lens distortion, found from the
-        lines themselves; it averages the maker's node errors best. ``parabola``: one non-oblique parabola a line,
-        as in the paper. ``local``: each intersection from the pieces beside it only, which keeps the node errors
-        visible to an adjustment that solves for them. None takes ``straight`` for the profile localiser, ``parabola`` for the paper's.
+        What joins a line's pieces. ``straight``: all lines are straight but for one common lens distortion, found
+        from the lines themselves; it averages the maker's node errors best. ``parabola``: one non-oblique parabola
+        a line, as in the paper. ``local``: each intersection from the pieces beside it only, which keeps the node
+        errors visible to an adjustment that solves for them. None takes ``straight`` for the profile localiser,
+        ``parabola`` for the paper's.
     saturation
         Grey level at which the sensor saturates; None finds it from the type and the image itself.
     max_bad_fraction
@@ -32,7 +33,8 @@ class GridOptions:
     max_bad_on_line
         Part of one line's pieces that may be spoilt.
     max_rotation_rad
-        Largest departure of the grid's rotation from 45 degrees: 20 degrees and a little for the estimate's own error.
+        Largest departure of the grid's rotation from 45 degrees: 20 degrees and a little for the estimate's own
+        error.
     """
 
     line_model: LineModel | None = None
@@ -46,10 +48,10 @@ class GridOptions:
 class GridView:
     """The grid as one image shows it.
 
-    A grid without marks looks the same after a turn by 90 or 180 degrees, and in a mirror: no single image tells them apart. The
-    indices here follow the image (X_sys right and down, Y_sys left and down), so both cameras give the same
-    physical corner the same index as long as both images stand upright. A turned or mirrored image shows itself in the calibration,
-    whose angles then disagree with the nominal rig.
+    A grid without marks looks the same after a turn by 90 or 180 degrees, and in a mirror: no single image tells
+    them apart. The indices here follow the image (X_sys right and down, Y_sys left and down), so both cameras give
+    the same physical corner the same index as long as both images stand upright. A turned or mirrored image shows
+    itself in the calibration, whose angles then disagree with the nominal rig.
 
     Parameters
     ----------

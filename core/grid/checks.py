@@ -1,0 +1,226 @@
+"""What makes a grid's index certain, and the refusals where it is not."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import TargetError
+from core.grid.lattice import Lattice, apply_homography, homography
+from core.grid.piece_table import PieceTable
+from core.grid.profile import IN, OUT
+from core.grid.view import GridOptions
+from core.lens import Bool, Float
+from core.target import GridTarget
+
+Cause = Literal["", "dirt", "glare"]
+
+_LEAST_INSIDE_PX = 3.0
+_AMPLITUDE_RANGE = (0.4, 2.2)  # of what the neighbours show
+_RMS_RATIO = 3.0
+_GLARE_RISE = 0.5  # ground above its neighbours', as part of the lines' depth
+
+
+def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int], options: GridOptions) -> None:
+    """Refuse a lattice that is turned too far, has other counts than the target, or leaves the image.
+
+    Raises
+    ------
+    TargetError
+        ``target_rotated``, ``target_line_count``, ``target_partly_seen``.
+    """
+    found, expected = lattice.counts, target.lines
+    rotation_deg = float(np.degrees(lattice.rotation_rad))
+    segments = polylines(lattice.nodes_px)
+    if abs(rotation_deg - 45.0) > np.degrees(options.max_rotation_rad):
+        raise TargetError(
+            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 tell its axes apart",
+            code="target_rotated",
+            remedy="Turn the grid (or the camera) until its lines run at about 45 degrees to the rows.",
+            rotation_deg=rotation_deg,
+            segments_px=segments,
+        )
+    if found == expected and inside(lattice.nodes_px, size_px).all():
+        return
+    if found == (expected[1], expected[0]) and found != expected:
+        raise TargetError(
+            f"{found[0]} lines are crossed along X_sys and {found[1]} along Y_sys, the target has {expected[0]} and"
+            f" {expected[1]}: it is turned by 90 degrees",
+            code="target_rotated",
+            remedy="Turn the grid by 90 degrees, or swap the counts in the target's description.",
+            found=list(found),
+            expected=list(expected),
+            segments_px=segments,
+        )
+    text = f"{found[0]} x {found[1]} lines found, {expected[0]} x {expected[1]} expected"
+    short = found[0] < expected[0] or found[1] < expected[1]
+    if found == expected or (short and _could_go_on_outside(lattice, target, size_px)):
+        raise TargetError(
+            f"the grid leaves the image: {text}",
+            code="target_partly_seen",
+            remedy="Move the grid or the camera until all lines, out to the corners, lie inside the image.",
+            found=list(found),
+            expected=list(expected),
+            segments_px=segments,
+        )
+    raise TargetError(
+        text,
+        code="target_line_count",
+        remedy="Check the target's description; uncover and clean the whole grid, and remove other lines beside it.",
+        found=list(found),
+        expected=list(expected),
+        strays=len(lattice.strays),
+        segments_px=segments,
+    )
+
+
+def inside(nodes_px: Float, size_px: tuple[int, int]) -> Bool:
+    """Which intersections lie inside the image with room for their lines, (...)."""
+    low = nodes_px >= _LEAST_INSIDE_PX
+    high = nodes_px <= np.array(size_px) - 1.0 - _LEAST_INSIDE_PX
+    return np.asarray((low & high).all(axis=-1))
+
+
+def _could_go_on_outside(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]) -> bool:
+    """Whether the lines that are missing may lie where the image does not see them (whole)."""
+    na, nb = lattice.counts
+    if not inside(lattice.nodes_px, size_px).all():
+        return True
+    for axis, (n, other) in enumerate(((na, nb), (nb, na))):
+        if n >= target.lines[axis]:
+            continue
+        for end in (-1.0, float(n)):
+            along = np.arange(other, dtype=np.float64)
+            fixed = np.full(other, end)
+            ij = np.stack([fixed, along] if axis == 0 else [along, fixed], axis=-1)
+            if not inside(apply_homography(lattice.plane_to_image, ij), size_px).all():
+                return True
+    return False
+
+
+def polylines(nodes_px: Float) -> list[list[float]]:
+    """Return the lattice's lines from end to end, [x0, y0, x1, y1] each, for a picture."""
+    ends = [(line[0], line[-1]) for line in nodes_px] + [(line[0], line[-1]) for line in np.swapaxes(nodes_px, 0, 1)]
+    return [[round(float(v), 1) for v in (*p, *q)] for p, q in ends]
+
+
+def saturation_level(image: NDArray[Any]) -> float:
+    """Grey level at which the sensor saturates; infinite where it cannot be told.
+
+    A 16-bit file may hold 10, 12, 14 or 16 significant bits: the level is the one at which pixels pile up.
+    """
+    array = np.asarray(image)
+    if array.dtype == np.uint8:
+        return 255.0
+    if array.dtype.kind != "u":
+        return float("inf")
+    top = int(array.max())
+    full = {1023, 4095, 16383, 65535, 65520, 65472}
+    return float(top) if top in full and np.count_nonzero(array == top) > 20 else float("inf")
+
+
+def judge_pieces(
+    table: PieceTable, fits: Float, target: GridTarget, saturation: float
+) -> tuple[Bool, NDArray[np.str_]]:
+    """Tell good pieces from spoilt ones.
+
+    Returns
+    -------
+    good, cause
+        (n,) and (n,) of ``""``, ``"dirt"``, ``"glare"``.
+    """
+    sign = -1.0 if target.dark_lines else 1.0
+    ok = fits[:, OUT["ok"]] > 0.0
+    amplitude = np.where(ok, sign * fits[:, OUT["amplitude"]], np.nan)
+    typical = _smooth(table, amplitude)
+    ground = _smooth(table, fits[:, OUT["ground"]])
+    rms = fits[:, OUT["rms"]]
+    with np.errstate(invalid="ignore"):
+        fits_shape = rms < _RMS_RATIO * np.nanmedian(rms) + 0.02 * np.abs(typical)
+        seen = (amplitude > _AMPLITUDE_RANGE[0] * typical) & (amplitude < _AMPLITUDE_RANGE[1] * typical)
+        certain = amplitude > 5.0 * np.sqrt(fits[:, OUT["var_amplitude"]])
+        saturated = fits[:, OUT["brightest"]] >= saturation
+        glaring = saturated | (~seen & (fits[:, OUT["ground"]] - ground > _GLARE_RISE * np.abs(typical)))
+    good = ok & fits_shape & seen & certain & ~saturated
+    cause = np.where(good, "", np.where(glaring, "glare", "dirt"))
+    return good, cause
+
+
+def _smooth(table: PieceTable, values: Float) -> Float:
+    """Quadratic over the image through the values, blind to outliers (two rounds of clipping), (n,)."""
+    x, y = table.rows[:, IN["x"]], table.rows[:, IN["y"]]
+    u, v = (x - x.mean()) / x.std(), (y - y.mean()) / y.std()
+    J = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    keep = np.isfinite(values)
+    middle = float(np.median(values[keep])) if keep.any() else np.nan
+    keep &= np.abs(values - middle) < 0.7 * abs(middle)
+    out = np.full(len(values), middle)
+    for _ in range(3):
+        if np.count_nonzero(keep) < 30:
+            break
+        out = J @ np.linalg.lstsq(J[keep], values[keep], rcond=None)[0]
+        off = np.abs(values - out)
+        keep = np.isfinite(values) & (off < 4.0 * 1.4826 * np.median(off[keep]) + 1e-3 * abs(middle))
+    return out
+
+
+def check_coverage(table: PieceTable, good: Bool, cause: NDArray[np.str_], options: GridOptions) -> None:
+    """Refuse a grid of which too much is spoilt.
+
+    Raises
+    ------
+    TargetError
+        ``target_dirty`` or ``target_glare``, whichever spoils more.
+    """
+    bad = ~good
+    share = float(bad.mean())
+    index = table.line_index()
+    per_line = np.bincount(index, weights=bad) / np.bincount(index)
+    if share <= options.max_bad_fraction and per_line.max() <= options.max_bad_on_line:
+        return
+    glare = np.count_nonzero(cause == "glare") >= np.count_nonzero(cause == "dirt")
+    worst = int(np.argmax(per_line))
+    na = table.counts[0]
+    name = f"line {worst} of family a" if worst < na else f"line {worst - na} of family b"
+    what = "is glaring (saturated or without contrast)" if glare else "is covered, dirty or unsharp"
+    raise TargetError(
+        f"{np.count_nonzero(bad)} of {len(bad)} pieces of lines cannot be used (at most"
+        f" {options.max_bad_fraction:.0%}), {per_line[worst]:.0%} of {name} (at most {options.max_bad_on_line:.0%}); most of it {what}",
+        code="target_glare" if glare else "target_dirty",
+        remedy="Take the reflection or the overexposure away: light the grid from behind, close the aperture."
+        if glare
+        else "Clean the grid, take away what covers it, and focus on it.",
+        bad=int(np.count_nonzero(bad)),
+        pieces=len(bad),
+        worst_line=name,
+        segments_px=[[round(float(v), 1) for v in ends.ravel()] for ends in table.ends_px()[bad]],
+    )
+
+
+def check_regular(straight_px: Float, nodes_px: Float, target: GridTarget) -> None:
+    """Refuse numbered lines that are no image of a regular grid.
+
+    Raises
+    ------
+    TargetError
+        ``target_irregular``.
+    """
+    na, nb = target.lines
+    grid = np.stack(np.meshgrid(np.arange(na), np.arange(nb), indexing="ij"), axis=-1).astype(np.float64).reshape(-1, 2)
+    image = straight_px.reshape(-1, 2)
+    H = homography(grid, image)
+    off = np.linalg.norm(apply_homography(H, grid) - image, axis=-1)
+    step = np.linalg.norm(apply_homography(H, grid + np.array([1.0, 0.0])) - apply_homography(H, grid), axis=-1)
+    worst = float((off / step).max())
+    limit = 0.03 + 4.0 * target.node_tolerance_mm / target.pitch_mm
+    if worst > limit:
+        raise TargetError(
+            f"the lines are no regular grid: one intersection lies {worst:.3f} pitches off the others' lattice"
+            f" (at most {limit:.3f})",
+            code="target_irregular",
+            remedy="Check that the target is the one described, that it is flat, and that no other lines lie on it.",
+            worst_pitches=worst,
+            segments_px=polylines(nodes_px),
+        )

@@ -1,0 +1,162 @@
+"""Detection of the grid in one image: coarse lattice, sub-pixel pieces, lines, intersections, and every check on
+the way."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import TargetError
+from core.grid.checks import check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
+from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
+from core.grid.lattice import find_lattice, pitch_px
+from core.grid.lines import LineFit, fit_lines
+from core.grid.piece_table import PieceTable, line_points, piece_table
+from core.grid.pieces import directions
+from core.grid.profile import OUT, fit_pieces
+from core.grid.threshold import checked_image, line_picture
+from core.grid.view import GridOptions, GridView, LineModel, Localiser
+from core.lens import Bool, Float
+from core.target import GridTarget
+
+_OUTLIER = 6.0  # standard deviations at which a line point is a blemish
+_ROUNDS = 3
+
+
+def detect_grid(
+    image: NDArray[Any], target: GridTarget, *, localiser: Localiser = "profile", options: GridOptions | None = None
+) -> GridView:
+    """Find the grid's intersections with no start values but the target's description.
+
+    Parameters
+    ----------
+    image
+        (rows, columns) gray image, any unsigned, signed or float type, as the camera gave it.
+    target
+        What the grid is.
+    localiser
+        ``profile``: maximum-likelihood fit of a blurred line's profile. ``paper``: dark pixels weighted by their
+        distance from the threshold, and non-oblique parabolas.
+    options
+        See :class:`GridOptions`.
+
+    Returns
+    -------
+    GridView
+        Intersections in pixels, indexed as :class:`GridView` says.
+
+    Raises
+    ------
+    ImageError
+        ``image_unsupported``, ``image_unusable``: no gray image.
+    TargetError
+        ``target_not_found``: no two families of lines. ``target_rotated``: lines not within 45 +- 20 degrees, or
+        counts swapped. ``target_line_count``: another number of lines than described. ``target_partly_seen``: the
+        grid leaves the image. ``target_dirty``, ``target_glare``: too many or too important pieces of lines are
+        spoilt. ``target_irregular``: lines that are no regular grid. The error's context holds the figures, and
+        ``segments_px`` for a picture where there are any.
+
+    Notes
+    -----
+    A grid without marks looks the same after a turn by 90 or 180 degrees and in a mirror, see :class:`GridView`.
+
+    References
+    ----------
+    Helm, McNeill, Sutton, "Improved three-dimensional image correlation for surface displacement measurement", Opt.
+    Eng. 35 (1996), section 3.2.2.
+    """
+    opts = GridOptions() if options is None else options
+    if localiser not in ("profile", "paper"):
+        raise ValueError(f"localiser must be 'profile' or 'paper', got {localiser!r}")
+    model: LineModel = opts.line_model or ("straight" if localiser == "profile" else "parabola")
+    if localiser == "paper" and model != "parabola":
+        raise ValueError(f"the paper's localiser fits parabolas; line_model {model!r} needs the profile localiser")
+    grey = checked_image(image)
+    size = (grey.shape[1], grey.shape[0])
+    picture = line_picture(grey, target)
+    lattice = find_lattice(picture, directions(picture))
+    check_lattice(lattice, target, size, opts)
+    nodes = lattice.nodes_px
+
+    saturation = opts.saturation if opts.saturation is not None else saturation_level(image)
+    try:
+        # first from the coarse lines, with a search across; then from the fitted lines, with their blur
+        coarse = _measure(grey, nodes, target, saturation, opts, model="straight", blur_px=None)
+        found = _measure(grey, coarse.fit.nodes_px, target, saturation, opts, model=model, blur_px=coarse.blur_px)
+        nodes, covariance = found.fit.nodes_px, found.fit.covariance_px2
+        if localiser == "paper":
+            parabolas = dark_pixel_lines(grey, found.table, found.fits, found.good, dark_lines=target.dark_lines)
+            nodes, covariance = meet_non_oblique(parabolas, nodes)
+    except np.linalg.LinAlgError as error:
+        raise TargetError(
+            f"a line of the grid cannot be fitted: {error}",
+            code="target_dirty",
+            remedy="Clean the grid and focus on it.",
+        ) from error
+    check_regular(found.fit.straight_px, nodes, target)
+    good, fits = found.good, found.fits
+    residual = found.fit.residual_px[found.used]
+    return GridView(
+        target=target,
+        xy_px=np.ascontiguousarray(nodes[1:-1, 1:-1]),
+        covariance_px2=np.ascontiguousarray(covariance[1:-1, 1:-1]),
+        localiser=localiser,
+        line_model=model,
+        image_size_px=size,
+        noise=float(np.median(fits[good, OUT["rms"]])),
+        contrast=float(np.median(np.abs(fits[good, OUT["amplitude"]]))),
+        background=float(np.median(fits[good, OUT["ground"]])),
+        blur_px=found.blur_px,
+        line_width_px=float(np.median(fits[good, OUT["width"]])),
+        pitch_px=pitch_px(nodes),
+        threshold=THRESHOLD if localiser == "paper" else picture.threshold,
+        rotation_rad=lattice.rotation_rad,
+        fit_rms_px=float(np.sqrt(np.mean(residual**2))),
+        pieces_px=found.table.ends_px(),
+        pieces_used=good,
+    )
+
+
+class _Measured(NamedTuple):
+    table: PieceTable
+    fits: Float
+    good: Bool
+    fit: LineFit
+    used: Bool
+    blur_px: float
+
+
+def _measure(
+    grey: NDArray[np.float32], nodes_px: Float, target: GridTarget, saturation: float, options: GridOptions, *,
+    model: LineModel, blur_px: float | None,
+) -> _Measured:  # fmt: skip
+    """Fit the pieces between given intersections, judge them, and fit the lines."""
+    node_sigma_px = target.node_tolerance_mm / np.sqrt(3.0) * pitch_px(nodes_px) / target.pitch_mm
+    table = piece_table(nodes_px, target, blur_px=blur_px)
+    fits = fit_pieces(grey, table.rows, dark_lines=target.dark_lines)
+    good, cause = judge_pieces(table, fits, target, saturation)
+    check_coverage(table, good, cause, options)
+    pp = line_points(table, fits)
+    size = (grey.shape[1], grey.shape[0])
+    used = good[pp.piece]
+    for _ in range(_ROUNDS):
+        fit = fit_lines(
+            pp.points, counts=target.lines, image_size_px=size, model=model, node_sigma_px=node_sigma_px, used=used
+        )
+        z = np.abs(fit.residual_px) / np.sqrt(fit.variance_px2)
+        # a grid worse than described spreads all points: judge by their own scatter then
+        limit = _OUTLIER * max(1.0, 1.4826 * float(np.median(z[used])))
+        spoilt = np.unique(pp.piece[z > limit])
+        fitting = good.copy()
+        fitting[spoilt] = False
+        if (fitting[pp.piece] == used).all():
+            break
+        used = fitting[pp.piece]
+        cause = np.where(good & ~fitting, "dirt", cause)
+        check_coverage(table, fitting, cause, options)
+    used_pieces = np.zeros(len(good), dtype=bool)
+    used_pieces[pp.piece[used]] = True
+    blur = float(np.median(fits[used_pieces, OUT["blur"]]))
+    return _Measured(table, fits, used_pieces, fit, used, blur)

@@ -1,0 +1,239 @@
+"""From two sets of lines to numbered intersections, or to the reason why not.
+
+Family a: lines at constant X_sys, crossed walking along X_sys (right and down in the image); family b: lines at
+constant Y_sys.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from core.errors import TargetError
+from core.grid.chains import Chain, CoarseLine, link, order
+from core.grid.pieces import Directions, family_pieces
+from core.grid.threshold import LinePicture
+from core.lens import Float
+
+_LEAST_CROSSING_RAD = np.radians(40.0)
+_LEAST_LINES = 4
+_STRAY_END = 0.1  # of the pitch; an end line that is off by more is an edge or a frame
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Numbered lines and their intersections.
+
+    Parameters
+    ----------
+    nodes_px
+        (m_a, m_b, 2) intersections of the lines found, straight from the coarse lines, or predicted where a line
+        was missed.
+    plane_to_image
+        (3, 3) homography from (number in a, number in b, 1).
+    rotation_rad
+        Rotation of the lattice in the image.
+    strays
+        Lines that belong to neither family's sequence.
+    """
+
+    nodes_px: Float
+    plane_to_image: Float
+    rotation_rad: float
+    strays: tuple[CoarseLine, ...]
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Lines of family a and b."""
+        return self.nodes_px.shape[0], self.nodes_px.shape[1]
+
+    @property
+    def pitch_px(self) -> float:
+        """Median distance of neighbouring intersections."""
+        return pitch_px(self.nodes_px)
+
+
+def pitch_px(nodes_px: Float) -> float:
+    """Return the median distance of neighbours in a lattice (m_a, m_b, 2)."""
+    da = np.linalg.norm(np.diff(nodes_px, axis=0), axis=-1).ravel()
+    db = np.linalg.norm(np.diff(nodes_px, axis=1), axis=-1).ravel()
+    return float(np.median(np.concatenate([da, db])))
+
+
+def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
+    """Try the picture's main directions in pairs; return the lattice with the most line seen.
+
+    Raises
+    ------
+    TargetError
+        ``target_not_found`` if no pair of directions has four lines each.
+    """
+    best: Lattice | None = None
+    best_seen = 0.0
+    most = (0, 0)
+    for p in range(len(found.peaks_rad)):
+        for q in range(p + 1, len(found.peaks_rad)):
+            apart = abs(found.peaks_rad[p] - found.peaks_rad[q])
+            if min(apart, np.pi - apart) < _LEAST_CROSSING_RAD:
+                continue
+            lattice, seen, counts = _try_pair(picture, found, found.peaks_rad[p], found.peaks_rad[q])
+            most = max(most, counts, key=min)
+            if lattice is not None and seen > best_seen:
+                best, best_seen = lattice, seen
+    if best is None:
+        raise not_found(
+            f"no two families of lines: {most[0]} and {most[1]} parallel lines at best, with a threshold of"
+            f" {picture.threshold:.3g} grey levels over a noise of {picture.noise:.3g}",
+            found_a=most[0],
+            found_b=most[1],
+        )
+    return best
+
+
+def not_found(cause: str, **context: Any) -> TargetError:
+    """Return the error for an image without a grid."""
+    return TargetError(cause, code="target_not_found", **context)
+
+
+def _try_pair(
+    picture: LinePicture, found: Directions, first_rad: float, second_rad: float
+) -> tuple[Lattice | None, float, tuple[int, int]]:
+    # X_sys runs right and down: its direction lies in (0, 90) degrees of the image, and family b runs along it
+    along_x, along_y = sorted((first_rad, second_rad))
+    if along_x > 0.5 * np.pi or along_y < 0.5 * np.pi:
+        # both in one quadrant: a lattice near 0 or 90 degrees, or strongly sheared; nearest to 45 degrees is X
+        candidates = (first_rad, second_rad)
+        off = [abs(((c - 0.25 * np.pi + 0.5 * np.pi) % np.pi) - 0.5 * np.pi) for c in candidates]
+        along_x = candidates[int(np.argmin(off))]
+        along_y = candidates[1 - int(np.argmin(off))]
+    pieces_a = family_pieces(picture, found, along_y)
+    pieces_b = family_pieces(picture, found, along_x)
+    if min(len(pieces_a), len(pieces_b)) < _LEAST_LINES:
+        return None, 0.0, (0, 0)
+    centre = np.median(np.concatenate([pieces_a.centre_px, pieces_b.centre_px]), axis=0)
+    # X grows to the right; where its direction is steep, downwards: one rule, since both are positive in (0, 90)
+    # degrees
+    x_dir = np.array([np.cos(along_x), np.sin(along_x)])
+    y_dir = np.array([np.cos(along_y), np.sin(along_y)])
+    if x_dir.sum() < 0.0:
+        x_dir = -x_dir
+    if x_dir[0] * y_dir[1] - x_dir[1] * y_dir[0] < 0.0:  # right-handed, y down: clockwise from X to Y
+        y_dir = -y_dir
+    chain_a = order(link(pieces_a), centre, x_dir)
+    chain_b = order(link(pieces_b), centre, y_dir)
+    counts = (len(chain_a.lines), len(chain_b.lines))
+    if min(counts) < _LEAST_LINES:
+        return None, 0.0, counts
+    chain_a, chain_b = _without_stray_ends(chain_a, chain_b)
+    counts = (len(chain_a.lines), len(chain_b.lines))
+    if min(counts) < _LEAST_LINES:
+        return None, 0.0, counts
+    seen = sum(line.seen_px for line in chain_a.lines) + sum(line.seen_px for line in chain_b.lines)
+    return _lattice(chain_a, chain_b), seen, counts
+
+
+def _without_stray_ends(chain_a: Chain, chain_b: Chain) -> tuple[Chain, Chain]:
+    """Drop end lines that the other lines' lattice does not predict."""
+    for _ in range(2):
+        chain_a = _drop_ends(chain_a, chain_b)
+        chain_b = _drop_ends(chain_b, chain_a)
+    return chain_a, chain_b
+
+
+def _drop_ends(chain: Chain, other: Chain) -> Chain:
+    for end in (0, -1):
+        if len(chain.lines) <= _LEAST_LINES:
+            break
+        keep = np.ones(len(chain.lines), dtype=bool)
+        keep[end] = False
+        inner = Chain(tuple(line for line, k in zip(chain.lines, keep, strict=True) if k), chain.number[keep], ())
+        i, j, xy = _known_nodes(inner, other)
+        H = homography(np.stack([i, j], axis=-1), xy)
+        number = np.full(len(other.number), chain.number[end])
+        guess = apply_homography(H, np.stack([number, other.number], axis=-1).astype(np.float64))
+        step = guess - apply_homography(
+            H, np.stack([number + (1 if end == 0 else -1), other.number], axis=-1).astype(np.float64)
+        )
+        truth = np.array([crossing(chain.lines[end], line) for line in other.lines])
+        off = np.linalg.norm(truth - guess, axis=-1) / np.linalg.norm(step, axis=-1)
+        if np.median(off) > _STRAY_END:
+            number_kept = chain.number[keep]
+            chain = Chain(inner.lines, number_kept - number_kept[0], (*chain.strays, chain.lines[end]))
+    return chain
+
+
+def _known_nodes(chain_a: Chain, chain_b: Chain) -> tuple[Float, Float, Float]:
+    rows = [
+        (float(i), float(j), *crossing(line_a, line_b))
+        for i, line_a in zip(chain_a.number, chain_a.lines, strict=True)
+        for j, line_b in zip(chain_b.number, chain_b.lines, strict=True)
+    ]
+    table = np.array(rows)
+    return table[:, 0], table[:, 1], table[:, 2:]
+
+
+def _lattice(chain_a: Chain, chain_b: Chain) -> Lattice:
+    i, j, xy = _known_nodes(chain_a, chain_b)
+    H = homography(np.stack([i, j], axis=-1), xy)
+    grid = np.stack(np.meshgrid(np.arange(chain_a.count), np.arange(chain_b.count), indexing="ij"), axis=-1)
+    nodes = apply_homography(H, grid.astype(np.float64))
+    nodes[i.astype(int), j.astype(int)] = xy
+    return Lattice(nodes, H, lattice_rotation(H, (chain_a.count, chain_b.count)), (*chain_a.strays, *chain_b.strays))
+
+
+def lattice_rotation(plane_to_image: Float, counts: tuple[int, int]) -> float:
+    """Rotation of the lattice at its centre: the rotation part of the local affine map's polar decomposition.
+
+    For a camera turned by gamma about the image's y axis the map is diag(cos gamma, 1) R(alpha), whose rotation
+    part is alpha.
+    """
+    centre = np.array([0.5 * (counts[0] - 1), 0.5 * (counts[1] - 1)])
+    hx, hy = 1e-3 * np.eye(2)
+    ex = apply_homography(plane_to_image, centre + hx) - apply_homography(plane_to_image, centre - hx)
+    ey = apply_homography(plane_to_image, centre + hy) - apply_homography(plane_to_image, centre - hy)
+    return float(np.arctan2(ex[1] - ey[0], ex[0] + ey[1]))
+
+
+def crossing(first: CoarseLine, second: CoarseLine) -> Float:
+    """Meet two coarse lines, (2,); from the straight lines first, then along the parabolas."""
+    s = 0.0
+    t = 0.0
+    for _ in range(4):
+        p, q = first.point(s), second.point(t)
+        dp = (first.point(s + 0.5) - first.point(s - 0.5)).ravel()
+        dq = (second.point(t + 0.5) - second.point(t - 0.5)).ravel()
+        ds, dt = np.linalg.solve(np.column_stack([dp, -dq]), q - p)
+        s, t = s + float(ds), t + float(dt)
+    return np.asarray(first.point(s))
+
+
+def homography(plane: Float, image: Float, weights: Float | None = None) -> Float:
+    """Least-squares homography (3, 3) from plane points (n, 2) to image points (n, 2), normalised, linear."""
+    Tp, p = _normalise(plane)
+    Ti, q = _normalise(image)
+    n = len(p)
+    A = np.zeros((2 * n, 9))
+    A[0::2, 0:2], A[0::2, 2] = p, 1.0
+    A[1::2, 3:5], A[1::2, 5] = p, 1.0
+    A[0::2, 6:8], A[0::2, 8] = -q[:, :1] * p, -q[:, 0]
+    A[1::2, 6:8], A[1::2, 8] = -q[:, 1:] * p, -q[:, 1]
+    if weights is not None:
+        A *= np.repeat(weights, 2)[:, None]
+    _, vectors = np.linalg.eigh(A.T @ A)
+    H = np.linalg.inv(Ti) @ vectors[:, 0].reshape(3, 3) @ Tp
+    return np.asarray(H / H[2, 2])
+
+
+def apply_homography(H: Float, points: Float) -> Float:
+    """Map points (..., 2)."""
+    p = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ H.T
+    return np.asarray(p[..., :2] / p[..., 2:])
+
+
+def _normalise(points: Float) -> tuple[Float, Float]:
+    centre = points.mean(axis=0)
+    scale = np.sqrt(2.0) / max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean())), 1e-12)
+    T = np.array([[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]])
+    return T, (points - centre) * scale

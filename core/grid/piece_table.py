@@ -1,0 +1,155 @@
+"""The pieces of lines between crossings: where to look for them, and what the fits say of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.grid.lines import LinePoints
+from core.grid.profile import IN, INPUTS, OUT
+from core.lens import Float
+from core.target import GridTarget
+
+_FIRST_BLUR_PX = 0.7
+_SEARCH_SHARE = 0.2  # of the spacing to the next line
+_STRIP_SHARE = 0.45
+
+
+@dataclass(frozen=True)
+class PieceTable:
+    """All pieces of a lattice, family a first.
+
+    Parameters
+    ----------
+    rows
+        (n, len(INPUTS)) for :func:`core.grid.profile.fit_pieces`.
+    family, line, place
+        (n,) family, number of the line, and number of the crossing at which the piece begins.
+    counts
+        (n_a, n_b) lines.
+    """
+
+    rows: Float
+    family: NDArray[np.intp]
+    line: NDArray[np.intp]
+    place: NDArray[np.intp]
+    counts: tuple[int, int]
+
+    def ends_px(self) -> Float:
+        """Return both ends of each piece, (n, 2, 2)."""
+        columns = (IN["start_x"], IN["start_y"]), (IN["end_x"], IN["end_y"])
+        return np.stack([self.rows[:, list(c)] for c in columns], axis=1)
+
+    def line_index(self) -> NDArray[np.intp]:
+        """Number of the line over both families, (n,)."""
+        return self.line + np.where(self.family == 0, 0, self.counts[0])
+
+
+def piece_table(nodes_px: Float, target: GridTarget, *, blur_px: float | None) -> PieceTable:
+    """Lay the pieces between the intersections (n_a, n_b, 2).
+
+    Parameters
+    ----------
+    nodes_px
+        Intersections, to a fraction of the spacing when ``blur_px`` is None, else to a fraction of a pixel.
+    target
+        For the line's width.
+    blur_px
+        Known blur; None searches across the line first.
+    """
+    tables = [_family(nodes_px, 0), _family(np.swapaxes(nodes_px, 0, 1), 1)]
+    rows = np.concatenate([t[0] for t in tables])
+    spacing = np.concatenate([t[1] for t in tables])
+    rows[:, IN["width"]] = np.maximum(spacing * target.line_width_mm / target.pitch_mm, 0.05)
+    rows[:, IN["blur"]] = _FIRST_BLUR_PX if blur_px is None else blur_px
+    rows[:, IN["search"]] = _SEARCH_SHARE * spacing if blur_px is None else 0.0
+    rows[:, IN["room"]] = _STRIP_SHARE * spacing
+    family, line, place = (np.concatenate([t[k] for t in tables]) for k in (2, 3, 4))
+    return PieceTable(rows, family, line, place, (nodes_px.shape[0], nodes_px.shape[1]))
+
+
+def _family(nodes: Float, family: int) -> tuple[Float, Float, NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Pieces of the lines along axis 1 of ``nodes`` (lines, crossings, 2); their table, spacing and numbers."""
+    n_line, n_cross = nodes.shape[:2]
+    start, end = nodes[:, :-1], nodes[:, 1:]
+    chord = end - start
+    length = np.linalg.norm(chord, axis=-1)
+    direction = chord / length[..., None]
+    normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
+    bend = _bends(nodes)
+    middle = 0.5 * (start + end) - normal * (bend * length**2 / 4.0)[..., None]
+    # the crossing lines' directions at the intersections, and the distance to the next line
+    step = np.gradient(nodes, axis=0)
+    cross = np.stack([-step[..., 1], step[..., 0]], axis=-1)
+    cross /= np.linalg.norm(cross, axis=-1, keepdims=True)
+    gap = 0.5 * (step[:, :-1] + step[:, 1:])
+    spacing = np.abs(np.sum(gap * normal, axis=-1))
+    rows = np.zeros((n_line, n_cross - 1, len(INPUTS)))
+    for names, value in (
+        (("x", "y"), middle), (("dir_x", "dir_y"), direction), (("start_x", "start_y"), start),
+        (("end_x", "end_y"), end), (("start_nx", "start_ny"), cross[:, :-1]), (("end_nx", "end_ny"), cross[:, 1:]),
+    ):  # fmt: skip
+        for k, name in enumerate(names):
+            rows[..., IN[name]] = value[..., k]
+    rows[..., IN["half_length"]] = 0.5 * length
+    rows[..., IN["bend"]] = bend
+    number = np.broadcast_to(np.arange(n_line)[:, None], length.shape).ravel()
+    place = np.broadcast_to(np.arange(n_cross - 1)[None], length.shape).ravel()
+    return rows.reshape(-1, len(INPUTS)), spacing.ravel(), np.full(number.size, family), number, place
+
+
+def _bends(nodes: Float) -> Float:
+    """Half the second derivative of each line across its chord, at each piece's middle, (lines, crossings - 1)."""
+    out = np.zeros((nodes.shape[0], nodes.shape[1] - 1))
+    for k, line in enumerate(nodes):
+        direction = line[-1] - line[0]
+        length = float(np.linalg.norm(direction))
+        direction = direction / length
+        t = (line - line[0]) @ direction / length
+        off = (line - line[0]) @ np.array([-direction[1], direction[0]])
+        p = np.polynomial.Polynomial.fit(t, off, min(3, len(t) - 2), domain=[0.0, 1.0], window=[0.0, 1.0])
+        out[k] = 0.5 * p.deriv(2)(0.5 * (t[1:] + t[:-1])) / length**2
+    return out
+
+
+@dataclass(frozen=True)
+class PiecePoints:
+    """Line points and the pieces they come from: two points a piece whose errors are independent."""
+
+    points: LinePoints
+    piece: NDArray[np.intp]
+
+
+def line_points(table: PieceTable, fits: Float) -> PiecePoints:
+    """Turn each fitted piece's offset and slope into two line points with independent errors.
+
+    The errors of offset and slope make the offset's error smallest at one place; at equal distances on both sides
+    of it, where the slope's share equals the offset's own, the two errors are not correlated.
+    """
+    piece = np.flatnonzero(fits[:, OUT["ok"]] > 0.0)
+    f, r = fits[piece], table.rows[piece]
+    var0, cov, var1 = f[:, OUT["var_c0"]], f[:, OUT["cov_c01"]], f[:, OUT["var_c1"]]
+    at = np.clip(-cov / var1, -r[:, IN["half_length"]], r[:, IN["half_length"]])
+    least = np.maximum(var0 - cov**2 / var1, 1e-16)
+    apart = np.minimum(np.sqrt(least / var1), r[:, IN["half_length"]])
+    direction = r[:, [IN["dir_x"], IN["dir_y"]]]
+    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
+    points, along = [], []
+    for sign in (-1.0, 1.0):
+        t = at + sign * apart
+        off = f[:, OUT["c0"]] + f[:, OUT["c1"]] * t + r[:, IN["bend"]] * t**2
+        points.append(r[:, [IN["x"], IN["y"]]] + t[:, None] * direction + off[:, None] * normal)
+        along.append(table.place[piece] + 0.5 + 0.5 * t / r[:, IN["half_length"]])
+    return PiecePoints(
+        LinePoints(
+            np.concatenate(points),
+            np.tile(normal, (2, 1)),
+            np.tile(np.sqrt(2.0 * least), 2),
+            np.tile(table.family[piece], 2),
+            np.tile(table.line[piece], 2),
+            np.concatenate(along),
+        ),
+        np.tile(piece, 2),
+    )

@@ -1,0 +1,314 @@
+"""Maximum-likelihood fit of one piece of a line: the profile that a straight line of known width leaves in square
+pixels.
+
+A line of width w, blurred by a Gaussian of standard deviation s and integrated over square pixels, crosses the
+piece's normal (n_x, n_y) with the profile
+
+    P(d) = (1 / (|n_x| |n_y|)) sum over signs of  +-G2(d +- w/2 +- |n_x|/2 +- |n_y|/2),   G2'' = Phi(d / s)
+
+since a square pixel, seen along the line, is the convolution of two boxes of widths |n_x| and |n_y|. The grey level
+is
+
+    I = B + B_t t + B_d d + A P(d - c0 - c1 t)
+
+with distance along the piece t and across it d, from a base parabola. With Gaussian noise, least squares is the
+maximum of the likelihood. P is even, so that width and blur are not correlated with the place c0, c1.
+"""
+
+from __future__ import annotations
+
+from math import erf, exp, sqrt
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from core.lens import Float
+
+# columns of the table of pieces
+INPUTS = (
+    "x", "y", "dir_x", "dir_y", "half_length", "bend",
+    "start_x", "start_y", "start_nx", "start_ny", "end_x", "end_y", "end_nx", "end_ny",
+    "width", "blur", "search", "room",
+)  # fmt: skip
+OUTPUTS = (
+    "c0", "c1", "var_c0", "cov_c01", "var_c1", "amplitude", "var_amplitude", "ground", "ground_t", "ground_d", "blur",
+    "width", "rms", "n_pixels", "brightest", "ok", "peak",
+)  # fmt: skip
+IN = {name: k for k, name in enumerate(INPUTS)}
+OUT = {name: k for k, name in enumerate(OUTPUTS)}
+
+_STEPS = 12
+_N = 8  # c0, c1, B, B_t, B_d, A, s, w
+_WIDTH_SEEN = 2.0  # px; narrower lines' width cannot be told from their depth
+_MOST_BLUR = 8.0
+_LEAST_PIXELS = 20
+
+
+@njit(cache=True, nogil=True)
+def profile_terms(d: float, width: float, blur: float, a: float, b: float) -> tuple[float, float, float, float]:
+    """Return P, dP/dd, dP/ds and dP/dw at the distance d."""
+    p = 0.0
+    pd = 0.0
+    pdd = 0.0
+    pw = 0.0
+    r2 = 1.0 / (blur * 1.4142135623730951)
+    g0 = blur * 0.3989422804014327
+    s2 = blur * blur
+    for k in range(8):
+        ew = 1.0 if k & 1 else -1.0
+        ea = 1.0 if k & 2 else -1.0
+        eb = 1.0 if k & 4 else -1.0
+        sign = ew * ea * eb
+        u = d + 0.5 * (ew * width + ea * a + eb * b)
+        z = u * r2
+        if z > 6.0:
+            phi0 = 1.0
+            g = 0.0
+        elif z < -6.0:
+            continue
+        else:
+            phi0 = 0.5 * (1.0 + erf(z))
+            g = g0 * exp(-z * z)
+        g1 = u * phi0 + g
+        p += sign * 0.5 * ((u * u + s2) * phi0 + u * g)
+        pd += sign * g1
+        pw += sign * ew * 0.5 * g1
+        pdd += sign * phi0
+    f = 1.0 / (a * b)
+    return p * f, pd * f, blur * pdd * f, pw * f
+
+
+@njit(cache=True, nogil=True)
+def strip_bounds(piece: Float, half_width: float, rows: int, cols: int) -> tuple[int, int, int, int]:
+    """Pixel box (x0, x1, y0, y1), half open, that holds the piece's strip."""
+    dx, dy, h = abs(piece[2]), abs(piece[3]), piece[4]
+    rx = dx * h + dy * half_width + 1.0
+    ry = dy * h + dx * half_width + 1.0
+    x0 = max(0, int(np.floor(piece[0] - rx)))
+    x1 = min(cols, int(np.ceil(piece[0] + rx)) + 1)
+    y0 = max(0, int(np.floor(piece[1] - ry)))
+    y1 = min(rows, int(np.ceil(piece[1] + ry)) + 1)
+    return x0, x1, y0, y1
+
+
+@njit(cache=True, nogil=True)
+def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) -> tuple[bool, float, float]:
+    """Tell whether a pixel lies in the piece's strip, away from both crossings, and its t and d."""
+    ex, ey = x - piece[0], y - piece[1]
+    t = ex * piece[2] + ey * piece[3]
+    d = -ex * piece[3] + ey * piece[2] - piece[5] * t * t
+    if abs(t) > piece[4] or abs(d) > half_width:
+        return False, t, d
+    if abs((x - piece[6]) * piece[8] + (y - piece[7]) * piece[9]) < guard:
+        return False, t, d
+    if abs((x - piece[10]) * piece[12] + (y - piece[11]) * piece[13]) < guard:
+        return False, t, d
+    return True, t, d
+
+
+@njit(cache=True, nogil=True)
+def _search(image: Float, piece: Float, guard: float, sign: float) -> float:
+    """Where the strip's mean profile is deepest within the search range; matched with a box of the line's width."""
+    search = piece[16]
+    reach = search + 2.0 + piece[14]
+    n_bin = 2 * int(np.ceil(2.0 * reach)) + 1
+    mid = n_bin // 2
+    total = np.zeros(n_bin)
+    count = np.zeros(n_bin)
+    x0, x1, y0, y1 = strip_bounds(piece, reach, image.shape[0], image.shape[1])
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            inside, _, d = in_strip(piece, float(x), float(y), reach, guard)
+            if inside:
+                k = mid + int(np.floor(2.0 * d + 0.5))
+                if 0 <= k < n_bin:
+                    total[k] += sign * image[y, x]
+                    count[k] += 1.0
+    half = max(1, int(np.floor(piece[14] + 0.5)))
+    best, at = -np.inf, 0.0
+    for k in range(mid - int(2.0 * search), mid + int(2.0 * search) + 1):
+        inner, n_in, outer, n_out = 0.0, 0.0, 0.0, 0.0
+        for m in range(k - half - 4, k + half + 5):
+            if 0 <= m < n_bin and count[m] > 0.0:
+                if abs(m - k) <= half:
+                    inner += total[m]
+                    n_in += count[m]
+                elif abs(m - k) > half + 1:
+                    outer += total[m]
+                    n_out += count[m]
+        if n_in > 0.0 and n_out > 0.0:
+            value = inner / n_in - outer / n_out
+            if value > best:
+                best, at = value, 0.5 * (k - mid)
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _fit_piece(image: Float, piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
+    out[:] = np.nan
+    out[15] = 0.0
+    width, blur = piece[14], piece[15]
+    fit_width = width > _WIDTH_SEEN
+    a, b = abs(piece[2]), abs(piece[3])
+    spread = sqrt(blur * blur + 1.0 / 12.0)
+    guard = 0.5 * width + guard_blurs * spread
+    half_width = max(min(0.5 * width + 5.0 * spread + 1.0, piece[17]), 0.5 * width + 2.0 * spread)
+    rows, cols = image.shape
+    c0 = _search(image, piece, guard, sign) if piece[16] > 0.0 else 0.0
+    x0, x1, y0, y1 = strip_bounds(piece, half_width + abs(c0), rows, cols)
+    room = (x1 - x0) * (y1 - y0)
+    if room <= 0:
+        return
+    ts = np.empty(room)
+    ds = np.empty(room)
+    gs = np.empty(room)
+    n = 0
+    brightest = -np.inf
+    moved = piece.copy()  # the strip is centred on the line, or its ground would lean
+    moved[0] += -piece[3] * c0
+    moved[1] += piece[2] * c0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            inside, t, d = in_strip(moved, float(x), float(y), half_width, guard)
+            if inside:
+                ts[n] = t
+                ds[n] = d + c0
+                gs[n] = image[y, x]
+                brightest = max(brightest, gs[n])
+                n += 1
+    if n < _LEAST_PIXELS:
+        return
+    scale = 1.0 / max(piece[4], 1.0)
+    par = np.zeros(_N)
+    par[0] = c0
+    par[6] = blur
+    par[7] = width
+    # start of the linear part: ground from the outer half of the strip
+    ground, n_ground, line, n_line = 0.0, 0, 0.0, 0
+    for k in range(n):
+        if abs(ds[k] - c0) > 0.5 * (width + half_width) * 0.5 + 0.5:
+            ground += gs[k]
+            n_ground += 1
+        elif abs(ds[k] - c0) < 0.5 * width + 0.3:
+            line += gs[k]
+            n_line += 1
+    if n_ground == 0 or n_line == 0:
+        return
+    par[2] = ground / n_ground
+    peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
+    par[5] = (line / n_line - par[2]) / max(peak, 0.1)
+    N = np.zeros((_N, _N))
+    g = np.zeros(_N)
+    J = np.zeros(_N)
+    trial = par.copy()
+    lam = 0.0
+    best = np.inf
+    kept = False
+    for step in range(_STEPS):
+        N[:] = 0.0
+        g[:] = 0.0
+        rss = 0.0
+        for k in range(n):
+            p, pd, ps, pw = profile_terms(ds[k] - trial[0] - trial[1] * ts[k] * scale, trial[7], trial[6], a, b)
+            J[0] = -trial[5] * pd
+            J[1] = J[0] * ts[k] * scale
+            J[2] = 1.0
+            J[3] = ts[k] * scale
+            J[4] = ds[k]
+            J[5] = p
+            J[6] = trial[5] * ps
+            J[7] = trial[5] * pw if fit_width else 0.0
+            r = gs[k] - (trial[2] + trial[3] * J[3] + trial[4] * ds[k] + trial[5] * p)
+            rss += r * r
+            for i in range(_N):
+                g[i] += J[i] * r
+                for j in range(i, _N):
+                    N[i, j] += J[i] * J[j]
+        if not rss <= best * (1.0 + 1e-9):  # also NaN
+            if step == 0:
+                return
+            lam = max(4.0 * lam, 1e-3)
+            # half way back
+            for i in range(_N):
+                trial[i] = 0.5 * (trial[i] + par[i])
+            continue
+        settled = kept and best - rss < 1e-7 * best
+        best = rss
+        kept = True
+        par[:] = trial
+        if not fit_width:
+            N[7, 7] = 1.0
+            g[7] = 0.0
+        # a hair of damping on the shape keeps the matrix regular when blur or contrast say nothing
+        N[6, 6] *= 1.0 + 1e-6
+        N[6, 6] += 1e-9
+        for i in range(_N):
+            for j in range(i):
+                N[i, j] = N[j, i]
+        if settled or step == _STEPS - 1:
+            break
+        M = N.copy()
+        for i in range(_N):
+            M[i, i] *= 1.0 + lam
+            if not M[i, i] > 0.0:
+                return
+        delta = np.linalg.solve(M, g)
+        lam *= 0.2
+        for i in range(_N):
+            trial[i] = par[i] + delta[i]
+        trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
+        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MOST_BLUR, 2.0 * par[6] + 0.1))
+        trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
+    dof = n - (_N if fit_width else _N - 1)
+    variance = best / dof
+    C = np.linalg.inv(N)
+    peak, _, _, _ = profile_terms(0.0, par[7], par[6], a, b)
+    out[0] = par[0]
+    out[1] = par[1] * scale
+    out[2] = C[0, 0] * variance
+    out[3] = C[0, 1] * variance * scale
+    out[4] = C[1, 1] * variance * scale * scale
+    out[5] = par[5]
+    out[6] = C[5, 5] * variance
+    out[7] = par[2]
+    out[8] = par[3] * scale
+    out[9] = par[4]
+    out[10] = par[6]
+    out[11] = par[7]
+    out[12] = sqrt(variance)
+    out[13] = n
+    out[14] = brightest
+    out[15] = 1.0
+    out[16] = peak
+
+
+@njit(cache=True, nogil=True)
+def _fit_pieces(image: Float, pieces: Float, guard_blurs: float, sign: float, out: Float) -> None:
+    for k in range(pieces.shape[0]):
+        _fit_piece(image, pieces[k], guard_blurs, sign, out[k])
+
+
+def fit_pieces(image: NDArray[np.float32], pieces: Float, *, dark_lines: bool, guard_blurs: float = 5.0) -> Float:
+    """Fit every piece of the table.
+
+    Parameters
+    ----------
+    image
+        (rows, columns) float32 grey levels.
+    pieces
+        (n, :data:`INPUTS`) base lines, crossings, start values; pixels, and unit vectors.
+    dark_lines
+        Sign of the contrast looked for.
+    guard_blurs
+        Pixels nearer to a crossing line than half its width and this many blurs are left out.
+
+    Returns
+    -------
+    Float
+        (n, :data:`OUTPUTS`); NaN and ``ok`` = 0 where a piece has too few pixels or no minimum.
+    """
+    out = np.empty((len(pieces), len(OUTPUTS)))
+    table = np.ascontiguousarray(pieces, dtype=np.float64)
+    _fit_pieces(image, table, guard_blurs, -1.0 if dark_lines else 1.0, out)
+    return out

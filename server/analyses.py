@@ -1,0 +1,155 @@
+"""An analysis as a job: one task a step in the worker, each step's file announced once it can be read."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from core.errors import InputError, RegionError, StateError
+from server.api.models import AnalysisRequest
+from server.compute import run_task
+from server.io.files import sha256_of
+from server.io.images import decode_mask, read_image
+from server.jobs import Job
+from server.service import Service
+from server.store.durable import without_nan
+from server.tasks import StepTask, measure_step
+
+
+def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:
+    """Return the steps of an analysis, the reference first.
+
+    Raises
+    ------
+    StateError
+        ``no_steps`` if the reference does not exist.
+    InputError
+        ``step_missing`` if a step that was asked for does not exist.
+    """
+    there = service.tests.step_numbers(test_id)
+    if reference not in there:
+        raise StateError(
+            f"Test {test_id} has no step {reference} to refer to; it has {len(there)} steps.",
+            code="no_steps",
+            remedy="Capture or import the reference first.",
+        )
+    if wanted is None:
+        wanted = [n for n in there if n > reference]
+    missing = [n for n in wanted if n not in there]
+    if missing:
+        raise InputError(
+            f"Test {test_id} has no step {missing[0]}.", code="step_missing", remedy="Ask for steps that exist."
+        )
+    return [reference, *[n for n in dict.fromkeys(wanted) if n != reference]]
+
+
+def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Path) -> dict[str, Any]:
+    """Checksums of everything that an analysis reads, fixed when it is made."""
+    return {
+        "calibration_sha256": sha256_of(calibration),
+        "steps": {str(n): service.tests.step(test_id, n).document["sha256"] for n in steps},
+    }
+
+
+def check_region(service: Service, test_id: str, reference: int, body: AnalysisRequest, mask: bytes | None) -> None:
+    """Refuse a region that leaves nothing to measure, before a job is made of it.
+
+    Raises
+    ------
+    RegionError
+        ``region_empty``, ``region_outside``, ``subset_too_large``, ``seed_outside`` or ``mask_size``.
+    """
+    image = read_image(service.tests.step(test_id, reference).cam1)
+    rows, cols = image.shape
+    inside = f"Camera 1's image is {cols} x {rows} px."
+    if body.subset_px > min(rows, cols):
+        raise RegionError(f"A subset of {body.subset_px} px does not fit. {inside}", code="subset_too_large",
+                          remedy="Take a smaller subset.")  # fmt: skip
+    if body.region.rectangle is not None:
+        x0, y0, x1, y1 = body.region.rectangle
+        if x1 <= x0 or y1 <= y0:
+            raise RegionError(f"The rectangle from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) is empty.", code="region_empty",
+                              remedy="Give the upper left corner first, then the lower right one.")  # fmt: skip
+        corners = [(x0, y0), (x1, y1)]
+    else:
+        corners = list(body.region.polygon or [])
+    _check_inside("region", corners, cols, rows)
+    _check_inside("seed", list(body.seeds or []), cols, rows)
+    if mask is not None:
+        found = decode_mask(mask)
+        if found.shape != (rows, cols):
+            raise RegionError(f"The mask is {found.shape[1]} x {found.shape[0]} px. {inside}", code="mask_size",
+                              remedy="Draw the mask over camera 1's reference image.")  # fmt: skip
+        if not found.any():
+            raise RegionError("The mask is black everywhere.", code="region_empty",
+                              remedy="Paint white where points may lie.")  # fmt: skip
+
+
+def _check_inside(what: str, points: list[tuple[float, float]], cols: int, rows: int) -> None:
+    for x, y in points:
+        if not (0.0 <= x <= cols - 1 and 0.0 <= y <= rows - 1):
+            raise RegionError(
+                f"The {what}'s point ({x:g}, {y:g}) lies outside camera 1's image of {cols} x {rows} px.",
+                code=f"{what}_outside",
+                remedy="Stay inside camera 1's reference image.",
+            )
+
+
+def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> dict[str, Any]:
+    """Compute phase of an analysis."""
+    document = service.tests.analysis(test_id, analysis_id)
+    settings = document["settings"]
+    folder = service.tests.analysis_path(test_id, analysis_id)
+    steps: list[int] = document["steps"]
+    reference = service.tests.verified_step(test_id, steps[0])
+    summaries: list[dict[str, Any]] = []
+    job.result = {"analysis_id": analysis_id, "test_id": test_id, "steps_finished": [], "steps": summaries}
+    measured = steps if document["kind"] == "displacement" else None
+    total = len(steps)
+    for index, n in enumerate(steps):
+        job.check()
+        step = service.tests.verified_step(test_id, n)
+        task = StepTask(
+            folder=str(folder),
+            calibration=str(service.tests.calibration_file(test_id)),
+            kind="shape" if index == 0 or measured is None else "motion",
+            n=n,
+            reference=steps[0] if measured is not None else n,
+            images={
+                "ref1": str(reference.cam1),
+                "ref2": str(reference.cam2),
+                "cur1": str(step.cam1),
+                "cur2": str(step.cam2),
+            },
+            previous=steps[index - 1] if index > 0 else None,
+            settings=settings,
+            inputs={
+                "calibration.json": document["inputs"]["calibration_sha256"],
+                **{f"reference_{cam}": digest for cam, digest in reference.document["sha256"].items()},
+                **{f"step_{cam}": digest for cam, digest in step.document["sha256"].items()},
+            },
+            label=step.document["label"],
+            load_n=step.document["load_n"],
+        )
+        started = time.monotonic()
+
+        def progress(stage: str, done: int, of: int, *, index: int = index, n: int = n) -> None:
+            # steps are the unit a user thinks in; within a step, the points found so far
+            fraction = done / of if of > 0 else 0.0
+            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * total)
+
+        summary = run_task(service.worker, job, measure_step, task, progress=progress)
+        summary = without_nan({**summary, "n": n, "wall_s": round(time.monotonic() - started, 3)})
+        summaries.append(summary)
+        job.result["steps_finished"] = [s["n"] for s in summaries]
+        service.hub.publish("result", {"test_id": test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
+    job.progress("done", total, total)
+    return job.result
+
+
+def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
+    """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
+    found = (job.result or {}).get("steps", [])
+    document = {"analysis_id": analysis_id, "state": state, "job_id": job.id, "problem": job.problem, "steps": found}
+    service.tests.put_summary(test_id, analysis_id, document)

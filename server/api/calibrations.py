@@ -1,0 +1,137 @@
+"""Calibrations: begin, list, look, residuals, views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+from fastapi import APIRouter, Query
+from fastapi.responses import FileResponse, Response
+
+from core.errors import StateError
+from server.api.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
+from server.api.models import CalibrationAccepted, CalibrationList, CalibrationReply, CalibrationRequest, CameraName
+from server.api.problems import errors
+from server.calibration_sequence import CalibrationPlan, check_plan, close, fit, plan_document, take_views, targets_of
+from server.io.images import read_image
+from server.jobs import Job, Phase
+from server.results import read_residuals
+
+router = APIRouter(prefix="/calibrations", tags=["calibrations"])
+
+
+@router.post(
+    "",
+    summary="Calibrate the pair",
+    response_model=CalibrationAccepted,
+    status_code=202,
+    responses=errors(409, 422, 503, 507),
+)
+def create_calibration(
+    service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None
+) -> dict[str, Any]:
+    """Move both cameras through the plan before the grid, then fit; the rig file gives what the body leaves out."""
+    body = body or CalibrationRequest.model_validate({})
+    usual = service.config.calibration
+    plan = CalibrationPlan(
+        positions_mm=tuple(usual.positions_mm if body.positions_mm is None else body.positions_mm),
+        held_out_mm=tuple(usual.held_out_mm if body.held_out_mm is None else body.held_out_mm),
+        frames=body.frames or usual.frames,
+        localiser=body.localiser or usual.localiser,
+        label=body.label,
+    )
+    request = mark("calibrations", key, body)
+
+    def make() -> dict[str, Any]:
+        check_plan(plan)
+        targets_of(service, plan)
+        made: dict[str, Any] = {}
+
+        def prepare() -> dict[str, Any]:
+            document = plan_document(plan, service.config) | request.document()
+            made["calibration_id"] = service.calibrations.create(
+                document, service.config.target.model_dump(mode="json")
+            )
+            return dict(made)
+
+        def hardware(job: Job) -> dict[str, Any]:
+            return take_views(service, job, made["calibration_id"], plan)
+
+        def compute(job: Job) -> dict[str, Any]:
+            return fit(service, job, made["calibration_id"])
+
+        job = service.jobs.submit(
+            "calibration",
+            "a calibration",
+            {},
+            [Phase("hardware", hardware), Phase("compute", compute)],
+            prepare=prepare,
+            on_end=lambda job, state: close(service, job, made["calibration_id"], state),
+            on_cancel=service.stop_if_moving,
+        )
+        return {**made, "job_id": job.id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"]), "calibration_id": made["calibration_id"]}
+
+
+@router.get("", summary="Calibrations, oldest first", response_model=CalibrationList)
+def list_calibrations(service: ServiceDep) -> dict[str, Any]:
+    """Return every calibration that was begun, with its state and verdict."""
+    return {"calibrations": service.catalog.entries("calibration")}
+
+
+@router.get("/{calibration_id}", summary="One calibration", response_model=CalibrationReply, responses=errors(404))
+def get_calibration(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+    """Return plan, views and, once complete, all of calibration.json."""
+    return service.calibrations.read(calibration_id)
+
+
+def _complete(service: ServiceDep, calibration_id: str) -> Path:
+    path = service.calibrations.path(calibration_id)
+    if not (path / "calibration.json").exists():
+        state = service.calibrations.read(calibration_id)["state"]
+        raise StateError(
+            f"Calibration {calibration_id} is {state}.", code="calibration_not_complete",
+            remedy="Wait for its job, or calibrate again.", state=state,
+        )  # fmt: skip
+    return path
+
+
+@router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))
+def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+    """Return, for each view, where every intersection was found and by how much the model misses it."""
+    return read_residuals(_complete(service, calibration_id) / "residuals.nc")
+
+
+@router.get(
+    "/{calibration_id}/file",
+    summary="calibration.json as stored",
+    response_class=FileResponse,
+    responses=errors(404, 409),
+)
+def get_file(service: ServiceDep, calibration_id: CalibrationId) -> FileResponse:
+    """Return the file, which `stereorig measure` reads."""
+    return FileResponse(_complete(service, calibration_id) / "calibration.json", media_type="application/json")
+
+
+@router.get(
+    "/{calibration_id}/views/{index}/{cam}",
+    summary="One view's image",
+    response_class=Response,
+    responses=errors(404, 422) | {200: {"content": {"image/tiff": {}, "image/png": {}}}},
+)
+def get_view(
+    service: ServiceDep,
+    calibration_id: CalibrationId,
+    index: int,
+    cam: CameraName,
+    format: Annotated[str, Query(pattern="^(png|tiff)$")] = "tiff",  # noqa: A002
+) -> Response:
+    """Return the image as stored (TIFF), or as PNG for looking at."""
+    path = service.calibrations.view_file(calibration_id, index, cam)
+    if format == "tiff":
+        return Response(path.read_bytes(), media_type="image/tiff")
+    _, data = cv2.imencode(".png", read_image(path))
+    return Response(data.tobytes(), media_type="image/png")

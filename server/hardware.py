@@ -1,0 +1,74 @@
+"""Who holds the hardware, and the one thread that talks to it.
+
+Hardware is never queued: a second caller is told who has it. Stopping needs neither the hold nor the thread.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from server.errors import BusyError
+
+T = TypeVar("T")
+
+
+class HardwareGate:
+    """Exclusive hold on cameras and stage, and their owner thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._holder: dict[str, Any] | None = None
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="hardware")
+
+    @property
+    def holder(self) -> dict[str, Any] | None:
+        """Who holds the hardware: ``what``, ``since_s`` and, for a job, ``job_id``."""
+        with self._lock:
+            if self._holder is None:
+                return None
+            shown = dict(self._holder)
+        shown["since_s"] = round(time.monotonic() - shown.pop("since"), 3)
+        return shown
+
+    def claim(self, what: str, **details: Any) -> object:
+        """Take the hold, or raise :class:`BusyError` with the holder; returns the token for :meth:`release`."""
+        with self._lock:
+            if self._holder is None:
+                self._holder = {"what": what, **details, "since": time.monotonic()}
+                return self._holder
+        holder = self.holder
+        if holder is None:  # released in between
+            return self.claim(what, **details)
+        raise BusyError(holder)
+
+    def release(self, token: object) -> None:
+        """Give the hold back; harmless if it is another's by now."""
+        with self._lock:
+            if self._holder is token:
+                self._holder = None
+
+    @contextmanager
+    def hold(self, what: str, **details: Any) -> Iterator[None]:
+        """Hold for a short operation."""
+        token = self.claim(what, **details)
+        try:
+            yield
+        finally:
+            self.release(token)
+
+    def start(self, function: Callable[[], None]) -> None:
+        """Run ``function`` on the owner thread, without waiting."""
+        self._thread.submit(function)
+
+    def call(self, function: Callable[[], T]) -> T:
+        """Run ``function`` on the owner thread and wait."""
+        return self._thread.submit(function).result()
+
+    def close(self) -> None:
+        """Let the owner thread end after what it is doing."""
+        self._thread.shutdown(wait=True, cancel_futures=True)

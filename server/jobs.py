@@ -1,0 +1,410 @@
+"""Jobs: anything that takes longer than a request.
+
+A job goes through phases, each on a lane: ``hardware`` (exclusive, never queued) or ``compute`` (queued, bounded, one
+at a time). Its states are ``queued running cancelling succeeded failed cancelled interrupted``. A job is in the
+catalogue before it is acknowledged; what was not finished when the service ended reads ``interrupted`` after the next
+start.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from core.errors import Cancelled, StateError, StereorigError, StorageError
+from server.errors import NotFoundError, QueueFullError
+from server.events import EventHub
+from server.hardware import HardwareGate
+from server.store.catalog import Catalog
+from server.store.durable import without_nan
+from server.store.folder import IdMaker, is_id, now_utc
+
+_log = logging.getLogger("stereorig.jobs")
+
+State = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
+FINAL: tuple[State, ...] = ("succeeded", "failed", "cancelled", "interrupted")
+ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
+RESTART = StateError(
+    "The service ended while the job was not finished.",
+    code="interrupted",
+    remedy="What was finished has been kept; start the job again for the rest.",
+)
+
+
+def problem_of(error: BaseException) -> dict[str, Any]:
+    """Describe an error as a job's ``problem``: code, cause, remedy and the values that a program may want."""
+    if isinstance(error, StereorigError):
+        context = {k: v for k, v in error.context.items() if isinstance(v, str | int | float | bool | list | dict)}
+        described = {"code": error.code, "cause": error.cause, "remedy": error.remedy, "context": context}
+        return dict(without_nan(described))
+    return {
+        "code": "internal_error",
+        "cause": f"{type(error).__name__}: {error}",
+        "remedy": "Report this with the service's log.",
+        "context": {},
+    }
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One phase of a job: where it runs, and what; what ``run`` returns is merged into the job's result."""
+
+    lane: Literal["hardware", "compute"]
+    run: Callable[[Job], dict[str, Any] | None]
+
+
+@dataclass(eq=False)
+class Job:
+    """One job; ``document`` is what the API shows. Doubles as progress callback and cancel token of its phases."""
+
+    id: str
+    kind: str
+    subject: dict[str, Any]
+    phases: Sequence[Phase]
+    publish: Callable[[Job, str], None]
+    state: State = "queued"
+    created_utc: str = field(default_factory=now_utc)
+    started_utc: str | None = None
+    finished_utc: str | None = None
+    result: dict[str, Any] | None = None
+    problem: dict[str, Any] | None = None
+    stage: str = "waiting"
+    done: int = 0
+    total: int = 0
+    #: called with the final state before that state is shown (writes summaries)
+    on_end: Callable[[Job, State], None] | None = None
+    #: called at once when the job is cancelled, from whatever thread asks (stops the stage)
+    on_cancel: Callable[[], None] | None = None
+    saving: threading.Lock = field(default_factory=threading.Lock)
+    _stage_since: float = 0.0
+    _last_shown: float = 0.0
+    _cancel: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether the job should stop (:class:`core.progress.CancelToken`)."""
+        return self._cancel.is_set()
+
+    def check(self) -> None:
+        """Raise :class:`core.errors.Cancelled` if the job should stop."""
+        if self.cancelled:
+            raise Cancelled(f"The {self.kind} was cancelled.")
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Report progress (:class:`core.progress.Progress`)."""
+        now = time.monotonic()
+        changed = stage != self.stage
+        if changed:
+            self._stage_since = now
+        self.stage, self.done, self.total = stage, done, total
+        # a kernel may report thousands of times a second; readers need ten
+        if changed or done >= total or now - self._last_shown > 0.1:
+            self._last_shown = now
+            self.publish(self, "progress")
+
+    @property
+    def eta_s(self) -> float | None:
+        """Seconds left in this stage, from its own pace; None while there is nothing to go by."""
+        if self.state not in ACTIVE or self.done <= 0 or self.total <= 0:
+            return None
+        elapsed = time.monotonic() - self._stage_since
+        return round(elapsed / self.done * max(self.total - self.done, 0), 2)
+
+    def document(self) -> dict[str, Any]:
+        """Return the job as the API shows and the catalogue keeps it."""
+        return {
+            "id": self.id,
+            "kind": self.kind,
+            "state": self.state,
+            "subject": self.subject,
+            "progress": {"stage": self.stage, "done": self.done, "total": self.total, "eta_s": self.eta_s},
+            "created_utc": self.created_utc,
+            "started_utc": self.started_utc,
+            "finished_utc": self.finished_utc,
+            "result": self.result,
+            "problem": self.problem,
+        }
+
+
+class JobManager:
+    """Runs jobs, keeps their table.
+
+    Parameters
+    ----------
+    queue_limit
+        How many compute phases may wait; beyond it :class:`QueueFullError`.
+    """
+
+    def __init__(
+        self, catalog: Catalog, hub: EventHub, gate: HardwareGate, ids: IdMaker, *, queue_limit: int = 16
+    ) -> None:
+        self._catalog = catalog
+        self._hub = hub
+        self._gate = gate
+        self._ids = ids
+        self.queue_limit = queue_limit
+        self._lock = threading.Lock()
+        self._active: dict[str, Job] = {}
+        self._queue: deque[Job] = deque()
+        self._reserved = 0  # jobs that will come to the compute lane after their hardware phase
+        self._wake = threading.Condition(self._lock)
+        self._closing = False
+        self._interrupt_left_overs()
+        self._thread = threading.Thread(target=self._run_compute, name="compute-jobs", daemon=True)
+        self._thread.start()
+
+    def _interrupt_left_overs(self) -> None:
+        for document in self._catalog.jobs():
+            self._ids.seen(document["id"])
+        for document in self._catalog.jobs(states=ACTIVE):
+            document |= {"state": "interrupted", "finished_utc": now_utc(), "problem": problem_of(RESTART)}
+            document["progress"]["eta_s"] = None
+            self._catalog.put_job(document["id"], "interrupted", document)
+
+    # making and finding ----------------------------------------------------------------------------------------
+
+    def submit(
+        self,
+        kind: str,
+        what: str,
+        subject: dict[str, Any],
+        phases: Sequence[Phase],
+        *,
+        prepare: Callable[[], dict[str, Any]] | None = None,
+        on_end: Callable[[Job, State], None] | None = None,
+        on_cancel: Callable[[], None] | None = None,
+    ) -> Job:
+        """Acknowledge a job and start it.
+
+        Parameters
+        ----------
+        what
+            The holder's name as a busy caller will read it.
+        prepare
+            Runs once it is certain that the job is accepted, before it starts; what it returns joins the subject.
+
+        Raises
+        ------
+        BusyError
+            The first phase needs the hardware and somebody has it.
+        QueueFullError
+            Too many computations wait.
+        """
+        job = Job(self._ids.new("j"), kind, dict(subject), phases, self._show, on_end=on_end, on_cancel=on_cancel)
+        computes = any(p.lane == "compute" for p in phases)
+        if computes:
+            self._reserve()
+        token: object | None = None
+        try:
+            if phases[0].lane == "hardware":
+                token = self._gate.claim(what, job_id=job.id, kind=kind)
+            if prepare is not None:
+                job.subject |= prepare()
+            self._catalog.put_job(job.id, job.state, job.document())
+        except BaseException:
+            if token is not None:
+                self._gate.release(token)
+            if computes:
+                self._unreserve()
+            raise
+        with self._lock:
+            self._active[job.id] = job
+        self._hub.publish("job", job.document())
+        if token is not None:
+            self._gate.start(lambda: self._run_hardware(job, token))
+        else:
+            self._enqueue(job)
+        return job
+
+    def _reserve(self) -> None:
+        with self._lock:
+            if self._closing:
+                raise StateError("The service is shutting down.", code="shutting_down", remedy="Start it again.")
+            if self._reserved >= self.queue_limit:
+                raise QueueFullError(f"{self._reserved} computations are waiting, the limit is {self.queue_limit}.")
+            self._reserved += 1
+
+    def _unreserve(self) -> None:
+        with self._lock:
+            self._reserved -= 1
+
+    def document(self, job_id: str) -> dict[str, Any]:
+        """Return a job of this or an earlier run."""
+        with self._lock:
+            job = self._active.get(job_id)
+        if job is not None:
+            return job.document()
+        found = self._catalog.job(job_id) if is_id(job_id, "j") else None
+        if found is None:
+            raise NotFoundError(f"There is no job {job_id[:40]!r}.", what="job")
+        return found
+
+    def documents(self, limit: int) -> list[dict[str, Any]]:
+        """Return jobs, newest first."""
+        with self._lock:
+            active = {j.id: j.document() for j in self._active.values()}
+        return [active.get(d["id"], d) for d in self._catalog.jobs(limit=limit)]
+
+    def active_count(self) -> int:
+        """Number of jobs that are not finished."""
+        with self._lock:
+            return len(self._active)
+
+    def waiting_count(self) -> int:
+        """Number of jobs that wait for the compute lane."""
+        with self._lock:
+            return len(self._queue)
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Ask a job to stop.
+
+        Raises
+        ------
+        StateError
+            ``job_finished`` if there is nothing left to cancel.
+        """
+        with self._lock:
+            job = self._active.get(job_id)
+            if job is not None:
+                job._cancel.set()
+                waiting = job in self._queue
+                if waiting:
+                    self._queue.remove(job)
+                    self._reserved -= 1
+                elif job.state == "running":
+                    job.state = "cancelling"
+        if job is None:
+            state = self.document(job_id)["state"]
+            raise StateError(
+                f"Job {job_id} is {state} already.",
+                code="job_finished",
+                remedy="There is nothing to cancel.",
+                state=state,
+            )
+        if job.on_cancel is not None:
+            job.on_cancel()
+        if waiting:
+            self._end(job, "cancelled", Cancelled(f"The {job.kind} was cancelled before it began."))
+        else:
+            self._save(job)
+            self._show(job, "state")
+        return job.document()
+
+    def cancel_hardware(self) -> str | None:
+        """Cancel the job that holds the hardware, if one does; return its id."""
+        holder = self._gate.holder
+        job_id = holder.get("job_id") if holder else None
+        if job_id is None:
+            return None
+        with self._lock:
+            job = self._active.get(job_id)
+            if job is None:
+                return None
+            job._cancel.set()
+        return str(job_id)
+
+    # running ---------------------------------------------------------------------------------------------------
+
+    def _enqueue(self, job: Job) -> None:
+        with self._wake:
+            if not self._closing:
+                job.stage, job.done, job.total = "waiting", 0, 0
+                self._queue.append(job)
+                self._wake.notify()
+                return
+        self._end(job, "interrupted", RESTART)
+
+    def _run_hardware(self, job: Job, token: object) -> None:
+        try:
+            finished = self._run_phase(job, 0)
+        finally:
+            self._gate.release(token)
+        if not finished:
+            if any(p.lane == "compute" for p in job.phases):
+                self._unreserve()
+        elif len(job.phases) > 1:
+            self._enqueue(job)
+        else:
+            self._end(job, "succeeded", None)
+
+    def _run_compute(self) -> None:
+        while True:
+            with self._wake:
+                while not self._queue and not self._closing:
+                    self._wake.wait()
+                if self._closing:
+                    return
+                job = self._queue.popleft()
+                self._reserved -= 1
+            index = 0 if job.phases[0].lane == "compute" else 1
+            if self._run_phase(job, index):
+                self._end(job, "succeeded", None)
+
+    def _run_phase(self, job: Job, index: int) -> bool:
+        try:
+            job.check()
+            if job.state == "queued":
+                job.state, job.started_utc = "running", now_utc()
+                self._save(job)
+                self._show(job, "state")
+            result = job.phases[index].run(job)
+            if result:
+                job.result = {**(job.result or {}), **without_nan(result)}
+            job.check()
+        except Cancelled as error:
+            self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
+            return False
+        except Exception as error:  # noqa: BLE001 - the job's failure, not the service's
+            if job.cancelled and isinstance(error, StereorigError) and error.code == "stage_stopped":
+                self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
+                return False
+            if not isinstance(error, StereorigError):
+                _log.exception("job %s (%s) failed", job.id, job.kind)
+            self._end(job, "failed", error)
+            return False
+        return True
+
+    def _end(self, job: Job, state: State, error: BaseException | None) -> None:
+        job.problem = None if error is None else problem_of(error)
+        if job.on_end is not None:
+            try:
+                job.on_end(job, state)
+            except Exception as second:  # noqa: BLE001 - a result that was not kept is no success
+                _log.exception("closing job %s failed", job.id)
+                state, job.problem = "failed", problem_of(second)
+        job.state, job.finished_utc = state, now_utc()
+        self._save(job)
+        with self._lock:
+            self._active.pop(job.id, None)
+        self._show(job, "state")
+
+    def _save(self, job: Job) -> None:
+        try:
+            with job.saving:  # the newest document is the last one written
+                self._catalog.put_job(job.id, job.state, job.document())
+        except StorageError:
+            _log.exception("the state of job %s could not be written", job.id)
+
+    def _show(self, job: Job, what: str) -> None:
+        self._hub.publish("job", {**job.document(), "change": what})
+
+    def close(self) -> None:
+        """Interrupt everything; returns when the compute lane has ended."""
+        with self._wake:
+            self._closing = True
+            queued = list(self._queue)
+            self._queue.clear()
+            active = [j for j in self._active.values() if j not in queued]
+            self._wake.notify_all()
+        for job in queued:
+            self._end(job, "interrupted", RESTART)
+        for job in active:
+            job._cancel.set()
+            if job.on_cancel is not None:
+                job.on_cancel()
+        self._thread.join(timeout=5.0)

@@ -1,0 +1,86 @@
+"""Quality of a captured image, before anyone relies on it.
+
+Figures are cheap and plain: mean grey level, share of saturated pixels, gradient (texture) and how much of it
+survives at the pixel scale (focus). A code names what is wrong with an image that cannot be measured on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: share of pixels at full scale above which grey levels are clipped over whole speckles
+SATURATED_SHARE = 0.02
+#: mean below this share of full scale: shutter closed, lamp off
+DARK_SHARE = 0.02
+#: standard deviation over the image, as a share of full scale, of an image that shows nothing but noise
+BLANK_SHARE = 0.012
+#: median over tiles of the rms gradient, as a share of full scale per px, below which matching will fail
+LOW_TEXTURE_SHARE = 0.004
+#: rms second difference over rms first difference; white noise on nothing has sqrt(3), blurred speckle far below this
+BLURRED_RATIO = 0.12
+_TILE_PX = 32
+
+
+@dataclass(frozen=True)
+class ImageQuality:
+    """Figures of one image; grey levels in counts."""
+
+    code: str
+    mean_grey: float
+    saturated_share: float
+    contrast_grey: float
+    texture_grey_per_px: float
+    focus: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Names and rounded numbers."""
+        return {
+            "code": self.code,
+            "mean_grey": round(self.mean_grey, 2),
+            "saturated_share": round(self.saturated_share, 5),
+            "contrast_grey": round(self.contrast_grey, 2),
+            "texture_grey_per_px": round(self.texture_grey_per_px, 3),
+            "focus": round(self.focus, 4),
+        }
+
+
+def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
+    """Judge one image (rows, cols)."""
+    full = float(2**bit_depth - 1)
+    a = pixels.astype(np.float32)
+    mean, contrast = float(a.mean()), float(a.std())
+    saturated = float(np.mean(pixels >= full))
+    # central differences: neighbouring pixels' independent noise does not cancel, but is halved
+    gx = 0.5 * (a[1:-1, 2:] - a[1:-1, :-2])
+    gy = 0.5 * (a[2:, 1:-1] - a[:-2, 1:-1])
+    g2 = gx * gx + gy * gy
+    rows, cols = (max(n // _TILE_PX, 1) for n in g2.shape)
+    tiles = g2[: g2.shape[0] // rows * rows, : g2.shape[1] // cols * cols]
+    tiles = tiles.reshape(rows, tiles.shape[0] // rows, cols, tiles.shape[1] // cols)
+    texture = float(np.sqrt(np.median(tiles.mean(axis=(1, 3)))))
+    second = 0.25 * (a[1:-1, 2:] + a[1:-1, :-2] + a[2:, 1:-1] + a[:-2, 1:-1]) - a[1:-1, 1:-1]
+    strongest = float(np.sqrt(g2.mean()))
+    focus = float(np.sqrt(np.mean(second * second))) / strongest if strongest > 0.0 else 0.0
+    if saturated > SATURATED_SHARE:
+        code = "saturated"
+    elif mean < DARK_SHARE * full:
+        code = "dark"
+    elif contrast < BLANK_SHARE * full:
+        code = "blank"
+    elif texture < LOW_TEXTURE_SHARE * full:
+        code = "low_texture"
+    elif focus < BLURRED_RATIO:
+        code = "blurred"
+    else:
+        code = "ok"
+    return ImageQuality(code, mean, saturated, contrast, texture, focus)
+
+
+def pair_quality(cam1: ImageQuality, cam2: ImageQuality) -> dict[str, Any]:
+    """Quality of a pair: the first thing that is wrong, and both cameras' figures."""
+    code = cam1.code if cam1.code != "ok" else cam2.code
+    return {"code": code, "cam1": cam1.as_dict(), "cam2": cam2.as_dict()}

@@ -1,0 +1,279 @@
+"""The rig as the service uses it: captures, moves, settings, state.
+
+Everything that makes the hardware do something runs on its one owner thread (:class:`server.hardware.HardwareGate`);
+reading the stage's state and stopping it do not.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from core.errors import DeviceError, InputError, StageError, StateError, StereorigError
+from drivers.frames import CameraSettings
+from drivers.stage import MoveResult
+from server.config import CameraName, RigConfig
+from server.hardware import HardwareGate
+from server.jobs import problem_of
+from server.rig.build import Devices, open_devices
+from server.rig.cameras import CAMERAS, CameraPair, PairShot
+
+_log = logging.getLogger("stereorig.rig")
+
+
+class Rig:
+    """Two cameras and their stage.
+
+    Parameters
+    ----------
+    config
+        The rig file.
+    gate
+        Hold and owner thread, shared with the jobs.
+    """
+
+    def __init__(self, config: RigConfig, gate: HardwareGate) -> None:
+        self.config = config
+        self.gate = gate
+        self._devices: Devices | None = None
+        self._fault: dict[str, Any] | None = {"code": "not_connected", "cause": "The rig was not opened yet."}
+        self.scene: dict[str, Any] | None = None
+
+    # opening and closing ----------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Open cameras and stage; a fault is kept and shown, and :meth:`reconnect` tries again."""
+        try:
+            self._devices = open_devices(self.config)
+            self._fault = None
+            if self._devices.world is not None and self.scene is None:
+                self.scene = {"scene": "grid", "load": 0.0}
+            if self.config.home_at_start:
+                self.home(self.config.axes)
+        except StereorigError as error:
+            _log.exception("the rig could not be opened")
+            self._fault = problem_of(error)
+            self._close_devices()
+
+    def close(self) -> None:
+        """Stop the stage first, then release everything."""
+        self._close_devices()
+
+    def reconnect(self) -> None:
+        """Close, open again, push the settings."""
+        self._close_devices()
+        self.open()
+        if self._fault is not None:
+            raise DeviceError(str(self._fault["cause"]), code=self._fault["code"], remedy=self._fault.get("remedy"))
+        if self.scene is not None:
+            scene = dict(self.scene)
+            self.set_scene(scene.pop("scene"), load=scene.pop("load"), **scene)
+
+    def _close_devices(self) -> None:
+        devices, self._devices = self._devices, None
+        if devices is not None:
+            devices.close()
+
+    @property
+    def fault(self) -> dict[str, Any] | None:
+        """Why the rig cannot be used, or None."""
+        return self._fault
+
+    def _ready(self) -> Devices:
+        devices = self._devices
+        if devices is None:
+            cause = self._fault["cause"] if self._fault else "The rig is closed."
+            raise DeviceError(f"The rig is not connected: {cause}", code="not_connected",
+                              remedy="Put the fault right, then POST /rig/reconnect.")  # fmt: skip
+        return devices
+
+    @property
+    def pair(self) -> CameraPair:
+        """Both cameras."""
+        return self._ready().pair
+
+    # description ------------------------------------------------------------------------------------------------
+
+    def describe(self) -> dict[str, Any]:
+        """Return everything a client wants to know before it does anything."""
+        config = self.config
+        return {
+            "name": config.rig.name,
+            "description": config.rig.description,
+            "sim": config.rig.kind == "simulated",
+            "connected": self._devices is not None,
+            "fault": self._fault,
+            "holder": self.gate.holder,
+            "scene": self.scene,
+            "max_skew_ms": config.rig.max_skew_ms,
+            "target": config.target.model_dump(mode="json"),
+            "calibration_plan": config.calibration.model_dump(mode="json"),
+            "cameras": {cam: self.describe_camera(cam) for cam in CAMERAS},
+            "stage": self.describe_stage(),
+        }
+
+    def describe_camera(self, cam: CameraName) -> dict[str, Any]:
+        """Nominal data, the device's own description, and the settings it has."""
+        section = self.config.camera(cam)
+        shown: dict[str, Any] = {
+            "name": cam,
+            "nominal": section.model_dump(mode="json"),
+            "device": None,
+            "settings": None,
+        }
+        if self._devices is not None:
+            unit = self._devices.pair.units[cam]
+            shown["device"] = asdict(unit.description)
+            shown["settings"] = asdict(unit.settings)
+        return shown
+
+    def describe_stage(self) -> dict[str, Any]:
+        """Identity, limits and state of each axis."""
+        section = self.config.stage
+        shown: dict[str, Any] = {"driver": section.driver, "identity": None, "axes": [], "zero_mm": section.zero_mm}
+        devices = self._devices
+        if devices is None:
+            return shown
+        shown["identity"] = asdict(devices.stage.identify())
+        for axis in devices.stage.axes:
+            status = devices.stage.state(axis)
+            shown["axes"].append({
+                **asdict(status), "state": status.state.value, "limits": asdict(devices.stage.limits(axis)),
+                "cameras": [cam for cam in CAMERAS if self.config.camera(cam).stage_axis == axis],
+            })  # fmt: skip
+        return shown
+
+    # cameras ----------------------------------------------------------------------------------------------------
+
+    def configure(self, cam: CameraName, settings: CameraSettings) -> CameraSettings:
+        """Change settings on the owner thread; returns what the device really took."""
+        pair = self.pair
+        return self.gate.call(lambda: pair.configure(cam, settings))
+
+    def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
+        """Capture ``frames`` pairs; call on the owner thread, with the hold."""
+        return self.pair.shoot(frames, max_skew_ms=self.config.rig.max_skew_ms, check=check)
+
+    def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> dict[str, Any]:
+        """Put something else before a simulated rig's cameras."""
+        world = self._ready().world
+        if world is None:
+            raise StateError(
+                "This rig has real cameras: there is no scene to set.",
+                code="not_simulated",
+                remedy="Start the service with a simulated rig's file.",
+            )
+        try:
+            world.set_scene(name, load=load, **params)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"Scene {name!r}: {error}.", code="scene_invalid") from error
+        self.scene = {"scene": name, "load": load, **params}
+        return self.scene
+
+    # stage ------------------------------------------------------------------------------------------------------
+
+    def targets_for_dz(self, dz_mm: dict[CameraName, float]) -> dict[int, float]:
+        """Return axis positions that bring each camera to its dZ.
+
+        Raises
+        ------
+        InputError
+            ``axis_conflict`` if one axis moves both cameras and they are asked for different places.
+        """
+        targets: dict[int, float] = {}
+        for cam, dz in dz_mm.items():
+            section = self.config.camera(cam)
+            position = self.config.stage.zero_mm + section.stage_sign * dz
+            if abs(targets.setdefault(section.stage_axis, position) - position) > 1e-9:
+                raise InputError(
+                    f"Axis {section.stage_axis} moves both cameras, and they are sent to different places.",
+                    code="axis_conflict",
+                    remedy="Ask for the same dZ for both.",
+                )
+        return targets
+
+    def dz_of(self, cam: CameraName, position_mm: float) -> float:
+        """Travel of a camera along its optical axis at a position that was read back."""
+        return self.config.camera(cam).stage_sign * (position_mm - self.config.stage.zero_mm)
+
+    def check_axes(self, axes: tuple[int, ...]) -> None:
+        """Refuse axes that the rig does not have."""
+        stage = self._ready().stage
+        for axis in axes:
+            if axis not in stage.axes:
+                raise StageError(
+                    f"The rig has no axis {axis}, only {list(stage.axes)}.",
+                    code="invalid_axis",
+                    remedy="Use an axis that the rig file names.",
+                )
+
+    def check_targets(self, targets_mm: dict[int, float]) -> None:
+        """Refuse targets outside the limits, and axes that are not ready, before any byte of a motion goes out."""
+        stage = self._ready().stage
+        self.check_axes(tuple(targets_mm))
+        for axis, target in targets_mm.items():
+            limits = stage.limits(axis)
+            if not limits.low_mm <= target <= limits.high_mm:
+                raise StageError(
+                    f"Axis {axis} cannot go to {target:g} mm: limits {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                    code="out_of_limits",
+                    remedy="Stay inside the limits that GET /stage shows.",
+                    axis=axis,
+                    target_mm=target,
+                    limits_mm=[limits.low_mm, limits.high_mm],
+                )
+        for axis in targets_mm:
+            status = stage.state(axis)
+            if status.state.value in ("not_homed", "motor_off", "fault", "configuration"):
+                code = status.state.value if status.state.value in ("not_homed", "motor_off") else "stage_not_ready"
+                raise StateError(
+                    f"Axis {axis} cannot move: it is {status.state.value}. {status.detail}".strip(),
+                    code=code,
+                    remedy="POST /stage/home first.",
+                    axis=axis,
+                )
+
+    def positions_mm(self, axes: tuple[int, ...] | None = None) -> dict[int, float]:
+        """Read positions back."""
+        stage = self._ready().stage
+        return {axis: stage.position(axis) for axis in axes or stage.axes}
+
+    def move(self, targets_mm: dict[int, float]) -> dict[int, MoveResult]:
+        """Move; call on the owner thread, with the hold."""
+        return self._ready().stage.move_many(targets_mm)
+
+    def home(self, axes: tuple[int, ...]) -> dict[int, float]:
+        """Switch on and home; call on the owner thread, with the hold."""
+        stage = self._ready().stage
+        found = {}
+        for axis in axes:
+            stage.enable(axis)
+            found[axis] = stage.home(axis)
+        return found
+
+    def stop(self) -> None:
+        """Stop every axis, now, from any thread."""
+        self._ready().stage.stop()
+
+    def stop_again_soon(self) -> None:
+        """Stop once more in 50 ms.
+
+        A job that passed its last check before it was cancelled may start a motion a moment after the first stop.
+        """
+
+        def again() -> None:
+            devices = self._devices
+            if devices is not None:
+                devices.stage.stop()
+
+        timer = threading.Timer(0.05, again)
+        timer.daemon = True
+        timer.start()
+
+    def wait_settled(self) -> None:
+        """Wait as long as the rig file says after a motion of the scene."""
+        time.sleep(self.config.stage.settle_ms / 1000.0)

@@ -1,0 +1,124 @@
+"""The service: every part put together once, with no globals."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from core.errors import StateError
+from server.config import RigConfig
+from server.events import EventHub
+from server.hardware import HardwareGate
+from server.jobs import JobManager
+from server.rig import Rig
+from server.store.calibrations import CalibrationStore
+from server.store.catalog import Catalog
+from server.store.folder import DataFolder
+from server.store.index import rebuild
+from server.store.tests import TestStore
+from server.worker import ComputeWorker
+
+_log = logging.getLogger("stereorig.service")
+
+
+class Service:
+    """Rig, store, jobs and worker of one running service.
+
+    Parameters
+    ----------
+    config
+        The rig file.
+    data
+        The data folder; locked while the service runs.
+    """
+
+    def __init__(self, config: RigConfig, data: Path) -> None:
+        self.config = config
+        self.folder = DataFolder(data)
+        try:
+            self.catalog = Catalog(self.folder.root / "catalog.sqlite")
+        except BaseException:
+            self.folder.close()
+            raise
+        self.calibrations = CalibrationStore(self.folder)
+        self.tests = TestStore(self.folder)
+        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests)
+        for line in self.differences:
+            _log.info("catalogue: %s", line)
+        self.hub = EventHub()
+        self.gate = HardwareGate()
+        self.jobs = JobManager(
+            self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
+        )
+        self.worker = ComputeWorker(threads=config.service.kernel_threads, warm_up="server.tasks:warm_up")
+        self.rig = Rig(config, self.gate)
+        # stopping must not wait behind forty slow requests
+        self.stop_thread = ThreadPoolExecutor(max_workers=2, thread_name_prefix="stop")
+        self.started_monotonic = time.monotonic()
+        self.closing = False
+        self._key_locks: dict[tuple[str, str], threading.Lock] = {}
+        self._key_guard = threading.Lock()
+        self.gate.start(self.rig.open)
+
+    def stop_if_moving(self) -> None:
+        """Stop the stage if a motion runs; for cancelled jobs that may or may not be moving."""
+        if self.rig.fault is None and self.gate.holder is not None:
+            self.rig.stop()
+
+    def stop_streams(self) -> None:
+        """End live views and event streams, which would otherwise outlast every shutdown."""
+        self.closing = True
+        self.hub.close()
+
+    def close(self) -> None:
+        """Stop the stage first, then jobs, worker, rig and files."""
+        self.stop_streams()
+        if self.rig.fault is None:
+            try:
+                self.rig.stop()
+            except Exception:  # noqa: BLE001 - the rest must still be closed
+                _log.exception("the stage could not be stopped at shutdown")
+        self.jobs.close()
+        self.worker.shutdown()
+        self.gate.close()
+        self.rig.close()
+        self.stop_thread.shutdown(wait=False)
+        self.catalog.close()
+        self.folder.close()
+
+    def once(
+        self, scope: str, key: str | None, body_sha256: str, make: Callable[[], dict[str, Any]]
+    ) -> tuple[dict[str, Any], bool]:
+        """Run ``make`` once per Idempotency-Key; return what it made and whether it was made before.
+
+        ``make`` returns the ids of what it made, from which the answer is built again.
+
+        Raises
+        ------
+        StateError
+            ``idempotency_key_reused`` if the key came with another body before.
+        """
+        if key is None:
+            return make(), False
+        with self._key_guard:
+            lock = self._key_locks.setdefault((scope, key), threading.Lock())
+        with lock:
+            earlier = self.catalog.request(scope, key)
+            if earlier is not None:
+                if earlier[0] != body_sha256:
+                    raise StateError(
+                        "This Idempotency-Key was used with another body.",
+                        code="idempotency_key_reused",
+                        remedy="Use a new key for a new request.",
+                    )
+                return earlier[1], True
+            made = make()
+            self.catalog.put_request(scope, key, body_sha256, made)
+        with self._key_guard:
+            self._key_locks.pop((scope, key), None)
+        return made, False

@@ -1,0 +1,1 @@
+"""The data folder: files are the truth, the catalogue is an index."""

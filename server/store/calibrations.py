@@ -1,0 +1,88 @@
+"""Calibrations on disk: the plan, the views as taken, the result.
+
+``plan.json`` is written first, ``view.json`` when every view is there, ``calibration.json`` last: only a folder that
+holds it is a calibration.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from server.errors import NotFoundError
+from server.io.files import sha256_of
+from server.io.images import GrayImage, encode_tiff
+from server.store.durable import make_folder, read_json, write_bytes, write_json
+from server.store.folder import DataFolder, is_id, now_utc
+
+
+class CalibrationStore:
+    """The calibrations of one data folder."""
+
+    def __init__(self, folder: DataFolder) -> None:
+        self._folder = folder
+
+    def path(self, calibration_id: str) -> Path:
+        """Folder of an existing calibration.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none with this id.
+        """
+        path = self._folder.calibrations / calibration_id if is_id(calibration_id, "c") else None
+        if path is None or not (path / "plan.json").is_file():
+            raise NotFoundError(f"There is no calibration {calibration_id[:40]!r}.", what="calibration")
+        return path
+
+    def ids(self) -> list[str]:
+        """Ids of all calibrations, finished or not, in the order of their making."""
+        return sorted(
+            p.parent.name for p in self._folder.calibrations.glob("c*/plan.json") if is_id(p.parent.name, "c")
+        )
+
+    def create(self, plan: dict[str, Any], target: dict[str, Any]) -> str:
+        """Make the folder of a new calibration and return its id."""
+        calibration_id = self._folder.ids.new("c")
+        path = self._folder.calibrations / calibration_id
+        make_folder(path)
+        make_folder(path / "views")
+        write_json(path / "target.json", target)
+        write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
+        return calibration_id
+
+    def put_view(self, calibration_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
+        """Store one view; return its file name and checksum."""
+        name = f"{index:03d}_{cam}.tif"
+        digest = write_bytes(self.path(calibration_id) / "views" / name, encode_tiff(image))
+        return {"file": f"views/{name}", "sha256": digest}
+
+    def put_views_done(self, calibration_id: str, views: list[dict[str, Any]]) -> None:
+        """Write ``view.json``: every view with camera, read-back position and checksum."""
+        write_json(self.path(calibration_id) / "view.json", {"views": views})
+
+    def put_failure(self, calibration_id: str, problem: dict[str, Any]) -> None:
+        """Record why there is no calibration."""
+        write_json(self.path(calibration_id) / "failure.json", problem)
+
+    def read(self, calibration_id: str) -> dict[str, Any]:
+        """Return plan, views, result and state (``unfinished``, ``failed``, ``complete``)."""
+        path = self.path(calibration_id)
+        document: dict[str, Any] = {"id": calibration_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
+        document["views"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
+        if (path / "calibration.json").exists():
+            document |= {**read_json(path / "calibration.json"), "id": calibration_id, "state": "complete"}
+        elif (path / "failure.json").exists():
+            document |= {"state": "failed", "problem": read_json(path / "failure.json")}
+        return document
+
+    def view_file(self, calibration_id: str, index: int, cam: str) -> Path:
+        """Path of one stored view."""
+        path = self.path(calibration_id) / "views" / f"{index:03d}_{cam}.tif"
+        if not path.is_file():
+            raise NotFoundError(f"Calibration {calibration_id} has no view {index} of {cam}.", what="view")
+        return path
+
+    def checksum(self, calibration_id: str) -> str:
+        """SHA-256 of ``calibration.json``."""
+        return sha256_of(self.path(calibration_id) / "calibration.json")

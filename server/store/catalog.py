@@ -1,0 +1,190 @@
+"""The catalogue: an index of the data folder and the table of jobs, in SQLite.
+
+One thread writes, everyone else asks it. WAL and ``synchronous=FULL``: a job that was acknowledged is on disk. The
+index of calibrations, tests, steps and analyses can be lost at any time; it is rebuilt from the folders.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import sqlite3
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+from core.errors import StorageError
+
+T = TypeVar("T")
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS jobs (
+    id TEXT PRIMARY KEY, state TEXT NOT NULL, document TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS requests (
+    scope TEXT NOT NULL, key TEXT NOT NULL, body_sha256 TEXT NOT NULL, made TEXT NOT NULL, PRIMARY KEY (scope, key)
+);
+CREATE TABLE IF NOT EXISTS entries (
+    kind TEXT NOT NULL, parent TEXT NOT NULL, id TEXT NOT NULL, document TEXT NOT NULL, PRIMARY KEY (kind, parent, id)
+);
+CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state);
+"""
+
+
+class Catalog:
+    """``catalog.sqlite`` with its one writer thread.
+
+    A file that SQLite cannot read is set aside (``catalog.corrupt-<n>.sqlite``) and begun anew; ``was_reset`` says so.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._work: queue.SimpleQueue[tuple[Callable[[sqlite3.Connection], Any], Future[Any]] | None] = (
+            queue.SimpleQueue()
+        )
+        self.was_reset = False
+        opened: Future[None] = Future()
+        self._thread = threading.Thread(target=self._run, args=(opened,), name="catalog", daemon=True)
+        self._thread.start()
+        opened.result()
+
+    def _open(self) -> sqlite3.Connection:
+        connection = sqlite3.connect(self._path, isolation_level=None)
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            connection.execute("PRAGMA synchronous=FULL")
+            if connection.execute("PRAGMA quick_check").fetchone()[0] != "ok":
+                raise sqlite3.DatabaseError("quick_check failed")
+            connection.executescript(_SCHEMA)
+        except sqlite3.Error:
+            connection.close()
+            raise
+        return connection
+
+    def _open_or_reset(self) -> sqlite3.Connection:
+        try:
+            return self._open()
+        except sqlite3.DatabaseError:
+            number = len(list(self._path.parent.glob("catalog.corrupt-*.sqlite"))) + 1
+            self._path.rename(self._path.with_name(f"catalog.corrupt-{number}.sqlite"))
+            for suffix in ("-wal", "-shm"):
+                self._path.with_name(self._path.name + suffix).unlink(missing_ok=True)
+            self.was_reset = True
+            return self._open()
+
+    def _run(self, opened: Future[None]) -> None:
+        try:
+            connection = self._open_or_reset()
+        except (sqlite3.Error, OSError) as error:
+            opened.set_exception(StorageError(f"The catalogue cannot be opened: {error}."))
+            return
+        opened.set_result(None)
+        while (item := self._work.get()) is not None:
+            function, future = item
+            try:
+                connection.execute("BEGIN IMMEDIATE")
+                try:
+                    result = function(connection)
+                except BaseException:
+                    connection.execute("ROLLBACK")
+                    raise
+                connection.execute("COMMIT")
+            except sqlite3.Error as error:
+                full = "full" in str(error)
+                future.set_exception(
+                    StorageError(f"The catalogue was not written: {error}.", code="storage_full" if full else None)
+                )
+            except BaseException as error:  # noqa: BLE001 - handed to the caller, who waits for it
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+        connection.close()
+
+    def transact(self, function: Callable[[sqlite3.Connection], T]) -> T:
+        """Run ``function`` in a transaction on the writer thread, and wait for its commit."""
+        future: Future[T] = Future()
+        self._work.put((function, future))
+        return future.result(timeout=30.0)
+
+    def close(self) -> None:
+        """Finish what is queued and close."""
+        self._work.put(None)
+        self._thread.join(timeout=30.0)
+
+    def put_job(self, job_id: str, state: str, document: dict[str, Any]) -> None:
+        """Insert or update a job."""
+        text = json.dumps(document)
+        self.transact(
+            lambda c: c.execute(
+                "INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job_id, state, text)
+            )
+        )
+
+    def jobs(self, *, states: tuple[str, ...] | None = None, limit: int | None = None) -> list[dict[str, Any]]:
+        """Return jobs, newest first."""
+
+        def read(c: sqlite3.Connection) -> list[dict[str, Any]]:
+            where, values = "", []
+            if states is not None:
+                where = f"WHERE state IN ({','.join('?' * len(states))})"
+                values = list(states)
+            rows = c.execute(f"SELECT document FROM jobs {where} ORDER BY id DESC LIMIT ?", (*values, limit or -1))
+            return [json.loads(row[0]) for row in rows]
+
+        return self.transact(read)
+
+    def job(self, job_id: str) -> dict[str, Any] | None:
+        """Return one job's document."""
+        row = self.transact(lambda c: c.execute("SELECT document FROM jobs WHERE id = ?", (job_id,)).fetchone())
+        return None if row is None else dict(json.loads(row[0]))
+
+    def put_entry(self, kind: str, parent: str, entry_id: str, document: dict[str, Any]) -> None:
+        """Insert or update an index entry (``calibration``, ``test``, ``step``, ``analysis``)."""
+        text = json.dumps(document)
+        self.transact(
+            lambda c: c.execute("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", (kind, parent, entry_id, text))
+        )
+
+    def entries(self, kind: str, parent: str = "") -> list[dict[str, Any]]:
+        """Return the index entries of a kind, in order of their ids."""
+        rows = self.transact(
+            lambda c: c.execute(
+                "SELECT document FROM entries WHERE kind = ? AND parent = ? ORDER BY id", (kind, parent)
+            ).fetchall()
+        )
+        return [json.loads(row[0]) for row in rows]
+
+    def replace_entries(self, entries: list[tuple[str, str, str, dict[str, Any]]]) -> list[str]:
+        """Make the index hold exactly ``entries`` (kind, parent, id, document); return the differences found."""
+        wanted = {(k, p, i): json.dumps(d) for k, p, i, d in entries}
+
+        def write(c: sqlite3.Connection) -> list[str]:
+            rows = c.execute("SELECT kind, parent, id, document FROM entries").fetchall()
+            had = {(k, p, i): d for k, p, i, d in rows}
+            differences = [
+                f"{k} {p + '/' if p else ''}{i} was not in the catalogue" for k, p, i in wanted.keys() - had.keys()
+            ]
+            differences += [f"{k} {p + '/' if p else ''}{i} has no folder" for k, p, i in had.keys() - wanted.keys()]
+            c.execute("DELETE FROM entries")
+            c.executemany("INSERT INTO entries VALUES (?, ?, ?, ?)", [(*key, text) for key, text in wanted.items()])
+            return sorted(differences)
+
+        return self.transact(write)
+
+    def put_request(self, scope: str, key: str, body_sha256: str, made: dict[str, Any]) -> None:
+        """Remember what a request with an Idempotency-Key made."""
+        text = json.dumps(made)
+        self.transact(
+            lambda c: c.execute("INSERT OR REPLACE INTO requests VALUES (?, ?, ?, ?)", (scope, key, body_sha256, text))
+        )
+
+    def request(self, scope: str, key: str) -> tuple[str, dict[str, Any]] | None:
+        """Return (body_sha256, made) of an earlier request."""
+        row = self.transact(
+            lambda c: c.execute(
+                "SELECT body_sha256, made FROM requests WHERE scope = ? AND key = ?", (scope, key)
+            ).fetchone()
+        )
+        return None if row is None else (row[0], json.loads(row[1]))

@@ -1,0 +1,89 @@
+"""What the compute worker can be asked to do: plain values in, plain values out.
+
+The functions import the numerical modules when they are called, so that only the worker's process loads the kernels.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class StepTask:
+    """One step of one analysis; plain paths and values, so that any executor can carry it.
+
+    Parameters
+    ----------
+    folder
+        The analysis' folder; the result goes there as ``step_<nnnn>.nc``.
+    calibration
+        Path of the test's calibration.
+    kind
+        ``shape`` of the pair ``ref1``, ``ref2``, or ``motion`` from it to ``cur1``, ``cur2``.
+    n
+        Number of the step that is measured.
+    reference
+        Number of the reference step, whose shape is measured first.
+    images
+        Paths ``ref1``, ``ref2``, ``cur1``, ``cur2``.
+    previous
+        Number of the step measured before, whose field gives start values.
+    settings
+        Region, subset and models, as in ``analysis.json``.
+    inputs
+        Name and SHA-256 of each input file.
+    """
+
+    folder: str
+    calibration: str
+    kind: Literal["shape", "motion"]
+    n: int
+    reference: int
+    images: dict[str, str]
+    previous: int | None
+    settings: dict[str, Any]
+    inputs: dict[str, str]
+    label: str
+    load_n: float | None
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """The fit of one calibration.
+
+    Parameters
+    ----------
+    folder
+        The calibration's folder, with its views; ``calibration.json`` goes there.
+    plan
+        Content of ``plan.json``.
+    views
+        Content of ``view.json``.
+    """
+
+    folder: str
+    plan: dict[str, Any]
+    views: list[dict[str, Any]]
+
+
+def warm_up(threads: int) -> None:
+    """Load and compile every kernel once, before the first task needs them."""
+    _heavy("server.measuring").warm_up(threads)
+
+
+def measure_step(task: StepTask) -> dict[str, Any]:
+    """Measure one step; its result file is readable when this returns. Returns the step's summary."""
+    summary: dict[str, Any] = _heavy("server.measuring").measure_step(task)
+    return summary
+
+
+def fit_calibration(task: FitTask) -> dict[str, Any]:
+    """Find the grid in every view and fit both cameras; ``calibration.json`` is there when this returns."""
+    summary: dict[str, Any] = _heavy("server.calibrating").fit_calibration(task)
+    return summary
+
+
+def _heavy(module: str) -> Any:
+    return importlib.import_module(module)
