@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.inputs import CAMERAS, CalibrationOptions, CalibrationView, CameraName, NominalCamera
+from core.calibration.prepare import check_hold_out
 from core.calibration.result import CalibrationResult
 from core.calibration.solve import calibrate
 from core.errors import ImageError, StereorigError
@@ -84,6 +85,7 @@ def calibrate_views(
         See :func:`core.calibration.solve.calibrate`.
     """
     options = options or CalibrationOptions()
+    check_hold_out([[i.dz_mm for i in images if i.camera == name] for name in CAMERAS], options)
     for image in images:
         _check_size(image, nominals[CAMERAS.index(image.camera)])
     grid_options = grid_options or GridOptions()
