@@ -34,6 +34,7 @@ _MIX_B: Final = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_C: Final = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S21, _S42 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(21), np.uint64(42)
 _MASK21: Final = np.uint64((1 << 21) - 1)
+_FAR_MM: Final = 1e9  # beyond it a cell's index is no whole number any more
 _UNIT: Final = 1.0 / float(1 << 21)
 
 
@@ -58,13 +59,22 @@ class Texture:
     nodes_mm: Float
     finest_mm: float
 
+    def paint(self, s_mm: Float, t_mm: Float, out: Float) -> None:
+        """Write the brightness of material points into ``out`` (n,), which stays as it is where they are NaN."""
+        if self.kind == SPECKLE:
+            _speckle(self.parameters, s_mm, t_mm, out)
+        elif self.kind == GRID:
+            _grid(self.parameters, self.nodes_mm, s_mm, t_mm, out)
+        else:
+            _dots(self.parameters, s_mm, t_mm, out)
+
     def value(self, st_mm: ArrayLike) -> Float:
         """Brightness (...) in [0, 1] at material points (..., 2) in mm."""
-        st = np.ascontiguousarray(st_mm, dtype=np.float64)
-        flat = st.reshape(-1, 2)
-        out = np.empty(len(flat))
-        _values(self.kind, self.parameters, self.nodes_mm, flat, out)
-        return out.reshape(st.shape[:-1])
+        st = np.asarray(st_mm, dtype=np.float64)
+        out = np.full(st.shape[:-1], np.nan)
+        flat = out.reshape(-1)
+        self.paint(np.ascontiguousarray(st[..., 0]).reshape(-1), np.ascontiguousarray(st[..., 1]).reshape(-1), flat)
+        return flat.reshape(st.shape[:-1])
 
 
 def speckle(
@@ -146,7 +156,7 @@ def dots(*, pitch_mm: float, diameter_mm: float, rim_mm: float, dark: float = 0.
     return Texture(kind=DOTS, parameters=par, nodes_mm=_NO_NODES, finest_mm=0.2 * rim_mm)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mix(z: np.uint64) -> np.uint64:
     # splitmix64's finaliser: every input bit reaches every output bit
     z = (z ^ (z >> _S30)) * _MIX_B
@@ -154,7 +164,7 @@ def _mix(z: np.uint64) -> np.uint64:
     return z ^ (z >> _S31)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fill_discs(i: int, j: int, par: Float, discs: Float) -> None:
     """Write centre and radius of the discs of the 3 x 3 cells around (i, j) into ``discs`` (9, 3), nearest first."""
     cell, radius, rim, seed = par[0], par[1], par[2], np.uint64(np.int64(par[5]))
@@ -172,49 +182,61 @@ def fill_discs(i: int, j: int, par: Float, discs: Float) -> None:
         discs[k, 2] = min(r, largest)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _rim_step(u: float) -> float:
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
-@njit(cache=True, nogil=True)
-def texture_value(
-    kind: int, par: Float, nodes: Float, s: float, t: float, cell_index: NDArray[np.int64], discs: Float
-) -> float:
-    """Brightness at one material point; ``cell_index`` (2,) and ``discs`` (9, 3) remember the last cell looked at."""
-    v = 1.0  # share of the brighter of the two
-    if kind == SPECKLE:
-        i = int(np.floor(s / par[0]))
-        j = int(np.floor(t / par[0]))
-        if i != cell_index[0] or j != cell_index[1]:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _speckle(par: Float, s: Float, t: Float, out: Float) -> None:
+    discs = np.empty((9, 3))
+    cell, e, dark, contrast = par[0], par[2], par[3], par[4] - par[3]
+    last_i, last_j = 0, 0
+    fill_discs(0, 0, par, discs)
+    for k in range(s.size):
+        sk, tk = s[k], t[k]
+        if not (abs(sk) < _FAR_MM and abs(tk) < _FAR_MM):
+            continue  # nothing hit
+        # the points come in rows, so the cell is mostly the last one
+        i, j = int(np.floor(sk / cell)), int(np.floor(tk / cell))
+        if i != last_i or j != last_j:
             fill_discs(i, j, par, discs)
-            cell_index[0] = i
-            cell_index[1] = j
-        e = par[2]
-        for k in range(9):
-            dx = s - discs[k, 0]
-            dy = t - discs[k, 1]
+            last_i, last_j = i, j
+        v = 1.0  # share of the ground
+        for n in range(9):
+            dx = sk - discs[n, 0]
+            dy = tk - discs[n, 1]
             d2 = dx * dx + dy * dy
-            outer = discs[k, 2] + e
+            outer = discs[n, 2] + e
             if d2 < outer * outer:
-                inner = discs[k, 2] - e
+                inner = discs[n, 2] - e
                 if d2 <= inner * inner:
                     v = 0.0
                     break
                 v *= _rim_step((np.sqrt(d2) - inner) / (2.0 * e))
-    elif kind == GRID:
-        a = _line_cover(par, nodes, s, t, 0)
-        b = _line_cover(par, nodes, t, s, 1)
-        v = (1.0 - a) * (1.0 - b)
-    else:
-        dx = s - np.floor(s / par[0] + 0.5) * par[0]
-        dy = t - np.floor(t / par[0] + 0.5) * par[0]
-        u = (np.sqrt(dx * dx + dy * dy) - (par[1] - par[2])) / (2.0 * par[2])
-        v = _rim_step(min(max(u, 0.0), 1.0))
-    return float(par[3] + (par[4] - par[3]) * v)
+        out[k] = dark + contrast * v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _grid(par: Float, nodes: Float, s: Float, t: Float, out: Float) -> None:
+    for k in range(s.size):
+        if abs(s[k]) < _FAR_MM and abs(t[k]) < _FAR_MM:
+            a = _line_cover(par, nodes, s[k], t[k], 0)
+            b = _line_cover(par, nodes, t[k], s[k], 1)
+            out[k] = par[4] + (par[3] - par[4]) * (1.0 - (1.0 - a) * (1.0 - b))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _dots(par: Float, s: Float, t: Float, out: Float) -> None:
+    for k in range(s.size):
+        if abs(s[k]) < _FAR_MM and abs(t[k]) < _FAR_MM:
+            dx = s[k] - np.floor(s[k] / par[0] + 0.5) * par[0]
+            dy = t[k] - np.floor(t[k] / par[0] + 0.5) * par[0]
+            u = (np.sqrt(dx * dx + dy * dy) - (par[1] - par[2])) / (2.0 * par[2])
+            out[k] = par[3] + (par[4] - par[3]) * _rim_step(min(max(u, 0.0), 1.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _line_cover(par: Float, nodes: Float, across: float, along: float, family: int) -> float:
     """How far the point lies under a line of family 0 (they cross s) or 1 (they cross t): 0 outside, 1 inside."""
     pitch, half, sd = par[0], par[1], par[2]
@@ -251,14 +273,6 @@ def _line_cover(par: Float, nodes: Float, across: float, along: float, family: i
     return float(cover)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _node(nodes: Float, line: int, along: int, family: int, axis: int) -> float:
     return float(nodes[along, line, axis] if family == 0 else nodes[line, along, axis])
-
-
-@njit(cache=True, nogil=True)
-def _values(kind: int, par: Float, nodes: Float, st: Float, out: Float) -> None:
-    cell_index = np.full(2, np.iinfo(np.int64).min, dtype=np.int64)
-    discs = np.empty((9, 3))
-    for k in range(st.shape[0]):
-        out[k] = texture_value(kind, par, nodes, st[k, 0], st[k, 1], cell_index, discs)
