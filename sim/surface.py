@@ -76,10 +76,11 @@ class Surface:
         nx, ny
             (n,) directions.
         """
-        s, t, lip = np.empty_like(nx), np.empty_like(nx), np.ones_like(nx)
+        s, t = np.empty_like(nx), np.empty_like(nx)
         if self.kind == FLAT:
             kernels.meet_plane(self.parameters, pose, nx, ny, s, t)
-            return s, t, lip
+            return s, t, np.broadcast_to(np.float64(1.0), nx.shape)
+        lip = np.ones_like(nx)
         for a in range(0, nx.size, _CHUNK):
             part = slice(a, a + _CHUNK)
             self._hit_curved(pose, nx[part], ny[part], s[part], t[part], lip[part])
