@@ -1,54 +1,101 @@
-"""One lock and one number of threads for every parallel kernel of the project.
+"""How many threads compute, and the lock around kernels that bring threads of their own.
 
-numba's ``workqueue`` layer aborts the process when two threads run parallel kernels at once, and the better layers may
-be missing. So every call of a parallel kernel holds :data:`kernel_lock`.
+Kernels that release the GIL are run over ranges by :func:`run_ranges`, on plain threads. numba's own parallel kernels
+(``prange``) are another matter: its ``workqueue`` layer aborts the process when two threads run such kernels at once,
+so whoever calls one holds :data:`kernel_lock` and calls :func:`apply_threads` first.
 """
 
 from __future__ import annotations
 
+import itertools
+import os
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numba
 
 from core.errors import InputError
 
 kernel_lock = threading.RLock()
-"""Held around every call of a parallel kernel; reentrant, so a caller may hold it over several."""
+"""Held around every call of a numba ``prange`` kernel; reentrant, so a caller may hold it over several."""
+
+_state_lock = threading.Lock()
+_pool: ThreadPoolExecutor | None = None
 
 
 def available_threads() -> int:
-    """Return the largest number :func:`set_threads` takes in this process."""
-    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]  # set while numba is imported
+    """Return the largest number :func:`set_threads` takes: the processors this process may use, and one at least."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1
 
 
 def threads() -> int:
-    """Return how many threads the kernels use."""
-    with kernel_lock:
-        return _threads
+    """Return how many threads compute."""
+    return _threads
 
 
 def set_threads(n: int) -> None:
-    """Let the parallel kernels use ``n`` threads from now on; results do not depend on it.
+    """Compute on ``n`` threads from now on; results do not depend on it.
 
     Raises
     ------
     InputError
         If ``n`` is not between 1 and :func:`available_threads`.
     """
-    global _threads
+    global _threads, _pool
     if not 1 <= n <= available_threads():
         raise InputError(
             f"{n} threads asked for, 1 to {available_threads()} are possible here.",
             code="threads_out_of_range",
-            remedy="Give a number of threads inside that range (NUMBA_NUM_THREADS sets its upper end at start).",
+            remedy="Give a number of threads inside that range.",
         )
-    with kernel_lock:
+    with _state_lock:
         _threads = n
+        if _pool is not None:
+            _pool.shutdown(wait=False)  # what runs in it finishes
+            _pool = None
 
 
 def apply_threads() -> None:
-    """Set the calling thread's number; numba keeps one per thread. Call with :data:`kernel_lock` held."""
-    numba.set_num_threads(_threads)
+    """Give numba's ``prange`` kernels the same number, in the calling thread. Call with :data:`kernel_lock` held."""
+    numba.set_num_threads(min(_threads, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
+
+
+def run_ranges(function: Callable[[int, int], None], n: int, size: int) -> None:
+    """Call ``function(first, last)`` over 0 ... n in ranges of ``size``, on all threads; the caller's is one of them.
+
+    The first exception is raised again, once all threads have stopped.
+    """
+    ranges = iter([(i, min(n, i + size)) for i in range(0, n, size)])
+    take = threading.Lock()
+
+    def work() -> None:
+        while True:
+            with take:
+                item = next(ranges, None)
+            if item is None:
+                return
+            function(*item)
+
+    helpers = min(_threads, (n + size - 1) // size) - 1
+    pending = [_executor().submit(work) for _ in itertools.repeat(None, helpers)] if helpers > 0 else []
+    try:
+        work()
+    finally:
+        for future in pending:
+            future.exception()
+    for future in pending:
+        future.result()
+
+
+def _executor() -> ThreadPoolExecutor:
+    global _pool
+    with _state_lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(max_workers=max(1, _threads - 1), thread_name_prefix="stereorig-compute")
+        return _pool
 
 
 _threads: int = available_threads()

@@ -9,8 +9,16 @@ import pytest
 from matching_scene import Plane, Texture, digitise, grid, paper_pair, render, true_g, true_w
 from scipy.spatial.transform import Rotation
 
+from core.errors import ImageError, InputError
 from core.matching import MatchOptions, fit_motion, fit_shape, prepare
-from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
+from core.matching.geometry import (
+    covariance_xyz,
+    covariance_xyzuvw,
+    motion_geometry,
+    plane_from_angles,
+    shape_geometry,
+)
+from core.threads import available_threads, run_ranges, set_threads, threads
 
 PLANES = {
     "rest": Plane(),
@@ -162,3 +170,119 @@ def test_prepared_and_raw_images_give_the_same():
     raw = fit_shape(pair, *images("rest"), XY, w)
     prepared = fit_shape(pair, *(prepare(image) for image in images("rest")), XY, w)
     np.testing.assert_array_equal(raw.w, prepared.w)
+
+
+def test_rigid_patch_follows_rotations_but_not_strain():
+    pair = paper_pair()
+    options = MatchOptions(subset_px=21, patch="rigid")
+    for name, low, high in (("turned", 0.0, 0.1), ("tilted", 0.0, 0.1), ("strained", 0.4, 4.0)):
+        fit = fit_motion(pair, *images("rest"), *images(name), XY, *starts(name), options)
+        assert (fit.status == 0).all()
+        motion = motion_geometry(pair, XY, fit.w, fit.G)
+        np.testing.assert_allclose(motion.stretch, 0.0, atol=1e-9)  # the constraint holds exactly
+        error_um = 1e3 * np.sqrt(((motion.uvw_mm - truth(name)[1]) ** 2).mean(0)).max()
+        assert low <= error_um < high  # 0.4 um per percent of strain at the least, as the study found
+
+
+def test_all_converge_from_a_pixel_off_in_any_direction():
+    pair = paper_pair()
+    options = MatchOptions(subset_px=21)
+    w, G = starts("moved")
+    exact = fit_motion(pair, *images("rest"), *images("moved"), XY, w, G, options)
+    for angle in np.arange(8) * np.pi / 4:
+        start = G.copy()
+        start[:, 0, 0] += np.cos(angle) / 12000.0
+        start[:, 1, 0] += np.sin(angle) / 12000.0
+        fit = fit_motion(pair, *images("rest"), *images("moved"), XY, w * [1.0001, 1.0, 1.0], start, options)
+        assert (fit.status == 0).all()
+        np.testing.assert_allclose(fit.G[:, :2, 0] * 12000.0, exact.G[:, :2, 0] * 12000.0, atol=2e-3)
+        assert fit.iterations.mean() < 7
+
+
+def test_gain_and_offset_of_the_images_change_nothing():
+    pair = paper_pair()
+    w, G = starts("moved")
+    options = MatchOptions(subset_px=21, tolerance_px=1e-5)
+    plain = fit_motion(pair, *images("rest"), *images("moved"), XY, w, G, options)
+    one, two = images("moved")
+    lit = fit_motion(
+        pair, images("rest")[0], 40.0 * images("rest")[1], 0.3 * one + 17.0, 2.0 * two - 90.0, XY, w, G, options
+    )
+    np.testing.assert_allclose(lit.zncc, plain.zncc, atol=2e-6)
+    error = 1e3 * (motion_geometry(pair, XY, lit.w, lit.G).uvw_mm - motion_geometry(pair, XY, plain.w, plain.G).uvw_mm)
+    assert np.abs(error).max() < 0.05  # the weights change with the contrast, the answer hardly
+
+
+@pytest.mark.fault(44)
+def test_threads_change_no_digit():
+    pair, rng = paper_pair(), np.random.default_rng(3)
+    before = threads()
+    four = [prepare(image) for image in (*noisy("rest", 2.0, rng), *noisy("moved", 2.0, rng))]
+    w, G = (np.concatenate([array] * 3) for array in starts("moved"))
+    xy = np.concatenate([XY] * 3)
+    try:
+        fits = []
+        for n in sorted({1, available_threads()}):
+            set_threads(n)
+            fits.append(fit_motion(pair, *four, xy, w, G, MatchOptions(subset_px=21)))
+    finally:
+        set_threads(before)
+    for fit in fits:
+        np.testing.assert_array_equal(fit.G, fits[0].G)
+        np.testing.assert_array_equal(fit.G[: len(XY)], fit.G[-len(XY) :])
+        np.testing.assert_array_equal(fit.covariance, fits[0].covariance)
+
+
+def test_ranges_cover_everything_once_and_hand_errors_on():
+    done = np.zeros(1001, int)
+
+    def count(first, last):
+        done[first:last] += 1
+
+    run_ranges(count, 1001, 7)
+    assert (done == 1).all()
+
+    def fail(first, last):
+        if first >= 500:
+            raise ValueError("range")
+
+    with pytest.raises(ValueError, match="range"):
+        run_ranges(fail, 1001, 7)
+    for n in (0, available_threads() + 1):
+        with pytest.raises(InputError) as caught:
+            set_threads(n)
+        assert caught.value.code == "threads_out_of_range"
+
+
+def test_the_plane_of_equation_12_comes_back():
+    pair = paper_pair()
+    theta, phi, zp = np.array([1.2, 1.7]), np.array([1.4, 1.6]), np.array([398.0, 404.0])
+    xy = np.array([[30.0, 40.0], [120.0, 90.0]])
+    shape = shape_geometry(pair, xy, plane_from_angles(pair, xy, theta, phi, zp))
+    np.testing.assert_allclose(shape.theta_rad, theta, rtol=1e-12)
+    np.testing.assert_allclose(shape.phi_rad, phi, rtol=1e-12)
+    np.testing.assert_allclose(shape.zp_mm, zp, rtol=1e-12)
+    # Eq. (12) itself, at the measured points in camera 1's frame
+    p = pair.cam1.cam_from_sys.apply(shape.xyz_mm)
+    xi = np.sqrt(1 - np.cos(theta) ** 2 - np.cos(phi) ** 2)
+    np.testing.assert_allclose(p[:, 0] * np.cos(theta) + p[:, 1] * np.cos(phi) + p[:, 2] * xi, zp * xi, rtol=1e-12)
+
+
+def test_what_cannot_be_used_is_refused():
+    image = images("rest")[0]
+    pair = paper_pair()
+    with pytest.raises(ImageError):
+        prepare(image[0])
+    with pytest.raises(ImageError):
+        prepare(np.where(image > 100, np.nan, image))
+    with pytest.raises(InputError) as caught:
+        fit_shape(pair, prepare(image, "quintic"), image, XY, np.zeros((len(XY), 3)))
+    assert caught.value.code == "interpolation_mismatch"
+    with pytest.raises(InputError):
+        fit_shape(pair, image, image, XY, np.zeros((2, 3)))
+    with pytest.raises(ImageError) as caught_size:
+        fit_motion(pair, image, image, image[1:], image, XY, np.zeros((len(XY), 3)))
+    assert caught_size.value.code == "image_size_mismatch"
+    for wrong in ({"subset_px": 3}, {"tolerance_px": 0.0}, {"patch": "bent"}, {"max_iterations": 0}):
+        with pytest.raises(InputError):
+            MatchOptions(**wrong)

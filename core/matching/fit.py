@@ -17,10 +17,12 @@ from core.matching.kernels.motion import N_MOTION_OUT
 from core.matching.kernels.shape import N_SHAPE_OUT
 from core.matching.options import SPLINE_ORDER, MatchOptions
 from core.stereo import StereoPair
-from core.threads import apply_threads, kernel_lock
+from core.threads import run_ranges
 
 Int = NDArray[np.int32]
 Status = NDArray[np.int8]
+
+POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to set it up
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +132,11 @@ def fit_shape(
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     pose = pair.cam2_from_cam1
     setting = _setting(options)
-    with kernel_lock:
-        apply_threads()
-        shape_points(
-            images[0].pixels, images[0].gradients, _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2),
-            _own(pose.rotation), _own(pose.translation_mm), xy, w, setting, out, status, iterations,
-        )  # fmt: skip
+    fixed = (
+        images[0].pixels, images[0].gradients, _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2),
+        _own(pose.rotation), _own(pose.translation_mm), xy, w, setting, out, status, iterations,
+    )  # fmt: skip
+    run_ranges(lambda first, last: shape_points(first, last, *fixed), n, POINTS_AT_ONCE)
     out[status != 0, :4] = np.nan
     out[status != 0, 6:] = np.nan
     covariance = out[:, [6, 7, 7, 8]].reshape(n, 2, 2)
@@ -200,13 +201,12 @@ def fit_motion(
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     pose = pair.cam2_from_cam1
     setting = (*_setting(options), options.patch == "rigid")
-    with kernel_lock:
-        apply_threads()
-        motion_points(
-            images[0].pixels, images[0].gradients, _flat(images[1]), _flat(images[2]), _flat(images[3]),
-            _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out,
-            status, iterations,
-        )  # fmt: skip
+    fixed = (
+        images[0].pixels, images[0].gradients, _flat(images[1]), _flat(images[2]), _flat(images[3]),
+        _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out,
+        status, iterations,
+    )  # fmt: skip
+    run_ranges(lambda first, last: motion_points(first, last, *fixed), n, POINTS_AT_ONCE)
     out[status != 0, :13] = np.nan
     out[status != 0, 17:] = np.nan
     covariance = out[:, 17:].reshape(n, 5, 5)

@@ -8,6 +8,7 @@ CR LF. The list of error texts is the manual's (appendix A).
 from __future__ import annotations
 
 import re
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from sim.controllers.axis import SimAxis, SimClock, Trouble
 from sim.controllers.wire import WireController
 
 _COMMAND = re.compile(r"(\d*)([A-Z]{2})(.*)")
+_LONGEST_LINE = 80
 _TICK_S = 400e-6  # one servo cycle, the unit of the time stamps in the error queue
 
 _TEXTS = {
@@ -123,6 +125,7 @@ class SimESP301(WireController):
             "MD": lambda _n, axis, _p: "0" if axis.motor.moving else "1",
             "MO": self._mo,
             "MF": self._mf,
+            "WS": self._ws,
             "OR": self._or,
             "DH": self._dh,
             "ST": self._st,
@@ -140,17 +143,12 @@ class SimESP301(WireController):
         """Give access to an axis and its faults."""
         return self._axes[number].motor
 
-    def true_position_mm(self, axis: int) -> float:
-        """Where the load of an axis really is along its axis, in mm from home."""
-        return self._axes[axis].motor.true_position_mm()
-
-    def true_displacement_mm(self, axis: int) -> tuple[float, float, float]:
-        """Where the load of an axis really is: across, across, along the axis, in mm from home."""
-        return self._axes[axis].motor.true_displacement_mm()
-
     def _execute(self, text: str) -> bytes:
         self._update()
         replies = []
+        if len(text) > _LONGEST_LINE:
+            self._error(6)
+            return b""
         for part in text.replace(" ", "").upper().split(";"):
             if part:
                 try:
@@ -256,6 +254,15 @@ class SimESP301(WireController):
             axis.homing = False
             self._error(20, number)
         axis.power = False
+        return None
+
+    def _ws(self, _number: int, axis: _Axis, parameter: str) -> str | None:
+        """Hold what follows back until the axis rests; as with the real one, even a stop waits behind it."""
+        after_s = float(parameter or 0.0) / 1000 / self.clock.time_scale
+        while axis.motor.moving:
+            time.sleep(0.001)
+        time.sleep(after_s)
+        self._update()
         return None
 
     def _or(self, number: int, axis: _Axis, parameter: str) -> str | None:

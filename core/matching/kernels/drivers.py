@@ -1,40 +1,59 @@
-"""The two parallel kernels: points in chunks of fixed size, one work space a chunk.
+"""The two compiled entry points: a range of points, one work space a call.
 
-A point's result depends on nothing but its own input, so neither the chunks nor the threads change a digit.
+They release the GIL and are called from several threads on ranges of their own. A point's result depends on nothing
+but its own input, so neither ranges nor threads change a digit.
+
+Only these two are cached on disk. numba looks at the date of the cached function's own file alone, and all kernels are
+inlined here; so the cache's key gets a stamp of all their sources, through a closure variable, and a change in any of
+them compiles anew.
 """
 
 from __future__ import annotations
 
-from numba import njit, prange
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from numba import njit
 
 from core.matching.kernels.motion import motion_point
 from core.matching.kernels.point import work_space
 from core.matching.kernels.shape import shape_point
 
-CHUNK = 64
+
+def _stamp() -> str:
+    here = Path(__file__).parent
+    sources = [*sorted(here.glob("*.py")), here.parent / "image.py", here.parents[1] / "status.py"]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def shape_points(reference, gradients, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations):
-    """Run ``shape_point`` for every row of ``xy``."""
-    n = xy.shape[0]
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+def _compile(stamp: str) -> tuple[Any, Any]:
+    @njit(cache=True, nogil=True, error_model="numpy")
+    def shape_points(first, last, reference, gradients, image2, lens1, lens2, R, t, xy, start, setting, out, status,
+                     iterations):  # fmt: skip
+        """Run ``shape_point`` for rows ``first`` to ``last`` of ``xy``."""
+        if stamp == "":
+            return
         space = work_space(setting[0], 1)
-        for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+        for i in range(first, last):
             status[i], iterations[i] = shape_point(
                 reference, gradients, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
             )
 
-
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def motion_points(reference, gradients, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
-                  out, status, iterations):  # fmt: skip
-    """Run ``motion_point`` for every row of ``xy``."""
-    n = xy.shape[0]
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+    @njit(cache=True, nogil=True, error_model="numpy")
+    def motion_points(first, last, reference, gradients, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w,
+                      start_g, setting, out, status, iterations):  # fmt: skip
+        """Run ``motion_point`` for rows ``first`` to ``last`` of ``xy``."""
+        if stamp == "":
+            return
         space = work_space(setting[0], 3)
-        for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+        for i in range(first, last):
             status[i], iterations[i] = motion_point(
                 reference, gradients, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i],
                 setting, space, out[i],
             )  # fmt: skip
+
+    return shape_points, motion_points
+
+
+shape_points, motion_points = _compile(_stamp())

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def factor(a, n):
     """Cholesky factor of the leading (n, n) of ``a`` in place (lower); False if not positive definite.
 
@@ -32,7 +32,7 @@ def factor(a, n):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def solve(a, b, n):
     """Solve in place with the factor from :func:`factor`."""
     for i in range(n):
@@ -47,7 +47,7 @@ def solve(a, b, n):
         b[i] = s / a[i, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def invert3(m, out):
     """Inverse of a 3 x 3 matrix; False if it has none."""
     c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
@@ -69,7 +69,7 @@ def invert3(m, out):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def assemble(weights, blocks, offsets, hessian, images, normal, half):
     """Normal equations in (theta_0, theta_1, theta_2, e) from the nine-column Gram matrix.
 
@@ -127,7 +127,7 @@ def assemble(weights, blocks, offsets, hessian, images, normal, half):
             normal[12, c] += s
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def gradient(weights, blocks, offsets, rhs, images, out):
     """Right-hand side (13,) in (theta_0, theta_1, theta_2, e) from each image's nine sums ``rhs`` (images, 9)."""
     out[:] = 0.0

@@ -174,7 +174,7 @@ def value_quintic(c, base, stride, p, x, y):
     return value + y5 * _row6(c, k, w0, w1, w2, w3, w4, w5)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
 def sums_cubic(c, base, stride, p, ref, n, sums):
     """Compare one image with the reference: the eleven sums over the subset's pixels, cubic spline.
 
@@ -232,7 +232,7 @@ def sums_cubic(c, base, stride, p, ref, n, sums):
     sums[10] = s10
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
 def sums_quintic(c, base, stride, p, ref, n, sums):
     """Compare one image with the reference: the eleven sums over the subset's pixels, quintic spline.
 

@@ -32,7 +32,7 @@ N_MOTION_OUT = 42
 N_RIGID = 10
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _tangents(columns, w, tangents):
     """w0 times the patch's two tangent vectors from a matrix that acts on (1, X, Y), rows of ``tangents``."""
     for j in range(2):
@@ -40,7 +40,7 @@ def _tangents(columns, w, tangents):
             tangents[j, i] = columns[i, 1 + j] - columns[i, 0] * w[1 + j] / w[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _frame(tangents, frame):
     """Orthonormal frame (columns) on two tangent vectors; their half-angles' symmetric choice."""
     a, b = tangents[0], tangents[1]
@@ -64,7 +64,7 @@ def _frame(tangents, frame):
     return np.isfinite(ls + ld)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def nearest_rotation(xc, yc, w, G, rotation):
     """Rotation that carries the reference patch's tangents closest to those in ``G``."""
     reference = np.array([[xc, 1.0, 0.0], [yc, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -84,7 +84,7 @@ def nearest_rotation(xc, yc, w, G, rotation):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def rotate(rotation, a, b, c):
     """Replace ``rotation`` by exp([(a, b, c)]x) ``rotation``, exactly (Rodrigues)."""
     angle = math.sqrt(a * a + b * b + c * c)
@@ -101,7 +101,7 @@ def rotate(rotation, a, b, c):
         rotation[2, j] = z + s * c1z + v * c2z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def rigid_columns(xc, yc, w, rotation, G):
     """Fill G's second and third column from w, the first column and the rotation."""
     for j in range(2):
@@ -111,7 +111,7 @@ def rigid_columns(xc, yc, w, rotation, G):
             G[i, 1 + j] = rotation[i, j] + r * (G[i, 0] - turned)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def rigid_chain(xc, yc, w, rotation, G, chain):
     """d(thirteen unknowns) / d(w0, G0, w1, w2, rotation vector, e), (13, 10), at the present state."""
     chain[:] = 0.0
@@ -137,7 +137,7 @@ def rigid_chain(xc, yc, w, rotation, G, chain):
         chain[first + 2, 6], chain[first + 2, 7] = a1, -a0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _reduce(normal, chain, rigid, half, reduced):
     """Normal equations of the unknowns that are free; their number."""
     if not rigid:
@@ -158,7 +158,7 @@ def _reduce(normal, chain, rigid, half, reduced):
     return N_RIGID
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
                  space, out):  # fmt: skip
     """Fit one point. ``out``: w (3), G (9), e, zncc (3), noise, covariance (25) of (w0, G00, G10, G20, e).

@@ -36,7 +36,7 @@ WHITE_ROUGHNESS = 1.2  # mean squared gradient over variance: 1.39 for white noi
 INTERPOLATED_NOISE = 0.75  # mean variance of white noise behind a cubic spline, over all sub-pixel places
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def work_space(subset, images):
     """Everything one thread needs, so that no point allocates."""
     return (
@@ -65,7 +65,7 @@ def work_space(subset, images):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def compare(image, lens, m, order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels, rhs):
     """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
 
@@ -102,7 +102,7 @@ def compare(image, lens, m, order, ref, n, f2, box, p, sums, sum_j, sum_fj, leve
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def epipolar_shift(lens2, R, t, xc, yc, w0):
     """Camera 2's normalised shift (nu_x, nu_y) that moves the point's image by 1 px across its epipolar line.
 
@@ -129,7 +129,7 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
     return i11 * gx + i12 * gy, i21 * gx + i22 * gy, along
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, images, M):
     """The matrices through which the images see the patch."""
     for i in range(3):
@@ -146,7 +146,7 @@ def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, images, M):
             M[k, 1, j] += e * nu_y * M[k, 2, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def jacobian_blocks(R, t, e, nu_x, nu_y, images, M, inverse, blocks, offsets):
     """``M^-1 dM`` per unknown, see :func:`core.matching.kernels.linear.assemble`; False if an M is singular."""
     for k in range(images):
@@ -171,7 +171,7 @@ def jacobian_blocks(R, t, e, nu_x, nu_y, images, M, inverse, blocks, offsets):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def joint_weights(levels, images, weights):
     """Inverse covariance of the comparisons' residuals, in units of 1 / sigma^2.
 
@@ -189,7 +189,7 @@ def joint_weights(levels, images, weights):
             weights[k, o] = (a if k == o else 0.0) - a * b / total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def corner_motion(blocks, offsets, step, images, box, scale_x, scale_y):
     """Largest motion of a corner of the subset over the images for a step (13,), in camera 1 px."""
     largest = 0.0
@@ -214,7 +214,7 @@ def corner_motion(blocks, offsets, step, images, box, scale_x, scale_y):
     return largest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def residual_variance(levels, images, n, f2, unknowns):
     """Variance of one image's noise, in reference grey levels squared, from all residuals."""
     total, expected = 0.0, 0.0
@@ -225,7 +225,7 @@ def residual_variance(levels, images, n, f2, unknowns):
     return total / expected / max(n - 2.0 - unknowns / images, 1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def too_rough(hessian, lens1, xc, yc, f2):
     """Whether the reference's gradients are those of white noise, or none at all."""
     j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
@@ -235,7 +235,7 @@ def too_rough(hessian, lens1, xc, yc, f2):
     return not (1e-6 < roughness < WHITE_ROUGHNESS)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def settled(motion, previous, tolerance):
     """Whether the steps still to come, as a geometric series, move no corner further than the tolerance."""
     if motion < 0.1 * tolerance:

@@ -36,7 +36,7 @@ def _dot(a, b, n):
     return float(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def set_up_reference(pixels, grad_x, grad_y, lens, x_px, y_px, subset, ref, box, poly):
     """Fill the reference subset about (x_px, y_px).
 
@@ -132,7 +132,7 @@ def set_up_reference(pixels, grad_x, grad_y, lens, x_px, y_px, subset, ref, box,
 _ROW = np.array([3, 5, 6, 4, 7, 8, 9, 10])  # where the eight columns lie in the reference
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def nine_from_eight(eight, nine):
     """Sums over the eight columns -> over the nine ``g_a m_j``, index 3 a + j."""
     nine[0] = -(eight[1] + eight[5])
@@ -142,7 +142,7 @@ def nine_from_eight(eight, nine):
         nine[3 + i] = eight[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian):
     """Sums of the nine columns, of f times them, and their Gram matrix with gain and offset projected out.
 

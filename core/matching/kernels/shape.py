@@ -31,7 +31,7 @@ from core.matching.kernels.reference import reference_sums, set_up_reference
 N_SHAPE_OUT = 9
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def shape_normal(weights, blocks, offsets, hessian, normal, half, reduced):
     """Normal equations of shape: w0, w1, w2, e out of the thirteen."""
     assemble(weights, blocks, offsets, hessian, 1, normal, half)
@@ -40,7 +40,7 @@ def shape_normal(weights, blocks, offsets, hessian, normal, half, reduced):
             reduced[i, j] = normal[4 * i, 4 * j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, setting, space, out):
     """Fit w0, w1, w2 and e of one point. ``out``: w (3), e, zncc, noise, cov(w0, e) (3), see ``fit.py``.
 

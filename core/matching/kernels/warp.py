@@ -18,7 +18,7 @@ N_WARP = 25
 _NEWTON_STEPS = 20
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def lens_expansion(lens, u, v):
     """Expand a lens about the normalised point (u, v).
 
@@ -52,7 +52,7 @@ def lens_expansion(lens, u, v):
     return x, y, l1, l2, l3, h11, h12, h22
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def lens_jacobian(lens, u, v):
     """d(image px) / d(normalised) at (u, v): the four entries row by row."""
     _, _, l1, _, _, h11, h12, h22 = lens_expansion(lens, u, v)
@@ -62,7 +62,7 @@ def lens_jacobian(lens, u, v):
     return lens[1] * a11 + lens[3] * a12, lens[1] * a12 + lens[3] * a22, lens[2] * a12, lens[2] * a22
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def undistort(lens, x, y):
     """Normalised point (u, v) of a pixel; NaN outside the lens model's domain."""
     yd = (y - lens[5]) / lens[2]
@@ -94,7 +94,7 @@ def undistort(lens, x, y):
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def set_up_warp(lens, m, box, rows, cols, stride, lead, p):
     """Prepare the pixel loop for one image that sees the patch through ``m``.
 

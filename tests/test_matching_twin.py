@@ -1,0 +1,100 @@
+"""The kernels against their numpy twin: same solution, same correlation, for both lenses and both splines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matching_scene import Plane, Texture, digitise, opencv_pair, paper_pair, render, true_g, true_w
+from matching_twin import Twin
+
+from core.matching import MatchOptions, fit_motion, fit_shape
+from core.matching.kernels.loops import _image_point
+from core.matching.kernels.point import image_matrices
+from core.matching.kernels.reference import set_up_reference
+from core.matching.kernels.warp import set_up_warp
+
+XY = np.array([[52.0, 61.0], [80.0, 80.0], [103.0, 94.0]])
+AFTER = Plane(np.array([0.02, -0.01, 0.015]), np.array([[1.01, 0.02], [-0.015, 0.995], [0.03, -0.02]]))
+
+
+def scene(kind):
+    pair = paper_pair(kappa=2e-8) if kind == "seidel" else opencv_pair()
+    texture = Texture(blob_mm=0.05 if kind == "seidel" else 0.11)
+    rng = np.random.default_rng(5)
+    images = [
+        digitise(render(camera, plane, texture), noise=2.0, rng=rng)
+        for plane in (Plane(), AFTER)
+        for camera in (pair.cam1, pair.cam2)
+    ]
+    images[3] = np.clip(0.8 * images[3] + 20.0, 0, 255).astype(np.uint8)
+    return pair, images
+
+
+@pytest.mark.parametrize("kind", ["seidel", "opencv"])
+@pytest.mark.parametrize(("interpolation", "order"), [("cubic", 3), ("quintic", 5)])
+def test_shape_solution_is_the_twins(kind, interpolation, order):
+    pair, images = scene(kind)
+    w = true_w(pair.cam1, Plane(), XY)
+    options = MatchOptions(subset_px=25, interpolation=interpolation, tolerance_px=3e-6)
+    fit = fit_shape(pair, images[0], images[1], XY, w, options)
+    assert (fit.status == 0).all()
+    for i, xy in enumerate(XY):
+        twin = Twin(pair, images[:2], xy, subset=25, order=order)
+        p = twin.solve(np.array([*w[i], 0.0]))
+        mine = np.array([*fit.w[i], fit.epipolar_px[i]])
+        assert np.abs(twin.place(0, p, twin.XY) - twin.place(0, mine, twin.XY)).max() < 1e-5
+        assert abs(fit.zncc[i, 0] - twin.residual(0, p)[2]) < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["seidel", "opencv"])
+@pytest.mark.parametrize(("interpolation", "order"), [("cubic", 3), ("quintic", 5)])
+def test_motion_solution_is_the_twins(kind, interpolation, order):
+    pair, images = scene(kind)
+    w, G = true_w(pair.cam1, Plane(), XY), true_g(pair.cam1, Plane(), AFTER, XY)
+    options = MatchOptions(subset_px=25, interpolation=interpolation, tolerance_px=3e-6)
+    first = fit_motion(pair, *images, XY, w, G, options)
+    assert (first.status == 0).all()
+    # from its own answer, so that the frozen Jacobian belongs to the solution
+    fit = fit_motion(pair, *images, XY, first.w, first.G, options)
+    for i, xy in enumerate(XY):
+        twin = Twin(pair, images, xy, subset=25, order=order)
+        mine = np.array([*fit.w[i], fit.epipolar_px[i], *fit.G[i].ravel()])
+        p = twin.solve(mine)
+        for k in range(3):
+            at = twin.place(k, p, twin.XY)
+            assert np.abs(at - twin.place(k, mine, twin.XY)).max() < 1e-5
+            before = np.array([*first.w[i], first.epipolar_px[i], *first.G[i].ravel()])
+            assert np.abs(at - twin.place(k, before, twin.XY)).max() < 2e-4
+            assert abs(fit.zncc[i, k] - twin.residual(k, p)[2]) < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["seidel", "opencv"])
+@pytest.mark.parametrize("subset", [33, 61])
+def test_the_pixel_loops_warp_is_exact_to_a_hundred_thousandth_of_a_pixel(kind, subset):
+    pair = paper_pair(kappa=2e-8) if kind == "seidel" else opencv_pair()
+    xy = np.array([82.3, 77.8])
+    lens1, lens2 = (np.array(camera.lens.kernel_parameters()) for camera in (pair.cam1, pair.cam2))
+    image = np.random.default_rng(0).normal(size=(160, 160)).astype(np.float32)
+    ref, box, poly = np.empty((11, subset**2), np.float32), np.empty(4), np.empty((2, 10))
+    inside, xc, yc, _ = set_up_reference(image, image, image, lens1, *xy, subset, ref, box, poly)
+    assert inside
+    left, top = np.floor(xy - 0.5 * (subset - 1) + 0.5)
+    x, y = np.meshgrid(left + np.arange(subset), top + np.arange(subset))
+    rays = pair.cam1.rays_cam(np.stack([x.ravel(), y.ravel()], -1)).xyz_mm
+    w = true_w(pair.cam1, AFTER, xy[None])[0]
+    pose = pair.cam2_from_cam1
+    M = np.empty((1, 3, 3))
+    image_matrices(np.array(pose.rotation), np.array(pose.translation_mm), xc, yc, w, M[0], 0.0, 0.0, 0.0, 1, M)
+    p = np.zeros(25, np.float32)
+    stride = 168
+    base = set_up_warp(lens2, M[0], box, 160, 160, stride, 1, p)
+    assert base >= 0
+    got = np.array([_image_point(p, a, b) for a, b in zip(ref[0], ref[1], strict=True)], float)
+    got += [base % stride - 3, base // stride - 3]
+    depth = 1.0 / (w[0] + (rays[:, :2] - [xc, yc]) @ w[1:])
+    expected = pair.image2_at_depth(np.stack([x.ravel(), y.ravel()], -1), depth)
+    error = got - expected
+    assert np.abs(error).max() < 1.5e-5  # float32's own rounding at 30 px is 4e-6
+    assert np.sqrt((error**2).mean()) < 4e-6
+    assert box[0] <= ref[0].min() * (1 - 1e-6)
+    assert box[3] >= ref[1].max() * (1 - 1e-6)
