@@ -16,15 +16,18 @@ from core.matching.kernels.point import (
     OUTSIDE_IMAGE,
     REFREEZE_PX,
     SINGULAR,
+    WHITE_ROUGHNESS,
     compare,
     corner_motion,
     epipolar_shift,
     image_matrices,
     jacobian_blocks,
     joint_weights,
+    noise_share,
     residual_variance,
     settled,
-    too_rough,
+    texture_roughness,
+    texture_status,
 )
 from core.matching.kernels.reference import reference_sums, set_up_reference
 
@@ -177,7 +180,8 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         return LOW_TEXTURE, 0
     sum_j, sum_fj = sum_both[0], sum_both[1]
     reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    if too_rough(hessian, lens1, xc, yc, f2):
+    roughness = texture_roughness(hessian, lens1, xc, yc, f2)
+    if not 1e-6 < roughness < WHITE_ROUGHNESS:
         return LOW_TEXTURE, 0
     w, step, rhs13, small = vectors[0], vectors[1], vectors[2], vectors[3]
     w[:] = 0.0
@@ -268,16 +272,18 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         for i in range(3):
             out[3 + 3 * i + j] = G[i, j]
     out[12] = e
-    variance = residual_variance(levels, 3, n, f2, float(free))
-    out[16] = math.sqrt(max(variance, 0.0))
+    variance = residual_variance(levels, 3, n, f2, float(free), order)
+    share = noise_share(variance, roughness, f2, n, order)
+    inflated = variance / max(1.0 - share, 0.01) ** 2
+    out[16] = math.sqrt(variance)
     for a in range(5):
         small[:] = 0.0
         small[a if a < 4 else free - 1] = 1.0
         solve(reduced, small, free)
         for b in range(4):
-            out[17 + 5 * a + b] = small[b] * variance
-        out[21 + 5 * a] = small[free - 1] * variance
+            out[17 + 5 * a + b] = small[b] * inflated
+        out[21 + 5 * a] = small[free - 1] * inflated
     sigma = max(math.sqrt(out[17]) * along, math.sqrt(out[23]) * lens1[1] / G[2, 0])
-    if status == OK and not sigma < max_sigma:
-        status = LOW_TEXTURE
+    if status == OK:
+        status = texture_status(share, sigma, max_sigma, min(levels[0, 2], levels[1, 2], levels[2, 2]))
     return status, iterations
