@@ -140,7 +140,7 @@ class ESP301Stage(SerialStage):
         return AxisStatus(axis, state, position, motor_on, homed, moving)
 
     def _switch_motor(self, axis: int, *, on: bool) -> None:
-        self._messages += self._drain_errors()
+        self._keep(self._drain_errors())
         self._line.command(f"{axis}{'MO' if on else 'MF'}")
         self._raise_refusal((axis,), f"motor {'on' if on else 'off'}")
         if self._line.query(f"{axis}MO?", _flag) is not on:
@@ -156,7 +156,7 @@ class ESP301Stage(SerialStage):
             raise StageError(
                 f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis
             )
-        self._messages += self._drain_errors()
+        self._keep(self._drain_errors())
         self._homed_at.pop(axis, None)
         self._line.command(f"{axis}OR{self._home_mode}")
         self._raise_refusal((axis,), "search for home")

@@ -34,6 +34,8 @@ _POLL_S = 0.02
 _JAM_S = 1.0
 # Added to the computed travel time before a motion counts as overdue
 _MARGIN_S = 5.0
+# Messages kept for `errors`; nobody may ever ask for them
+_MESSAGES = 100
 # How long an axis may take to come to rest after a stop
 _REST_S = 3.0
 
@@ -108,9 +110,10 @@ class SerialStage(ABC):
 
     def errors(self) -> tuple[ControllerMessage, ...]:
         """Empty the controller's error queue."""
-        fresh = self._drain_errors()
-        old, self._messages = self._messages, []
-        return (*old, *fresh)
+        if not self._moving:  # a motion reads the queue itself, and must find there what went wrong with it
+            self._keep(self._drain_errors())
+        found, self._messages = self._messages, []
+        return tuple(found)
 
     def stop(self, axis: int | None = None) -> None:
         """Stop one axis or all, at once; takes no lock."""
@@ -172,7 +175,7 @@ class SerialStage(ABC):
         self._check_not_stopped(noted, axes, write=False)
         here = {axis: self._check_ready(axis).position_mm for axis in axes}
         detours = {axis: mm for axis in axes if (mm := self._detour(axis, here[axis], goals[axis])) is not None}
-        self._messages += self._drain_errors()  # what is found afterwards was caused by this motion
+        self._keep(self._drain_errors())  # what is found afterwards was caused by this motion
         with self._stopped_on_error(axes):
             if detours:
                 self._leg(here, detours, noted)
@@ -214,7 +217,9 @@ class SerialStage(ABC):
                     continue
                 now = time.monotonic()
                 mm, since = last.get(axis, (math.inf, now))
-                if abs(status.position_mm - mm) > self._options[axis].tolerance_mm / 2:
+                # a slow axis must not count as jammed
+                step = min(self._options[axis].tolerance_mm / 2, 0.2 * self._velocity_mm_s[axis] * _JAM_S)
+                if abs(status.position_mm - mm) > step:
                     last[axis] = (status.position_mm, now)
                 elif watch_jam and now - since > _JAM_S:
                     raise self._fault(axis, f"has stood at {status.position_mm:.5f} mm for {now - since:.1f} s")
@@ -345,8 +350,11 @@ class SerialStage(ABC):
     def _new_errors(self, axes: tuple[int, ...]) -> list[ControllerMessage]:
         """Empty the error queue into `errors`, and return what concerns these axes or no axis in particular."""
         found = [message for axis in axes for message in self._drain_errors(axis)]
-        self._messages += found
+        self._keep(found)
         return [message for message in found if message.axis is None or message.axis in axes]
+
+    def _keep(self, messages: list[ControllerMessage]) -> None:
+        self._messages = [*self._messages, *messages][-_MESSAGES:]
 
     def _raise_refusal(self, axes: tuple[int, ...], what: str) -> None:
         bad = self._new_errors(axes)

@@ -15,7 +15,13 @@ STAGE_DRIVERS: dict[str, Callable[..., SerialStage]] = {"esp301": ESP301Stage, "
 
 
 def open_stage(
-    driver: str, url: str, options: Mapping[int, AxisOptions], *, record: Path | None = None, timeout_s: float = 0.5
+    driver: str,
+    url: str,
+    options: Mapping[int, AxisOptions],
+    *,
+    baudrate: int | None = None,
+    record: Path | None = None,
+    timeout_s: float = 0.5,
 ) -> SerialStage:
     """Make a stage by the name of its driver and open it.
 
@@ -27,6 +33,8 @@ def open_stage(
         Serial URL as pyserial takes it.
     options
         Axis number -> how it is used; for the SMC100 family the axis number is the address on the chain.
+    baudrate
+        For true serial ports where it is not the driver's usual one (ESP301's USB 921600, SMC100 57600).
     record
         File for a transcript of the wire.
     timeout_s
@@ -43,6 +51,7 @@ def open_stage(
             code="unknown_driver",
             remedy="Correct [stage] driver in the rig file.",
         )
-    stage = STAGE_DRIVERS[driver](url, options, record=record, timeout_s=timeout_s)
+    extra = {} if baudrate is None else {"baudrate": baudrate}
+    stage = STAGE_DRIVERS[driver](url, options, record=record, timeout_s=timeout_s, **extra)
     stage.open()
     return stage

@@ -113,7 +113,7 @@ class SMC100Stage(SerialStage):
         # without a reference the controller refuses new speeds; homing comes back here
         if self._read_status(axis).state in (AxisState.READY, AxisState.MOTOR_OFF):
             option = self._options[axis]
-            self._messages += self._drain_errors(axis)
+            self._keep(self._drain_errors(axis))
             if option.acceleration_mm_s2 is not None:
                 self._line.command(f"{axis}AC{option.acceleration_mm_s2:.6f}")
             if option.velocity_mm_s is not None:
@@ -127,7 +127,7 @@ class SMC100Stage(SerialStage):
     def _read_status(self, axis: int) -> AxisStatus:
         errors, number = self._read_word(axis)
         fresh = self._fresh_errors(axis, errors)
-        self._messages += fresh
+        self._keep(fresh)
         state = _STATES.get(number, AxisState.FAULT)
         detail = "; ".join(message.text for message in fresh)
         if fresh and state is not AxisState.NOT_HOMED:
@@ -171,7 +171,7 @@ class SMC100Stage(SerialStage):
             raise StageError(
                 f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis
             )
-        self._messages += self._drain_errors(axis)
+        self._keep(self._drain_errors(axis))
         self._line.command(f"{axis}PA0" if status.homed else f"{axis}OR")
         self._raise_refusal((axis,), "search for home")
 

@@ -11,7 +11,7 @@ Large deflection: with w's shape kept, the mid-plane's radial displacement solve
     u = (w0^2 / a) (c1 p + c3 p^3 + c5 p^5 + c7 p^7),  p = r / a,
     c3 = -(3 - nu), c5 = (10 - 2 nu) / 3, c7 = -(7 - nu) / 6, c1 = (5 - 3 nu) / 6   (edge held),
 
-and minimum energy gives w0 (1 + k (w0/t)^2) = q a^4 / (64 D), where k is 0.488 for nu = 0.3.
+and minimum energy gives w0 (1 + k (w0/t)^2) = q a^4 / (64 D), where k is 0.471 for nu = 0.3.
 """
 
 from __future__ import annotations

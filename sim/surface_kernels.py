@@ -151,7 +151,7 @@ def cracked_panel(par: Float, s: Float, t: Float, lip: Float, out: Float) -> Non
     for i in range(s.size):
         x, y = s[i], t[i]
         # root = sqrt(z^2 - a^2) with its cut along the crack, continued across it on the lip asked for
-        zeta = complex(x, y)
+        zeta = complex(x, y + 0.0)  # no negative zero, whose root lies on the other lip
         root = np.sqrt(zeta - a) * np.sqrt(zeta + a)
         if abs(x) < a and (y < 0.0) == (lip[i] > 0.0):
             root = -root

@@ -34,6 +34,7 @@ _MIX_B: Final = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_C: Final = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S21, _S42 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(21), np.uint64(42)
 _MASK21: Final = np.uint64((1 << 21) - 1)
+_EDGE_REACH_SD: Final = 6.0  # a line's soft edge ends here, with 1e-9 left
 _FAR_MM: Final = 1e9  # beyond it a cell's index is no whole number any more
 _UNIT: Final = 1.0 / float(1 << 21)
 
@@ -89,12 +90,12 @@ def speckle(
     seed
         Names the pattern; the same seed is the same specimen.
     rim_mm
-        Width over which a disc's rim goes from bright to dark; a quarter of the diameter by default, like sprayed
+        Width over which a disc's rim goes from bright to dark; a third of the diameter by default, like sprayed
         paint.
     dark, bright
         Brightness of disc and ground.
     """
-    rim = 0.25 * diameter_mm if rim_mm is None else rim_mm
+    rim = 0.35 * diameter_mm if rim_mm is None else rim_mm
     if not 0.0 < rim <= 0.5 * diameter_mm:
         raise ValueError(f"rim_mm must lie in (0, {0.5 * diameter_mm:g}], got {rim:g}")
     cell = _CELL_PER_DIAMETER * diameter_mm
@@ -142,11 +143,12 @@ def line_grid(
         raise ValueError(f"a grid needs two lines each way, got {lines}")
     x = (np.arange(n_a) - 0.5 * (n_a - 1)) * pitch_mm
     y = (np.arange(n_b) - 0.5 * (n_b - 1)) * pitch_mm
-    nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    nodes = nodes + np.random.default_rng(seed).uniform(-node_tolerance_mm, node_tolerance_mm, nodes.shape)
+    ideal = np.stack(np.meshgrid(x, y), axis=-1)
+    nodes = ideal + np.random.default_rng(seed).uniform(-node_tolerance_mm, node_tolerance_mm, ideal.shape)
     edge = line_width_mm / 12.0 if edge_sd_mm is None else edge_sd_mm
     line, ground = (dark, bright) if dark_lines else (bright, dark)
-    par = np.array([pitch_mm, 0.5 * line_width_mm, edge, line, ground])
+    worst = float(np.abs(nodes - ideal).max())
+    par = np.array([pitch_mm, 0.5 * line_width_mm, edge, line, ground, worst])
     return Texture(kind=GRID, parameters=par, nodes_mm=nodes, finest_mm=edge)
 
 
@@ -219,11 +221,23 @@ def _speckle(par: Float, s: Float, t: Float, out: Float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _grid(par: Float, nodes: Float, s: Float, t: Float, out: Float) -> None:
+    per_mm = 1.0 / par[0]
+    n_b, n_a = nodes.shape[:2]
+    centre_a, centre_b = 0.5 * (n_a - 1) + 0.5, 0.5 * (n_b - 1) + 0.5
+    # no line is nearer to a point than its nominal distance less the worst node's error
+    reach = par[1] + _EDGE_REACH_SD * par[2] + par[5]
+    near = reach * per_mm
     for k in range(s.size):
-        if abs(s[k]) < _FAR_MM and abs(t[k]) < _FAR_MM:
-            a = _line_cover(par, nodes, s[k], t[k], 0)
-            b = _line_cover(par, nodes, t[k], s[k], 1)
-            out[k] = par[4] + (par[3] - par[4]) * (1.0 - (1.0 - a) * (1.0 - b))
+        if not (abs(s[k]) < _FAR_MM and abs(t[k]) < _FAR_MM):
+            continue
+        a, b = s[k] * per_mm + centre_a, t[k] * per_mm + centre_b
+        line_a, line_b = np.floor(a), np.floor(b)
+        v = 1.0  # share of the ground
+        if abs(a - line_a - 0.5) < near and 0 <= line_a < n_a:
+            v -= _line_cover(par, nodes, s[k], t[k], 0)
+        if abs(b - line_b - 0.5) < near and 0 <= line_b < n_b:
+            v *= 1.0 - _line_cover(par, nodes, t[k], s[k], 1)
+        out[k] = par[4] + (par[3] - par[4]) * (1.0 - v)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -258,17 +272,16 @@ def _line_cover(par: Float, nodes: Float, across: float, along: float, family: i
     l1 = _node(nodes, line, seg + 1, family, other)
     slope = (c1 - c0) / (l1 - l0)
     off = (across - (c0 + slope * (along - l0))) / np.sqrt(1.0 + slope * slope)
-    reach = half + 6.0 * sd
-    if abs(off) > reach:
+    if abs(off) > half + _EDGE_REACH_SD * sd:
         return 0.0
     root = 1.0 / (1.4142135623730951 * sd)
     cover: float = 0.5 * (erf((half - off) * root) + erf((half + off) * root))
     # lines end half a line width behind the outermost crossings, so that the corners are square
     start = _node(nodes, line, 0, family, other) - half
     end = _node(nodes, line, n_along - 1, family, other) + half
-    if along < start + 6.0 * sd:
+    if along < start + _EDGE_REACH_SD * sd:
         cover *= 0.5 * (1.0 + erf((along - start) * root))
-    if along > end - 6.0 * sd:
+    if along > end - _EDGE_REACH_SD * sd:
         cover *= 0.5 * (1.0 + erf((end - along) * root))
     return float(cover)
 

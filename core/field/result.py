@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.starts import Starts
 from core.status import PointStatus
 
 Float = NDArray[np.float64]
@@ -47,6 +48,9 @@ class Field:
         (r, c, 3) rotation vector of the patch, system frame, or None.
     stretch
         (r, c, 3) in-plane stretch e11, e22, e12 in the patch's tangent frame, or None.
+    starts
+        The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
+        file, None in a field that was read from one.
     """
 
     x_px: Float
@@ -65,6 +69,7 @@ class Field:
     uvw_mm: Float | None = None
     rotation_rad: Float | None = None
     stretch: Float | None = None
+    starts: Starts | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -1,0 +1,229 @@
+"""Every point that is shipped is checked again, against what the field itself says a right match looks like.
+
+Four checks: correlation in each comparison, offset across the epipolar line, agreement with the neighbours' patches,
+and support by other points at all. Limits are multiples of the field's own robust scatter, so they follow noise,
+texture and lens; the floors keep a nearly perfect field from throwing away its second-best points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from core.field.fitter import PointFits
+from core.field.kernels import N_QUANTITIES, compare_with_neighbours
+from core.field.starts import depth_per_px
+from core.lens import Bool, Float
+from core.status import PointStatus
+from core.stereo import StereoPair
+
+_MAD_TO_SIGMA = 1.4826
+_FEW = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateOptions:
+    """Limits of the checks.
+
+    Parameters
+    ----------
+    epipolar_sigmas
+        Allowed distance from the field's smooth epipolar offset, in its robust standard deviations.
+    epipolar_floor_px
+        Added to it.
+    correlation_sigmas
+        Allowed excess of log(1 - zncc) over what texture and place predict, in robust standard deviations.
+    correlation_least_factor, correlation_most_factor
+        1 - zncc up to the first times its expectation is never refused; above the second always.
+    neighbour_sigmas
+        Allowed disagreement with the neighbours' patches, in robust standard deviations.
+    neighbour_floor_px
+        Added to it, as a distance in the images: curvature between neighbouring points must fit in.
+    least_cluster
+        Groups of fewer connected points are not trusted.
+    """
+
+    epipolar_sigmas: float = 5.0
+    epipolar_floor_px: float = 0.002
+    correlation_sigmas: float = 6.0
+    correlation_least_factor: float = 2.5
+    correlation_most_factor: float = 12.0
+    neighbour_sigmas: float = 6.0
+    neighbour_floor_px: float = 0.05
+    least_cluster: int = 4
+
+
+def apply_gates(
+    points: PointFits,
+    *,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    xy_px: Float,
+    rays: Float,
+    texture: Float,
+    options: GateOptions,
+) -> int:
+    """Refuse points in place; returns how many.
+
+    Parameters
+    ----------
+    points
+        n = rows x columns points of the grid, row by row.
+    pair
+        The calibrated cameras.
+    shape
+        Rows and columns of the grid.
+    xy_px, rays
+        (n, 2) px and (n, 3) normalised, of the points.
+    texture
+        (n,) grey-level variance of camera 1's subset.
+    options
+        Limits.
+    """
+    before = int(points.ok.sum())
+    few = before < _FEW
+    if not few:
+        _gate_correlation(points, xy_px, texture, options)
+    for _ in range(2):
+        _gate_neighbours(points, pair, shape, rays, options, few=few)
+    if not few:
+        _gate_epipolar(points, xy_px, options)
+        _gate_clusters(points, shape, options)
+    return before - int(points.ok.sum())
+
+
+def _gate_correlation(points: PointFits, xy_px: Float, texture: Float, options: GateOptions) -> None:
+    ok = np.flatnonzero(points.ok)
+    if len(ok) < _FEW:
+        return
+    trend = np.column_stack([_smooth_terms(xy_px[ok]), np.log(np.maximum(texture[ok], 1e-6))])
+    worst = np.full(len(ok), -np.inf)
+    for k in range(points.zncc.shape[1]):
+        y = np.log(np.maximum(1.0 - points.zncc[ok, k], 1e-7))
+        r, sigma = _robust_residual(trend, y)
+        limit = np.clip(
+            options.correlation_sigmas * sigma,
+            np.log(options.correlation_least_factor),
+            np.log(options.correlation_most_factor),
+        )
+        worst = np.maximum(worst, r - limit)
+    points.refuse(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
+
+
+def _gate_epipolar(points: PointFits, xy_px: Float, options: GateOptions) -> None:
+    for _ in range(4):
+        ok = np.flatnonzero(points.ok)
+        if len(ok) < _FEW:
+            return
+        e = points.epipolar_px[ok]
+        r, sigma = _robust_residual(_smooth_terms(xy_px[ok]), e)
+        # the plain mean and standard deviation too: the figure that a reader recomputes from the file
+        plain = np.abs(e - e.mean()) / max(float(e.std()), 1e-12)
+        bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | (
+            (plain > options.epipolar_sigmas) & (np.abs(e - e.mean()) > options.epipolar_floor_px)
+        )
+        if not bad.any():
+            return
+        points.refuse(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
+
+
+def neighbour_disagreement(
+    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float
+) -> tuple[Float, Float, NDArray[np.int32]]:
+    """Return (n, 4) disagreement with the neighbours and its local spread in px, and how many neighbours spoke.
+
+    The four are depth as camera 2 sees it, and displacement along x, y and (as camera 2 sees it) depth.
+    """
+    rows, cols = shape
+    n = rows * cols
+    difference = np.full((rows, cols, N_QUANTITIES), np.nan)
+    spread = np.full((rows, cols, N_QUANTITIES), np.nan)
+    count = np.zeros((rows, cols), np.int32)
+    motion = points.zncc.shape[1] == 3
+    compare_with_neighbours(
+        points.ok.reshape(shape),
+        np.ascontiguousarray(rays.reshape(rows, cols, 3)),
+        np.ascontiguousarray(points.w.reshape(rows, cols, 3)),
+        np.ascontiguousarray(points.G.reshape(rows, cols, 3, 3)),
+        motion,
+        np.inf,
+        difference,
+        spread,
+        count,
+    )
+    scale = np.full((n, N_QUANTITIES), np.nan)
+    ok = np.flatnonzero(points.ok)
+    if len(ok):
+        w0 = points.w[ok, 0]
+        scale[ok, 0] = scale[ok, 3] = w0 / depth_per_px(pair, rays[ok], w0)
+        J = pair.cam1.lens.image_jacobian(rays[ok, :2])
+        scale[ok, 1], scale[ok, 2] = np.linalg.norm(J[:, :, 0], axis=1), np.linalg.norm(J[:, :, 1], axis=1)
+    return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
+
+
+def _gate_neighbours(
+    points: PointFits,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    rays: Float,
+    options: GateOptions,
+    *,
+    few: bool,
+) -> None:
+    difference, spread, count = neighbour_disagreement(points, pair, shape, rays)
+    ok = points.ok
+    bad = np.zeros(len(ok), bool)
+    heard = ok & (count >= 2)
+    for q in range(N_QUANTITIES if points.zncc.shape[1] == 3 else 1):
+        d = np.abs(difference[heard, q])
+        if len(d) == 0:
+            continue
+        sigma = _MAD_TO_SIGMA * float(np.median(d))
+        limit = (
+            options.neighbour_sigmas * np.hypot(sigma, _MAD_TO_SIGMA * spread[heard, q]) + options.neighbour_floor_px
+        )
+        bad[np.flatnonzero(heard)[d > limit]] = True
+    if not few:
+        bad |= ok & (count < 2)  # nothing near it that could confirm it
+    points.refuse(bad, PointStatus.NEIGHBOUR_MISMATCH)
+
+
+def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions) -> None:
+    labels, n = ndimage.label(points.ok.reshape(shape), structure=np.ones((3, 3)))
+    if n == 0:
+        return
+    size = np.bincount(labels.ravel())
+    size[0] = options.least_cluster
+    points.refuse((size[labels] < options.least_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
+
+
+def _smooth_terms(xy: Float) -> Float:
+    """Quadratic surface over the points, scaled to unit size."""
+    s = (xy - xy.mean(axis=0)) / np.maximum(np.ptp(xy, axis=0), 1.0)
+    x, y = s[:, 0], s[:, 1]
+    terms = [np.ones(len(x)), x, y, x * x, x * y, y * y]
+    return np.column_stack(terms if len(x) > 60 else terms[:1])
+
+
+def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
+    """Return residuals about a robust linear fit (Tukey's biweight) and their robust standard deviation."""
+    weight = np.ones(len(values))
+    residual = values - np.median(values)
+    for _ in range(6):
+        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual)))), 1e-12)
+        u = residual / (4.685 * sigma)
+        weight = np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
+        root = np.sqrt(weight)
+        solution = np.linalg.lstsq(design * root[:, None], values * root, rcond=1e-9)[0]
+        residual = values - design @ solution
+    sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-12)
+    return residual, sigma
+
+
+def _at(points: PointFits, index: NDArray[np.intp]) -> Bool:
+    mask = np.zeros(len(points.status), bool)
+    mask[index] = True
+    return mask

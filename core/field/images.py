@@ -1,0 +1,164 @@
+"""Images of a measurement: checked once, prepared once, features found once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from core.errors import ImageError
+from core.field.features import Features, detect
+from core.lens import Float
+from core.matching.image import ImageData, prepare
+from core.matching.options import Interpolation
+
+_TILE = 48
+_LEAST_STRUCTURE = 0.2
+_BAND_PX = 6.0
+_SMALLEST = 32
+
+
+class MeasureImage:
+    """One image with what was computed from it.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels uint8, uint16 or float; or an image already prepared.
+    name
+        How errors call it.
+
+    Raises
+    ------
+    ImageError
+        ``image_shape``, ``image_type``, ``image_not_finite``.
+    """
+
+    def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
+        self.name = name
+        self._prepared: dict[Interpolation, ImageData] = {}
+        self._features: list[tuple[NDArray[np.bool_] | None, Features]] = []
+        self._variance: dict[int, Float] = {}
+        if isinstance(image, MeasureImage):
+            self.pixels: NDArray[Any] = image.pixels
+            self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
+        elif isinstance(image, ImageData):
+            self.pixels = image.pixels
+            self._prepared["cubic" if image.order == 3 else "quintic"] = image
+        else:
+            self.pixels = _checked(np.asarray(image), name)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return int(self.pixels.shape[0]), int(self.pixels.shape[1])
+
+    def prepared(self, interpolation: Interpolation) -> ImageData:
+        """Return the spline coefficients, computed on the first call."""
+        if interpolation not in self._prepared:
+            self._prepared[interpolation] = prepare(self.pixels, interpolation)
+        return self._prepared[interpolation]
+
+    def features(self, mask: NDArray[np.bool_] | None = None) -> Features:
+        """Return keypoints where ``mask`` allows them, found on the first call for that mask."""
+        for known, features in self._features:
+            if known is mask or (known is not None and mask is not None and np.array_equal(known, mask)):
+                return features
+        features = detect(self.pixels, mask=mask)
+        self._features.append((mask, features))
+        return features
+
+    def subset_variance(self, subset_px: int) -> Float:
+        """Return the grey-level variance (rows, cols) in the square of ``subset_px`` about each pixel."""
+        if subset_px not in self._variance:
+            pixels = self.pixels.astype(np.float64)
+            pixels -= pixels.mean()
+            mean = cv2.boxFilter(pixels, -1, (subset_px, subset_px))
+            square = cv2.boxFilter(pixels * pixels, -1, (subset_px, subset_px))
+            self._variance[subset_px] = np.maximum(np.asarray(square) - np.asarray(mean) ** 2, 0.0)
+        return self._variance[subset_px]
+
+    def refuse_blank(self, box: tuple[float, float, float, float] | None = None) -> None:
+        """Raise ``image_blank`` if nothing but noise is seen in (x0, y0, x1, y1), or anywhere when left out."""
+        pixels = self.pixels
+        if box is not None:
+            x0, y0, x1, y1 = (round(v) for v in box)
+            pixels = pixels[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1]
+        low, high = float(pixels.min()), float(pixels.max())
+        where = f"{self.name}" if box is None else f"{self.name} in the region"
+        remedy = "Check lens cap, light, exposure and that the specimen carries a pattern."
+        if low == high:
+            raise ImageError(f"{where} shows one grey level, {low:g}, everywhere.", code="image_blank", remedy=remedy)
+        structure = largest_structure(pixels)
+        if structure < _LEAST_STRUCTURE:
+            raise ImageError(
+                f"{where} shows noise only: neighbouring pixels correlate by {structure:.2f} at most, a pattern by "
+                f"{_LEAST_STRUCTURE:g} and more (grey levels {low:g} to {high:g}).",
+                code="image_blank",
+                remedy=remedy,
+            )
+
+
+def largest_structure(pixels: NDArray[Any]) -> float:
+    """Return the largest correlation between neighbouring pixels over tiles of 48 px, slow shading taken out.
+
+    White camera noise gives 0 +- 0.02, a pattern that a camera resolves 0.5 and more.
+    """
+    p = pixels.astype(np.float32)
+    p = p - ndimage.gaussian_filter(p, _BAND_PX, mode="nearest")
+    best = 0.0
+    tile = min(_TILE, *p.shape)
+    for y in range(0, p.shape[0] - tile + 1, tile):
+        for x in range(0, p.shape[1] - tile + 1, tile):
+            t = p[y : y + tile, x : x + tile]
+            variance = float(np.mean(t * t))
+            if variance > 1e-4:
+                lag = 0.5 * float(np.mean(t[:, 1:] * t[:, :-1]) + np.mean(t[1:] * t[:-1]))
+                best = max(best, lag / variance)
+    return best
+
+
+def same_size(a: MeasureImage, b: MeasureImage) -> None:
+    """Raise ``image_size_mismatch`` if two images of one camera differ in size."""
+    if a.shape != b.shape:
+        raise ImageError(
+            f"{b.name} is {b.shape[1]} x {b.shape[0]} px, {a.name} is {a.shape[1]} x {a.shape[0]} px.",
+            code="image_size_mismatch",
+            remedy="Give images of one size per camera.",
+        )
+
+
+def check_calibrated_size(image: MeasureImage, size_px: tuple[int, int] | None) -> None:
+    """Raise ``image_size_mismatch`` if an image has not the (width, height) that its camera was calibrated with."""
+    if size_px is not None and (image.shape[1], image.shape[0]) != tuple(size_px):
+        raise ImageError(
+            f"{image.name} is {image.shape[1]} x {image.shape[0]} px, its camera was calibrated at "
+            f"{size_px[0]} x {size_px[1]} px.",
+            code="image_size_mismatch",
+            remedy="Use the calibration made with this camera and this image format.",
+        )
+
+
+def _checked(image: NDArray[Any], name: str) -> NDArray[Any]:
+    if image.ndim != 2 or min(image.shape) < _SMALLEST:
+        raise ImageError(
+            f"{name} has the shape {image.shape}; it must be 2-D and {_SMALLEST} px or more wide and high.",
+            code="image_shape",
+            remedy="Give one channel of grey levels.",
+        )
+    if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise ImageError(
+            f"{name} holds {image.dtype}; grey levels must be uint8, uint16 or float.",
+            code="image_type",
+            remedy="Give the image as the camera delivered it.",
+        )
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise ImageError(
+            f"{name} holds {int((~np.isfinite(image)).sum())} NaN or infinite grey levels.",
+            code="image_not_finite",
+            remedy="Give the image as the camera delivered it.",
+        )
+    return np.ascontiguousarray(image)

@@ -1,0 +1,99 @@
+"""Robust local linear fits to scattered matches, many places at once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from core.lens import Float
+
+_TRIPLETS = 48
+
+
+class LocalFits(NamedTuple):
+    """Linear maps about M places.
+
+    Attributes
+    ----------
+    value
+        (M, d) the map at the place itself.
+    slope
+        (M, d, 2) its derivatives over x and y.
+    spread
+        (M,) median residual of the neighbours used, in units of the values; inf where no fit was possible.
+    inliers
+        (M,) how many neighbours agreed.
+    distance
+        (M,) how far the neighbours reach.
+    """
+
+    value: Float
+    slope: Float
+    spread: Float
+    inliers: Float
+    distance: Float
+
+
+def robust_local_fits(
+    places: Float, points: Float, values: Float, *, neighbours: int = 14, tolerance: float, seed: int = 0
+) -> LocalFits:
+    """Fit value = a + B (x - place) to the nearest points by least median of squares, then least squares on inliers.
+
+    Parameters
+    ----------
+    places
+        (M, 2) where the fits are wanted.
+    points, values
+        (N, 2) and (N, d) scattered samples, some of them wrong.
+    neighbours
+        How many nearest points take part.
+    tolerance
+        Residual up to which a neighbour counts as an inlier, in the values' unit.
+    seed
+        Of the random triplets: equal input gives equal output.
+    """
+    m, d = len(places), values.shape[1]
+    k = min(neighbours, len(points))
+    empty = LocalFits(np.full((m, d), np.nan), np.full((m, d, 2), np.nan), np.full(m, np.inf), np.zeros(m), np.zeros(m))
+    if k < 4 or m == 0:
+        return empty
+    found, index = cKDTree(points).query(places, k=k)
+    distance = np.asarray(found)
+    x = points[index] - places[:, None, :]  # (M, K, 2)
+    v = values[index]
+    scale = np.maximum(distance[:, -1], 1e-12)
+    A = np.concatenate([np.ones((m, k, 1)), x / scale[:, None, None]], axis=2)
+
+    rng = np.random.default_rng(seed)
+    triplets = np.argsort(rng.random((_TRIPLETS, k)), axis=1)[:, :3]
+    corner, target = A[:, triplets], v[:, triplets]  # (M, S, 3, 3), (M, S, 3, d)
+    flat = np.abs(np.linalg.det(corner)) < 1e-2  # nearly collinear triplets say nothing about slopes
+    corner = np.where(flat[..., None, None], np.eye(3), corner)
+    candidate = np.linalg.solve(corner, target)  # (M, S, 3, d)
+    residual = np.linalg.norm(np.einsum("mki,msid->mskd", A, candidate) - v[:, None], axis=3)
+    median = np.where(flat, np.inf, np.median(residual, axis=2))
+    best = np.argmin(median, axis=1)
+    r = residual[np.arange(m), best]
+    for _ in range(2):
+        weight = (r < tolerance).astype(float)
+        normal = np.einsum("mki,mk,mkj->mij", A, weight, A)
+        enough = (weight.sum(axis=1) >= 4) & (np.abs(np.linalg.det(normal)) > 1e-3) & np.isfinite(median.min(axis=1))
+        normal = np.where(enough[:, None, None], normal, np.eye(3))
+        solution = np.linalg.solve(normal, np.einsum("mki,mk,mkd->mid", A, weight, v))
+        r = np.linalg.norm(np.einsum("mki,mid->mkd", A, solution) - v, axis=2)
+    spread = np.where(enough, np.median(np.where(weight > 0, r, np.nan_to_num(r.max())), axis=1), np.inf)
+    solution = np.where(enough[:, None, None], solution, np.nan)
+    slope = np.swapaxes(solution[:, 1:], 1, 2) / scale[:, None, None]
+    return LocalFits(solution[:, 0], slope, spread, np.where(enough, weight.sum(axis=1), 0.0), distance[:, -1])
+
+
+def consistent(points: Float, values: Float, *, tolerance: float, neighbours: int = 14) -> np.ndarray:
+    """Return (N,) bool: which samples agree with the robust fit of their own neighbourhood."""
+    if len(points) < 8:
+        return np.zeros(len(points), bool)
+    fits = robust_local_fits(points, points, values, neighbours=neighbours, tolerance=tolerance)
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(fits.value - values, axis=1) < tolerance
+    return np.asarray(near & (fits.inliers >= 0.5 * min(neighbours, len(points))))

@@ -1,0 +1,176 @@
+"""Scattered shape and motion from feature matches, filtered by the cameras' geometry, and start values from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.errors import ImageError
+from core.field.features import Features, match
+from core.field.local_fit import consistent, robust_local_fits
+from core.field.starts import Starts, depth_per_px
+from core.lens import Bool, Float
+from core.stereo import StereoPair
+
+EPIPOLAR_PX = 1.5
+"""Distance from the epipolar line up to which a feature match can be right."""
+_DEPTH_TOLERANCE_PX = 1.5
+_MOTION_TOLERANCE_PX = 2.0
+_FEWEST = 12
+_SWAP_FEWEST = 25
+
+
+@dataclass(frozen=True, eq=False)
+class ScatteredShape:
+    """Matches between camera 1 and camera 2 that fit the epipolar geometry and their neighbours.
+
+    Attributes
+    ----------
+    xy_px
+        (n, 2) in camera 1.
+    w0
+        (n,) inverse depth, 1/mm.
+    """
+
+    xy_px: Float
+    w0: Float
+
+
+@dataclass(frozen=True, eq=False)
+class ScatteredMotion:
+    """Matches between camera 1 at t0 and camera 1 at t that agree with their neighbours; (n, 2) px each."""
+
+    xy_px: Float
+    xy_now_px: Float
+
+
+def scattered_shape(pair: StereoPair, features1: Features, features2: Features) -> ScatteredShape:
+    """Match camera 1 with camera 2 and keep what the geometry and the neighbourhood allow.
+
+    Raises
+    ------
+    ImageError
+        ``cameras_swapped`` if the matches fit the cameras with exchanged roles and not as given.
+    """
+    pairs = match(features1, features2)
+    xy1, xy2 = features1.xy_px[pairs[:, 0]], features2.xy_px[pairs[:, 1]]
+    near = _on_line(pair, xy1, xy2)
+    refuse_swapped(pair, xy1, xy2, near)
+    xy1, xy2 = xy1[near], xy2[near]
+    if len(xy1) == 0:
+        return ScatteredShape(np.zeros((0, 2)), np.zeros(0))
+    points = pair.triangulate(xy1, xy2)
+    depth = pair.cam1.cam_from_sys.apply(points.xyz_mm)[:, 2]
+    depth2 = pair.cam2.cam_from_sys.apply(points.xyz_mm)[:, 2]
+    with np.errstate(invalid="ignore"):
+        front = points.valid & (depth > 0.0) & (depth2 > 0.0)
+    xy1, w0 = xy1[front], 1.0 / depth[front]
+    if len(xy1) < _FEWEST:
+        return ScatteredShape(xy1[:0], w0[:0])
+    tolerance = _DEPTH_TOLERANCE_PX * float(np.median(depth_per_px(pair, pair.cam1.rays_cam(xy1).xyz_mm, w0)))
+    right = consistent(xy1, w0[:, None], tolerance=2.0 * tolerance)
+    return ScatteredShape(xy1[right], w0[right])
+
+
+def scattered_motion(features_ref: Features, features_now: Features) -> ScatteredMotion:
+    """Match one camera's image at t0 with its image at t and keep what agrees with its neighbourhood."""
+    pairs = match(features_ref, features_now)
+    xy, now = features_ref.xy_px[pairs[:, 0]], features_now.xy_px[pairs[:, 1]]
+    if len(xy) < _FEWEST:
+        return ScatteredMotion(xy[:0], now[:0])
+    right = consistent(xy, now, tolerance=2.0 * _MOTION_TOLERANCE_PX)
+    return ScatteredMotion(xy[right], now[right])
+
+
+def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float) -> Starts:
+    """Return ``w`` (n, 3) at places ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree."""
+    w = np.full((len(xy_px), 3), np.nan)
+    if len(shape.xy_px) < 4 or len(xy_px) == 0:
+        return Starts(w)
+    rays = pair.cam1.rays_cam(shape.xy_px).xyz_mm
+    tolerance = _DEPTH_TOLERANCE_PX * float(np.median(depth_per_px(pair, rays, shape.w0)))
+    fits = robust_local_fits(xy_px, shape.xy_px, shape.w0[:, None], tolerance=tolerance)
+    centre = pair.cam1.rays_cam(xy_px).xyz_mm
+    per_norm = pair.cam1.lens.image_jacobian(centre[:, :2])
+    w[:, 0] = fits.value[:, 0]
+    w[:, 1:] = np.einsum("nj,nji->ni", fits.slope[:, 0], per_norm)  # d w / d px times d px / d normalised
+    return Starts(w)
+
+
+def motion_starts(
+    pair: StereoPair, w: Float, motion: ScatteredMotion, shape_now: ScatteredShape, xy_px: Float
+) -> Starts:
+    """Return start values at places ``xy_px`` with known shape ``w`` (n, 3), from the matches in time and at t."""
+    G = np.full((len(xy_px), 3, 3), np.nan)
+    if len(motion.xy_px) < 4 or len(shape_now.xy_px) < 4 or len(xy_px) == 0:
+        return Starts(w, G)
+    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=_MOTION_TOLERANCE_PX)
+    known = np.isfinite(fits.value).all(axis=1)
+    if known.any():
+        w_now = shape_starts(pair, shape_now, fits.value[known]).w
+        G[known] = combine(pair, w[known], xy_px[known], fits.value[known], fits.slope[known], w_now)
+    return Starts(w, G)
+
+
+def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_px: Float, w_now: Float) -> Float:
+    """Return ``G`` (n, 3, 3) from shape at t0, where camera 1 sees the patch at t, and the shape there.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    w
+        (n, 3) shape at t0.
+    xy_px, xy_now_px
+        (n, 2) the point in camera 1 at t0 and at t.
+    affine_px
+        (n, 2, 2) derivative of camera 1's image at t over its image at t0.
+    w_now
+        (n, 3) shape at t about ``xy_now_px``.
+    """
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    now = pair.cam1.rays_cam(xy_now_px).xyz_mm
+    J = pair.cam1.lens.image_jacobian(ray[:, :2])
+    J_now = pair.cam1.lens.image_jacobian(now[:, :2])
+    usable = np.isfinite(J_now).all(axis=(1, 2)) & np.isfinite(affine_px).all(axis=(1, 2))
+    A = np.full_like(J, np.nan)
+    A[usable] = np.linalg.solve(J_now[usable], affine_px[usable] @ J[usable])
+    # the point at t is (now + A X, 1) / w_now(A X); G (1, X, Y) is w(X, Y) times it, to first order
+    G = np.empty((len(w), 3, 3))
+    G[:, :, 0] = (w[:, :1] / w_now[:, :1]) * now
+    for j in range(2):
+        slope = np.einsum("ni,ni->n", w_now[:, 1:], A[:, :, j])
+        G[:, :, 1 + j] = now * (w[:, 1 + j] / w_now[:, 0] - w[:, 0] * slope / w_now[:, 0] ** 2)[:, None]
+        G[:, :2, 1 + j] += A[:, :, j] * (w[:, 0] / w_now[:, 0])[:, None]
+    return G
+
+
+def refuse_swapped(pair: StereoPair, xy1: Float, xy2: Float, near: Bool) -> None:
+    """Raise ``cameras_swapped`` if matches (n, 2) fit the cameras clearly better with exchanged roles."""
+    n = len(xy1)
+    if n < _SWAP_FEWEST or near.mean() > 0.6:
+        return
+    swapped = _on_line(pair, xy2, xy1)
+    if swapped.mean() > 0.7 and swapped.sum() > 1.5 * near.sum():
+        raise ImageError(
+            f"of {n} matches between the two images {near.sum()} fit the calibration as given, "
+            f"{swapped.sum()} fit it with the cameras exchanged.",
+            code="cameras_swapped",
+            remedy="Give camera 1's images as camera 1 and camera 2's as camera 2.",
+            matches=n,
+            as_given=int(near.sum()),
+            exchanged=int(swapped.sum()),
+        )
+
+
+def _on_line(pair: StereoPair, xy1: Float, xy2: Float) -> Bool:
+    if len(xy1) == 0:
+        return np.zeros(0, bool)
+    ray1, ray2 = pair.cam1.rays_cam(xy1), pair.cam2.rays_cam(xy2)
+    both = ray1.valid & ray2.valid
+    near = np.zeros(len(xy1), bool)
+    if both.any():
+        with np.errstate(invalid="ignore"):
+            near[both] = np.abs(pair.epipolar_residual_px(xy1[both], xy2[both])) < EPIPOLAR_PX
+    return near

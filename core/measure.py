@@ -1,0 +1,453 @@
+"""Shape and displacement of a full field: the whole chain from images to a checked result.
+
+Seeds, growth, checks, a second growth into what the checks emptied, checks again. The parts lie in ``core.field``; the
+point-level matching in ``core.matching``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import InputError, SeedError
+from core.field.assemble import assemble
+from core.field.fitter import Fitter, PointFits
+from core.field.gates import GateOptions, apply_gates
+from core.field.grow import fit_in_batches, grow
+from core.field.images import MeasureImage, same_size
+from core.field.region import PointGrid, check_region, check_subset
+from core.field.result import Field
+from core.field.scatter import scattered_motion, scattered_shape
+from core.field.seeds import (
+    Seed,
+    as_seeds,
+    nearest_points,
+    refine,
+    search_motion,
+    seeds_from_matches,
+    spread,
+    sweep_shape,
+    swept_places,
+)
+from core.field.starts import Starts
+from core.lens import Bool, Float
+from core.matching.fit import no_motion
+from core.matching.image import ImageData
+from core.matching.options import Interpolation, MatchOptions, Patch
+from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
+from core.status import PointStatus
+from core.stereo import StereoPair
+
+Image = ArrayLike | ImageData | MeasureImage
+Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
+
+_FEWEST_MATCHES = 12
+_SAMPLE_FAR_PX = 3.0
+_SAMPLE_SHARE = 0.7
+_REACH_STEPS = 2.0
+_LEFT_OVER = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureOptions:
+    """How a field is measured.
+
+    Parameters
+    ----------
+    subset_px
+        Width of the square subset, odd, 9 or more.
+    patch
+        ``stretch`` (default) or the paper's ``rigid``.
+    interpolation
+        ``cubic`` (default) or ``quintic``, for sharp speckle at low noise.
+    least_zncc
+        Correlation below which no comparison is a match. The field's own scatter decides above it.
+    gates
+        Limits of the checks that every point must pass.
+    """
+
+    subset_px: int = 33
+    patch: Patch = "stretch"
+    interpolation: Interpolation = "cubic"
+    least_zncc: float = 0.6
+    gates: GateOptions = field(default_factory=GateOptions)
+
+    def __post_init__(self) -> None:
+        check_subset(self.subset_px)
+        if not 0.0 < self.least_zncc < 1.0:
+            raise InputError(f"least_zncc is {self.least_zncc}, it must lie in 0 to 1.", code="option_out_of_range")
+        self.match_options()
+
+    def match_options(self) -> MatchOptions:
+        """Return the point-level options."""
+        return MatchOptions(subset_px=self.subset_px, patch=self.patch, interpolation=self.interpolation)
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePair:
+    """The reference images of a sequence: prepared once, used in every step.
+
+    >>> reference = ReferencePair(pair, image1, image2)            # doctest: +SKIP
+    >>> shape = reference.shape(grid, options)                     # doctest: +SKIP
+    >>> step = reference.motion(now1, now2, grid, options, shape=shape)  # doctest: +SKIP
+    """
+
+    pair: StereoPair
+    image1: MeasureImage
+    image2: MeasureImage
+
+    def __init__(self, pair: StereoPair, image1: Image, image2: Image) -> None:
+        object.__setattr__(self, "pair", pair)
+        object.__setattr__(self, "image1", MeasureImage(image1, "camera 1's reference image"))
+        object.__setattr__(self, "image2", MeasureImage(image2, "camera 2's reference image"))
+
+    def shape(self, grid: PointGrid, options: MeasureOptions | None = None, **more: Any) -> Field:
+        """Measure the reference's shape; see :func:`measure_shape`."""
+        return measure_shape(self.pair, self.image1, self.image2, grid, options, **more)
+
+    def motion(
+        self, image1: Image, image2: Image, grid: PointGrid, options: MeasureOptions | None = None, **more: Any
+    ) -> Field:
+        """Measure the displacement to a later pair; see :func:`measure_motion`."""
+        return measure_motion(self.pair, self.image1, self.image2, image1, image2, grid, options, **more)
+
+
+def measure_shape(
+    pair: StereoPair,
+    image1: Image,
+    image2: Image,
+    grid: PointGrid,
+    options: MeasureOptions | None = None,
+    *,
+    seeds: Seeds | None = None,
+    progress: Progress | None = None,
+    cancel: CancelToken | None = None,
+) -> Field:
+    """Measure the shape of the surface, section 4.1.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    image1, image2
+        (rows, cols) camera 1's and camera 2's image, raw or prepared.
+    grid
+        Points in camera 1's image.
+    options
+        Defaults to ``MeasureOptions()``.
+    seeds
+        Where to start, (x, y) in camera 1 or ``Seed``; found from feature matches when left out.
+    progress, cancel
+        Reports (stage, points done, points in all), and stop.
+
+    Returns
+    -------
+    Field
+        Lengths in mm, system frame. Points that failed a check have a status and no numbers.
+
+    Raises
+    ------
+    RegionError, ImageError
+        If region or images cannot be used; ``cameras_swapped`` if they fit with exchanged roles only.
+    SeedError
+        If no start was found.
+    Cancelled
+        If the token said so.
+    """
+    run = _Run(pair, image1, image2, None, None, grid, options, progress, cancel)
+    run.seed_shape(seeds)
+    return run.finish(seeds is None, None)
+
+
+def measure_motion(
+    pair: StereoPair,
+    ref1: Image,
+    ref2: Image,
+    cur1: Image,
+    cur2: Image,
+    grid: PointGrid,
+    options: MeasureOptions | None = None,
+    *,
+    shape: Field | None = None,
+    previous: Field | None = None,
+    seeds: Seeds | None = None,
+    progress: Progress | None = None,
+    cancel: CancelToken | None = None,
+) -> Field:
+    """Measure the displacement since the reference, section 4.2: three comparisons at once.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    ref1, ref2, cur1, cur2
+        (rows, cols) both cameras' images at the reference and now, raw or prepared.
+    grid
+        Points in camera 1's reference image.
+    options
+        Defaults to ``MeasureOptions()``.
+    shape
+        The reference's shape on the same grid; measured first when left out. Only its valid points are measured.
+    previous
+        An earlier step's field on the same grid, to start from.
+    seeds, progress, cancel
+        As in :func:`measure_shape`.
+
+    Returns
+    -------
+    Field
+        With ``uvw_mm``, ``rotation_rad`` and ``stretch``; ``xyz_mm`` is the shape's, the same in every step.
+
+    Raises
+    ------
+    RegionError, ImageError, SeedError, Cancelled
+        As in :func:`measure_shape`.
+    InputError
+        ``grid_mismatch`` if ``shape`` or ``previous`` belongs to another grid.
+    """
+    reference1, reference2 = (
+        MeasureImage(ref1, "camera 1's reference image"),
+        MeasureImage(ref2, "camera 2's reference image"),
+    )
+    if shape is None:
+        shape = measure_shape(
+            pair, reference1, reference2, grid, options, seeds=seeds, progress=progress, cancel=cancel
+        )
+    run = _Run(pair, reference1, reference2, cur1, cur2, grid, options, progress, cancel)
+    for name, other in (("shape", shape), ("previous", previous)):
+        if other is not None and (other.shape != grid.shape or not np.allclose(other.x_px, grid.x_px)):
+            raise InputError(
+                f"the {name} field has {other.shape} points, the grid {grid.shape}, or they lie elsewhere.",
+                code="grid_mismatch",
+                remedy="Measure every step on the same grid.",
+            )
+    run.seed_motion(shape, previous, seeds)
+    return run.finish(seeds is None, shape)
+
+
+class _Run:
+    """One computation: its images, its points, and the stages that fill them."""
+
+    def __init__(
+        self,
+        pair: StereoPair,
+        ref1: Image,
+        ref2: Image,
+        cur1: Image | None,
+        cur2: Image | None,
+        grid: PointGrid,
+        options: MeasureOptions | None,
+        progress: Progress | None,
+        cancel: CancelToken | None,
+    ) -> None:
+        self.options = options or MeasureOptions()
+        self.pair, self.grid, self.cancel = pair, grid, cancel
+        self.progress: Progress = progress or no_progress
+        self.ref1, self.ref2 = MeasureImage(ref1, "camera 1's image"), MeasureImage(ref2, "camera 2's image")
+        self.cur1 = None if cur1 is None else MeasureImage(cur1, "camera 1's image at t")
+        self.cur2 = None if cur2 is None else MeasureImage(cur2, "camera 2's image at t")
+        self.fits_image = check_region(grid, image_shape=self.ref1.shape, subset_px=self.options.subset_px)
+        if self.cur1 is None or self.cur2 is None:
+            self.ref1.refuse_blank(grid.extent_px)
+            self.ref2.refuse_blank()
+        else:
+            same_size(self.ref1, self.cur1)
+            same_size(self.ref2, self.cur2)
+            self.cur1.refuse_blank()
+            self.cur2.refuse_blank()
+        self.xy_px = grid.xy_px.reshape(-1, 2)
+        self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
+        self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
+        kind = self.options.interpolation
+        self.fitter = Fitter(
+            pair=pair,
+            ref1=self.ref1.prepared(kind),
+            ref2=self.ref2.prepared(kind),
+            cur1=None if self.cur1 is None else self.cur1.prepared(kind),
+            cur2=None if self.cur2 is None else self.cur2.prepared(kind),
+            options=self.options.match_options(),
+            least_zncc=self.options.least_zncc,
+        )
+        self.points = PointFits.empty(len(self.xy_px), self.fitter.comparisons)
+        self.known_w: Float | None = None
+        rows, cols = np.clip(np.rint(self.xy_px[:, ::-1]).astype(int), 0, np.array(self.ref1.shape) - 1).T
+        self.texture = self.ref1.subset_variance(self.options.subset_px)[rows, cols]
+
+    # seeds
+
+    def seed_shape(self, seeds: Seeds | None) -> None:
+        """Put the first points of a shape down."""
+        self.progress("seeds", 0, 1)
+        if seeds is not None:
+            self._user_shape(as_seeds(seeds))
+        elif self._match_seeds() == 0:
+            self._swept_shape()
+        self.progress("seeds", 1, 1)
+
+    def seed_motion(self, shape: Field, previous: Field | None, seeds: Seeds | None) -> None:
+        """Put the first points of a motion down: from the last step, where they stood, or from matches."""
+        self.usable = self.usable & shape.valid.ravel()
+        if not self.usable.any():
+            return
+        self.points.status[~self.usable & self.fits_image.ravel()] = shape.status.ravel()[
+            ~self.usable & self.fits_image.ravel()
+        ]
+        if shape.starts is not None:
+            self.known_w = shape.starts.w.reshape(-1, 3)
+        if previous is not None and previous.starts is not None and previous.starts.G is not None:
+            w, G = previous.starts.w.reshape(-1, 3), previous.starts.G.reshape(-1, 3, 3)
+            if self._sample_holds(w, G):
+                index = np.flatnonzero(self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2)))
+                self.progress("previous", 0, len(index))
+                fit_in_batches(
+                    self.fitter, self.points, index, self.xy_px, w[index], G[index], far_px=_SAMPLE_FAR_PX,
+                    cancel=self.cancel,
+                )  # fmt: skip
+                self._gate()
+                return
+        self.progress("seeds", 0, 1)
+        if seeds is not None:
+            self._user_motion(as_seeds(seeds))
+        elif not (self.known_w is not None and self._sample_holds(self.known_w, no_motion(self.pair, self.xy_px))):
+            self.points.status[self.usable] = PointStatus.NOT_SEEDED
+            if self._match_seeds() == 0:
+                self._searched_motion()
+        self.progress("seeds", 1, 1)
+
+    def _sample_holds(self, w: Float, G: Float) -> bool:
+        """Fit a spread sample from given starts; True (and the sample stands as seeds) if nearly all of it matches."""
+        usable = self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+        if usable.sum() < 1:
+            return False
+        index = spread(self.xy_px, usable, np.zeros(len(usable)))[0]
+        fits = refine(self.fitter, self.xy_px[index], Starts(w[index], G[index]), far_px=_SAMPLE_FAR_PX)
+        if fits.ok.mean() < _SAMPLE_SHARE:
+            return False
+        good = np.flatnonzero(fits.ok)
+        self.points.put(index[good], fits.take(good))
+        return True
+
+    def _match_seeds(self) -> int:
+        """Seeds from feature matches; how many stand."""
+        raise_if_cancelled(self.cancel)
+        mask = self._feature_mask()
+        f1, f2 = self.ref1.features(mask), self.ref2.features()
+        raise_if_cancelled(self.cancel)
+        shape = scattered_shape(self.pair, f1, f2)
+        motion = shape_now = None
+        if self.cur1 is not None and self.cur2 is not None:
+            n1 = self.cur1.features()
+            raise_if_cancelled(self.cancel)
+            n2 = self.cur2.features()
+            raise_if_cancelled(self.cancel)
+            motion = scattered_motion(f1, n1)
+            shape_now = scattered_shape(self.pair, n1, n2)
+        elif len(shape.xy_px) < _FEWEST_MATCHES:
+            return 0
+        self._scattered = (shape, motion, shape_now)
+        return seeds_from_matches(
+            self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
+        )
+
+    def _feature_mask(self) -> NDArray[np.bool_]:
+        """Where features of camera 1's reference help: within a subset and a step of the points."""
+        reach = self.options.subset_px + self.grid.step_px
+        mask = np.zeros(self.ref1.shape, bool)
+        xy = self.xy_px[self.usable]
+        x0, y0 = np.maximum(np.floor(xy.min(axis=0) - reach).astype(int), 0)
+        x1, y1 = np.ceil(xy.max(axis=0) + reach).astype(int)
+        mask[y0 : y1 + 1, x0 : x1 + 1] = True
+        return mask
+
+    def _swept_shape(self) -> None:
+        for i in swept_places(self.xy_px, self.usable):
+            raise_if_cancelled(self.cancel)
+            found = sweep_shape(self.fitter, self.ref1.pixels, self.ref2.pixels, self.xy_px[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+
+    def _searched_motion(self) -> None:
+        if self.known_w is None:
+            return
+        known = self.usable & np.isfinite(self.known_w).all(axis=1)
+        for i in swept_places(self.xy_px, known)[:6]:
+            raise_if_cancelled(self.cancel)
+            found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+
+    def _user_shape(self, seeds: tuple[Seed, ...]) -> None:
+        reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
+        for seed, i in zip(seeds, nearest_points(seeds, self.xy_px, self.usable, reach_px=reach), strict=True):
+            raise_if_cancelled(self.cancel)
+            found = PointFits.empty(1, 1)
+            if seed.xy2_px is not None:
+                p = self.pair.triangulate(np.array([seed.xy_px]), np.array([seed.xy2_px]))
+                depth = self.pair.cam1.cam_from_sys.apply(p.xyz_mm)[:, 2]
+                found = refine(
+                    self.fitter.shape_only(),
+                    self.xy_px[i : i + 1],
+                    Starts(np.array([[1.0 / depth[0], 0.0, 0.0]])),
+                )
+            if not found.ok[0]:
+                found = sweep_shape(self.fitter, self.ref1.pixels, self.ref2.pixels, self.xy_px[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+
+    def _user_motion(self, seeds: tuple[Seed, ...]) -> None:
+        if self.known_w is None:
+            raise SeedError("a seed for a motion needs the shape that was measured before it.")
+        usable = self.usable & np.isfinite(self.known_w).all(axis=1)
+        reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
+        index = nearest_points(seeds, self.xy_px, usable, reach_px=reach)
+        for i in index:
+            raise_if_cancelled(self.cancel)
+            found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+        if not self.points.ok.any():
+            # turned or stretched too far for a template: matches about the seed know how
+            self._match_seeds()
+
+    # field
+
+    def finish(self, automatic: bool, shape: Field | None) -> Field:
+        """Grow, check, grow into the gaps, check again, and hand over."""
+        if not self.points.ok.any() and (shape is None or shape.valid.any()):
+            raise SeedError(
+                "no point of the region could be matched between the images from any start.",
+                remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
+                "these images, or give a seed point.",
+            )
+        self._grow()
+        self._gate()
+        for _ in range(2):
+            if self._grow() == 0:
+                break
+            self._gate()
+        if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
+            self._grow()
+            self._gate()
+        self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
+        return assemble(self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape)
+
+    def _unreached(self) -> float:
+        """Share of the usable points that nothing reached."""
+        untouched = self.usable & (self.points.status == PointStatus.NOT_SEEDED)
+        return float(untouched.sum()) / max(int(self.usable.sum()), 1)
+
+    def _grow(self) -> int:
+        return grow(
+            self.fitter, self.points, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
+            progress=self.progress, cancel=self.cancel,
+        )  # fmt: skip
+
+    def _gate(self) -> int:
+        return apply_gates(
+            self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
+            options=self.options.gates,
+        )  # fmt: skip
