@@ -94,7 +94,8 @@ def compare(image, lens, m, order, ref, n, f2, box, p, sums, sum_j, sum_fj, leve
     if not y2 > 1e-12 * f2:
         levels[2] = 0.0
         levels[3] = 0.0
-        rhs[:] = 0.0
+        for i in range(9):
+            rhs[i] = 0.0
         return True
     c = math.sqrt(y2 / f2)
     nine_from_eight(sums[3:], rhs)

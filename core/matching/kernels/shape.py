@@ -96,7 +96,8 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
         small = vectors[3]
         small[0], small[1], small[2], small[3] = -rhs13[0], -rhs13[4], -rhs13[8], -rhs13[12]
         solve(reduced, small, 4)
-        step[:] = 0.0
+        for i in range(13):
+            step[i] = 0.0
         step[0], step[4], step[8], step[12] = small[0], small[1], small[2], small[3]
         motion = corner_motion(blocks, offsets, step, 1, box, lens1[1], lens1[2])
         cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
