@@ -48,7 +48,7 @@ class RenderOptions:
         Threads to use; the kernel holds no lock.
     """
 
-    blur_px: float = 0.55
+    blur_px: float = 0.7
     samples: int | None = None
     threads: int = 1
 

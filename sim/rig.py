@@ -102,8 +102,8 @@ class SimRig:
     cam2: SimCamera
     target: SimTarget
     seed: int = 0
-    speckle_mm: float = 0.135
-    blur_px: float = 0.55
+    speckle_mm: float = 0.145
+    blur_px: float = 0.7
 
     def camera(self, name: CameraName) -> SimCamera:
         """Return one of the two by name."""
@@ -161,7 +161,7 @@ def _rig(tables: Mapping[str, Any]) -> SimRig:
         ),
         seed=int(sim.get("seed", 0)),
         speckle_mm=float(sim["speckle_mm"]),
-        blur_px=float(sim.get("blur_px", 0.55)),
+        blur_px=float(sim.get("blur_px", 0.7)),
     )
 
 

@@ -39,7 +39,7 @@ BLOCK_TRANSLATION_MM = (0.20, -0.15, 0.25)
 BLOCK_ROTATION_RAD = (0.01, -0.015, 0.03)
 _LAY_RAD = 0.35  # the steel's lay against the vertical
 _STEEL_SEED, _SPECKLE_SEED = 1, 2  # keep the random numbers of one rig apart
-_BACKLIT, _BEHIND = 0.8, 0.04
+_BACKLIT, _CHROME, _BEHIND = 0.9, 0.03, 0.04
 
 
 def make_scene(
@@ -89,7 +89,7 @@ def make_scene(
             surface=_surface(rig, name, load, parameters),
             texture=_target(rig, parameters) if name == "grid" else _paint(rig, float(speckles)),
             sys_from_body=_moved(_mounting(name), *motion),
-            background=(_BACKLIT if rig.target.dark_lines else _BEHIND) if name == "grid" else _BEHIND,
+            background=(_BACKLIT if rig.target.dark_lines else _CHROME) if name == "grid" else _BEHIND,
         )
     except (TypeError, ValueError) as error:
         raise InputError(
@@ -124,6 +124,7 @@ def _target(rig: SimRig, parameters: dict[str, Any]) -> Texture:
         node_tolerance_mm=float(parameters.get("node_tolerance_mm", target.node_tolerance_mm)),
         dark_lines=target.dark_lines,
         seed=rig.seed,
+        dark=_CHROME,
         bright=_BACKLIT,
     )
 

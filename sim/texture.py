@@ -90,12 +90,12 @@ def speckle(
     seed
         Names the pattern; the same seed is the same specimen.
     rim_mm
-        Width over which a disc's rim goes from bright to dark; a quarter of the diameter by default, like sprayed
+        Width over which a disc's rim goes from bright to dark; a third of the diameter by default, like sprayed
         paint.
     dark, bright
         Brightness of disc and ground.
     """
-    rim = 0.25 * diameter_mm if rim_mm is None else rim_mm
+    rim = 0.35 * diameter_mm if rim_mm is None else rim_mm
     if not 0.0 < rim <= 0.5 * diameter_mm:
         raise ValueError(f"rim_mm must lie in (0, {0.5 * diameter_mm:g}], got {rim:g}")
     cell = _CELL_PER_DIAMETER * diameter_mm

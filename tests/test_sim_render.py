@@ -61,7 +61,8 @@ def test_pixels_agree_with_brute_force(blur_px: float, pose: RigidTransform) -> 
 def test_grid_lines_agree_with_brute_force() -> None:
     scene = Scene(name="grid", surface=flat(), texture=line_grid(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03))
     x, y = (int(v) for v in np.round(camera().project([0.5, 0.0, 0.0]).xy))
-    image = render(scene, camera(), SIZE, window=(x - 3, y - 3, x + 4, y + 4))
+    options = RenderOptions(blur_px=0.55)
+    image = render(scene, camera(), SIZE, window=(x - 3, y - 3, x + 4, y + 4), options=options)
     truth = [[brute_force(scene, camera(), i, j, 0.55, 200) for i in range(x - 3, x + 4)] for j in range(y - 3, y + 4)]
     assert np.ptp(truth) > 0.2
     np.testing.assert_allclose(image, truth, atol=2e-4)

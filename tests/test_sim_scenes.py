@@ -40,8 +40,8 @@ def test_speckle_covers_half_and_depends_on_its_seed_only() -> None:
     # smooth: no jump anywhere, least of all where cells meet
     s = np.linspace(-3, 3, 600_001)
     line = speckle(diameter_mm=0.14, seed=1).value(np.stack([s, 0.3 * s], -1))
-    # the steepest rim changes by 0.75 * 1.875 / 0.035 per mm; where two overlap, by up to twice that
-    assert np.abs(np.diff(line)).max() < 2 * 0.75 * 1.875 / 0.035 * 1e-5 * np.hypot(1, 0.3)
+    # the steepest rim changes by 0.75 * 1.875 / 0.049 per mm; where two overlap, by up to twice that
+    assert np.abs(np.diff(line)).max() < 2 * 0.75 * 1.875 / 0.049 * 1e-5 * np.hypot(1, 0.3)
 
 
 def test_grid_nodes_miss_by_the_tolerance_and_lines_run_through_them() -> None:
@@ -215,10 +215,10 @@ def test_crack_shows_as_a_gap_that_grows() -> None:
         assert np.isfinite(image).all()
         dark.append(float((image < 0.07).sum()) / size[0])
         opening_px = np.ptp(camera.project(lips).xy[:, 1])
-        # paint is never darker than 0.1, the gap is 0.04; beside bright paint the blur lights 1.1 px of each rim
-        assert max(opening_px - 2.3, 0.0) <= dark[-1] <= opening_px + 0.05
+        # paint is never darker than 0.1, the gap is 0.04; beside bright paint the blur lights 1.4 px of each rim
+        assert max(opening_px - 2.8, 0.0) <= dark[-1] <= opening_px + 0.05
     assert dark[0] == 0.0
-    assert dark[2] > 3.0
+    assert dark[2] > 2.5
 
 
 def test_steel_has_the_roughness_asked_for_and_a_subset_sees_most_of_it() -> None:

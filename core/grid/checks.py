@@ -18,7 +18,8 @@ from core.target import GridTarget
 Cause = Literal["", "dirt", "glare"]
 
 _LEAST_INSIDE_PX = 3.0
-_AMPLITUDE_RANGE = (0.4, 2.2)  # of what the neighbours show
+_DEPTH_RANGE = (0.4, 2.2)  # of what the neighbours show
+_LEAST_CERTAIN = 0.25  # standard deviation of a piece's place, as part of the line's width and blur
 _RMS_RATIO = 3.0
 _GLARE_RISE = 0.5  # ground above its neighbours', as part of the lines' depth
 
@@ -133,14 +134,14 @@ def judge_pieces(
     """
     sign = -1.0 if target.dark_lines else 1.0
     ok = fits[:, OUT["ok"]] > 0.0
-    amplitude = np.where(ok, sign * fits[:, OUT["amplitude"]], np.nan)
-    typical = _smooth(table, amplitude)
+    depth = np.where(ok, sign * fits[:, OUT["amplitude"]] * fits[:, OUT["peak"]], np.nan)
+    typical = _smooth(table, depth)
     ground = _smooth(table, fits[:, OUT["ground"]])
     rms = fits[:, OUT["rms"]]
     with np.errstate(invalid="ignore"):
         fits_shape = rms < _RMS_RATIO * np.nanmedian(rms) + 0.02 * np.abs(typical)
-        seen = (amplitude > _AMPLITUDE_RANGE[0] * typical) & (amplitude < _AMPLITUDE_RANGE[1] * typical)
-        certain = amplitude > 5.0 * np.sqrt(fits[:, OUT["var_amplitude"]])
+        seen = (depth > _DEPTH_RANGE[0] * typical) & (depth < _DEPTH_RANGE[1] * typical)
+        certain = np.sqrt(fits[:, OUT["var_c0"]]) < _LEAST_CERTAIN * (fits[:, OUT["width"]] + fits[:, OUT["blur"]])
         saturated = fits[:, OUT["brightest"]] >= saturation
         glaring = saturated | (~seen & (fits[:, OUT["ground"]] - ground > _GLARE_RISE * np.abs(typical)))
     good = ok & fits_shape & seen & certain & ~saturated
@@ -187,7 +188,8 @@ def check_coverage(table: PieceTable, good: Bool, cause: NDArray[np.str_], optio
     what = "is glaring (saturated or without contrast)" if glare else "is covered, dirty or unsharp"
     raise TargetError(
         f"{np.count_nonzero(bad)} of {len(bad)} pieces of lines cannot be used (at most"
-        f" {options.max_bad_fraction:.0%}), {per_line[worst]:.0%} of {name} (at most {options.max_bad_on_line:.0%}); most of it {what}",
+        f" {options.max_bad_fraction:.0%}), {per_line[worst]:.0%} of {name} (at most"
+        f" {options.max_bad_on_line:.0%}); most of it {what}",
         code="target_glare" if glare else "target_dirty",
         remedy="Take the reflection or the overexposure away: light the grid from behind, close the aperture."
         if glare

@@ -45,8 +45,8 @@ class Parabolas:
 
 @njit(cache=True, nogil=True)
 def _collect(
-    image: Float, rows: Float, fits: Float, use: Bool, line: Float, steep: Bool, centre: Float, share: float,
-    guard_blurs: float, sign: float, N: Float, g: Float, yy: Float,
+    image: NDArray[np.float32], rows: Float, fits: Float, use: Bool, line: Float, steep: Bool, centre: Float,
+    share: float, guard_blurs: float, sign: float, N: Float, g: Float, yy: Float,
 ) -> None:  # fmt: skip
     for k in range(rows.shape[0]):
         if not use[k]:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from core.errors import TargetError
 from core.grid.checks import check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
-from core.grid.lattice import find_lattice, pitch_px
+from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
 from core.grid.lines import LineFit, fit_lines
 from core.grid.piece_table import PieceTable, line_points, piece_table
 from core.grid.pieces import directions
 from core.grid.profile import OUT, fit_pieces
-from core.grid.threshold import checked_image, line_picture
+from core.grid.threshold import checked_image, coarse_factors, line_picture
 from core.grid.view import GridOptions, GridView, LineModel, Localiser
 from core.lens import Bool, Float
 from core.target import GridTarget
@@ -75,16 +75,17 @@ def detect_grid(
         raise ValueError(f"the paper's localiser fits parabolas; line_model {model!r} needs the profile localiser")
     grey = checked_image(image)
     size = (grey.shape[1], grey.shape[0])
-    picture = line_picture(grey, target)
-    lattice = find_lattice(picture, directions(picture))
+    lattice, threshold = _coarse(grey, target)
     check_lattice(lattice, target, size, opts)
     nodes = lattice.nodes_px
 
     saturation = opts.saturation if opts.saturation is not None else saturation_level(image)
     try:
         # first from the coarse lines, with a search across; then from the fitted lines, with their blur
-        coarse = _measure(grey, nodes, target, saturation, opts, model="straight", blur_px=None)
-        found = _measure(grey, coarse.fit.nodes_px, target, saturation, opts, model=model, blur_px=coarse.blur_px)
+        coarse = _measure(grey, nodes, target, saturation, opts, model="straight", blur_px=None, floor_px=0.05)
+        found = _measure(
+            grey, coarse.fit.nodes_px, target, saturation, opts, model=model, blur_px=coarse.blur_px, floor_px=0.015
+        )
         nodes, covariance = found.fit.nodes_px, found.fit.covariance_px2
         if localiser == "paper":
             parabolas = dark_pixel_lines(grey, found.table, found.fits, found.good, dark_lines=target.dark_lines)
@@ -111,12 +112,32 @@ def detect_grid(
         blur_px=found.blur_px,
         line_width_px=float(np.median(fits[good, OUT["width"]])),
         pitch_px=pitch_px(nodes),
-        threshold=THRESHOLD if localiser == "paper" else picture.threshold,
+        threshold=THRESHOLD if localiser == "paper" else threshold,
         rotation_rad=lattice.rotation_rad,
         fit_rms_px=float(np.sqrt(np.mean(residual**2))),
         pieces_px=found.table.ends_px(),
         pieces_used=good,
     )
+
+
+def _coarse(grey: NDArray[np.float32], target: GridTarget) -> tuple[Lattice, float]:
+    """Find the lattice at the scale that shows all its lines; else the one with the most of them."""
+    best: tuple[Lattice, float] | None = None
+    failure: TargetError | None = None
+    for factor in coarse_factors((grey.shape[1], grey.shape[0]), target):
+        picture = line_picture(grey, target, factor)
+        try:
+            lattice = find_lattice(picture, directions(picture))
+        except TargetError as error:
+            failure = failure or error
+            continue
+        if lattice.counts == target.lines:
+            return lattice, picture.threshold
+        if best is None or sum(lattice.counts) > sum(best[0].counts):
+            best = lattice, picture.threshold
+    if best is None:
+        raise failure if failure is not None else not_found("nothing was tried")
+    return best
 
 
 class _Measured(NamedTuple):
@@ -130,9 +151,12 @@ class _Measured(NamedTuple):
 
 def _measure(
     grey: NDArray[np.float32], nodes_px: Float, target: GridTarget, saturation: float, options: GridOptions, *,
-    model: LineModel, blur_px: float | None,
+    model: LineModel, blur_px: float | None, floor_px: float,
 ) -> _Measured:  # fmt: skip
-    """Fit the pieces between given intersections, judge them, and fit the lines."""
+    """Fit the pieces between given intersections, judge them, and fit the lines.
+
+    ``floor_px``: a piece that is off by no more than a few times this is no blemish, however little noise there is.
+    """
     node_sigma_px = target.node_tolerance_mm / np.sqrt(3.0) * pitch_px(nodes_px) / target.pitch_mm
     table = piece_table(nodes_px, target, blur_px=blur_px)
     fits = fit_pieces(grey, table.rows, dark_lines=target.dark_lines)
@@ -145,7 +169,7 @@ def _measure(
         fit = fit_lines(
             pp.points, counts=target.lines, image_size_px=size, model=model, node_sigma_px=node_sigma_px, used=used
         )
-        z = np.abs(fit.residual_px) / np.sqrt(fit.variance_px2)
+        z = np.abs(fit.residual_px) / np.sqrt(fit.variance_px2 + floor_px**2)
         # a grid worse than described spreads all points: judge by their own scatter then
         limit = _OUTLIER * max(1.0, 1.4826 * float(np.median(z[used])))
         spoilt = np.unique(pp.piece[z > limit])

@@ -6,6 +6,7 @@ constant Y_sys.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +14,12 @@ import numpy as np
 
 from core.errors import TargetError
 from core.grid.chains import Chain, CoarseLine, link, order
+from core.grid.lines import meet_parabolas
 from core.grid.pieces import Directions, family_pieces
 from core.grid.threshold import LinePicture
 from core.lens import Float
 
+_COARSE = ("centre_px", "direction", "bend")
 _LEAST_CROSSING_RAD = np.radians(40.0)
 _LEAST_LINES = 4
 _STRAY_END = 0.1  # of the pitch; an end line that is off by more is an edge or a frame
@@ -149,14 +152,13 @@ def _drop_ends(chain: Chain, other: Chain) -> Chain:
         keep = np.ones(len(chain.lines), dtype=bool)
         keep[end] = False
         inner = Chain(tuple(line for line, k in zip(chain.lines, keep, strict=True) if k), chain.number[keep], ())
-        i, j, xy = _known_nodes(inner, other)
-        H = homography(np.stack([i, j], axis=-1), xy)
+        H = homography(*_known_nodes(inner, other))
         number = np.full(len(other.number), chain.number[end])
         guess = apply_homography(H, np.stack([number, other.number], axis=-1).astype(np.float64))
         step = guess - apply_homography(
             H, np.stack([number + (1 if end == 0 else -1), other.number], axis=-1).astype(np.float64)
         )
-        truth = np.array([crossing(chain.lines[end], line) for line in other.lines])
+        truth = crossings([chain.lines[end]], other.lines)[0]
         off = np.linalg.norm(truth - guess, axis=-1) / np.linalg.norm(step, axis=-1)
         if np.median(off) > _STRAY_END:
             number_kept = chain.number[keep]
@@ -164,22 +166,19 @@ def _drop_ends(chain: Chain, other: Chain) -> Chain:
     return chain
 
 
-def _known_nodes(chain_a: Chain, chain_b: Chain) -> tuple[Float, Float, Float]:
-    rows = [
-        (float(i), float(j), *crossing(line_a, line_b))
-        for i, line_a in zip(chain_a.number, chain_a.lines, strict=True)
-        for j, line_b in zip(chain_b.number, chain_b.lines, strict=True)
-    ]
-    table = np.array(rows)
-    return table[:, 0], table[:, 1], table[:, 2:]
+def _known_nodes(chain_a: Chain, chain_b: Chain) -> tuple[Float, Float]:
+    """Numbers (n, 2) and places (n, 2) of the intersections of all lines seen."""
+    number = np.stack(np.meshgrid(chain_a.number, chain_b.number, indexing="ij"), axis=-1).astype(np.float64)
+    return number.reshape(-1, 2), crossings(chain_a.lines, chain_b.lines).reshape(-1, 2)
 
 
 def _lattice(chain_a: Chain, chain_b: Chain) -> Lattice:
-    i, j, xy = _known_nodes(chain_a, chain_b)
-    H = homography(np.stack([i, j], axis=-1), xy)
+    number, xy = _known_nodes(chain_a, chain_b)
+    H = homography(number, xy)
     grid = np.stack(np.meshgrid(np.arange(chain_a.count), np.arange(chain_b.count), indexing="ij"), axis=-1)
     nodes = apply_homography(H, grid.astype(np.float64))
-    nodes[i.astype(int), j.astype(int)] = xy
+    i, j = number.astype(int).T
+    nodes[i, j] = xy
     return Lattice(nodes, H, lattice_rotation(H, (chain_a.count, chain_b.count)), (*chain_a.strays, *chain_b.strays))
 
 
@@ -196,17 +195,12 @@ def lattice_rotation(plane_to_image: Float, counts: tuple[int, int]) -> float:
     return float(np.arctan2(ex[1] - ey[0], ex[0] + ey[1]))
 
 
-def crossing(first: CoarseLine, second: CoarseLine) -> Float:
-    """Meet two coarse lines, (2,); from the straight lines first, then along the parabolas."""
-    s = 0.0
-    t = 0.0
-    for _ in range(4):
-        p, q = first.point(s), second.point(t)
-        dp = (first.point(s + 0.5) - first.point(s - 0.5)).ravel()
-        dq = (second.point(t + 0.5) - second.point(t - 0.5)).ravel()
-        ds, dt = np.linalg.solve(np.column_stack([dp, -dq]), q - p)
-        s, t = s + float(ds), t + float(dt)
-    return np.asarray(first.point(s))
+def crossings(lines_a: Sequence[CoarseLine], lines_b: Sequence[CoarseLine]) -> Float:
+    """Meet all lines of one family with all of the other, (n_a, n_b, 2)."""
+    lines = [*lines_a, *lines_b]
+    origin, direction, bend = (np.stack([getattr(line, k) for line in lines]) for k in _COARSE)
+    nodes, _ = meet_parabolas(origin, direction, bend, np.zeros((len(lines), 3, 3)), (len(lines_a), len(lines_b)))
+    return nodes
 
 
 def homography(plane: Float, image: Float, weights: Float | None = None) -> Float:

@@ -27,6 +27,7 @@ _ALL_TERMS = 10
 # that the lines show, but some combinations they do not show: with lines at exactly 45 degrees, (x^2 - y^2) u turns
 # lines and bends none
 _TERM_PRIOR = np.array([0.5, 0.002, 0.1, 0.02, 0.02, 0.1, 0.1, 0.02, 0.02, 0.002])
+_MISFIT = 1.15  # chi^2 per degree of freedom below which nothing more is asked for
 _MORE_TERMS_GAIN = 60.0  # fall of chi^2 that five more terms must bring; five would fall by 5 by chance
 
 
@@ -205,7 +206,7 @@ def _fit_straight(
             J[:, 2 * n_line :] = -np.einsum("nk,nkm->nm", normal[index], _terms(u, n_terms))
             y = np.sum((u - origin[index]) * normal[index], axis=-1)
             JW = J * weight[:, None]
-            N = JW.T @ J
+            N = np.einsum("ni,nj->ij", JW, J)  # too small for threads
             N[np.diag_indices(len(N))] *= 1.0 + 1e-12
             prior = np.arange(2 * n_line, len(N))
             N[prior, prior] += 1.0 / (_TERM_PRIOR[:n_terms] * scale) ** 2
@@ -217,17 +218,17 @@ def _fit_straight(
     result = solve(_BASE_TERMS)
     chi2 = float(np.sum(weight * result[1] ** 2))
     dof = max(int(used.sum()) - 2 * n_line - _BASE_TERMS, 1)
-    unit = max(1.0, chi2 / dof) if node_sigma_px > 0.0 else 1.0
-    richer = solve(_ALL_TERMS)
-    chi2_richer = float(np.sum(weight * richer[1] ** 2))
-    if (chi2 - chi2_richer) / max(unit, chi2_richer / max(dof - 5, 1)) > _MORE_TERMS_GAIN:
-        result = richer
+    if chi2 > _MISFIT * dof:
+        richer = solve(_ALL_TERMS)
+        chi2_richer = float(np.sum(weight * richer[1] ** 2))
+        if (chi2 - chi2_richer) / max(1.0, chi2_richer / dof) > _MORE_TERMS_GAIN:
+            result = richer
     solution, residual, N, JW, origin, direction, normal = result
     D = solution[2 * n_line :]
     distortion = _Distortion(centre, scale, D)
     # noise of the solution from the points' own noise alone
     A = np.linalg.solve(N, JW.T)
-    covariance = (A * (points.sigma_px / scale) ** 2) @ A.T
+    covariance = np.einsum("in,jn->ij", A * (points.sigma_px / scale) ** 2, A)
     alpha, beta = solution[0 : 2 * n_line : 2], solution[1 : 2 * n_line : 2]
     point = origin + alpha[:, None] * normal
     along = direction + beta[:, None] * normal

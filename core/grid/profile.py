@@ -40,7 +40,8 @@ OUT = {name: k for k, name in enumerate(OUTPUTS)}
 
 _STEPS = 12
 _N = 8  # c0, c1, B, B_t, B_d, A, s, w
-_WIDTH_SEEN = 2.0  # px; narrower lines' width cannot be told from their depth
+_WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be told from their depth
+_WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
 _MOST_BLUR = 8.0
 _LEAST_PIXELS = 20
 
@@ -108,7 +109,7 @@ def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) 
 
 
 @njit(cache=True, nogil=True)
-def _search(image: Float, piece: Float, guard: float, sign: float) -> float:
+def _search(image: NDArray[np.float32], piece: Float, guard: float, sign: float) -> float:
     """Where the strip's mean profile is deepest within the search range; matched with a box of the line's width."""
     search = piece[16]
     reach = search + 2.0 + piece[14]
@@ -145,7 +146,7 @@ def _search(image: Float, piece: Float, guard: float, sign: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _fit_piece(image: Float, piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
+def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
     out[:] = np.nan
     out[15] = 0.0
     width, blur = piece[14], piece[15]
@@ -237,7 +238,12 @@ def _fit_piece(image: Float, piece: Float, guard_blurs: float, sign: float, out:
         best = rss
         kept = True
         par[:] = trial
-        if not fit_width:
+        if fit_width:
+            # without the description's width, a line of two pixels trades its width for depth and blur
+            prior = rss / (n - _N) / (_WIDTH_PRIOR * width) ** 2
+            N[7, 7] += prior
+            g[7] += prior * (width - par[7])
+        else:
             N[7, 7] = 1.0
             g[7] = 0.0
         # a hair of damping on the shape keeps the matrix regular when blur or contrast say nothing
@@ -284,7 +290,7 @@ def _fit_piece(image: Float, piece: Float, guard_blurs: float, sign: float, out:
 
 
 @njit(cache=True, nogil=True)
-def _fit_pieces(image: Float, pieces: Float, guard_blurs: float, sign: float, out: Float) -> None:
+def _fit_pieces(image: NDArray[np.float32], pieces: Float, guard_blurs: float, sign: float, out: Float) -> None:
     for k in range(pieces.shape[0]):
         _fit_piece(image, pieces[k], guard_blurs, sign, out[k])
 

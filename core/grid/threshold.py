@@ -46,7 +46,7 @@ class LinePicture:
     mask: Bool
     threshold: float
     noise: float
-    factor: int
+    factor: float
 
 
 def checked_image(image: NDArray[Any]) -> NDArray[np.float32]:
@@ -80,7 +80,20 @@ def noise_level(grey: NDArray[np.float32]) -> float:
     return float(np.median(np.abs(d)) / 0.6745 / np.sqrt(6.0))
 
 
-def line_picture(grey: NDArray[np.float32], target: GridTarget) -> LinePicture:
+def coarse_factors(size_px: tuple[int, int], target: GridTarget) -> tuple[float, ...]:
+    """Full-size pixels per coarse pixel to try in turn; 0.5 doubles the image for lines that stand close."""
+    widest_pitch = _widest_pitch_px(size_px, target)
+    # a grid worth measuring fills a third of the view at least; coarse pixels no wider than its lines keep them
+    by_width = 0.35 * widest_pitch * target.line_width_mm / target.pitch_mm
+    first = float(int(max(1.0, min(round(by_width), round(min(size_px) / _COARSE_SIDE_PX)))))
+    return (first, 0.5 * first, 2.0 * first) if first > 1.0 else (1.0, 0.5, 2.0)
+
+
+def _widest_pitch_px(size_px: tuple[int, int], target: GridTarget) -> float:
+    return max(size_px) / (min(target.lines) - 1)
+
+
+def line_picture(grey: NDArray[np.float32], target: GridTarget, factor: float) -> LinePicture:
     """Find what is thinner than the target's lines can be.
 
     Parameters
@@ -88,24 +101,24 @@ def line_picture(grey: NDArray[np.float32], target: GridTarget) -> LinePicture:
     grey
         (rows, columns) as :func:`checked_image` returns it.
     target
-        Tells the ratio of line width to pitch; the pitch in pixels is bounded by the image, since the whole grid
-        must be seen.
+        Tells the ratio of line width to pitch; the pitch in pixels is bounded by the image, since the whole grid must
+        be seen.
+    factor
+        Full-size pixels per coarse pixel, see :func:`coarse_factors`.
     """
     noise = noise_level(grey)
     height, width = grey.shape
-    ratio = target.line_width_mm / target.pitch_mm
-    widest_pitch = max(height, width) / (min(target.lines) - 1)
-    # a grid worth measuring fills a third of the view at least; coarse pixels no wider than its lines keep their
-    # contrast
-    factor = int(max(1.0, min(round(0.35 * ratio * widest_pitch), round(min(height, width) / _COARSE_SIDE_PX))))
     coarse = grey
-    if factor > 1:
-        size = (width // factor, height // factor)
-        block = grey[: size[1] * factor, : size[0] * factor]
-        coarse = np.asarray(cv2.resize(block, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    if factor != 1.0:
+        step = max(int(factor), 1)
+        block = grey[: height // step * step, : width // step * step]
+        size = (round(block.shape[1] / factor), round(block.shape[0] / factor))
+        how = cv2.INTER_AREA if factor > 1.0 else cv2.INTER_CUBIC
+        coarse = np.asarray(cv2.resize(block, size, interpolation=how), dtype=np.float32)
     signed = coarse if target.dark_lines else -coarse
-    smooth = cv2.GaussianBlur(signed, (0, 0), 0.8)
-    widest_line = ratio * widest_pitch / factor + 3.0
+    smooth = cv2.GaussianBlur(signed, (0, 0), 0.8 / min(factor, 1.0))
+    widest_pitch = _widest_pitch_px((width, height), target)
+    widest_line = (target.line_width_mm / target.pitch_mm * widest_pitch + 3.0) / factor
     k = 2 * int(np.ceil(widest_line)) + 1
     ground = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
     depth = (ground - smooth).astype(np.float32)

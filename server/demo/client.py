@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,9 +112,9 @@ class ServiceClient:
         ).json()
         return step
 
-    def analyse(self, test_id: str, kind: str, rectangle_px: Sequence[float], **settings: Any) -> AnalysisHandle:
-        """Run an analysis to its end."""
-        body = {"kind": kind, "region": {"rectangle": list(rectangle_px)}, **settings}
+    def analyse(self, test_id: str, kind: str, region: dict[str, Any], **settings: Any) -> AnalysisHandle:
+        """Run an analysis to its end; the region as the API takes it."""
+        body = {"kind": kind, "region": region, **settings}
         accepted = self.call("POST", f"/tests/{test_id}/analyses", json=body).json()
         job = self.wait(accepted["job"]["id"])
         return AnalysisHandle(test_id, str(accepted["analysis_id"]), job)
