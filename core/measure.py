@@ -73,7 +73,7 @@ class MeasureOptions:
 
     subset_px: int = 33
     patch: Patch = "stretch"
-    interpolation: Interpolation = "cubic"
+    interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
 

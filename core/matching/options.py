@@ -39,7 +39,7 @@ class MatchOptions:
 
     subset_px: int = 33
     patch: Patch = "stretch"
-    interpolation: Interpolation = "cubic"
+    interpolation: Interpolation = "quintic"
     max_iterations: int = 30
     tolerance_px: float = 1e-3
     max_sigma_px: float = 0.25

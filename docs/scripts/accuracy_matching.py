@@ -42,7 +42,7 @@ def _errors(rig: Rig, before: Scene, after: Scene, field: Field) -> tuple[Float,
 
 
 def _motion(rig: Rig, before: Scene, after: Scene, *, noise: float, seed: int, subset: int,
-            patch: str = "stretch", interpolation: str = "cubic", pair: StereoPair | None = None) -> Field:  # fmt: skip
+            patch: str = "stretch", interpolation: str = "quintic", pair: StereoPair | None = None) -> Field:  # fmt: skip
     ref = rig.shoot(before, noise=noise, seed=seed)
     cur = rig.shoot(after, noise=noise, seed=seed + 1000)
     options = MeasureOptions(subset_px=subset, patch=patch, interpolation=interpolation)  # type: ignore[arg-type]
