@@ -26,7 +26,10 @@ Float = NDArray[np.float64]
 POSITIONS = (0.0, 5.0, 2.0, 4.0)
 HELD_OUT = (2.0, 4.0)
 NODE_SEEDS = (11, 12, 13)
-NOMINALS = (NominalCamera((512, 480), 12300.0, 404.0, -30.0, 0.9617), NominalCamera((512, 480), 12300.0, 404.0, 30.0, 0.9617))
+NOMINALS = (
+    NominalCamera((512, 480), 12300.0, 404.0, -30.0, 0.9617),
+    NominalCamera((512, 480), 12300.0, 404.0, 30.0, 0.9617),
+)
 FORTY_FIVE = rotation_from_angles(0.0, 0.0, 0.0)
 
 
@@ -84,7 +87,9 @@ def calibration(figures: Path) -> Section:
             shown = runs[0]
     assert shown is not None
     fig, axes = plt.subplots(2, 4, figsize=(12, 6), layout="constrained", sharex=True, sharey=True)
-    for ax, view in zip(axes.T.ravel() if len(shown.result.views) != 8 else axes.ravel(), shown.result.views, strict=False):
+    for ax, view in zip(
+        axes.T.ravel() if len(shown.result.views) != 8 else axes.ravel(), shown.result.views, strict=False
+    ):
         grid = next(g for g, k in zip(shown.grids, _order(), strict=True) if k == (view.camera, round(view.dz_mm, 3)))
         xy, r = grid.xy_px.reshape(-1, 2), view.residual_px.reshape(-1, 2)
         q = ax.quiver(xy[:, 0], xy[:, 1], r[:, 0], r[:, 1], angles="xy", scale_units="xy", scale=2e-4, width=0.004)

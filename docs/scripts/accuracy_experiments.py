@@ -92,7 +92,12 @@ def specimen(figures: Path) -> Section:
         rows += [
             Row(f"step {k}: points valid", 100 * float(ok.mean()), "%", 97.0, at_least=True),
             Row(f"step {k}: epipolar residual rms", float(np.sqrt(np.mean(e**2))), "px", 0.08),
-            Row(f"step {k}: epipolar residual beyond 5 sigma of the field", int((np.abs(e - np.median(e)) > 5 * robust).sum()), "points", 0),
+            Row(
+                f"step {k}: epipolar residual beyond 5 sigma of the field",
+                int((np.abs(e - np.median(e)) > 5 * robust).sum()),
+                "points",
+                0,
+            ),
         ]
     rows += [
         Row("plane residual of the face", _plane_rms_um(fields[0]), "um", 15.0),
@@ -101,7 +106,9 @@ def specimen(figures: Path) -> Section:
     fig, axes = plt.subplots(4, 1, figsize=(9, 9), layout="constrained")
     last = fields[-1]
     x, y = last["x_px"].values, last["y_px"].values
-    for ax, (name, unit, scale) in zip(axes, (("z_mm", "mm", 1.0), ("u_mm", "um", 1e3), ("v_mm", "um", 1e3), ("w_mm", "um", 1e3)), strict=True):
+    for ax, (name, unit, scale) in zip(
+        axes, (("z_mm", "mm", 1.0), ("u_mm", "um", 1e3), ("v_mm", "um", 1e3), ("w_mm", "um", 1e3)), strict=True
+    ):
         mesh = ax.pcolormesh(x, y, last[name].values * scale, shading="nearest")
         ax.invert_yaxis()
         ax.set_title(f"{name[0]} / {unit}", loc="left", fontsize=9)

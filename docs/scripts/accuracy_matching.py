@@ -138,7 +138,11 @@ def strain(figures: Path) -> Section:
                                 "um", 0.04 if patch == "stretch" else None))  # fmt: skip
                 rows.append(Row(f"{patch} patch, 5 % strain, points valid", 100 * float(field.valid.mean()), "%"))
             elif patch == "rigid":
-                rows.append(Row(f"rigid patch, {100 * eps:g} % strain, rms of the worst component", float(curve[-1].max()), "um"))
+                rows.append(
+                    Row(
+                        f"rigid patch, {100 * eps:g} % strain, rms of the worst component", float(curve[-1].max()), "um"
+                    )
+                )
         curves[patch] = np.array(curve)
     fig, ax = plt.subplots(figsize=(6, 3.2), layout="constrained")
     for patch, style in (("stretch", "o-"), ("rigid", "s--")):
