@@ -6,9 +6,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from core.aspect import measure_aspect
 from numpy.typing import NDArray
 
-from core.aspect import measure_aspect
 from core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
 from core.calibration.inputs import CalibrationOptions, NominalCamera
 from core.camera import Camera, RigidTransform, rotation_from_angles
@@ -69,8 +69,12 @@ def calibration(figures: Path) -> Section:
     rig = load_rig()
     rows, notes = [], []
     shown: CalibrationFromImages | None = None
-    for localiser, tolerance, limit in (("profile", 0.0, 0.0035), ("paper", 0.0, 0.006), ("profile", 0.004, 0.045),
-                                        ("paper", 0.004, None)):  # fmt: skip
+    for localiser, tolerance, limit in (
+        ("profile", 0.0, 0.0035),
+        ("paper", 0.0, 0.006),
+        ("profile", 0.004, 0.045),
+        ("paper", 0.004, None),
+    ):
         seeds = NODE_SEEDS
         runs = [_calibrate(rig, tolerance, seed, localiser) for seed in seeds]
         held = [run.result.held_out.rbe_px for run in runs if run.result.held_out is not None]
@@ -94,15 +98,25 @@ def calibration(figures: Path) -> Section:
         xy, r = grid.xy_px.reshape(-1, 2), view.residual_px.reshape(-1, 2)
         q = ax.quiver(xy[:, 0], xy[:, 1], r[:, 0], r[:, 1], angles="xy", scale_units="xy", scale=2e-4, width=0.004)
         ax.quiverkey(q, 0.85, 1.06, 0.005, "0.005 px", labelpos="W", fontproperties={"size": 7})
-        ax.set_title(f"{view.camera} dZ {view.dz_mm:+.1f} mm{' (held out)' if view.held_out else ''}: RBE {view.rbe_px:.4f} px",
-                     fontsize=8, loc="left")  # fmt: skip
+        ax.set_title(
+            f"{view.camera} dZ {view.dz_mm:+.1f} mm{' (held out)' if view.held_out else ''}: RBE {view.rbe_px:.4f} px",
+            fontsize=8,
+            loc="left",
+        )
         ax.set(xlim=(0, 512), ylim=(480, 0))
     fig.savefig(figures / "accuracy_calibration.png", dpi=100)
     plt.close(fig)
-    notes.append("Fitted on 0 and 5 mm, held out 2 and 4 mm. Where the target states a tolerance, corrections of its nodes are unknowns "
-                 "with that tolerance as prior, and the RBE is against the corrected nodes.")  # fmt: skip
-    return Section("Calibration", "Grid pictures of both cameras at four positions, one frame each, noise 2 of 255.", rows,
-                   [("accuracy_calibration.png", "Residuals of one calibration on the exact grid")], notes)  # fmt: skip
+    notes.append(
+        "Fitted on 0 and 5 mm, held out 2 and 4 mm. Where the target states a tolerance, corrections of its nodes are unknowns "
+        "with that tolerance as prior, and the RBE is against the corrected nodes."
+    )
+    return Section(
+        "Calibration",
+        "Grid pictures of both cameras at four positions, one frame each, noise 2 of 255.",
+        rows,
+        [("accuracy_calibration.png", "Residuals of one calibration on the exact grid")],
+        notes,
+    )
 
 
 def _order() -> list[tuple[str, float]]:
@@ -138,5 +152,10 @@ def aspect(figures: Path) -> Section:
         Row("refined: error", abs(float(result.aspect) - 0.9617), "", 1e-4),
         Row("its reported sd", float(result.sigma), ""),
     ]
-    return Section("Aspect ratio", "Twenty pictures of the grid, axis normal to it within 0.3 degrees, moved about; true value 0.9617.",
-                   rows, [("accuracy_aspect.png", "Aspect ratio by picture")], [])  # fmt: skip
+    return Section(
+        "Aspect ratio",
+        "Twenty pictures of the grid, axis normal to it within 0.3 degrees, moved about; true value 0.9617.",
+        rows,
+        [("accuracy_aspect.png", "Aspect ratio by picture")],
+        [],
+    )

@@ -76,10 +76,25 @@ def specimen(figures: Path) -> Section:
     data = _shared()
     with tempfile.TemporaryDirectory() as folder:
         command = [
-            sys.executable, "-m", "server.cli", "measure", "--cam1", str(data / "000*_0.tif"), "--cam2",
-            str(data / "000*_1.tif"), "--calibration", str(data / "calibration_dice.xml"), "--roi", "340,430,1560,690",
-            "--subset", "33", "--step", "10", "--out", folder,
-        ]  # fmt: skip
+            sys.executable,
+            "-m",
+            "server.cli",
+            "measure",
+            "--cam1",
+            str(data / "000*_0.tif"),
+            "--cam2",
+            str(data / "000*_1.tif"),
+            "--calibration",
+            str(data / "calibration_dice.xml"),
+            "--roi",
+            "340,430,1560,690",
+            "--subset",
+            "33",
+            "--step",
+            "10",
+            "--out",
+            folder,
+        ]
         start = time.perf_counter()
         subprocess.run(command, check=True, cwd=ROOT)
         seconds = time.perf_counter() - start
@@ -115,5 +130,10 @@ def specimen(figures: Path) -> Section:
         fig.colorbar(mesh, ax=ax)
     fig.savefig(figures / "accuracy_specimen.png", dpi=100)
     plt.close(fig)
-    return Section("Real specimen", "`d_specimen`: 1920 x 1200, columns 340 to 1560, rows 430 to 690, 33 px / 10 px.", rows,
-                   [("accuracy_specimen.png", "Shape and displacement of the third pair")], [])  # fmt: skip
+    return Section(
+        "Real specimen",
+        "`d_specimen`: 1920 x 1200, columns 340 to 1560, rows 430 to 690, 33 px / 10 px.",
+        rows,
+        [("accuracy_specimen.png", "Shape and displacement of the third pair")],
+        [],
+    )

@@ -41,8 +41,18 @@ def _errors(rig: Rig, before: Scene, after: Scene, field: Field) -> tuple[Float,
     return error[field.valid], dz[field.valid], error
 
 
-def _motion(rig: Rig, before: Scene, after: Scene, *, noise: float, seed: int, subset: int,
-            patch: str = "stretch", interpolation: str = "quintic", pair: StereoPair | None = None) -> Field:  # fmt: skip
+def _motion(
+    rig: Rig,
+    before: Scene,
+    after: Scene,
+    *,
+    noise: float,
+    seed: int,
+    subset: int,
+    patch: str = "stretch",
+    interpolation: str = "quintic",
+    pair: StereoPair | None = None,
+) -> Field:
     ref = rig.shoot(before, noise=noise, seed=seed)
     cur = rig.shoot(after, noise=noise, seed=seed + 1000)
     options = MeasureOptions(subset_px=subset, patch=patch, interpolation=interpolation)  # type: ignore[arg-type]
@@ -78,8 +88,13 @@ def plane(figures: Path) -> Section:
     ax.legend()
     fig.savefig(figures / "accuracy_plane.png", dpi=110)
     plt.close(fig)
-    return Section("Plane", f"{len(TEXTURES)} speckle patterns, {samples[21].size} points, step 10 px; the true calibration.",
-                   rows, [("accuracy_plane.png", "Errors of Z on a plane")], [])  # fmt: skip
+    return Section(
+        "Plane",
+        f"{len(TEXTURES)} speckle patterns, {samples[21].size} points, step 10 px; the true calibration.",
+        rows,
+        [("accuracy_plane.png", "Errors of Z on a plane")],
+        [],
+    )
 
 
 def translation(figures: Path) -> Section:
@@ -116,8 +131,13 @@ def translation(figures: Path) -> Section:
     ax.legend()
     fig.savefig(figures / "accuracy_translation.png", dpi=110)
     plt.close(fig)
-    return Section("Translation", f"Three speckle patterns, three translations up to 0.2 mm, {len(e)} points.", rows,
-                   [("accuracy_translation.png", "Errors of u, v, w")], [])  # fmt: skip
+    return Section(
+        "Translation",
+        f"Three speckle patterns, three translations up to 0.2 mm, {len(e)} points.",
+        rows,
+        [("accuracy_translation.png", "Errors of u, v, w")],
+        [],
+    )
 
 
 def strain(figures: Path) -> Section:
@@ -134,8 +154,14 @@ def strain(figures: Path) -> Section:
             e, _, _ = _errors(rig, before, after, field)
             curve.append(np.sqrt((e**2).mean(0)) if len(e) else np.full(3, np.nan))
             if eps == strains[-1]:
-                rows.append(Row(f"{patch} patch, 5 % strain, noise-free, rms of the worst component", float(curve[-1].max()),
-                                "um", 0.04 if patch == "stretch" else None))  # fmt: skip
+                rows.append(
+                    Row(
+                        f"{patch} patch, 5 % strain, noise-free, rms of the worst component",
+                        float(curve[-1].max()),
+                        "um",
+                        0.04 if patch == "stretch" else None,
+                    )
+                )
                 rows.append(Row(f"{patch} patch, 5 % strain, points valid", 100 * float(field.valid.mean()), "%"))
             elif patch == "rigid":
                 rows.append(
@@ -152,9 +178,13 @@ def strain(figures: Path) -> Section:
     ax.legend(ncols=2, fontsize=8)
     fig.savefig(figures / "accuracy_strain.png", dpi=110)
     plt.close(fig)
-    return Section("Strain", "Uniaxial strain with Poisson's ratio 0.33, 21 px, noise-free; all errors, systematic and random, together.",
-                   rows, [("accuracy_strain.png", "Errors under strain")],
-                   ["The rigid patch is the paper's: under strain e its edge is off by e h / 2, and that goes into u, v and w."])  # fmt: skip
+    return Section(
+        "Strain",
+        "Uniaxial strain with Poisson's ratio 0.33, 21 px, noise-free; all errors, systematic and random, together.",
+        rows,
+        [("accuracy_strain.png", "Errors under strain")],
+        ["The rigid patch is the paper's: under strain e its edge is off by e h / 2, and that goes into u, v and w."],
+    )
 
 
 def rotation(figures: Path) -> Section:
@@ -173,8 +203,15 @@ def rotation(figures: Path) -> Section:
             e, _, _ = _errors(rig, before, after, field)
             curves[label].append(float(np.sqrt((e**2).mean(0)).max()) if len(e) else np.nan)
         worst[label] = max(curves[label])
-    rows = [Row(f"rotation up to 25 degrees {k}, noise-free, rms of the worst component", v, "um",
-                0.1 if "plane" in k else None) for k, v in worst.items()]  # fmt: skip
+    rows = [
+        Row(
+            f"rotation up to 25 degrees {k}, noise-free, rms of the worst component",
+            v,
+            "um",
+            0.1 if "plane" in k else None,
+        )
+        for k, v in worst.items()
+    ]
     fig, ax = plt.subplots(figsize=(6, 3.2), layout="constrained")
     for label, curve in curves.items():
         ax.plot(angles, curve, "o-", label=label)
@@ -182,8 +219,13 @@ def rotation(figures: Path) -> Section:
     ax.legend()
     fig.savefig(figures / "accuracy_rotation.png", dpi=110)
     plt.close(fig)
-    return Section("Rotation", "Rigid rotation about the origin, 21 px, noise-free; points that leave a view are lost.", rows,
-                   [("accuracy_rotation.png", "Errors under rotation")], [])  # fmt: skip
+    return Section(
+        "Rotation",
+        "Rigid rotation about the origin, 21 px, noise-free; points that leave a view are lost.",
+        rows,
+        [("accuracy_rotation.png", "Errors under rotation")],
+        [],
+    )
 
 
 def epipolar(figures: Path) -> Section:
@@ -211,5 +253,10 @@ def epipolar(figures: Path) -> Section:
         Row("its departure from 0.1 px", 100 * abs(offset / 0.1 - 1), "%", 5.0),
         Row("true offset across the epipolar lines", float(expected), "px"),
     ]
-    return Section("A wrong calibration", "A rigid translation of 0.07 mm, 21 px, noise 2; the offset is each point's thirteenth unknown.",
-                   rows, [], [])  # fmt: skip
+    return Section(
+        "A wrong calibration",
+        "A rigid translation of 0.07 mm, 21 px, noise 2; the offset is each point's thirteenth unknown.",
+        rows,
+        [],
+        [],
+    )

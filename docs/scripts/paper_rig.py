@@ -17,8 +17,19 @@ from sim.surface import flat
 from sim.texture import Texture, speckle
 
 ROOT = Path(__file__).resolve().parents[2]
-ELEVEN = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect", "alpha_rad", "beta_rad", "gamma_rad", "x0_mm",
-          "y0_mm", "z0_mm")  # fmt: skip
+ELEVEN = (
+    "phd_px",
+    "cx_px",
+    "cy_px",
+    "kappa_per_px2",
+    "aspect",
+    "alpha_rad",
+    "beta_rad",
+    "gamma_rad",
+    "x0_mm",
+    "y0_mm",
+    "z0_mm",
+)
 DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255
 
 Float = NDArray[np.float64]
@@ -36,16 +47,18 @@ class Rig:
     def texture(self, seed: int = 1) -> Texture:
         return speckle(diameter_mm=self.speckle_mm, seed=seed)
 
-    def shoot(self, scene: Scene, *, noise: float = 2.0, seed: int = 0, cam: int | None = None,
-              dz_mm: float = 0.0) -> list[NDArray[np.uint8]] | list[Float]:  # fmt: skip
+    def shoot(
+        self, scene: Scene, *, noise: float = 2.0, seed: int = 0, cam: int | None = None, dz_mm: float = 0.0
+    ) -> list[NDArray[np.uint8]] | list[Float]:
         """Pictures of both cameras, 8 bit with noise; unrounded where noise is 0, so that nothing but the method shows."""
         rng = np.random.default_rng(seed)
         out = []
         for k, camera in enumerate((self.pair.cam1, self.pair.cam2)):
             if cam is not None and k != cam:
                 continue
-            clean = render(scene, camera.moved(dz_mm), self.size_px,
-                           options=RenderOptions(blur_px=self.blur_px, threads=2))  # fmt: skip
+            clean = render(
+                scene, camera.moved(dz_mm), self.size_px, options=RenderOptions(blur_px=self.blur_px, threads=2)
+            )
             grey = DARK + (BRIGHT - DARK) * clean * (1.0 if k == 0 else 0.88)
             if noise:
                 out.append(np.clip(np.round(grey + rng.normal(0.0, noise, grey.shape)), 0, 255).astype(np.uint8))
