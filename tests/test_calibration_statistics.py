@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from core.calibration import COVARIANCE_NAMES, CalibrationOptions, calibrate
 from tests.calibration_truth import PAPER, Array, Grid, nodes, project
@@ -30,7 +29,7 @@ def ten_of(result: object) -> Array:
 
 
 def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
-    """All 20 + 162 unknowns at once by scipy with differences, on the projection written apart."""
+    """All 20 + 162 unknowns at once with differences, on the projection written apart."""
     tolerance, sigma = 0.004, 0.0022
     grid = Grid(node_tolerance_mm=tolerance)
     error = np.random.default_rng(5).uniform(-tolerance, tolerance, (9, 9, 2))
@@ -53,21 +52,25 @@ def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
         parts.append((d / (tolerance / math.sqrt(3.0))).ravel())
         return np.concatenate(parts)
 
-    brute = least_squares(residuals, np.zeros(182), diff_step=1e-6, x_scale="jac", max_nfev=8)
+    # the problem is nearly linear at the truth: Gauss-Newton with central differences, no derivative of ours
+    u = np.zeros(182)
+    for _ in range(3):
+        jac = np.column_stack([(residuals(u + e) - residuals(u - e)) / 2e-3 for e in 1e-3 * np.eye(182)])
+        u = u - np.linalg.lstsq(jac, residuals(u), rcond=1e-15)[0]
     ours = (ten_of(result) - truth_vector()) / np.tile(SCALE, 2)
     sigma_of = np.sqrt(np.diagonal(result.covariance)) / np.tile(SCALE, 2)
     # ours stops where a step changes the sum of squares by 1e-6: a thousandth of a standard deviation
-    np.testing.assert_allclose(ours / sigma_of, brute.x[:20] / sigma_of, atol=0.01)
+    np.testing.assert_allclose(ours / sigma_of, u[:20] / sigma_of, atol=0.01)
     assert result.node_corrections_mm is not None
-    np.testing.assert_allclose(1e3 * result.node_corrections_mm.ravel(), brute.x[20:], atol=0.02)
+    np.testing.assert_allclose(1e3 * result.node_corrections_mm.ravel(), u[20:], atol=0.02)
 
-    H = brute.jac.T @ brute.jac
+    H = jac.T @ jac
     s = 1.0 / np.sqrt(np.diagonal(H))
     covariance = (np.linalg.inv(H * s[:, None] * s) * s[:, None] * s)[:20, :20]
     np.testing.assert_allclose(sigma_of, np.sqrt(np.diagonal(covariance)), rtol=0.01)
 
 
-def monte_carlo(tolerance: float, runs: int, **options: float) -> tuple[Array, list[Array], list[Array], Array]:
+def monte_carlo(tolerance: float, runs: int, degree: int | None) -> tuple[Array, list[Array], list[Array], Array]:
     grid = Grid(node_tolerance_mm=tolerance)
     found, claimed, shapes = [], [], []
     points = np.stack(np.meshgrid(*[np.linspace(-4, 4, 3)] * 2, [-1.0, 1.0]), -1).reshape(-1, 3)
@@ -77,7 +80,8 @@ def monte_carlo(tolerance: float, runs: int, **options: float) -> tuple[Array, l
         rng = np.random.default_rng(1000 + seed)
         # Gaussian node errors with the same variance as the bound's box, so that theory and draw agree
         error = rng.standard_normal((9, 9, 2)) * tolerance / math.sqrt(3.0)
-        settings = CalibrationOptions(**options)  # type: ignore[arg-type]
+        error = through_lines(error, degree)
+        settings = CalibrationOptions(correction_degree=degree)
         result = calibrate(make_views((0.0, 5.0), grid=grid, error_mm=error, seed=seed), grid, NOMINAL, settings)
         found.append(ten_of(result) - truth_vector())
         claimed.append(result.covariance)
@@ -86,14 +90,26 @@ def monte_carlo(tolerance: float, runs: int, **options: float) -> tuple[Array, l
     return np.array(found), claimed, shapes, np.array(sigma_shape)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.004])
-def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float) -> None:
-    runs = 40
-    found, claimed, shapes, sigma_shape = monte_carlo(tolerance, runs)
+def through_lines(error: Array, degree: int | None) -> Array:
+    """What a polynomial fitted to each line by least squares lets through of the nodes' errors."""
+    if degree is None:
+        return error
+    out = error.copy()
+    t = np.arange(9.0)
+    for k in range(9):
+        out[k, :, 0] = np.polyval(np.polyfit(t, error[k, :, 0], degree), t)  # a line at one X moves in X along Y
+        out[:, k, 1] = np.polyval(np.polyfit(t, error[:, k, 1], degree), t)
+    return out
+
+
+@pytest.mark.parametrize(("tolerance", "degree"), [(0.0, None), (0.004, None), (0.004, 1), (0.004, 2)])
+def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float, degree: int | None) -> None:
+    runs = 30
+    found, claimed, shapes, sigma_shape = monte_carlo(tolerance, runs, degree)
     covariance = np.mean(claimed, axis=0)
     ratio = found.std(axis=0) / np.sqrt(np.diagonal(covariance))
-    # sd of a sd from 40 runs is 11 %; three of those over 20 correlated figures
-    assert (np.abs(ratio - 1.0) < 0.35).all(), ratio.round(2)
+    # sd of a sd from 30 runs is 13 %; three of those over 20 correlated figures
+    assert (np.abs(ratio - 1.0) < 0.4).all(), ratio.round(2)
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.12)
     # no bias beyond three standard errors, taken together: chi^2 of 20 correlated figures, whitened by the claim
     whitened = np.linalg.solve(np.linalg.cholesky(_scaled(covariance)), (found / _sd(covariance)).T)
@@ -111,6 +127,22 @@ def _sd(covariance: Array) -> Array:
 def _scaled(covariance: Array) -> Array:
     s = _sd(covariance)
     return np.asarray(covariance / s[:, None] / s)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_corrections_are_of_the_kind_that_the_lines_let_through(degree: int) -> None:
+    error = np.random.default_rng(8).uniform(-0.004, 0.004, (9, 9, 2))
+    seen = through_lines(error, degree)
+    grid = Grid(node_tolerance_mm=0.004)
+    views = make_views((0.0, 2.0, 4.0, 5.0), grid=grid, error_mm=seen, seed=8)
+    result = calibrate(views, grid, NOMINAL, dataclasses.replace(HELD, correction_degree=degree))
+    assert result.held_out is not None
+    assert result.held_out.mean.rbe_px < 0.0035
+    assert result.node_corrections_mm is not None
+    found = result.node_corrections_mm
+    np.testing.assert_allclose(through_lines(found, degree), found, atol=1e-9)
+    # up to what the cameras share with the grid (place, turn, scale and the like), they are the true ones
+    assert np.sqrt(np.mean((found - seen) ** 2)) < 0.5 * np.sqrt(np.mean(seen**2))
 
 
 def test_a_tilted_stage_axis_hides_from_the_residuals_but_not_from_the_declared_covariance() -> None:

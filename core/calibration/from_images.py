@@ -14,9 +14,11 @@ from core.calibration.prepare import check_hold_out
 from core.calibration.result import CalibrationResult
 from core.calibration.solve import calibrate
 from core.errors import ImageError, StereorigError
-from core.grid import GridOptions, GridView, Localiser, detect_grid
+from core.grid import GridOptions, GridView, LineModel, Localiser, detect_grid
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.target import GridTarget
+
+_DEGREE_OF_LINES: dict[LineModel, int | None] = {"straight": 1, "parabola": 2, "local": None}
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,8 @@ def calibrate_views(
     target, nominals, options
         See :func:`core.calibration.solve.calibrate`.
     localiser, grid_options
-        See :func:`core.grid.detect_grid`. Where node corrections are estimated, the intersections come from the
-        lines near each node, since a fit over a whole line smears the nodes' errors.
+        See :func:`core.grid.detect_grid`. What its line model lets through of the nodes' errors is what the adjustment
+        takes as unknown, whatever ``options.correction_degree`` says.
     progress, cancel
         Stages ``grid`` (one an image) and ``calibration``.
 
@@ -89,13 +91,6 @@ def calibrate_views(
     for image in images:
         _check_size(image, nominals[CAMERAS.index(image.camera)])
     grid_options = grid_options or GridOptions()
-    if (
-        localiser == "profile"
-        and grid_options.line_model is None
-        and target.node_tolerance_mm > 0.0
-        and options.estimate_nodes is not False
-    ):
-        grid_options = replace(grid_options, line_model="local")
     grids: list[GridView] = []
     views: list[CalibrationView] = []
     total = len(images) + 1
@@ -117,6 +112,7 @@ def calibrate_views(
         views.append(CalibrationView(image.camera, image.dz_mm, grid.xy_px, sigma, image.label))
     raise_if_cancelled(cancel)
     progress("calibration", len(images), total)
+    options = replace(options, correction_degree=_DEGREE_OF_LINES[grids[0].line_model])
     result = calibrate(views, target, nominals, options)
     progress("calibration", total, total)
     return CalibrationFromImages(tuple(grids), result)
