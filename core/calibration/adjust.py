@@ -1,9 +1,9 @@
 """Both cameras, the stage axes and the target's nodes in one adjustment.
 
-The unknowns are ten parameters and two axis tilts a camera, and corrections of the nodes, the same for both cameras
-(:mod:`core.calibration.corrections`). The corrections are eliminated block by block (Schur complement), so that the
-system to solve stays 24 x 24. Priors enter as observations: the image centre, the axis tilt, and the nodes'
-tolerance, which also fixes the freedoms that camera poses and corrections share.
+The unknowns are ten parameters and two axis tilts a camera, and two corrections a node, the same for both cameras.
+Each node's corrections meet only its own observations, so they are eliminated (Schur complement) and the system to
+solve stays 24 x 24. Priors enter as observations: the image centre, the axis tilt, and the nodes' tolerance, which
+also fixes the freedoms that camera poses and node corrections share.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.calibration.corrections import CorrectionBasis
 from core.calibration.inputs import CAMERAS, CalibrationOptions, NominalCamera
 from core.calibration.model import N_CAMERA, Linearised, Observations, linearise
 from core.errors import CalibrationError
@@ -55,13 +54,13 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations in blocks: parameters, their coupling to the corrections, corrections."""
+    """Normal equations in blocks: parameters, their coupling to the nodes, nodes."""
 
     U: Float  # (2, 12, 12) without priors
     g: Float  # (24,) with priors
-    W: Float  # (blocks, 24, k)
-    V: Float  # (2, blocks, k, k) without priors
-    h: Float  # (blocks, k) with priors
+    W: Float  # (n, 24, 2)
+    V: Float  # (2, n, 2, 2) without priors
+    h: Float  # (n, 2) with priors
     cost: float
     weighted_squares: Float  # (2,) of the residuals in px^2
     valid: bool
@@ -94,7 +93,6 @@ def covariance_of(
     *,
     noise_px: Float,
     node_sigma_mm: float,
-    basis: CorrectionBasis,
 ) -> Float:
     """Return the (24, 24) covariance at given parameters, without any residual: the prediction before measuring.
 
@@ -106,8 +104,7 @@ def covariance_of(
     lins = [linearise(parameters[c], nominals[c].aspect, nodes_mm, observations[c]) for c in range(2)]
     mean, weight = prior_terms(nominals, options)
     tau = node_sigma_mm**-2 if node_sigma_mm > 0.0 else np.inf
-    none = basis.zero(len(nodes_mm))
-    normal = _assemble(lins, observations, parameters.ravel(), none, noise_px, mean, weight, tau, basis)
+    normal = _assemble(lins, observations, parameters.ravel(), np.zeros_like(nodes_mm), noise_px, mean, weight, tau)
     return _covariance(normal, weight, tau, free_mask(options))[0]
 
 
@@ -119,7 +116,6 @@ def adjust(
     options: CalibrationOptions,
     *,
     node_sigma_mm: float,
-    basis: CorrectionBasis,
 ) -> Adjustment:
     """Minimise the weighted squares of residuals and priors by Levenberg-Marquardt.
 
@@ -135,8 +131,6 @@ def adjust(
         Priors and limits.
     node_sigma_mm
         Prior on a node's corrections per axis; 0 holds the nodes.
-    basis
-        Which corrections there are.
 
     Raises
     ------
@@ -146,13 +140,12 @@ def adjust(
     mean, prior = prior_terms(nominals, options)
     tau = node_sigma_mm**-2 if node_sigma_mm > 0.0 else np.inf
     free = free_mask(options)
-    x, d = np.array(parameters, dtype=np.float64).ravel(), basis.zero(len(nodes_mm))
+    x, d = np.array(parameters, dtype=np.float64).ravel(), np.zeros_like(nodes_mm)
 
     def evaluate(x_: Float, d_: Float, noise_: Float) -> _Normal:
         p = x_.reshape(2, N_CAMERA)
-        nodes = nodes_mm + basis.corrections(d_)
-        lins = [linearise(p[c], nominals[c].aspect, nodes, observations[c]) for c in range(2)]
-        return _assemble(lins, observations, x_, d_, noise_, mean, prior, tau, basis)
+        lins = [linearise(p[c], nominals[c].aspect, nodes_mm + d_, observations[c]) for c in range(2)]
+        return _assemble(lins, observations, x_, d_, noise_, mean, prior, tau)
 
     noise = np.ones(2)
     counts = np.array([o.count for o in observations], dtype=np.float64)
@@ -177,10 +170,8 @@ def adjust(
     normal = evaluate(x, d, noise)
     covariance, node_covariance, taken = _covariance(normal, prior, tau, free)
     redundancy = counts - taken
-    node_sigma = np.sqrt(basis.variances(node_covariance))
-    return Adjustment(
-        x.reshape(2, N_CAMERA), covariance, basis.corrections(d), node_sigma, noise, redundancy, iterations
-    )
+    node_sigma = np.sqrt(np.diagonal(node_covariance, axis1=1, axis2=2))
+    return Adjustment(x.reshape(2, N_CAMERA), covariance, d, node_sigma, noise, redundancy, iterations)
 
 
 def _noise(normal: _Normal, redundancy: Float) -> Float:
@@ -196,9 +187,8 @@ def _assemble(
     mean: Float,
     prior: Float,
     tau: float,
-    basis: CorrectionBasis,
 ) -> _Normal:
-    n = observations[0].found.shape[1]
+    n = len(d)
     U, g = np.zeros((2, N_CAMERA, N_CAMERA)), prior * (mean - x)
     W, V, h = np.zeros((n, _P, 2)), np.zeros((2, n, 2, 2)), np.zeros((n, 2))
     squares = np.zeros(2)
@@ -212,8 +202,6 @@ def _assemble(
         V[c] = np.einsum("vn,vnij,vnik->njk", w, lin.by_node, lin.by_node, optimize=True)
         h += np.einsum("vn,vnij,vni->nj", w, lin.by_node, lin.residual_px, optimize=True)
         squares[c] = np.sum(observations[c].weight[..., None] * lin.residual_px**2)
-    W, h = basis.couplings(W), basis.vectors(h)
-    V = np.stack([basis.squares(part) for part in V])
     cost = float(np.sum(squares / noise_px**2) + np.sum(prior * (mean - x) ** 2))
     if np.isfinite(tau):
         h -= tau * d
@@ -240,10 +228,9 @@ def _solve(
     U[np.diag_indices(_P)] *= 1.0 + damping
     Y = None
     if np.isfinite(tau):
-        k = normal.h.shape[1]
-        V = normal.V.sum(axis=0) + tau * np.eye(k)
-        V[:, range(k), range(k)] *= 1.0 + damping
-        Y = np.linalg.solve(V, np.swapaxes(normal.W, 1, 2))  # V^-1 W', (blocks, k, 24)
+        V = normal.V.sum(axis=0) + tau * np.eye(2)
+        V[:, [0, 1], [0, 1]] *= 1.0 + damping
+        Y = np.linalg.solve(V, np.swapaxes(normal.W, 1, 2))  # V^-1 W', (n, 2, 24)
         U -= np.einsum("npj,njq->pq", normal.W, Y)
         g -= np.einsum("njp,nj->p", Y, normal.h)
     step = np.zeros(_P)
@@ -305,20 +292,20 @@ def _minimise(
 
 
 def _covariance(normal: _Normal, prior: Float, tau: float, free: Bool) -> tuple[Float, Float, Float]:
-    """Covariance of parameters (24, 24) and corrections (blocks, k, k); observations taken up per camera (2,)."""
+    """Covariance of the parameters (24, 24) and of each node (n, 2, 2); observations taken up, per camera (2,)."""
     S = _with_priors(normal, prior)
-    n, k = normal.h.shape
+    n = len(normal.h)
     C = np.zeros((_P, _P))
     if np.isfinite(tau):
-        V_inv = np.linalg.inv(normal.V.sum(axis=0) + tau * np.eye(k))
+        V_inv = np.linalg.inv(normal.V.sum(axis=0) + tau * np.eye(2))
         Y = V_inv @ np.swapaxes(normal.W, 1, 2)
         S -= np.einsum("npj,njq->pq", normal.W, Y)
         C[np.ix_(free, free)] = _inverse(S[np.ix_(free, free)])
-        CY = C @ np.swapaxes(Y, 1, 2)  # minus the covariance of parameters and corrections, (blocks, 24, k)
+        CY = C @ np.swapaxes(Y, 1, 2)  # minus the covariance of parameters and nodes, (n, 24, 2)
         C_nn = V_inv + Y @ CY
     else:
         C[np.ix_(free, free)] = _inverse(S[np.ix_(free, free)])
-        CY, C_nn = np.zeros((n, _P, k)), np.zeros((n, k, k))
+        CY, C_nn = np.zeros((n, _P, 2)), np.zeros((n, 2, 2))
     taken = np.zeros(2)
     for c in range(2):
         span = slice(c * N_CAMERA, (c + 1) * N_CAMERA)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,9 @@ from core.calibration.prepare import check_hold_out
 from core.calibration.result import CalibrationResult
 from core.calibration.solve import calibrate
 from core.errors import ImageError, StereorigError
-from core.grid import GridOptions, GridView, LineModel, Localiser, detect_grid
+from core.grid import GridOptions, GridView, Localiser, detect_grid
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.target import GridTarget
-
-_DEGREE_OF_LINES: dict[LineModel, int | None] = {"straight": 1, "parabola": 2, "local": None}
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,10 @@ def calibrate_views(
     target, nominals, options
         See :func:`core.calibration.solve.calibrate`.
     localiser, grid_options
-        See :func:`core.grid.detect_grid`. What its line model lets through of the nodes' errors is what the adjustment
-        takes as unknown, whatever ``options.correction_degree`` says.
+        See :func:`core.grid.detect_grid`. Its default of straight lines serves toleranced grids as well: measured on
+        eight simulated 4 um grids at two positions, node corrections left 0.37 um of shape error with straight
+        lines, 0.37 with parabolas, 0.40 with intersections from the lines near each node (less smeared, but
+        noisier); straight lines also stay nearest to the nominal grid.
     progress, cancel
         Stages ``grid`` (one an image) and ``calibration``.
 
@@ -112,7 +112,6 @@ def calibrate_views(
         views.append(CalibrationView(image.camera, image.dz_mm, grid.xy_px, sigma, image.label))
     raise_if_cancelled(cancel)
     progress("calibration", len(images), total)
-    options = replace(options, correction_degree=_DEGREE_OF_LINES[grids[0].line_model])
     result = calibrate(views, target, nominals, options)
     progress("calibration", total, total)
     return CalibrationFromImages(tuple(grids), result)

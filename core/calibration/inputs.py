@@ -117,9 +117,6 @@ class CalibrationOptions:
         axis fixed.
     estimate_nodes
         Whether node corrections are unknowns; None means: where the target has a tolerance.
-    correction_degree
-        Degree of the polynomial that the localiser fitted to whole lines (1 straight, 2 parabola), which is all it
-        shows of the nodes' errors; None where it took each intersection from its own neighbourhood.
     max_shape_uncertainty
         Largest predicted standard deviation of shape, relative to the target's extent, that is accepted.
     max_centre_sigma_px, max_standoff_sigma
@@ -134,7 +131,6 @@ class CalibrationOptions:
     centre_sigma_px: float = 20.0
     axis_tilt_sigma_rad: float = 0.0
     estimate_nodes: bool | None = None
-    correction_degree: int | None = None
     max_shape_uncertainty: float = 1e-3
     max_centre_sigma_px: float = 3.0
     max_standoff_sigma: float = 0.02

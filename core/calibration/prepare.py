@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from core.calibration.adjust import covariance_of
-from core.calibration.corrections import correction_basis
 from core.calibration.inputs import (
     CAMERAS,
     CalibrationOptions,
@@ -119,7 +118,6 @@ def predict_uncertainty(
         options,
         noise_px=np.full(2, noise_px),
         node_sigma_mm=node_sigma_mm,
-        basis=correction_basis((nodes.shape[0], nodes.shape[1]), options.correction_degree),
     )
     pair = StereoPair(*(camera_of(parameters[c], nominals[c].aspect) for c in range(2)))
     return volume_uncertainty(pair, covariance, target)

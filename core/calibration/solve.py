@@ -8,7 +8,6 @@ import numpy as np
 
 from core.calibration.adjust import Adjustment, adjust
 from core.calibration.angles import check_angles
-from core.calibration.corrections import correction_basis
 from core.calibration.inputs import (
     CAMERAS,
     CalibrationOptions,
@@ -109,5 +108,4 @@ def _fit(
         {name: camera_of(parameters[c], nominals[c].aspect).cam_from_sys.rotation for c, name in enumerate(CAMERAS)},
         dict(zip(CAMERAS, nominals, strict=True)),
     )
-    basis = correction_basis((nodes_mm.shape[0], nodes_mm.shape[1]), options.correction_degree)
-    return adjust(parameters, flat, observations, nominals, options, node_sigma_mm=node_sigma_mm, basis=basis)
+    return adjust(parameters, flat, observations, nominals, options, node_sigma_mm=node_sigma_mm)
