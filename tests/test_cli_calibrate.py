@@ -235,6 +235,6 @@ def test_a_calibration_that_failed_its_check_is_not_written(
     assert main(command(folder, "--hold-out", "2")) == 1
     captured = capsys.readouterr()
     assert "verdict: failed" in captured.out
-    assert "Worst views: cam2_+2.000mm.tif 1.0" in captured.out
+    assert "Worst views: cam2_+2.000mm.tif " in captured.out
     assert captured.err.startswith("stereorig: calibration_rejected: ")
     assert not (folder / "calibration.json").exists()
