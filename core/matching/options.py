@@ -24,7 +24,7 @@ class MatchOptions:
     patch
         ``stretch`` (12 unknowns, the default) or ``rigid`` (the paper's 9). Shape does not use it.
     interpolation
-        Spline that the images were prepared with; ``cubic`` is faster, and biased by thousandths of a pixel on sharp speckle.
+        Spline that the images were prepared with; ``cubic`` is faster, and biased on sharp speckle.
     max_iterations
         Gauss-Newton steps before a point counts as not converged. Points inside the basin need 2 to 8.
     tolerance_px
