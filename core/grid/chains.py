@@ -17,6 +17,7 @@ from core.lens import Bool, Float
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens
 _MOST_ROUNDS = 40
+_MOST_LINES = 150
 _MOST_TURN = 0.15  # rad between a piece and its line
 _LEAST_SHARE = 0.25  # of the longest line's seen length; shorter ones are clutter
 
@@ -61,7 +62,7 @@ def link(pieces: Pieces) -> list[CoarseLine]:
     typical = float(np.median(pieces.length_px))
     lines: list[CoarseLine] = []
     for seed in np.argsort(-pieces.weight):
-        if free[seed]:
+        if free[seed] and len(lines) < _MOST_LINES:
             members = _grow(pieces, int(seed), free, typical)
             free[members] = False
             lines.append(_fit(pieces.take(members)))

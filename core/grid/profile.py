@@ -209,6 +209,8 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
                 n += 1
     if n < _LEAST_PIXELS:
         return
+    out[7] = gs[:n].mean()  # kept also where the fit fails: it tells glare from dirt
+    out[14] = brightest
     scale = 1.0 / max(piece[4], 1.0)
     par = np.zeros(_N)
     par[0] = c0
