@@ -55,7 +55,7 @@ def open_devices(config: RigConfig) -> Devices:
         for cam in CAMERAS:
             section = config.camera(cam)
             unit = CameraUnit(cam, _grabber(config, cam, world))
-            stack.callback(unit.grabber.close)
+            stack.callback(unit.close)
             unit.open(
                 CameraSettings(
                     exposure_ms=section.exposure_ms,
@@ -67,7 +67,9 @@ def open_devices(config: RigConfig) -> Devices:
             units.append(unit)
         stage = open_stage(config.stage.driver, url, _axis_options(config))
         stack.callback(stage.close)
-        return Devices(CameraPair(*units), stage, world, controller, stack.pop_all())
+        return Devices(
+            CameraPair(*units, max_skew_ms=config.rig.max_skew_ms), stage, world, controller, stack.pop_all()
+        )
 
 
 def _axis_options(config: RigConfig) -> dict[int, AxisOptions]:

@@ -156,7 +156,7 @@ class Rig:
 
     def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs; call on the owner thread, with the hold."""
-        return self.pair.shoot(frames, max_skew_ms=self.config.rig.max_skew_ms, check=check)
+        return self.pair.shoot(frames, check)
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> dict[str, Any]:
         """Put something else before a simulated rig's cameras."""
