@@ -110,6 +110,7 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
     for index, n in enumerate(steps):
         job.check()
         step = service.tests.verified_step(test_id, n)
+        start = step if measured is None else reference  # a profile is each step's own
         task = StepTask(
             folder=str(folder),
             calibration=str(service.tests.calibration_file(test_id)),
@@ -117,8 +118,8 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
             n=n,
             reference=steps[0] if measured is not None else n,
             images={
-                "ref1": str(reference.cam1),
-                "ref2": str(reference.cam2),
+                "ref1": str(start.cam1),
+                "ref2": str(start.cam2),
                 "cur1": str(step.cam1),
                 "cur2": str(step.cam2),
             },
@@ -126,7 +127,7 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
             settings=settings,
             inputs={
                 "calibration.json": document["inputs"]["calibration_sha256"],
-                **{f"reference_{cam}": digest for cam, digest in reference.document["sha256"].items()},
+                **{f"reference_{cam}": digest for cam, digest in start.document["sha256"].items()},
                 **{f"step_{cam}": digest for cam, digest in step.document["sha256"].items()},
             },
             label=step.document["label"],
