@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import InputError, SeedError
 from core.field.assemble import assemble
+from core.field.features import LARGE_PIXELS
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
 from core.field.grow import fit_in_batches, grow
@@ -332,23 +333,28 @@ class _Run:
         return True
 
     def _match_seeds(self) -> int:
-        """Seeds from feature matches; how many stand."""
+        """Seeds from feature matches; how many stand. Large images are tried at half their size first."""
+        large = max(self.ref1.pixels.size, self.ref2.pixels.size) > LARGE_PIXELS
+        return (self._match_seeds_at(halve=True) if large else 0) or self._match_seeds_at(halve=False)
+
+    def _match_seeds_at(self, *, halve: bool) -> int:
         raise_if_cancelled(self.cancel)
         mask = self._feature_mask()
-        f1, f2 = self.ref1.features(mask), self.ref2.features()
+        f1 = self.ref1.features(mask, halve=halve)
+        raise_if_cancelled(self.cancel)
+        f2 = self.ref2.features(halve=halve)
         raise_if_cancelled(self.cancel)
         shape = scattered_shape(self.pair, f1, f2)
         motion = shape_now = None
         if self.cur1 is not None and self.cur2 is not None:
-            n1 = self.cur1.features()
+            n1 = self.cur1.features(halve=halve)
             raise_if_cancelled(self.cancel)
-            n2 = self.cur2.features()
+            n2 = self.cur2.features(halve=halve)
             raise_if_cancelled(self.cancel)
             motion = scattered_motion(f1, n1)
             shape_now = scattered_shape(self.pair, n1, n2)
         elif len(shape.xy_px) < _FEWEST_MATCHES:
             return 0
-        self._scattered = (shape, motion, shape_now)
         return seeds_from_matches(
             self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
         )

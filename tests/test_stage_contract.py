@@ -224,6 +224,41 @@ def test_a_stop_voids_a_motion_that_still_waits_for_its_turn(kind: tuple[str, Tr
         assert stand.controller.true_position_mm(2) == 0.0
 
 
+@pytest.mark.parametrize("first", ["stop", "move"])
+def test_whichever_of_stop_and_move_is_first_on_the_wire_the_axis_stands_still(
+    kind: tuple[str, Transport], first: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench(*kind, time_scale=1.0, start_mm=0.0) as stand:
+        stand.ready(1)
+        send = stand.stage._send_move
+
+        def race(axis: int, position_mm: float) -> None:
+            if first == "stop":
+                stand.stage.stop()
+            send(axis, position_mm)
+            if first == "move":
+                stand.stage.stop()
+
+        monkeypatch.setattr(stand.stage, "_send_move", race)
+        with pytest.raises(StageError) as caught:
+            stand.stage.move_to(1, 40.0)
+        assert code_of(caught) == "stage_stopped"
+        assert stand.controller.commands(MOVE_WORD)
+        wait_until(lambda: not stand.axis(1).moving)
+        assert stand.controller.true_position_mm(1) < 5.0
+
+
+def test_stopping_one_axis_leaves_the_other_moving(kind: tuple[str, Transport]) -> None:
+    with bench(*kind, time_scale=10.0, start_mm=0.0) as stand:
+        stand.ready(1, 2)
+        thread, errors = in_thread(lambda: stand.stage.move_to(1, 20.0))
+        wait_until(lambda: stand.axis(1).velocity_now_mm_s > 1)
+        stand.stage.stop(2)
+        thread.join(5.0)
+        assert not errors
+        assert stand.stage.position(1) == pytest.approx(20.0, abs=1e-4)
+
+
 def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Transport]) -> None:
     with bench(*kind, time_scale=1.0, start_mm=30.0) as stand:
         stand.stage.enable(1)

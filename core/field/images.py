@@ -40,7 +40,7 @@ class MeasureImage:
     def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
         self.name = name
         self._prepared: dict[Interpolation, ImageData] = {}
-        self._features: list[tuple[NDArray[np.bool_] | None, Features]] = []
+        self._features: list[tuple[NDArray[np.bool_] | None, bool, Features]] = []
         self._variance: dict[int, Float] = {}
         if isinstance(image, MeasureImage):
             self.pixels: NDArray[Any] = image.pixels
@@ -62,13 +62,14 @@ class MeasureImage:
             self._prepared[interpolation] = prepare(self.pixels, interpolation)
         return self._prepared[interpolation]
 
-    def features(self, mask: NDArray[np.bool_] | None = None) -> Features:
-        """Return keypoints where ``mask`` allows them, found on the first call for that mask."""
-        for known, features in self._features:
-            if known is mask or (known is not None and mask is not None and np.array_equal(known, mask)):
+    def features(self, mask: NDArray[np.bool_] | None = None, *, halve: bool = False) -> Features:
+        """Return keypoints where ``mask`` allows them, found on the first call for that mask and size."""
+        for known, size, features in self._features:
+            same = known is mask or (known is not None and mask is not None and np.array_equal(known, mask))
+            if same and size == halve:
                 return features
-        features = detect(self.pixels, mask=mask)
-        self._features.append((mask, features))
+        features = detect(self.pixels, mask=mask, halve=halve)
+        self._features.append((mask, halve, features))
         return features
 
     def subset_variance(self, subset_px: int) -> Float:
