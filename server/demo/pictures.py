@@ -33,6 +33,18 @@ def upright_mm(xyz_mm: Float) -> tuple[Float, Float]:
     return half * (xyz_mm[..., 0] - xyz_mm[..., 1]), half * (xyz_mm[..., 0] + xyz_mm[..., 1])
 
 
+def _places(values: Float, valid: NDArray[np.bool_], *, axis: int) -> Float:
+    """One place for every column (axis 0) or row (axis 1): contours need places where points failed, too."""
+    lines = np.moveaxis(np.where(valid, values, np.nan), axis, -1)
+    known = np.isfinite(lines).any(axis=-1)
+    k = np.arange(len(lines))
+    medians = np.array([np.nanmedian(line) for line in lines[known]])
+    slope, offset = np.polyfit(k[known], medians, 1)
+    places = slope * k + offset
+    places[known] = medians
+    return places
+
+
 def _save(figure: Any, path: Path) -> None:
     figure.savefig(path)
     plt.close(figure)
@@ -202,9 +214,7 @@ def panel(
         figure, axes = plt.subplots(2, 2, figsize=(9.4, 6.8), layout="constrained")
         for axis, result, load, letter in zip(axes.flat, fields, loads_kn, "abcd", strict=False):
             x, y = upright_mm(result.xyz_mm)
-            # contours need places for every point: failed ones get theirs from the rows and columns they stand in
-            px = np.nanmedian(x, axis=0)
-            py = np.nanmedian(y, axis=1)
+            px, py = _places(x, result.valid, axis=0), _places(y, result.valid, axis=1)
             w = -result.uvw_mm[..., 2]  # type: ignore[index]
             drawn = axis.contourf(px, py, np.ma.masked_invalid(w), levels=14, cmap=_HEIGHT)
             axis.contour(px, py, np.ma.masked_invalid(w), levels=14, colors="black", linewidths=0.3)
@@ -217,7 +227,7 @@ def panel(
             bar.set_label("towards the cameras, mm")
         _save(figure, out / "panel_w.png")
 
-        figure, axes = plt.subplots(2, len(fields), figsize=(3.4 * len(fields), 5.6))
+        figure, axes = plt.subplots(2, len(fields), figsize=(3.4 * len(fields), 5.6), squeeze=False)
         for k, (result, comparison, load) in enumerate(zip(fields, comparisons, loads_kn, strict=True)):
             opening = result.uvw_mm @ np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
             _map(axes[0, k], result, opening, f"along the load, {load:g} kN", "mm", cmap=_HEIGHT)
