@@ -242,6 +242,15 @@ def test_ranges_cover_everything_once_and_hand_errors_on():
     run_ranges(count, 1001, 7)
     assert (done == 1).all()
 
+    nested = np.zeros((40, 50), int)
+
+    def outer(first, last):
+        for row in range(first, last):
+            run_ranges(lambda a, b, row=row: nested[row].__setitem__(slice(a, b), 1), 50, 3)
+
+    run_ranges(outer, 40, 2)  # a range may itself run ranges
+    assert (nested == 1).all()
+
     def fail(first, last):
         if first >= 500:
             raise ValueError("range")
