@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration import (
-    CalibrationOptions,
-    CalibrationResult,
-    CalibrationView,
-    NominalCamera,
-    calibrate,
-)
+from core.calibration import CalibrationOptions, CalibrationResult, NominalCamera
+from core.calibration.from_images import ImageOfTarget, calibrate_views
 from core.calibration.inputs import CAMERAS
-from core.errors import CalibrationError, TargetError
+from core.errors import CalibrationError
 from core.grid import GridOptions, GridView, detect_grid
 from core.target import GridTarget
 from server.io.calibration_json import calibration_content
 from server.io.files import written_aside
-from server.io.images import read_image
+from server.io.images import GrayImage, read_image
 from server.store.durable import write_json
 from server.tasks import FitTask
 from server.version import software_version
-from server.worker_process import TaskChannel, current_task
+from server.worker_process import current_task
 
 #: mean shift of the grid between the first and the last view at zero: above the first a warning, above the second no
 #: calibration. The detector repeats to 0.002 px; 0.1 px of epipolar error shows as micrometres of false motion.
@@ -48,69 +45,54 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     TargetError
         The grid was not found in a view; ``view`` and ``camera`` say where.
     CalibrationError
-        No usable minimum, or ``grid_moved`` while the views were taken.
+        No usable minimum, ``calibration_rejected`` by its verdict, or ``grid_moved`` while the views were taken.
     """
     channel = current_task()
     folder = Path(task.folder)
     rig, plan = task.plan["rig"], task.plan
     target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
-    found = _detect_all(folder, task.views, target, plan["localiser"], channel)
-    drift = _drift(task.views, found)
-    views = [
-        CalibrationView(
-            camera=view["camera"],
-            dz_mm=view["dz_mm"],
-            xy_px=grid.xy_px,
-            sigma_px=np.sqrt(np.mean(grid.sigma_px**2, axis=-1)),
-            name=Path(view["file"]).name,
-        )
-        for view, grid in zip(task.views, found, strict=True)
-        if view["role"] in ("fitted", "held_out")
-    ]
-    channel.progress("fit", 0, 1)
-    options = CalibrationOptions(held_out_mm=tuple(plan["held_out_mm"]))
-    result = calibrate(views, target, _nominals(rig), options)
+    measured = [view for view in task.views if view["role"] in ("fitted", "held_out")]
+    # averages are scaled: the type's largest number is not where the sensor saturated
+    grid_options = GridOptions(saturation=float(min(view["full_scale"] for view in task.views)))
+    found = calibrate_views(
+        [
+            ImageOfTarget(view["camera"], view["dz_mm"], read_image(folder / view["file"]), Path(view["file"]).name)
+            for view in measured
+        ],
+        target,
+        _nominals(rig),
+        CalibrationOptions(held_out_mm=tuple(plan["held_out_mm"]), axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"]),
+        localiser=plan["localiser"],
+        grid_options=grid_options,
+        progress=channel.progress,
+        cancel=channel,
+    )
+    known = {view["file"]: grid for view, grid in zip(measured, found.grids, strict=True)}
+    like = replace(grid_options, line_model=found.grids[0].line_model)
+    drift = _drift(folder, task.views, known, lambda image: detect_grid(
+        image, target, localiser=plan["localiser"], options=like))  # fmt: skip
     provenance = {
         "software_version": software_version(),
         "rig": rig["name"],
         "localiser": plan["localiser"],
+        "line_model": found.grids[0].line_model,
         "frames": plan["frames"],
         "views_sha256": {Path(v["file"]).name: v["sha256"] for v in task.views},
     }
-    content = calibration_content(result, target, provenance=provenance)
+    content = calibration_content(found.result, target, provenance=provenance)
     _judge_drift(content, drift)
-    _write_residuals(folder / "residuals.nc", result, views)
+    _write_residuals(folder / "residuals.nc", found.result, {Path(f).name: grid for f, grid in known.items()})
+    if content["verdict"]["level"] == "failed":
+        write_json(folder / "rejected.json", content)
+        raise CalibrationError(
+            f"The calibration is not usable: {' '.join(content['verdict']['reasons'])}", code="calibration_rejected"
+        )
     write_json(folder / "calibration.json", content)
-    channel.progress("fit", 1, 1)
     return {
         "verdict": content["verdict"],
         "checks": {k: _three(content["checks"][k]) for k in ("fitted", "held_out")},
         "drift_px": drift,
     }
-
-
-def _detect_all(
-    folder: Path,
-    views: list[dict[str, Any]],
-    target: GridTarget,
-    localiser: Literal["profile", "paper"],
-    channel: TaskChannel,
-) -> list[GridView]:
-    # an adjustment that solves for the maker's errors needs to see them: no smoothing along whole lines
-    local = localiser == "profile" and target.node_tolerance_mm > 0.0
-    found = []
-    for index, view in enumerate(views):
-        channel.check()
-        channel.progress("grid", index, len(views))
-        options = GridOptions(line_model="local" if local else None, saturation=float(view["full_scale"]))
-        try:
-            found.append(detect_grid(read_image(folder / view["file"]), target, localiser=localiser, options=options))
-        except TargetError as error:
-            error.cause = f"{view['camera']} at dZ = {view['dz_mm']:+.3f} mm: {error.cause}"
-            error.context |= {"camera": view["camera"], "view": view["index"], "dz_mm": view["dz_mm"]}
-            raise
-    channel.progress("grid", len(views), len(views))
-    return found
 
 
 def _nominals(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
@@ -127,12 +109,20 @@ def _nominals(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
     return one, two
 
 
-def _drift(views: list[dict[str, Any]], found: list[GridView]) -> dict[str, float]:
+def _drift(
+    folder: Path,
+    views: list[dict[str, Any]],
+    known: dict[str, GridView],
+    detect: Callable[[GrayImage], GridView],
+) -> dict[str, float]:
     """Mean shift of the intersections between the first and the last view at zero, per camera."""
     drift: dict[str, float] = {}
     for cam in CAMERAS:
-        at_zero = [g for v, g in zip(views, found, strict=True) if v["camera"] == cam and v["dz_commanded_mm"] == 0.0]
-        shift = np.nanmean(at_zero[-1].xy_px - at_zero[0].xy_px, axis=(0, 1))
+        at_zero = [v["file"] for v in views if v["camera"] == cam and v["dz_commanded_mm"] == 0.0]
+        first, last = (
+            known[file] if file in known else detect(read_image(folder / file)) for file in (at_zero[0], at_zero[-1])
+        )
+        shift = np.nanmean(last.xy_px - first.xy_px, axis=(0, 1))
         drift[cam] = float(np.hypot(*shift))
     return drift
 
@@ -166,11 +156,10 @@ def _three(check: dict[str, Any] | None) -> dict[str, Any] | None:
     return None if check is None else {k: check[k] for k in ("rbe_px", "raz_mm", "nsce")}
 
 
-def _write_residuals(path: Path, result: CalibrationResult, views: list[CalibrationView]) -> None:
+def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, GridView]) -> None:
     """Write where each intersection was found and by how much the model misses it, (view, i, j, xy)."""
-    by_name = {view.name: view for view in views}
     residuals = np.stack([view.residual_px for view in result.views])
-    found = np.stack([np.asarray(by_name[view.name].xy_px) for view in result.views])
+    found = np.stack([grids[view.name].xy_px for view in result.views])
     facts = [
         {
             "name": v.name, "camera": v.camera, "dz_mm": v.dz_mm, "held_out": v.held_out,

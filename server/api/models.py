@@ -123,8 +123,12 @@ class StopReply(Reply):
 class SceneRequest(Request):
     """What stands before a simulated rig's cameras."""
 
-    scene: Literal["grid", "steel", "plate", "panel", "block", "strip"] = Field(description="Name of the scene.")
-    load: Number = Field(0.0, description="kPa for `plate`, kN for `panel`; the others ignore it.")
+    scene: Literal["grid", "steel", "plate", "panel", "block", "strip", "sphere"] = Field(
+        description="Name of the scene."
+    )
+    load: Number = Field(
+        0.0, description="kPa for `plate`, kN for `panel`, per cent for `strip`, share of the motion for `block`."
+    )
     params: dict[str, Number | list[Number]] = Field(
         default_factory=dict, description="Further parameters of the scene.", max_length=20
     )
@@ -159,7 +163,7 @@ class CalibrationReply(Reply):
     id: str = Field(description="Id.")
     state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")
     plan: dict[str, Any] = Field(description="Positions, frames and localiser asked for.")
-    views: list[dict[str, Any]] | None = Field(None, description="Views with camera, read-back dZ and checksum.")
+    taken: list[dict[str, Any]] | None = Field(None, description="Views taken: camera, role, read-back dZ, checksum.")
     problem: JobProblem | None = Field(None, description="Why there is no calibration.")
 
 

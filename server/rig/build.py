@@ -72,6 +72,18 @@ def open_devices(config: RigConfig) -> Devices:
         )
 
 
+def check_config(config: RigConfig) -> None:
+    """Refuse a simulated rig whose truth cannot be read, before anything is opened.
+
+    Raises
+    ------
+    InputError
+        ``rig_invalid``.
+    """
+    if config.rig.kind == "simulated":
+        SimRig.from_dict(_tables(config))
+
+
 def _axis_options(config: RigConfig) -> dict[int, AxisOptions]:
     section = config.stage
     options = AxisOptions(
