@@ -323,7 +323,7 @@ def test_what_cannot_be_used_is_refused():
     with pytest.raises(ImageError):
         prepare(np.where(image > 100, np.nan, image))
     with pytest.raises(InputError) as caught:
-        fit_shape(pair, prepare(image, "quintic"), image, XY, np.zeros((len(XY), 3)))
+        fit_shape(pair, prepare(image, "cubic"), image, XY, np.zeros((len(XY), 3)))
     assert caught.value.code == "interpolation_mismatch"
     with pytest.raises(InputError):
         fit_shape(pair, image, image, XY, np.zeros((2, 3)))

@@ -132,6 +132,16 @@ def same_size(a: MeasureImage, b: MeasureImage) -> None:
         )
 
 
+def different(a: MeasureImage, b: MeasureImage) -> None:
+    """Raise ``images_identical`` if both cameras are said to have taken the very same image."""
+    if a.pixels is b.pixels or np.array_equal(a.pixels, b.pixels):
+        raise ImageError(
+            f"{a.name} and {b.name} are the same image, grey level by grey level.",
+            code="images_identical",
+            remedy="Give camera 1's image as camera 1 and camera 2's as camera 2.",
+        )
+
+
 def check_calibrated_size(image: MeasureImage, size_px: tuple[int, int] | None) -> None:
     """Raise ``image_size_mismatch`` if an image has not the (width, height) that its camera was calibrated with."""
     if size_px is not None and (image.shape[1], image.shape[0]) != tuple(size_px):

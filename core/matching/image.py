@@ -65,7 +65,7 @@ class ImageData:
         return np.ascontiguousarray(gx, dtype=np.float32), np.ascontiguousarray(gy, dtype=np.float32)
 
 
-def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "cubic") -> ImageData:
+def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quintic") -> ImageData:
     """Find the spline coefficients of an image.
 
     Parameters
