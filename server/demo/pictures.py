@@ -40,7 +40,7 @@ def _places(values: Float, valid: NDArray[np.bool_], *, axis: int) -> Float:
     k = np.arange(len(lines))
     medians = np.array([np.nanmedian(line) for line in lines[known]])
     slope, offset = np.polyfit(k[known], medians, 1)
-    places = slope * k + offset
+    places: Float = np.asarray(slope * k + offset)
     places[known] = medians
     return places
 
