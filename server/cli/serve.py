@@ -95,6 +95,7 @@ def run(args: argparse.Namespace) -> int:
     import uvicorn
 
     from server.api.app import create_app
+    from server.api.guard import LOOPBACK_NAMES
     from server.config import load_config
     from server.service import Service
 
@@ -105,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     except BaseException:
         listener.close()
         raise
-    app = create_app(service)
+    app = create_app(service, hosts=LOOPBACK_NAMES | {args.host})
     name = f"[{args.host}]" if ":" in args.host else args.host
     url = f"http://{name}:{listener.getsockname()[1]}"
 
