@@ -31,7 +31,8 @@ def make_grid(settings: Mapping[str, Any], mask: NDArray[np.bool_] | None, image
     """
     if mask is not None and mask.shape != image_shape:
         raise RegionError(
-            f"The mask is {mask.shape[1]} x {mask.shape[0]} px, camera 1's image {image_shape[1]} x {image_shape[0]} px.",
+            f"The mask is {mask.shape[1]} x {mask.shape[0]} px, camera 1's image {image_shape[1]} x "
+            f"{image_shape[0]} px.",
             code="mask_size",
             remedy="Draw the mask over camera 1's reference image.",
         )
