@@ -64,7 +64,7 @@ class MeasureOptions:
     patch
         ``stretch`` (default) or the paper's ``rigid``.
     interpolation
-        ``cubic`` (default) or ``quintic``, for sharp speckle at low noise.
+        ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
     least_zncc
         Correlation below which no comparison is a match. The field's own scatter decides above it.
     gates
@@ -73,7 +73,7 @@ class MeasureOptions:
 
     subset_px: int = 33
     patch: Patch = "stretch"
-    interpolation: Interpolation = "cubic"
+    interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
 

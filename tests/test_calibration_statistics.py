@@ -7,9 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
-from core.calibration import COVARIANCE_NAMES, CalibrationOptions, calibrate
+from core.calibration import COVARIANCE_NAMES, calibrate
 from tests.calibration_truth import PAPER, Array, Grid, nodes, project
 from tests.test_calibration import HELD, NOMINAL, make_views
 
@@ -30,7 +29,7 @@ def ten_of(result: object) -> Array:
 
 
 def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
-    """All 20 + 162 unknowns at once by scipy with differences, on the projection written apart."""
+    """All 20 + 162 unknowns at once with differences, on the projection written apart."""
     tolerance, sigma = 0.004, 0.0022
     grid = Grid(node_tolerance_mm=tolerance)
     error = np.random.default_rng(5).uniform(-tolerance, tolerance, (9, 9, 2))
@@ -53,21 +52,25 @@ def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
         parts.append((d / (tolerance / math.sqrt(3.0))).ravel())
         return np.concatenate(parts)
 
-    brute = least_squares(residuals, np.zeros(182), diff_step=1e-6, x_scale="jac", max_nfev=8)
+    # the problem is nearly linear at the truth: Gauss-Newton with central differences, no derivative of ours
+    u = np.zeros(182)
+    for _ in range(3):
+        jac = np.column_stack([(residuals(u + e) - residuals(u - e)) / 2e-3 for e in 1e-3 * np.eye(182)])
+        u = u - np.linalg.lstsq(jac, residuals(u), rcond=1e-15)[0]
     ours = (ten_of(result) - truth_vector()) / np.tile(SCALE, 2)
     sigma_of = np.sqrt(np.diagonal(result.covariance)) / np.tile(SCALE, 2)
     # ours stops where a step changes the sum of squares by 1e-6: a thousandth of a standard deviation
-    np.testing.assert_allclose(ours / sigma_of, brute.x[:20] / sigma_of, atol=0.01)
+    np.testing.assert_allclose(ours / sigma_of, u[:20] / sigma_of, atol=0.01)
     assert result.node_corrections_mm is not None
-    np.testing.assert_allclose(1e3 * result.node_corrections_mm.ravel(), brute.x[20:], atol=0.02)
+    np.testing.assert_allclose(1e3 * result.node_corrections_mm.ravel(), u[20:], atol=0.02)
 
-    H = brute.jac.T @ brute.jac
+    H = jac.T @ jac
     s = 1.0 / np.sqrt(np.diagonal(H))
     covariance = (np.linalg.inv(H * s[:, None] * s) * s[:, None] * s)[:20, :20]
     np.testing.assert_allclose(sigma_of, np.sqrt(np.diagonal(covariance)), rtol=0.01)
 
 
-def monte_carlo(tolerance: float, runs: int, **options: float) -> tuple[Array, list[Array], list[Array], Array]:
+def monte_carlo(tolerance: float, runs: int) -> tuple[Array, list[Array], list[Array], Array]:
     grid = Grid(node_tolerance_mm=tolerance)
     found, claimed, shapes = [], [], []
     points = np.stack(np.meshgrid(*[np.linspace(-4, 4, 3)] * 2, [-1.0, 1.0]), -1).reshape(-1, 3)
@@ -77,8 +80,7 @@ def monte_carlo(tolerance: float, runs: int, **options: float) -> tuple[Array, l
         rng = np.random.default_rng(1000 + seed)
         # Gaussian node errors with the same variance as the bound's box, so that theory and draw agree
         error = rng.standard_normal((9, 9, 2)) * tolerance / math.sqrt(3.0)
-        settings = CalibrationOptions(**options)  # type: ignore[arg-type]
-        result = calibrate(make_views((0.0, 5.0), grid=grid, error_mm=error, seed=seed), grid, NOMINAL, settings)
+        result = calibrate(make_views((0.0, 5.0), grid=grid, error_mm=error, seed=seed), grid, NOMINAL)
         found.append(ten_of(result) - truth_vector())
         claimed.append(result.covariance)
         shapes.append(result.pair.triangulate(*seen).xyz_mm - points)
@@ -88,12 +90,12 @@ def monte_carlo(tolerance: float, runs: int, **options: float) -> tuple[Array, l
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.004])
 def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float) -> None:
-    runs = 40
+    runs = 30
     found, claimed, shapes, sigma_shape = monte_carlo(tolerance, runs)
     covariance = np.mean(claimed, axis=0)
     ratio = found.std(axis=0) / np.sqrt(np.diagonal(covariance))
-    # sd of a sd from 40 runs is 11 %; three of those over 20 correlated figures
-    assert (np.abs(ratio - 1.0) < 0.35).all(), ratio.round(2)
+    # sd of a sd from 30 runs is 13 %; three of those over 20 correlated figures
+    assert (np.abs(ratio - 1.0) < 0.4).all(), ratio.round(2)
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.12)
     # no bias beyond three standard errors, taken together: chi^2 of 20 correlated figures, whitened by the claim
     whitened = np.linalg.solve(np.linalg.cholesky(_scaled(covariance)), (found / _sd(covariance)).T)

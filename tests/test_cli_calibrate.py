@@ -115,8 +115,9 @@ def test_a_toleranced_grid_stays_within_the_band() -> None:
     options = CalibrationOptions(held_out_mm=(2.0,))
     found = calibrate_views(views, target, nominal, options, progress=lambda *s: stages.append(s))
     assert found.result.held_out is not None
-    assert found.result.held_out.mean.rbe_px < 0.045
-    assert found.result.held_out.nominal_mean.rbe_px < 0.11
+    # against the corrected nodes; the nominal grid's own figure profits from straight lines only
+    assert found.result.held_out.mean.rbe_px < 0.0045
+    assert found.result.held_out.nominal_mean.rbe_px < 0.045
     assert volume_error_um(found.result.pair) < 1.5
     assert stages[0] == ("grid", 0, 7)
     assert stages[-1] == ("calibration", 7, 7)
@@ -234,6 +235,6 @@ def test_a_calibration_that_failed_its_check_is_not_written(
     assert main(command(folder, "--hold-out", "2")) == 1
     captured = capsys.readouterr()
     assert "verdict: failed" in captured.out
-    assert "Worst views: cam2_+2.000mm.tif 1.0" in captured.out
+    assert "Worst views: cam2_+2.000mm.tif " in captured.out
     assert captured.err.startswith("stereorig: calibration_rejected: ")
     assert not (folder / "calibration.json").exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -72,8 +72,10 @@ def calibrate_views(
     target, nominals, options
         See :func:`core.calibration.solve.calibrate`.
     localiser, grid_options
-        See :func:`core.grid.detect_grid`. Where node corrections are estimated, the intersections come from the
-        lines near each node, since a fit over a whole line smears the nodes' errors.
+        See :func:`core.grid.detect_grid`. Its default of straight lines serves toleranced grids as well: measured on
+        eight simulated 4 um grids at two positions, node corrections left 0.37 um of shape error with straight
+        lines, 0.37 with parabolas, 0.40 with intersections from the lines near each node (less smeared, but
+        noisier); straight lines also stay nearest to the nominal grid.
     progress, cancel
         Stages ``grid`` (one an image) and ``calibration``.
 
@@ -89,13 +91,6 @@ def calibrate_views(
     for image in images:
         _check_size(image, nominals[CAMERAS.index(image.camera)])
     grid_options = grid_options or GridOptions()
-    if (
-        localiser == "profile"
-        and grid_options.line_model is None
-        and target.node_tolerance_mm > 0.0
-        and options.estimate_nodes is not False
-    ):
-        grid_options = replace(grid_options, line_model="local")
     grids: list[GridView] = []
     views: list[CalibrationView] = []
     total = len(images) + 1

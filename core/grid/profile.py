@@ -200,6 +200,7 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
     peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
     par[5] = (line / n_line - par[2]) / max(peak, 0.1)
     N = np.zeros((_N, _N))
+    accepted = np.zeros((_N, _N))  # the normal matrix at ``par``; N may belong to a trial that was refused
     g = np.zeros(_N)
     J = np.zeros(_N)
     trial = par.copy()
@@ -252,6 +253,7 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
         for i in range(_N):
             for j in range(i):
                 N[i, j] = N[j, i]
+        accepted[:] = N
         if settled or step == _STEPS - 1:
             break
         M = N.copy()
@@ -268,7 +270,7 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
         trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
     dof = n - (_N if fit_width else _N - 1)
     variance = best / dof
-    C = np.linalg.inv(N)
+    C = np.linalg.inv(accepted)
     peak, _, _, _ = profile_terms(0.0, par[7], par[6], a, b)
     out[0] = par[0]
     out[1] = par[1] * scale

@@ -283,7 +283,7 @@ class AnalysisRequest(Request):
     subset_px: Annotated[int, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
     step_px: Annotated[int, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
     patch: Literal["stretch", "rigid"] = Field("stretch", description="Patch model of the motion.")
-    interpolation: Literal["cubic", "quintic"] = Field("cubic", description="B-spline order.")
+    interpolation: Literal["cubic", "quintic"] = Field("quintic", description="B-spline order.")
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
     )

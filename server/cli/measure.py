@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
     add("--step", default="10", metavar="PX", help="distance of the points (10)")
     add("--patch", choices=("stretch", "rigid"), default="stretch", help="how a patch may move (stretch)")
-    add("--interpolation", choices=("cubic", "quintic"), default="cubic", help="spline between the pixels (cubic)")
+    add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
     add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 

@@ -19,6 +19,8 @@ from sim.grabber import SimFrameGrabber
 from sim.rig import SimRig
 from sim.world import SimWorld
 
+_RENDER_S_PER_PIXEL = 100e-6
+
 
 @dataclass(eq=False)
 class Devices:
@@ -118,7 +120,9 @@ def _simulated_controller(config: RigConfig) -> SimESP301 | SimSMC100:
 def _grabber(config: RigConfig, cam: CameraName, world: SimWorld | None) -> FrameGrabber:
     driver = config.camera(cam).driver
     if driver == "sim" and world is not None:
-        return SimFrameGrabber(world, cam)
+        columns, rows = config.camera(cam).image_size_px
+        # a view is rendered when it is first asked for; the watchdog must not take that for death
+        return SimFrameGrabber(world, cam, latency_s=max(30.0, _RENDER_S_PER_PIXEL * columns * rows))
     raise CameraError(
         f"There is no camera driver {driver!r} in this version.",
         code="unknown_driver",

@@ -129,6 +129,7 @@ class Rig:
             unit = self._devices.pair.units[cam]
             shown["device"] = asdict(unit.description)
             shown["settings"] = asdict(unit.settings)
+            shown["fault"] = None if unit.fault is None else problem_of(unit.fault)
         return shown
 
     def describe_stage(self) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     if not f2 > 0.0:
         return LOW_TEXTURE, 0
     reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    roughness = texture_roughness(hessian, lens1, xc, yc, f2)
+    roughness, weakest = texture_roughness(hessian, lens1, xc, yc, f2)
     if not 1e-6 < roughness < WHITE_ROUGHNESS:
         return LOW_TEXTURE, 0
     w = vectors[0]
@@ -132,6 +132,7 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     solve(reduced, column, 4)
     out[5] = math.sqrt(variance)
     out[6], out[7], out[8] = c00, c01, column[3] * inflated
-    if status == OK:
-        status = texture_status(share, math.sqrt(c00) * along, max_sigma, levels[0, 2])
+    sigma = max(math.sqrt(c00) * along, math.sqrt(out[8]))
+    share = noise_share(variance, weakest, f2, n, order)
+    status = texture_status(status, share, sigma, max_sigma, levels[0, 2])
     return status, iterations
