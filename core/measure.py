@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import InputError, SeedError
 from core.field.assemble import assemble
+from core.field.features import LARGE_PIXELS
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
 from core.field.grow import fit_in_batches, grow
-from core.field.images import MeasureImage, same_size
+from core.field.images import MeasureImage, different, same_size
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
 from core.field.scatter import scattered_motion, scattered_shape
@@ -63,7 +64,7 @@ class MeasureOptions:
     patch
         ``stretch`` (default) or the paper's ``rigid``.
     interpolation
-        ``cubic`` (default) or ``quintic``, for sharp speckle at low noise.
+        ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
     least_zncc
         Correlation below which no comparison is a match. The field's own scatter decides above it.
     gates
@@ -72,7 +73,7 @@ class MeasureOptions:
 
     subset_px: int = 33
     patch: Patch = "stretch"
-    interpolation: Interpolation = "cubic"
+    interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
 
@@ -254,11 +255,13 @@ class _Run:
         if self.cur1 is None or self.cur2 is None:
             self.ref1.refuse_blank(grid.extent_px)
             self.ref2.refuse_blank()
+            different(self.ref1, self.ref2)
         else:
             same_size(self.ref1, self.cur1)
             same_size(self.ref2, self.cur2)
             self.cur1.refuse_blank()
             self.cur2.refuse_blank()
+            different(self.cur1, self.cur2)
         self.xy_px = grid.xy_px.reshape(-1, 2)
         self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
         self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
@@ -274,6 +277,8 @@ class _Run:
         )
         self.points = PointFits.empty(len(self.xy_px), self.fitter.comparisons)
         self.known_w: Float | None = None
+        self.hoped_for = self.usable  # where new seeds are worth their time
+        self.checked = False  # whether every point that stands went through the gates
         rows, cols = np.clip(np.rint(self.xy_px[:, ::-1]).astype(int), 0, np.array(self.ref1.shape) - 1).T
         self.texture = self.ref1.subset_variance(self.options.subset_px)[rows, cols]
 
@@ -298,6 +303,10 @@ class _Run:
         ]
         if shape.starts is not None:
             self.known_w = shape.starts.w.reshape(-1, 3)
+        if previous is not None:
+            self.hoped_for = self.usable & previous.valid.ravel()
+        else:
+            self.hoped_for = self.usable
         if previous is not None and previous.starts is not None and previous.starts.G is not None:
             w, G = previous.starts.w.reshape(-1, 3), previous.starts.G.reshape(-1, 3, 3)
             if self._sample_holds(w, G):
@@ -332,23 +341,28 @@ class _Run:
         return True
 
     def _match_seeds(self) -> int:
-        """Seeds from feature matches; how many stand."""
+        """Seeds from feature matches; how many stand. Large images are tried at half their size first."""
+        large = max(self.ref1.pixels.size, self.ref2.pixels.size) > LARGE_PIXELS
+        return (self._match_seeds_at(halve=True) if large else 0) or self._match_seeds_at(halve=False)
+
+    def _match_seeds_at(self, *, halve: bool) -> int:
         raise_if_cancelled(self.cancel)
         mask = self._feature_mask()
-        f1, f2 = self.ref1.features(mask), self.ref2.features()
+        f1 = self.ref1.features(mask, halve=halve)
+        raise_if_cancelled(self.cancel)
+        f2 = self.ref2.features(halve=halve)
         raise_if_cancelled(self.cancel)
         shape = scattered_shape(self.pair, f1, f2)
         motion = shape_now = None
         if self.cur1 is not None and self.cur2 is not None:
-            n1 = self.cur1.features()
+            n1 = self.cur1.features(halve=halve)
             raise_if_cancelled(self.cancel)
-            n2 = self.cur2.features()
+            n2 = self.cur2.features(halve=halve)
             raise_if_cancelled(self.cancel)
             motion = scattered_motion(f1, n1)
             shape_now = scattered_shape(self.pair, n1, n2)
         elif len(shape.xy_px) < _FEWEST_MATCHES:
             return 0
-        self._scattered = (shape, motion, shape_now)
         return seeds_from_matches(
             self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
         )
@@ -423,10 +437,8 @@ class _Run:
                 remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
                 "these images, or give a seed point.",
             )
-        self._grow()
-        self._gate()
-        for _ in range(2):
-            if self._grow() == 0:
+        for _ in range(3):
+            if self._grow() == 0 and self.checked:
                 break
             self._gate()
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
@@ -436,18 +448,21 @@ class _Run:
         return assemble(self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape)
 
     def _unreached(self) -> float:
-        """Share of the usable points that nothing reached."""
-        untouched = self.usable & (self.points.status == PointStatus.NOT_SEEDED)
+        """Share of the usable points that nothing reached; those lost in an earlier step do not count again."""
+        untouched = self.hoped_for & (self.points.status == PointStatus.NOT_SEEDED)
         return float(untouched.sum()) / max(int(self.usable.sum()), 1)
 
     def _grow(self) -> int:
-        return grow(
+        added = grow(
             self.fitter, self.points, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
             progress=self.progress, cancel=self.cancel,
         )  # fmt: skip
+        self.checked = self.checked and added == 0
+        return added
 
-    def _gate(self) -> int:
-        return apply_gates(
+    def _gate(self) -> None:
+        apply_gates(
             self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
             options=self.options.gates,
         )  # fmt: skip
+        self.checked = True

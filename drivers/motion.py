@@ -2,9 +2,9 @@
 
 A driver adds only its controller's words, as the methods that begin with an underscore at the end of `SerialStage`.
 
-A stop takes no lock. It counts up a number that every motion notes when it is asked for, and then writes. A motion
-looks at the number again after each command that starts movement: whichever of the two was first on the wire, the axis
-stands still afterwards, and a motion that was still waiting for its turn never starts.
+A stop takes no lock. It sets a number of its own on the axes it concerns, and then writes. A motion notes these numbers
+when it is asked for, and looks at them again after each command that starts movement: whichever of the two was first on
+the wire, the axis stands still afterwards, and a motion that was still waiting for its turn never starts.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SerialStage(ABC):
         self._messages: list[ControllerMessage] = []
         self._motion_lock = threading.RLock()
         self._stop_numbers = itertools.count(1)
-        self._stops = 0
+        self._stops = dict.fromkeys(self._options, 0)  # axis -> number of the last stop that concerned it
         self._moving: set[int] = set()
         self._identity: StageIdentity | None = None
 
@@ -119,7 +119,9 @@ class SerialStage(ABC):
         """Stop one axis or all, at once; takes no lock."""
         if axis is not None:
             self._check_axis(axis)
-        self._stops = next(self._stop_numbers)
+        number = next(self._stop_numbers)
+        for stopped in self._options if axis is None else (axis,):
+            self._stops[stopped] = number
         self._line.urgent(self._stop_text(axis))
 
     def enable(self, axis: int) -> None:
@@ -137,12 +139,12 @@ class SerialStage(ABC):
     def home(self, axis: int, *, timeout_s: float = 120.0) -> float:
         """Search home and return the position read back in mm."""
         self._check_axis(axis)
-        noted = self._stops
+        noted = self._note_stops((axis,))
         with self._motion_lock:
-            self._check_not_stopped(noted, (axis,))
+            self._check_not_stopped(noted, write=False)
             with self._stopped_on_error((axis,)):
                 self._start_homing(axis)
-                self._check_not_stopped(noted, (axis,))
+                self._check_not_stopped(noted)
                 self._wait((axis,), noted, time.monotonic() + timeout_s, watch_jam=False)
                 self._finish_homing(axis)
             return self._read_position_mm(axis)
@@ -155,24 +157,24 @@ class SerialStage(ABC):
         """As `move_to`, from the position read back at the start."""
         self._check_axis(axis)
         self._check_number(axis, distance_mm)
-        noted = self._stops
+        noted = self._note_stops((axis,))
         with self._motion_lock:
             return self._move({axis: self._read_position_mm(axis) + distance_mm}, noted)[axis]
 
     def move_many(self, targets_mm: Mapping[int, float]) -> dict[int, MoveResult]:
         """Move several axes at the same time."""
-        noted = self._stops
+        noted = self._note_stops(tuple(targets_mm))
         for axis, target in targets_mm.items():
             self._check_axis(axis)
             self._check_target(axis, target)
         with self._motion_lock:
             return self._move(targets_mm, noted)
 
-    def _move(self, targets_mm: Mapping[int, float], noted: int) -> dict[int, MoveResult]:
+    def _move(self, targets_mm: Mapping[int, float], noted: Mapping[int, int]) -> dict[int, MoveResult]:
         axes = tuple(targets_mm)
         start = time.monotonic()
         goals = {axis: self._check_target(axis, target) for axis, target in targets_mm.items()}
-        self._check_not_stopped(noted, axes, write=False)
+        self._check_not_stopped(noted, write=False)
         here = {axis: self._check_ready(axis).position_mm for axis in axes}
         detours = {axis: mm for axis in axes if (mm := self._detour(axis, here[axis], goals[axis])) is not None}
         self._keep(self._drain_errors())  # what is found afterwards was caused by this motion
@@ -181,7 +183,7 @@ class SerialStage(ABC):
                 self._leg(here, detours, noted)
             self._leg({**here, **detours}, goals, noted)
             time.sleep(max(self._options[axis].settle_ms for axis in axes) / 1000)
-            self._check_not_stopped(noted, axes)
+            self._check_not_stopped(noted)
             results = {}
             for axis, goal in goals.items():
                 there = self._read_position_mm(axis)
@@ -190,23 +192,25 @@ class SerialStage(ABC):
                 results[axis] = MoveResult(axis, goal, there, time.monotonic() - start)
         return results
 
-    def _leg(self, here: Mapping[int, float], goals: Mapping[int, float], noted: int) -> None:
+    def _leg(self, here: Mapping[int, float], goals: Mapping[int, float], noted: Mapping[int, int]) -> None:
         longest = 0.0
         for axis, goal in goals.items():
-            self._check_not_stopped(noted, tuple(goals))
+            self._check_not_stopped(noted)
             self._send_move(axis, goal)
-            self._check_not_stopped(noted, tuple(goals))
+            self._check_not_stopped(noted)
             self._raise_refusal(tuple(goals), f"move to {goal:.5f} mm")
             speed, ramp = self._velocity_mm_s[axis], self._acceleration_mm_s2[axis]
             longest = max(longest, abs(goal - here[axis]) / speed + speed / ramp)
         self._wait(tuple(goals), noted, time.monotonic() + 1.5 * longest + _MARGIN_S)
 
-    def _wait(self, axes: tuple[int, ...], noted: int, deadline: float, *, watch_jam: bool = True) -> None:
+    def _wait(
+        self, axes: tuple[int, ...], noted: Mapping[int, int], deadline: float, *, watch_jam: bool = True
+    ) -> None:
         waiting = set(axes)
         last: dict[int, tuple[float, float]] = {}
         while waiting:
             for axis in sorted(waiting):
-                self._check_not_stopped(noted, axes)
+                self._check_not_stopped(noted)
                 status = self._read_status(axis)
                 if status.state is AxisState.FAULT or (watch_jam and status.state is AxisState.MOTOR_OFF):
                     raise self._fault(axis, status.detail or "switched its motor off")
@@ -314,8 +318,12 @@ class SerialStage(ABC):
             )
         return AxisLimits(low, high, low_mm, high_mm)
 
-    def _check_not_stopped(self, noted: int, axes: tuple[int, ...], *, write: bool = True) -> None:
-        if self._stops == noted:
+    def _note_stops(self, axes: tuple[int, ...]) -> dict[int, int]:
+        return {axis: self._stops.get(axis, 0) for axis in axes}
+
+    def _check_not_stopped(self, noted: Mapping[int, int], *, write: bool = True) -> None:
+        axes = tuple(noted)
+        if self._note_stops(axes) == noted:
             return
         if write:
             # The stop may have been on the wire before the command that started this motion

@@ -6,15 +6,23 @@ import time
 from pathlib import Path
 from typing import Any
 
-from core.errors import InputError, RegionError, StateError
-from server.api.models import AnalysisRequest
+from core.errors import (
+    Cancelled,
+    InputError,
+    MeasurementError,
+    StateError,
+    StereorigError,
+    StorageError,
+)  # fmt: skip
 from server.compute import run_task
 from server.io.files import sha256_of
 from server.io.images import decode_mask, read_image
-from server.jobs import Job
+from server.jobs import Job, problem_of
+from server.regions import make_grid
 from server.service import Service
 from server.store.durable import without_nan
 from server.tasks import StepTask, measure_step
+from server.worker import WorkerDiedError
 
 
 def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:
@@ -52,104 +60,101 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
     }
 
 
-def check_region(service: Service, test_id: str, reference: int, body: AnalysisRequest, mask: bytes | None) -> None:
-    """Refuse a region that leaves nothing to measure, before a job is made of it.
-
-    Raises
-    ------
-    RegionError
-        ``region_empty``, ``region_outside``, ``subset_too_large``, ``seed_outside`` or ``mask_size``.
-    """
+def check_region(service: Service, test_id: str, reference: int, settings: dict[str, Any], mask: bytes | None) -> None:
+    """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
     image = read_image(service.tests.step(test_id, reference).cam1)
-    rows, cols = image.shape
-    inside = f"Camera 1's image is {cols} x {rows} px."
-    if body.subset_px > min(rows, cols):
-        raise RegionError(f"A subset of {body.subset_px} px does not fit. {inside}", code="subset_too_large",
-                          remedy="Take a smaller subset.")  # fmt: skip
-    if body.region.rectangle is not None:
-        x0, y0, x1, y1 = body.region.rectangle
-        if x1 <= x0 or y1 <= y0:
-            raise RegionError(f"The rectangle from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) is empty.", code="region_empty",
-                              remedy="Give the upper left corner first, then the lower right one.")  # fmt: skip
-        corners = [(x0, y0), (x1, y1)]
-    else:
-        corners = list(body.region.polygon or [])
-    _check_inside("region", corners, cols, rows)
-    _check_inside("seed", list(body.seeds or []), cols, rows)
-    if mask is not None:
-        found = decode_mask(mask)
-        if found.shape != (rows, cols):
-            raise RegionError(f"The mask is {found.shape[1]} x {found.shape[0]} px. {inside}", code="mask_size",
-                              remedy="Draw the mask over camera 1's reference image.")  # fmt: skip
-        if not found.any():
-            raise RegionError("The mask is black everywhere.", code="region_empty",
-                              remedy="Paint white where points may lie.")  # fmt: skip
+    make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
 
 
-def _check_inside(what: str, points: list[tuple[float, float]], cols: int, rows: int) -> None:
-    for x, y in points:
-        if not (0.0 <= x <= cols - 1 and 0.0 <= y <= rows - 1):
-            raise RegionError(
-                f"The {what}'s point ({x:g}, {y:g}) lies outside camera 1's image of {cols} x {rows} px.",
-                code=f"{what}_outside",
-                remedy="Stay inside camera 1's reference image.",
-            )
+class StepsFailedError(MeasurementError):
+    """Some steps could not be measured; the others were, and are kept."""
+
+    code = "steps_failed"
+    remedy = "Read each step's problem in the summary; the other steps' results stand."
 
 
 def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> dict[str, Any]:
-    """Compute phase of an analysis."""
+    """Compute phase of an analysis: a step that fails does not take the others with it.
+
+    Raises
+    ------
+    StereorigError
+        What went wrong with the reference; or, with the same code, with the first other step that failed.
+    """
     document = service.tests.analysis(test_id, analysis_id)
-    settings = document["settings"]
-    folder = service.tests.analysis_path(test_id, analysis_id)
     steps: list[int] = document["steps"]
-    reference = service.tests.verified_step(test_id, steps[0])
-    summaries: list[dict[str, Any]] = []
-    job.result = {"analysis_id": analysis_id, "test_id": test_id, "steps_finished": [], "steps": summaries}
-    measured = steps if document["kind"] == "displacement" else None
-    total = len(steps)
+    finished: list[dict[str, Any]] = []
+    failed: dict[int, StereorigError] = {}
+    job.result = {"analysis_id": analysis_id, "test_id": test_id, "steps_finished": [], "steps": finished}
     for index, n in enumerate(steps):
         job.check()
-        step = service.tests.verified_step(test_id, n)
-        task = StepTask(
-            folder=str(folder),
-            calibration=str(service.tests.calibration_file(test_id)),
-            kind="shape" if index == 0 or measured is None else "motion",
-            n=n,
-            reference=steps[0] if measured is not None else n,
-            images={
-                "ref1": str(reference.cam1),
-                "ref2": str(reference.cam2),
-                "cur1": str(step.cam1),
-                "cur2": str(step.cam2),
-            },
-            previous=steps[index - 1] if index > 0 else None,
-            settings=settings,
-            inputs={
-                "calibration.json": document["inputs"]["calibration_sha256"],
-                **{f"reference_{cam}": digest for cam, digest in reference.document["sha256"].items()},
-                **{f"step_{cam}": digest for cam, digest in step.document["sha256"].items()},
-            },
-            label=step.document["label"],
-            load_n=step.document["load_n"],
-        )
-        started = time.monotonic()
+        previous = finished[-1]["n"] if finished else None
 
         def progress(stage: str, done: int, of: int, *, index: int = index, n: int = n) -> None:
             # steps are the unit a user thinks in; within a step, the points found so far
-            fraction = done / of if of > 0 else 0.0
-            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * total)
+            fraction = min(done / of, 1.0) if of > 0 else 0.0
+            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * len(steps))
 
-        summary = run_task(service.worker, job, measure_step, task, progress=progress)
-        summary = without_nan({**summary, "n": n, "wall_s": round(time.monotonic() - started, 3)})
-        summaries.append(summary)
-        job.result["steps_finished"] = [s["n"] for s in summaries]
+        started = time.monotonic()
+        try:
+            task = _task(service, document, n, previous)
+            summary = run_task(service.worker, job, measure_step, task, progress=progress)
+        except (Cancelled, StorageError, WorkerDiedError):
+            raise  # not the step's own doing
+        except StereorigError as error:
+            if n == steps[0] and document["kind"] == "displacement":
+                raise
+            failed[n] = error
+            continue
+        finished.append(without_nan({"n": n, **summary, "wall_s": round(time.monotonic() - started, 3)}))
+        job.result["steps_finished"] = [s["n"] for s in finished]
         service.hub.publish("result", {"test_id": test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
-    job.progress("done", total, total)
+    job.progress("done", 1000 * len(steps), 1000 * len(steps))
+    if failed:
+        first = min(failed)
+        job.result["steps_failed"] = {str(n): problem_of(error) for n, error in failed.items()}
+        raise StepsFailedError(
+            f"{len(failed)} of {len(steps)} steps failed; step {first}: {failed[first].cause}",
+            code=failed[first].code,
+            remedy=failed[first].remedy,
+            steps_failed=sorted(failed),
+        )
     return job.result
+
+
+def _task(service: Service, document: dict[str, Any], n: int, previous: int | None) -> StepTask:
+    test_id, displacement = document["test_id"], document["kind"] == "displacement"
+    reference = document["steps"][0] if displacement else n
+    ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
+    checksums = {
+        "calibration.json": document["inputs"]["calibration_sha256"],
+        **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
+        **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
+    }
+    return StepTask(
+        folder=str(service.tests.analysis_path(test_id, document["id"])),
+        calibration=str(service.tests.calibration_file(test_id)),
+        kind="motion" if n != reference else "shape",
+        n=n,
+        reference=reference,
+        images={"ref1": str(ref.cam1), "ref2": str(ref.cam2), "cur1": str(now.cam1), "cur2": str(now.cam2)},
+        previous=previous,
+        settings=document["settings"],
+        inputs=checksums,
+        label=now.document["label"],
+        load_n=now.document["load_n"],
+    )
 
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
     """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
-    found = (job.result or {}).get("steps", [])
-    document = {"analysis_id": analysis_id, "state": state, "job_id": job.id, "problem": job.problem, "steps": found}
+    found = job.result or {}
+    document = {
+        "analysis_id": analysis_id,
+        "state": state,
+        "job_id": job.id,
+        "problem": job.problem,
+        "steps": found.get("steps", []),
+        "steps_failed": found.get("steps_failed", {}),
+    }
     service.tests.put_summary(test_id, analysis_id, document)

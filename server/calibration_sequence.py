@@ -124,7 +124,7 @@ def _role(plan: CalibrationPlan, dz: float, *, last: bool) -> str:
 def fit(service: Service, job: Job, calibration_id: str) -> dict[str, Any]:
     """Compute phase: find the grid in every view, adjust, check; ``calibration.json`` is there when this returns."""
     document = service.calibrations.read(calibration_id)
-    task = FitTask(str(service.calibrations.path(calibration_id)), document["plan"], document["views"])
+    task = FitTask(str(service.calibrations.path(calibration_id)), document["plan"], document["taken"])
     return dict(run_task(service.worker, job, fit_calibration, task))
 
 
@@ -133,6 +133,7 @@ def rig_facts(config: RigConfig) -> dict[str, Any]:
     return {
         "name": config.rig.name,
         "target": config.target.model_dump(mode="json"),
+        "axis_tilt_sigma_rad": config.calibration.axis_tilt_sigma_rad,
         "cam1": config.cam1.model_dump(mode="json"),
         "cam2": config.cam2.model_dump(mode="json"),
     }

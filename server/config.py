@@ -97,6 +97,9 @@ class CalibrationSection(_Closed):
     held_out_mm: tuple[Finite, ...] = Field((), description="dZ of the positions kept for the check.", max_length=100)
     frames: int = Field(4, ge=1, le=256, description="Frames averaged at each position.")
     localiser: Literal["profile", "paper"] = Field("profile", description="Grid line localiser.")
+    axis_tilt_sigma_rad: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
+        0.0, description="Prior on the angle between stage axis and optical axis; carried into the covariance."
+    )
 
 
 class ServiceSection(_Closed):

@@ -81,7 +81,7 @@ class Job:
     #: called at once when the job is cancelled, from whatever thread asks (stops the stage)
     on_cancel: Callable[[], None] | None = None
     saving: threading.Lock = field(default_factory=threading.Lock)
-    _stage_since: float = 0.0
+    _pace_from: tuple[float, int] | None = None
     _last_shown: float = 0.0
     _cancel: threading.Event = field(default_factory=threading.Event)
 
@@ -99,8 +99,8 @@ class Job:
         """Report progress (:class:`core.progress.Progress`)."""
         now = time.monotonic()
         changed = stage != self.stage
-        if changed:
-            self._stage_since = now
+        if total != self.total or done < self.done or self._pace_from is None:
+            self._pace_from = (now, done)  # other units from here on
         self.stage, self.done, self.total = stage, done, total
         # a kernel may report thousands of times a second; readers need ten
         if changed or done >= total or now - self._last_shown > 0.1:
@@ -109,11 +109,14 @@ class Job:
 
     @property
     def eta_s(self) -> float | None:
-        """Seconds left in this stage, from its own pace; None while there is nothing to go by."""
-        if self.state not in ACTIVE or self.done <= 0 or self.total <= 0:
+        """Seconds left in these units, from their own pace; None while there is nothing to go by."""
+        if self.state not in ACTIVE or self._pace_from is None or self.total <= 0:
             return None
-        elapsed = time.monotonic() - self._stage_since
-        return round(elapsed / self.done * max(self.total - self.done, 0), 2)
+        since, first = self._pace_from
+        if self.done <= first:
+            return None
+        pace_s = (time.monotonic() - since) / (self.done - first)
+        return round(pace_s * max(self.total - self.done, 0), 2)
 
     def document(self) -> dict[str, Any]:
         """Return the job as the API shows and the catalogue keeps it."""

@@ -66,6 +66,21 @@ def read_variable(path: Path, name: str) -> Variable:
         )
 
 
+def list_variables(path: Path) -> list[dict[str, Any]]:
+    """Return name, unit, meaning and dimensions of every variable of a result file."""
+    with _library, _open(path) as data:
+        return [
+            {
+                "name": name,
+                "units": str(getattr(variable, "units", "1")),
+                "long_name": str(getattr(variable, "long_name", "")),
+                "dimensions": list(variable.dimensions),
+                "shape": list(variable.shape),
+            }
+            for name, variable in data.variables.items()
+        ]
+
+
 def read_residuals(path: Path) -> dict[str, Any]:
     """Return a calibration's residuals: for each view its facts, and lists of found places and residuals."""
     with _library, _open(path) as data:

@@ -16,6 +16,7 @@ from server.events import EventHub
 from server.hardware import HardwareGate
 from server.jobs import JobManager
 from server.rig import Rig
+from server.rig.build import check_config
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
@@ -24,6 +25,7 @@ from server.store.tests import TestStore
 from server.worker import ComputeWorker
 
 _log = logging.getLogger("stereorig.service")
+_OPEN_WAIT_S = 5.0
 
 
 class Service:
@@ -38,6 +40,7 @@ class Service:
     """
 
     def __init__(self, config: RigConfig, data: Path) -> None:
+        check_config(config)
         self.config = config
         self.folder = DataFolder(data)
         try:
@@ -63,7 +66,19 @@ class Service:
         self.closing = False
         self._key_locks: dict[tuple[str, str], threading.Lock] = {}
         self._key_guard = threading.Lock()
-        self.gate.start(self.rig.open)
+        opened = threading.Event()
+        token = self.gate.claim("the opening of the rig")
+
+        def open_rig() -> None:
+            try:
+                self.rig.open()
+            finally:
+                self.gate.release(token)
+                opened.set()
+
+        self.gate.start(open_rig)
+        # so that the first request finds the rig; a device that hangs must not keep the service from starting
+        opened.wait(timeout=_OPEN_WAIT_S)
 
     def stop_if_moving(self) -> None:
         """Stop the stage if a motion runs; for cancelled jobs that may or may not be moving."""

@@ -138,9 +138,14 @@ class SimRig:
 
     @staticmethod
     def from_toml(path: str | Path) -> SimRig:
-        """Read a rig file."""
-        with Path(path).open("rb") as file:
-            return SimRig.from_dict(tomllib.load(file))
+        """Read a rig file; raises InputError ``rig_unreadable`` or ``rig_invalid``."""
+        try:
+            tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise InputError(
+                f"The rig file {path} cannot be read: {error}.", code="rig_unreadable", remedy="Give a TOML rig file."
+            ) from error
+        return SimRig.from_dict(tables)
 
 
 def _rig(tables: Mapping[str, Any]) -> SimRig:
@@ -165,13 +170,23 @@ def _rig(tables: Mapping[str, Any]) -> SimRig:
     )
 
 
+def _finite(table: Mapping[str, Any], name: str) -> float:
+    value = float(table[name])
+    if not np.isfinite(value):
+        raise ValueError(f"{name} is {value}")
+    return value
+
+
 def _camera(known: Mapping[str, Any], true: Mapping[str, Any], noise: Mapping[str, Any]) -> SimCamera:
     columns, rows = (int(n) for n in known["image_size_px"])
     tilt_x, tilt_y = (float(a) for a in true.get("axis_tilt_rad", (0.0, 0.0)))
     right, down = (float(g) for g in true.get("gradient", (0.0, 0.0)))
+    sign = int(known.get("stage_sign", 1))
+    if sign not in (-1, 1):
+        raise ValueError(f"stage_sign must be 1 or -1, got {sign}")
     sensor = Sensor(bit_depth=int(known.get("bit_depth", 8)), **{k: float(v) for k, v in noise.items()})
     return SimCamera(
-        camera=Camera.from_paper(**{name: float(true[name]) for name in _PARAMETERS}),
+        camera=Camera.from_paper(**{name: _finite(true, name) for name in _PARAMETERS}),
         size_px=(columns, rows),
         sensor=sensor,
         lighting=Lighting(
@@ -182,7 +197,7 @@ def _camera(known: Mapping[str, Any], true: Mapping[str, Any], noise: Mapping[st
         ),
         exposure_ms=float(known.get("exposure_ms", 10.0)),
         stage_axis=int(known.get("stage_axis", 1)),
-        stage_sign=int(known.get("stage_sign", 1)),
+        stage_sign=sign,
         stage_zero_mm=float(known.get("stage_zero_mm", 0.0)),
         axis_tilt_rad=(tilt_x, tilt_y),
     )

@@ -53,7 +53,7 @@ class SimWorld:
         self._state = threading.Lock()  # scene, tilts and cache; never held while rendering
         self._rendering = {name: threading.Lock() for name in CAMERA_NAMES}  # so that nobody renders the same twice
         self._scene = make_scene(rig, "grid")
-        self._version = 0
+        self._scene_key: tuple[Any, ...] = ("grid", 0.0)
         self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERA_NAMES}
         self._cache: OrderedDict[tuple[Any, ...], NDArray[np.float32]] = OrderedDict()
 
@@ -73,7 +73,8 @@ class SimWorld:
         scene = make_scene(self._rig, name, load=load, **params)
         with self._state:
             self._scene = scene
-            self._version += 1
+            # going back to a state finds what was rendered of it
+            self._scene_key = (name, float(load), *sorted((k, repr(v)) for k, v in params.items()))
 
     def set_axis_tilt(self, cam: CameraName, tilt_rad: tuple[float, float]) -> None:
         """Misalign a camera's stage axis: turned about the camera's x and y from the optical axis."""
@@ -115,9 +116,9 @@ class SimWorld:
             sim = self._sim_camera(cam)
         with self._rendering[cam]:
             with self._state:
-                scene, version, sim = self._scene, self._version, self._sim_camera(cam)
+                scene, state, sim = self._scene, self._scene_key, self._sim_camera(cam)
             position = self._position_mm(sim.stage_axis)
-            key = (cam, version, round(position / _KEY_MM), sim.axis_tilt_rad)
+            key = (cam, state, round(position / _KEY_MM), sim.axis_tilt_rad)
             with self._state:
                 known = self._cache.get(key)
                 if known is not None:

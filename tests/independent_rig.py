@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 Array = NDArray[np.float64]
 
@@ -126,16 +127,19 @@ def render(
     low: float = 40.0,
     high: float = 210.0,
     noise: float = 2.0,
+    blur_px: float = 0.6,
     seed: int = 0,
 ) -> NDArray[np.uint8]:
-    """Integrate the pattern over each pixel, light it unevenly, add noise, round to eight bits."""
+    """Blur the pattern, integrate it over each pixel, light it unevenly, add noise, round to eight bits."""
     w, h = camera.size
-    out = np.empty((h, w))
+    fine = np.empty((h * n, w * n), dtype=np.float32)
     for start in range(0, h, 32):
         rows = slice(start, min(h, start + 32))
         rays = camera.sub_pixel_rays(n, rows)
         ab = material_points(camera, rays, frame=frame, origin=np.zeros(3) if origin is None else origin, dz=dz)
-        out[rows] = pattern(ab).mean(-1)
+        samples = pattern(ab).reshape(-1, w, n, n).transpose(0, 2, 1, 3)
+        fine[start * n : rows.stop * n] = samples.reshape(-1, w * n)
+    out = gaussian_filter(fine, blur_px * n).reshape(h, n, w, n).mean((1, 3))
     yy, xx = np.mgrid[:h, :w]
     light = 1.0 - 0.08 * ((xx / w - 0.4) ** 2 + (yy / h - 0.6) ** 2)
     grey = (low + (high - low) * out) * light + np.random.default_rng(seed).normal(0.0, noise, (h, w))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,11 @@ from drivers.motion import SerialStage
 from drivers.registry import STAGE_DRIVERS
 from drivers.stage import AxisOptions
 from sim.controllers.axis import SimAxis
-from sim.controllers.esp301 import SimESP301
+from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
-from sim.controllers.smc100 import SimSMC100
 
 Transport = Literal["socket", "pty"]
-CONTROLLERS: dict[str, Callable[..., Any]] = {"esp301": SimESP301, "smc100": SimSMC100}
+CONTROLLERS = ("esp301", "smc100")
 # the words that start a motion, by which the tests count what was sent
 MOVE_WORD = "PA"
 
@@ -59,7 +58,7 @@ def bench(
     record: Path | None = None,
     **controller_options: Any,
 ) -> Iterator[Bench]:
-    controller = CONTROLLERS[driver](**{"time_scale": 50.0, "start_mm": 3.0, **controller_options})
+    controller = make_controller(driver, (1, 2), **{"time_scale": 50.0, "start_mm": 3.0, **controller_options})
     with ControllerServer(controller, transport) as server:
         stage = STAGE_DRIVERS[driver](
             server.url,

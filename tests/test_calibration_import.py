@@ -261,6 +261,10 @@ def test_a_file_with_only_the_two_cameras_is_enough(tmp_path: Path) -> None:
     expected = Camera.from_paper(**OURS).project([[1.0, 2.0, 0.5]]).xy
     np.testing.assert_array_equal(loaded.pair.cam1.project([[1.0, 2.0, 0.5]]).xy, expected)
     assert loaded.image_size1_px is None
+    sizes = {"cam1": [512, 480], "cam2": [640, 480]}
+    path.write_text(json.dumps({"cam1": OURS, "cam2": {**OURS, "gamma_rad": 0.5}, "image_size_px": sizes}))
+    assert load_calibration(path).image_size1_px == (512, 480)
+    assert load_calibration(path).image_size2_px == (640, 480)
     assert loaded.source == "calibration_json"
 
 

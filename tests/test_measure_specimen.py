@@ -1,4 +1,4 @@
-"""The real specimen: a field as the issue asks for it, judged by the cameras' geometry and by the specimen's flatness."""
+"""The real specimen: a field as the issue asks for it, judged by the geometry and by the specimen's flatness."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.errors import ImageError
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.measure import MeasureOptions, ReferencePair
@@ -71,3 +72,11 @@ def test_a_tensile_step_is_followed_from_where_the_specimen_stood(
     moved = plane_residual_mm((field.xyz_mm + field.uvw_mm)[field.valid])
     assert moved.std() <= 0.020
     assert np.abs(moved).max() <= 0.12
+
+
+@pytest.mark.fault(17)
+def test_swapped_cameras_are_refused(reference: ReferencePair, grid: PointGrid) -> None:
+    swapped = ReferencePair(reference.pair, reference.image2, reference.image1)
+    with pytest.raises(ImageError) as error:
+        swapped.shape(grid)
+    assert error.value.code == "cameras_swapped"

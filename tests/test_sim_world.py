@@ -120,6 +120,24 @@ def test_what_makes_no_sense_is_refused(rig: SimRig) -> None:
     with pytest.raises(InputError) as caught:
         world.expose("cam3", exposure_ms=1.0, rng=None)  # type: ignore[arg-type]
     assert caught.value.code == "unknown_camera"
+
+
+def test_a_rig_file_that_makes_no_sense_is_refused(tmp_path: Path) -> None:
+    text = (CONFIG / "sim_paper.toml").read_text()
+    for change, code in (
+        (("[sim.cam1]\nphd_px = 12062.0", "[sim.cam1]"), "rig_invalid"),
+        (("z0_mm = 399.3", "z0_mm = nan"), "rig_invalid"),
+        (("stage_sign = 1", "stage_sign = 2"), "rig_invalid"),
+        (("lines = [11, 11]", "lines = 11"), "rig_invalid"),
+        (("full_well_e = 40000.0", "full_well_e = 0.0"), "rig_invalid"),
+        (("[target]", "[target"), "rig_unreadable"),
+    ):
+        assert change[0] in text
+        file = tmp_path / "rig.toml"
+        file.write_text(text.replace(*change))
+        with pytest.raises(InputError) as caught:
+            SimRig.from_toml(file)
+        assert caught.value.code == code
     with pytest.raises(InputError) as caught:
-        SimRig.from_dict({"sim": {}})
-    assert caught.value.code == "rig_invalid"
+        SimRig.from_toml(tmp_path / "none.toml")
+    assert caught.value.code == "rig_unreadable"

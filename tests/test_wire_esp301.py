@@ -10,7 +10,9 @@ import pytest
 from core.errors import StageError
 from drivers.esp301 import ESP301Stage
 from drivers.stage import AxisOptions
+from sim.controllers.axis import SimAxis
 from sim.controllers.esp301 import SimESP301
+from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
 from sim.controllers.wire import WireController
 
@@ -30,8 +32,8 @@ class Scripted(WireController):
             reply = reply.pop(0) if len(reply) > 1 else reply[0]
         return b"" if reply is None else reply.encode("ascii") + b"\r\n"
 
-    def true_position_mm(self, axis: int) -> float:
-        raise NotImplementedError
+    def axis(self, number: int) -> SimAxis:
+        raise AssertionError(f"nobody asks a script where axis {number} is")
 
 
 REPLIES: dict[str, str | list[str]] = {
@@ -193,3 +195,11 @@ def test_a_lost_line_takes_the_reference_with_it() -> None:
             stage.move_to(1, 1.0)
         assert caught.value.code == "not_homed"
         stage.close()
+
+
+def test_a_simulated_controller_is_made_by_its_drivers_name() -> None:
+    assert make_controller("esp301", (1, 3)).take_line(b"3TP") == b"0.0000\r\n"
+    assert make_controller("smc100", (2, 7)).take_line(b"7TS") == b"7TS00000A\r\n"
+    with pytest.raises(StageError) as caught:
+        make_controller("xps", (1,))
+    assert caught.value.code == "unknown_driver"

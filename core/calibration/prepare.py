@@ -38,15 +38,11 @@ def sort_views(views: Sequence[CalibrationView], target: TargetLike, nominals: S
     Raises
     ------
     CalibrationInputError
-        ``view_missing`` where a camera has no view, and the codes of :func:`check_view`.
+        The codes of :func:`check_view`.
     """
     per_camera: Views = []
     for name, nominal in zip(CAMERAS, nominals, strict=True):
         own = sorted((v for v in views if v.camera == name), key=lambda v: v.dz_mm)
-        if not own:
-            raise CalibrationInputError(
-                f"There is no view of {name}.", code="view_missing", remedy="Give views of both cameras.", camera=name
-            )
         for view in own:
             check_view(view, target, nominal)
         per_camera.append(own)
@@ -54,16 +50,25 @@ def sort_views(views: Sequence[CalibrationView], target: TargetLike, nominals: S
 
 
 def split_hold_out(per_camera: Views, options: CalibrationOptions) -> Views:
-    """Return the views to fit.
+    """Return the views to fit; raises as :func:`check_hold_out`."""
+    check_hold_out([[v.dz_mm for v in own] for own in per_camera], options)
+    return [[v for v in own if not is_held_out(v.dz_mm, options)] for own in per_camera]
+
+
+def check_hold_out(positions_mm: Sequence[Sequence[float]], options: CalibrationOptions) -> None:
+    """Check the held-out positions against those taken, per camera.
 
     Raises
     ------
     CalibrationInputError
-        ``hold_out_unknown`` where a held-out position was not taken, ``hold_out_all`` where nothing is left to fit.
+        ``view_missing`` where a camera has no view, ``hold_out_unknown`` where a held-out position was not taken,
+        ``hold_out_all`` where nothing is left to fit.
     """
-    fitted: Views = []
-    for name, own in zip(CAMERAS, per_camera, strict=True):
-        taken = [v.dz_mm for v in own]
+    for name, taken in zip(CAMERAS, positions_mm, strict=True):
+        if not taken:
+            raise CalibrationInputError(
+                f"There is no view of {name}.", code="view_missing", remedy="Give views of both cameras.", camera=name
+            )
         for held in options.held_out_mm:
             if not any(abs(t - held) <= options.hold_out_tolerance_mm for t in taken):
                 raise CalibrationInputError(
@@ -73,15 +78,13 @@ def split_hold_out(per_camera: Views, options: CalibrationOptions) -> Views:
                     remedy="Hold out positions at which views were taken.",
                     camera=name,
                 )
-        fitted.append([v for v in own if not is_held_out(v.dz_mm, options)])
-        if not fitted[-1]:
+        if all(is_held_out(t, options) for t in taken):
             raise CalibrationInputError(
                 f"Every position of {name} is held out.",
                 code="hold_out_all",
                 remedy="Leave at least two positions in the fit.",
                 camera=name,
             )
-    return fitted
 
 
 def predict_uncertainty(

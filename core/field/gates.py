@@ -216,8 +216,8 @@ def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
         sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual)))), 1e-12)
         u = residual / (4.685 * sigma)
         weight = np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
-        root = np.sqrt(weight)
-        solution = np.linalg.lstsq(design * root[:, None], values * root, rcond=1e-9)[0]
+        weighted = design * weight[:, None]
+        solution = np.linalg.lstsq(weighted.T @ design, weighted.T @ values, rcond=1e-9)[0]
         residual = values - design @ solution
     sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-12)
     return residual, sigma

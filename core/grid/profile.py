@@ -231,6 +231,7 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
     peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
     par[5] = (line / n_line - par[2]) / max(peak, 0.1)
     N = np.zeros((_N, _N))
+    accepted = np.zeros((_N, _N))  # the normal matrix at ``par``; N may belong to a trial that was refused
     g = np.zeros(_N)
     J = np.zeros(_N)
     trial = par.copy()
@@ -285,6 +286,7 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
         for i in range(_N):
             for j in range(i):
                 N[i, j] = N[j, i]
+        accepted[:] = N
         if settled or step == _STEPS - 1:
             break
         M = N.copy()
@@ -303,7 +305,7 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
     dof = n - (_N if fit_width else _N - 1)
     variance = best / dof
     for j in range(_N):  # inverse, column by column
-        M = N.copy()
+        M = accepted.copy()
         J[:] = 0.0
         J[j] = 1.0
         if not _solve(M, J, delta):

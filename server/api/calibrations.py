@@ -99,6 +99,12 @@ def _complete(service: ServiceDep, calibration_id: str) -> Path:
     return path
 
 
+@router.get("/{calibration_id}/views", summary="Views that were taken", responses=errors(404))
+def list_views(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+    """Return camera, role, read-back dZ and checksum of every view; empty until all are taken."""
+    return {"views": service.calibrations.read(calibration_id)["taken"] or []}
+
+
 @router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))
 def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
     """Return, for each view, where every intersection was found and by how much the model misses it."""

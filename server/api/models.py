@@ -123,8 +123,12 @@ class StopReply(Reply):
 class SceneRequest(Request):
     """What stands before a simulated rig's cameras."""
 
-    scene: Literal["grid", "steel", "plate", "panel", "block", "strip"] = Field(description="Name of the scene.")
-    load: Number = Field(0.0, description="kPa for `plate`, kN for `panel`; the others ignore it.")
+    scene: Literal["grid", "steel", "plate", "panel", "block", "strip", "sphere"] = Field(
+        description="Name of the scene."
+    )
+    load: Number = Field(
+        0.0, description="kPa for `plate`, kN for `panel`, per cent for `strip`, share of the motion for `block`."
+    )
     params: dict[str, Number | list[Number]] = Field(
         default_factory=dict, description="Further parameters of the scene.", max_length=20
     )
@@ -159,7 +163,7 @@ class CalibrationReply(Reply):
     id: str = Field(description="Id.")
     state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")
     plan: dict[str, Any] = Field(description="Positions, frames and localiser asked for.")
-    views: list[dict[str, Any]] | None = Field(None, description="Views with camera, read-back dZ and checksum.")
+    taken: list[dict[str, Any]] | None = Field(None, description="Views taken: camera, role, read-back dZ, checksum.")
     problem: JobProblem | None = Field(None, description="Why there is no calibration.")
 
 
@@ -279,7 +283,7 @@ class AnalysisRequest(Request):
     subset_px: Annotated[int, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
     step_px: Annotated[int, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
     patch: Literal["stretch", "rigid"] = Field("stretch", description="Patch model of the motion.")
-    interpolation: Literal["cubic", "quintic"] = Field("cubic", description="B-spline order.")
+    interpolation: Literal["cubic", "quintic"] = Field("quintic", description="B-spline order.")
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
     )

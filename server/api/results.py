@@ -12,7 +12,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response
 from server.api.dependencies import AnalysisId, ServiceDep, StepNumber, TestId
 from server.api.models import FieldReply, ProbeReply
 from server.api.problems import errors
-from server.results import probe_result, read_variable
+from server.results import list_variables, probe_result, read_variable
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
@@ -55,6 +55,12 @@ def get_field(
         "shape": list(variable.values.shape),
         "values": _nested(variable.values),
     })  # fmt: skip
+
+
+@router.get("/steps/{n}/fields", summary="The variables of one step", responses=errors(404, 422))
+def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> dict[str, Any]:
+    """Return name, unit, meaning and dimensions of every variable."""
+    return {"fields": list_variables(service.tests.result_file(test_id, analysis_id, n))}
 
 
 @router.get(

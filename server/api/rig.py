@@ -125,6 +125,7 @@ def get_stats(service: ServiceDep, cam: CameraName) -> dict[str, Any]:
     return {
         "name": cam,
         "frames": service.rig.pair.units[cam].counters(),
+        "pairs": service.rig.pair.account(),
         "sequence": frame.sequence,
         "quality": image_quality(frame.pixels, frame.bit_depth).as_dict(),
         "histogram": histogram.tolist(),

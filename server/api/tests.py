@@ -143,6 +143,13 @@ def import_images(
     return _step_reply(service, test_id, made["n"])
 
 
+@router.get("/{test_id}/steps", summary="A test's steps, in order", responses=errors(404))
+def list_steps(service: ServiceDep, test_id: TestId) -> dict[str, Any]:
+    """Return the complete steps."""
+    service.tests.path(test_id)
+    return {"steps": service.catalog.entries("step", test_id)}
+
+
 def _step_reply(service: Service, test_id: str, n: int) -> dict[str, Any]:
     return {k: v for k, v in service.tests.step(test_id, n).document.items() if k != "request"}
 

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError, RegionError
+from core.field.region import PointGrid
+from core.field.region import check_region as check_points
 from server.io.images import read_mask
 
 Rectangle = tuple[float, float, float, float]
@@ -24,14 +26,14 @@ class RegionRequest:
     ----------
     rectangle_px
         (X0, Y0, X1, Y1), points lie at X0 + i step and Y0 + j step up to X1, Y1.
-    mask
-        (rows, cols) of camera 1's image, True where points may lie; None = everywhere.
+    grid
+        The points, those on the mask's black not allowed.
     seeds_px
         (n, 2) in camera 1's reference image; None = found by the program.
     """
 
     rectangle_px: Rectangle
-    mask: NDArray[np.bool_] | None
+    grid: PointGrid
     seeds_px: NDArray[np.float64] | None
 
 
@@ -96,44 +98,21 @@ def check_region(
     mask_path: Path | None,
     seeds: Sequence[str],
 ) -> RegionRequest:
-    """Check region, mask and seeds against camera 1's image.
+    """Check region, mask and seeds against camera 1's image, and lay the points.
 
     Raises
     ------
     RegionError
-        ``region_unusable``: outside the image, smaller than a subset, no white pixel under any point;
-        ``mask_size_mismatch``; ``seed_outside``.
+        Outside the image, smaller than a subset, no white under any point, a mask of another size, a seed outside.
     ImageError
         If the mask cannot be read.
     """
-    rows, cols = image_shape
-    x0, y0, x1, y1 = rectangle
-    text = f"{x0:g},{y0:g},{x1:g},{y1:g}"
-    if x0 < 0 or y0 < 0 or x1 > cols or y1 > rows:
-        raise RegionError(f"--roi {text} does not lie in camera 1's image of {cols} x {rows} px.",
-                          remedy="Give a region inside camera 1's image.")  # fmt: skip
-    if min(x1 - x0, y1 - y0) + 1 < subset_px:
-        raise RegionError(
-            f"--roi {text} is {x1 - x0 + 1:g} x {y1 - y0 + 1:g} px, smaller than one subset of {subset_px} px.",
-            remedy="Give a larger region or a smaller --subset.",
-        )
-    mask = None
-    if mask_path is not None:
-        mask = read_mask(mask_path)
-        if mask.shape != image_shape:
-            raise RegionError(
-                f"The mask {mask_path} is {mask.shape[1]} x {mask.shape[0]} px, camera 1's image {cols} x {rows} px.",
-                code="mask_size_mismatch",
-                remedy="Draw the mask over camera 1's first image.",
-            )
-        points_x = np.minimum(np.rint(np.arange(x0, x1 + 1e-9, step_px)).astype(int), cols - 1)
-        points_y = np.minimum(np.rint(np.arange(y0, y1 + 1e-9, step_px)).astype(int), rows - 1)
-        if not mask[np.ix_(points_y, points_x)].any():
-            raise RegionError(
-                f"The mask {mask_path} leaves no point of --roi {text} ({100 * mask.mean():.3g} % of it is white).",
-                remedy="Paint white where points may lie.",
-            )
-    return RegionRequest(rectangle, mask, _seeds(seeds, rectangle, mask))
+    grid = PointGrid.rectangle(*rectangle, step_px=step_px)
+    mask = None if mask_path is None else read_mask(mask_path)
+    checked = grid if mask is None else grid.within_mask(mask)
+    mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
+    check_points(checked, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
+    return RegionRequest(rectangle, checked, _seeds(seeds, rectangle, mask))
 
 
 def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> NDArray[np.float64] | None:

@@ -50,6 +50,16 @@ class ProgressLine:
         line = f"{text}, {100 * fraction:.0f} % of all"
         if fraction > 0.02:
             line += f", about {duration((now - self._start) * (1 - fraction) / fraction)} left"
+        self._draw(line)
+
+    def status(self, text: str) -> None:
+        """Say something about the work, without an estimate of its own."""
+        now = time.monotonic()
+        if now - self._last >= (_REDRAW_S if self._live else _QUIET_S):
+            self._last = now
+            self._draw(text)
+
+    def _draw(self, line: str) -> None:
         if not self._live:
             self.note(line)
             return

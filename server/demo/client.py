@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,10 +40,16 @@ class ServiceClient:
         ``http://127.0.0.1:port``.
     on_progress
         Called with (stage, done, total, seconds left or None) while a job runs.
+    transport
+        Carries the requests; the network when left out.
     """
 
-    def __init__(self, base_url: str, on_progress: OnProgress | None = None) -> None:
-        self._http = httpx.Client(base_url=f"{base_url}/api/v1", timeout=_REQUEST_TIMEOUT_S, trust_env=False)
+    def __init__(
+        self, base_url: str, on_progress: OnProgress | None = None, *, transport: httpx.BaseTransport | None = None
+    ) -> None:
+        self._http = httpx.Client(
+            base_url=f"{base_url}/api/v1", timeout=_REQUEST_TIMEOUT_S, trust_env=False, transport=transport
+        )
         self._on_progress = on_progress
 
     def close(self) -> None:
@@ -112,9 +118,9 @@ class ServiceClient:
         ).json()
         return step
 
-    def analyse(self, test_id: str, kind: str, rectangle_px: Sequence[float], **settings: Any) -> AnalysisHandle:
-        """Run an analysis to its end."""
-        body = {"kind": kind, "region": {"rectangle": list(rectangle_px)}, **settings}
+    def analyse(self, test_id: str, kind: str, region: dict[str, Any], **settings: Any) -> AnalysisHandle:
+        """Run an analysis to its end; the region as the API takes it."""
+        body = {"kind": kind, "region": region, **settings}
         accepted = self.call("POST", f"/tests/{test_id}/analyses", json=body).json()
         job = self.wait(accepted["job"]["id"])
         return AnalysisHandle(test_id, str(accepted["analysis_id"]), job)

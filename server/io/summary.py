@@ -31,8 +31,9 @@ def summarise(result: Field) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``points`` (in the region), ``valid``, ``valid_fraction``, ``status`` (counts by name), ``epipolar_mean_px``,
-        ``epipolar_rms_px``, ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
+        ``points`` (in the region), ``valid``, ``valid_fraction``, ``status`` (counts by name), ``epipolar_mean_px``
+        (what the calibration is off across the epipolar lines), ``epipolar_rms_px``, ``epipolar_sd_px`` (about the
+        mean), ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
         ``sigma_median_mm``, for displacements also ``displacement_mm`` (mean, min, max of u, v, w). What cannot be
         told is None.
     """
@@ -50,6 +51,7 @@ def summarise(result: Field) -> dict[str, Any]:
         "status": {s.name.lower(): int((status == s).sum()) for s in PointStatus if (status == s).any()},
         "epipolar_mean_px": float(epipolar.mean()) if n else None,
         "epipolar_rms_px": _rms(epipolar),
+        "epipolar_sd_px": float(epipolar.std()) if n else None,
         "plane_residual_rms_mm": _rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
         "zncc_median": {
             name: float(np.median(result.zncc[valid][:, k])) if n else None

@@ -19,6 +19,8 @@ from sim.grabber import SimFrameGrabber
 from sim.rig import SimRig
 from sim.world import SimWorld
 
+_RENDER_S_PER_PIXEL = 100e-6
+
 
 @dataclass(eq=False)
 class Devices:
@@ -55,7 +57,7 @@ def open_devices(config: RigConfig) -> Devices:
         for cam in CAMERAS:
             section = config.camera(cam)
             unit = CameraUnit(cam, _grabber(config, cam, world))
-            stack.callback(unit.grabber.close)
+            stack.callback(unit.close)
             unit.open(
                 CameraSettings(
                     exposure_ms=section.exposure_ms,
@@ -67,7 +69,21 @@ def open_devices(config: RigConfig) -> Devices:
             units.append(unit)
         stage = open_stage(config.stage.driver, url, _axis_options(config))
         stack.callback(stage.close)
-        return Devices(CameraPair(*units), stage, world, controller, stack.pop_all())
+        return Devices(
+            CameraPair(*units, max_skew_ms=config.rig.max_skew_ms), stage, world, controller, stack.pop_all()
+        )
+
+
+def check_config(config: RigConfig) -> None:
+    """Refuse a simulated rig whose truth cannot be read, before anything is opened.
+
+    Raises
+    ------
+    InputError
+        ``rig_invalid``.
+    """
+    if config.rig.kind == "simulated":
+        SimRig.from_dict(_tables(config))
 
 
 def _axis_options(config: RigConfig) -> dict[int, AxisOptions]:
@@ -104,7 +120,9 @@ def _simulated_controller(config: RigConfig) -> SimESP301 | SimSMC100:
 def _grabber(config: RigConfig, cam: CameraName, world: SimWorld | None) -> FrameGrabber:
     driver = config.camera(cam).driver
     if driver == "sim" and world is not None:
-        return SimFrameGrabber(world, cam)
+        columns, rows = config.camera(cam).image_size_px
+        # a view is rendered when it is first asked for; the watchdog must not take that for death
+        return SimFrameGrabber(world, cam, latency_s=max(30.0, _RENDER_S_PER_PIXEL * columns * rows))
     raise CameraError(
         f"There is no camera driver {driver!r} in this version.",
         code="unknown_driver",

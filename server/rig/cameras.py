@@ -9,16 +9,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.errors import CameraError, StateError
-from drivers.frames import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, FrameStatus, Pixels
+from drivers.frames import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, Pixels
+from drivers.pairing import NumberPairing, Pair, PairingAccount
+from drivers.reader import CameraReader
 
 Cam = Literal["cam1", "cam2"]
 CAMERAS: tuple[Cam, Cam] = ("cam1", "cam2")
+_SLICE_S = 0.1
 _STALE_DURING_CAPTURE_S = 0.5
 
 
@@ -45,114 +49,145 @@ class PairShot:
     host_ns: int
 
 
-@dataclass(eq=False)
 class CameraUnit:
-    """One opened camera."""
+    """One camera: its grabber, its reader thread, the settings it has."""
 
-    name: Cam
-    grabber: FrameGrabber
-    timeout_s: float = 3.0
-    description: CameraDescription = field(init=False)
-    settings: CameraSettings = field(init=False)
-    latest: Frame | None = None
-    delivered: int = 0
-    incomplete: int = 0
-    timeouts: int = 0
+    def __init__(self, name: Cam, grabber: FrameGrabber) -> None:
+        self.name = name
+        self.grabber = grabber
+        self.latest: Frame | None = None
+        self._reader: CameraReader | None = None
+        self._earlier = FrameCounters()
 
     def open(self, settings: CameraSettings) -> None:
         """Connect, push settings, arm for software triggers."""
         self.grabber.open()
-        self.description = self.grabber.describe()
-        self.timeout_s += self.description.latency_s
-        self.settings = self.grabber.configure(settings)
-        self.grabber.arm()
+        self.description: CameraDescription = self.grabber.describe()
+        self.settings: CameraSettings = self.grabber.configure(settings)
+        self._start()
+
+    def _start(self) -> None:
+        # from a trigger to its frame: the exposure, and a generous read-out
+        period_s = (self.settings.exposure_ms or 0.0) / 1000.0 + 0.2
+        self._reader = CameraReader(self.grabber, name=self.name, period_s=period_s, expects_frames=False)
+        self._reader.start()
+
+    def _stop(self) -> None:
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.stop()
+            new, old = reader.counters.as_dict(), self._earlier.as_dict()
+            self._earlier = FrameCounters(**{name: old[name] + n for name, n in new.items()})
+
+    @property
+    def reader(self) -> CameraReader:
+        """The running reader."""
+        if self._reader is None:
+            raise CameraError(f"{self.name} is not armed.", code="camera_lost", remedy="POST /rig/reconnect.")
+        return self._reader
+
+    @property
+    def fault(self) -> CameraError | None:
+        """Why the camera was lost, or None."""
+        return None if self._reader is None else self._reader.fault
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Change settings; the camera is armed again afterwards, whatever happens."""
-        self.grabber.disarm()
+        self._stop()
         try:
             self.settings = self.grabber.configure(settings)
         finally:
-            self.grabber.arm()
+            self._start()
         return self.settings
 
-    def wait_for(self, trigger: int | None) -> Frame:
-        """Return the complete frame of ``trigger``; older ones are thrown away.
-
-        Raises
-        ------
-        CameraError
-            ``camera_silent`` if none came in time, ``frame_incomplete`` if it came damaged.
-        """
-        deadline = time.monotonic() + self.timeout_s
-        while (left := deadline - time.monotonic()) > 0.0:
-            frame = self.grabber.next_frame(left)
-            if frame is None:
-                break
-            if trigger is not None and frame.trigger is not None and frame.trigger != trigger:
-                continue
-            if frame.status is not FrameStatus.OK:
-                self.incomplete += 1
-                raise CameraError(f"{self.name} delivered an incomplete frame.", code="frame_incomplete",
-                                  remedy="Capture again; check cable and packet size if it comes back.")  # fmt: skip
-            self.delivered += 1
-            self.latest = frame
-            return frame
-        self.timeouts += 1
-        raise CameraError(f"{self.name} sent no frame in {self.timeout_s:g} s after its trigger.", code="camera_silent",
-                          remedy="Check power and cable, then POST /rig/reconnect.", camera=self.name)  # fmt: skip
-
     def counters(self) -> dict[str, int]:
-        """What became of the frames."""
-        own = FrameCounters(delivered=self.delivered, incomplete=self.incomplete).as_dict()
-        return {**own, "timeouts": self.timeouts}
+        """What became of the frames since the camera was opened."""
+        now = FrameCounters() if self._reader is None else self._reader.counters
+        old = self._earlier.as_dict()
+        return {name: old[name] + n for name, n in now.as_dict().items()}
+
+    def close(self) -> None:
+        """End the reader, release the camera."""
+        self._stop()
+        self.grabber.close()
 
 
 class CameraPair:
     """Camera 1 and camera 2 with one trigger."""
 
-    def __init__(self, cam1: CameraUnit, cam2: CameraUnit) -> None:
+    def __init__(self, cam1: CameraUnit, cam2: CameraUnit, *, max_skew_ms: float) -> None:
         self.units: dict[Cam, CameraUnit] = {"cam1": cam1, "cam2": cam2}
+        self._max_skew_ms = max_skew_ms
+        self._pairing: NumberPairing | None = None
         self._lock = threading.Lock()
         self._capturing = threading.Event()
 
-    def _grab(self) -> tuple[Frame, Frame]:
-        a, b = self.units["cam1"], self.units["cam2"]
-        number1, number2 = a.grabber.trigger(), b.grabber.trigger()
-        return a.wait_for(number1), b.wait_for(number2)
+    def account(self) -> dict[str, int]:
+        """What became of every trigger."""
+        return PairingAccount().as_dict() if self._pairing is None else self._pairing.account.as_dict()
 
-    def shoot(self, frames: int, *, max_skew_ms: float, check: Callable[[], None] | None = None) -> PairShot:
-        """Capture ``frames`` pairs and average each camera's.
+    def _grab(self) -> Pair:
+        numbers = {cam: self.units[cam].reader.trigger() or 0 for cam in CAMERAS}
+        if self._pairing is None:
+            # all cameras hang on one trigger line, whose clock the simulated ones share
+            self._pairing = NumberPairing(
+                by="trigger", max_skew_ms=self._max_skew_ms, common_clock=True, origin=dict(numbers)
+            )
+        made: Pair | None = None
+        for cam in CAMERAS:
+            made = self._pairing.feed(cam, self._frame_of(cam, numbers[cam], self._pairing)) or made
+        if made is None:
+            raise CameraError(
+                f"The frames of trigger {numbers['cam1']} make no pair.",
+                code="pair_incomplete",
+                remedy="Capture again; POST /rig/reconnect if it comes back.",
+            )
+        return made
+
+    def _frame_of(self, cam: Cam, number: int, pairing: NumberPairing) -> Frame:
+        """Wait for a camera's frame of one trigger; what still comes of earlier ones goes into the account."""
+        unit = self.units[cam]
+        damaged = unit.counters()["incomplete"]
+        while True:
+            frame = unit.reader.take(_SLICE_S)  # raises when the watchdog gives the camera up
+            if frame is None:
+                if unit.counters()["incomplete"] > damaged:
+                    raise CameraError(
+                        f"{cam} delivered an incomplete frame.",
+                        code="frame_incomplete",
+                        remedy="Capture again; check cable and packet size if it comes back.",
+                        camera=cam,
+                    )
+                continue
+            unit.latest = frame
+            if frame.trigger is None or frame.trigger == number:
+                return frame
+            pairing.feed(cam, frame)
+
+    def shoot(self, frames: int, check: Callable[[], None] | None = None) -> PairShot:
+        """Capture ``frames`` pairs and average each camera's; ``check`` may raise between them.
 
         Raises
         ------
-        StateError
-            ``skew_too_large`` if the exposures of a pair began too far apart.
+        CameraError
+            ``skew_too_large`` if the exposures of a pair began too far apart, or what the cameras bring up.
         """
         self._capturing.set()
         try:
             with self._lock:
-                return self._shoot(frames, max_skew_ms, check)
+                return self._shoot(frames, check)
         finally:
             self._capturing.clear()
 
-    def _shoot(self, frames: int, max_skew_ms: float, check: Callable[[], None] | None) -> PairShot:
-        sums: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.uint32]]] = {}
+    def _shoot(self, frames: int, check: Callable[[], None] | None) -> PairShot:
+        sums: dict[str, NDArray[np.uint32]] = {}
         worst = 0.0
         for index in range(frames):
             if check is not None:
                 check()
-            one, two = self._grab()
-            skew = abs(one.device_ns - two.device_ns) / 1e6
-            worst = max(worst, skew)
-            if skew > max_skew_ms:
-                raise StateError(
-                    f"The exposures began {skew:.3f} ms apart, the rig allows {max_skew_ms:g} ms.",
-                    code="skew_too_large",
-                    remedy="Use a common trigger, or raise max_skew_ms for a static scene.",
-                    skew_ms=skew,
-                    max_skew_ms=max_skew_ms,
-                )
+            pair = self._grab().require()
+            one, two = pair.cam1, pair.cam2
+            worst = max(worst, abs(pair.skew_ms))
             if frames > 1:
                 for cam, frame in (("cam1", one), ("cam2", two)):
                     if index == 0:
@@ -203,4 +238,4 @@ class CameraPair:
     def close(self) -> None:
         """Release both cameras."""
         for unit in self.units.values():
-            unit.grabber.close()
+            unit.close()

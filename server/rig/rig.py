@@ -129,6 +129,7 @@ class Rig:
             unit = self._devices.pair.units[cam]
             shown["device"] = asdict(unit.description)
             shown["settings"] = asdict(unit.settings)
+            shown["fault"] = None if unit.fault is None else problem_of(unit.fault)
         return shown
 
     def describe_stage(self) -> dict[str, Any]:
@@ -156,7 +157,7 @@ class Rig:
 
     def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs; call on the owner thread, with the hold."""
-        return self.pair.shoot(frames, max_skew_ms=self.config.rig.max_skew_ms, check=check)
+        return self.pair.shoot(frames, check)
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> dict[str, Any]:
         """Put something else before a simulated rig's cameras."""

@@ -66,10 +66,10 @@ class CalibrationStore:
         write_json(self.path(calibration_id) / "failure.json", problem)
 
     def read(self, calibration_id: str) -> dict[str, Any]:
-        """Return plan, views, result and state (``unfinished``, ``failed``, ``complete``)."""
+        """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``)."""
         path = self.path(calibration_id)
         document: dict[str, Any] = {"id": calibration_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
-        document["views"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
+        document["taken"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
         if (path / "calibration.json").exists():
             document |= {**read_json(path / "calibration.json"), "id": calibration_id, "state": "complete"}
         elif (path / "failure.json").exists():

@@ -143,14 +143,6 @@ class SimESP301(WireController):
         """Give access to an axis and its faults."""
         return self._axes[number].motor
 
-    def true_position_mm(self, axis: int) -> float:
-        """Where the load of an axis really is along its axis, in mm from home."""
-        return self._axes[axis].motor.true_position_mm()
-
-    def true_displacement_mm(self, axis: int) -> tuple[float, float, float]:
-        """Where the load of an axis really is: across, across, along the axis, in mm from home."""
-        return self._axes[axis].motor.true_displacement_mm()
-
     def _execute(self, text: str) -> bytes:
         self._update()
         replies = []

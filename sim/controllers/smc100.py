@@ -135,14 +135,6 @@ class SimSMC100(WireController):
         """Give access to an axis and its faults."""
         return self._units[number].motor
 
-    def true_position_mm(self, axis: int) -> float:
-        """Where the load of an axis really is along its axis, in mm from home."""
-        return self._units[axis].motor.true_position_mm()
-
-    def true_displacement_mm(self, axis: int) -> tuple[float, float, float]:
-        """Where the load of an axis really is: across, across, along the axis, in mm from home."""
-        return self._units[axis].motor.true_displacement_mm()
-
     def cut_power(self) -> bytes:
         """Lose the motor supply and get it back: all references are gone, and the chain sends a NUL byte."""
         with self._lock:

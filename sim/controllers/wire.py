@@ -7,6 +7,8 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from sim.controllers.axis import SimAxis
+
 
 @dataclass
 class LineFaults:
@@ -94,5 +96,13 @@ class WireController(ABC):
         """Carry out a command line."""
 
     @abstractmethod
+    def axis(self, number: int) -> SimAxis:
+        """Give access to an axis and its faults."""
+
     def true_position_mm(self, axis: int) -> float:
         """Where the load of an axis really is along its axis, in mm from home."""
+        return self.axis(axis).true_position_mm()
+
+    def true_displacement_mm(self, axis: int) -> tuple[float, float, float]:
+        """Where the load of an axis really is: across, across, along the axis, in mm from home."""
+        return self.axis(axis).true_displacement_mm()

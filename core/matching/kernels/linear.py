@@ -112,7 +112,9 @@ def assemble(weights, blocks, offsets, hessian, images, normal, half):
                     half[k, r, c] = weights[k, 0] * a + weights[k, 1] * b + weights[k, 2] * d
             else:
                 half[0, r, c] *= weights[0, 0]
-    normal[:] = 0.0
+    for r in range(13):
+        for c in range(13):
+            normal[r, c] = 0.0
     for k in range(images):
         for j in range(3):
             for i in range(4):
@@ -130,13 +132,15 @@ def assemble(weights, blocks, offsets, hessian, images, normal, half):
 @njit(nogil=True, error_model="numpy")
 def gradient(weights, blocks, offsets, rhs, images, out):
     """Right-hand side (13,) in (theta_0, theta_1, theta_2, e) from each image's nine sums ``rhs`` (images, 9)."""
-    out[:] = 0.0
+    for r in range(13):
+        out[r] = 0.0
     for k in range(images):
         for r in range(9):
             s = 0.0
             for o in range(images):
                 s += weights[k, o] * rhs[o, r]
-            a, j = divmod(r, 3)
+            a = r // 3
+            j = r - 3 * a
             for i in range(4):
                 out[4 * j + i] += blocks[k, a, i] * s
             out[12] += offsets[k, r] * s

@@ -16,15 +16,18 @@ from core.matching.kernels.point import (
     OUTSIDE_IMAGE,
     REFREEZE_PX,
     SINGULAR,
+    WHITE_ROUGHNESS,
     compare,
     corner_motion,
     epipolar_shift,
     image_matrices,
     jacobian_blocks,
     joint_weights,
+    noise_share,
     residual_variance,
     settled,
-    too_rough,
+    texture_roughness,
+    texture_status,
 )
 from core.matching.kernels.reference import reference_sums, set_up_reference
 
@@ -33,16 +36,8 @@ N_RIGID = 10
 
 
 @njit(nogil=True, error_model="numpy")
-def _tangents(columns, w, tangents):
-    """w0 times the patch's two tangent vectors from a matrix that acts on (1, X, Y), rows of ``tangents``."""
-    for j in range(2):
-        for i in range(3):
-            tangents[j, i] = columns[i, 1 + j] - columns[i, 0] * w[1 + j] / w[0]
-
-
-@njit(nogil=True, error_model="numpy")
 def _frame(tangents, frame):
-    """Orthonormal frame (columns) on two tangent vectors; their half-angles' symmetric choice."""
+    """Orthonormal frame (columns) on two tangent vectors (rows): along their bisectors, so neither is preferred."""
     a, b = tangents[0], tangents[1]
     la = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     lb = math.sqrt(b[0] * b[0] + b[1] * b[1] + b[2] * b[2])
@@ -67,12 +62,16 @@ def _frame(tangents, frame):
 @njit(nogil=True, error_model="numpy")
 def nearest_rotation(xc, yc, w, G, rotation):
     """Rotation that carries the reference patch's tangents closest to those in ``G``."""
-    reference = np.array([[xc, 1.0, 0.0], [yc, 0.0, 1.0], [1.0, 0.0, 0.0]])
     tangents, before, after = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
-    _tangents(reference, w, tangents)
+    for j in range(2):
+        r = w[1 + j] / w[0]
+        tangents[j, 0], tangents[j, 1], tangents[j, 2] = -xc * r, -yc * r, -r
+        tangents[j, j] += 1.0
     if not _frame(tangents, before):
         return False
-    _tangents(G, w, tangents)
+    for j in range(2):
+        for i in range(3):
+            tangents[j, i] = G[i, 1 + j] - G[i, 0] * w[1 + j] / w[0]
     if not _frame(tangents, after):
         return False
     for i in range(3):
@@ -114,7 +113,9 @@ def rigid_columns(xc, yc, w, rotation, G):
 @njit(nogil=True, error_model="numpy")
 def rigid_chain(xc, yc, w, rotation, G, chain):
     """d(thirteen unknowns) / d(w0, G0, w1, w2, rotation vector, e), (13, 10), at the present state."""
-    chain[:] = 0.0
+    for i in range(13):
+        for j in range(N_RIGID):
+            chain[i, j] = 0.0
     for i in range(4):
         chain[i, i] = 1.0
     chain[4, 4] = 1.0
@@ -141,7 +142,9 @@ def rigid_chain(xc, yc, w, rotation, G, chain):
 def _reduce(normal, chain, rigid, half, reduced):
     """Normal equations of the unknowns that are free; their number."""
     if not rigid:
-        reduced[:] = normal
+        for i in range(13):
+            for j in range(13):
+                reduced[i, j] = normal[i, j]
         return 13
     product = half[0]  # one row of work space
     for i in range(N_RIGID):
@@ -177,15 +180,18 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         return LOW_TEXTURE, 0
     sum_j, sum_fj = sum_both[0], sum_both[1]
     reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    if too_rough(hessian, lens1, xc, yc, f2):
+    roughness, weakest = texture_roughness(hessian, lens1, xc, yc, f2)
+    if not 1e-6 < roughness < WHITE_ROUGHNESS:
         return LOW_TEXTURE, 0
     w, step, rhs13, small = vectors[0], vectors[1], vectors[2], vectors[3]
-    w[:] = 0.0
+    total = 0.0
     for i in range(3):
         w[i] = start_w[i]
+        total += w[i]
         for j in range(3):
             G[i, j] = start_g[i, j]
-    if not (np.isfinite(w.sum()) and np.isfinite(G.sum())):
+            total += G[i, j]
+    if not np.isfinite(total):
         return NOT_SEEDED, 0
     nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
     if not along > 0.0:
@@ -268,16 +274,21 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         for i in range(3):
             out[3 + 3 * i + j] = G[i, j]
     out[12] = e
-    variance = residual_variance(levels, 3, n, f2, float(free))
-    out[16] = math.sqrt(max(variance, 0.0))
+    variance = residual_variance(levels, 3, n, f2, float(free), order)
+    share = noise_share(variance, roughness, f2, n, order)
+    inflated = variance / max(1.0 - share, 0.01) ** 2
+    out[16] = math.sqrt(variance)
     for a in range(5):
-        small[:] = 0.0
+        for b in range(13):
+            small[b] = 0.0
         small[a if a < 4 else free - 1] = 1.0
         solve(reduced, small, free)
         for b in range(4):
-            out[17 + 5 * a + b] = small[b] * variance
-        out[21 + 5 * a] = small[free - 1] * variance
-    sigma = max(math.sqrt(out[17]) * along, math.sqrt(out[23]) * lens1[1] / G[2, 0])
-    if status == OK and not sigma < max_sigma:
-        status = LOW_TEXTURE
+            out[17 + 5 * a + b] = small[b] * inflated
+        out[21 + 5 * a] = small[free - 1] * inflated
+    # px: along and across camera 2's epipolar line, and both ways in camera 1 at t
+    sigma = max(math.sqrt(out[17]) * along, math.sqrt(out[41]))
+    sigma = max(sigma, math.sqrt(max(out[23], out[29])) * lens1[1] / G[2, 0])
+    share = noise_share(variance, weakest, f2, n, order)
+    status = texture_status(status, share, sigma, max_sigma, min(levels[0, 2], levels[1, 2], levels[2, 2]))
     return status, iterations

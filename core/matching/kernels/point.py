@@ -29,11 +29,16 @@ LOW_TEXTURE = int(PointStatus.LOW_TEXTURE)
 NOT_CONVERGED = int(PointStatus.NOT_CONVERGED)
 SINGULAR = int(PointStatus.SINGULAR)
 NOT_SEEDED = int(PointStatus.NOT_SEEDED)
+LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 
 REFREEZE_PX = 0.5  # corner motion after which the frozen Hessian is set up anew
 FIRST_RATE = 0.3  # convergence rate assumed before two steps have shown it
-WHITE_ROUGHNESS = 1.2  # mean squared gradient over variance: 1.39 for white noise seen by a cubic spline
-INTERPOLATED_NOISE = 0.75  # mean variance of white noise behind a cubic spline, over all sub-pixel places
+MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
+# white noise of variance 1 behind a spline: variance of the value, mean over all sub-pixel places, and of the
+# derivative at pixel centres (integrals of the cardinal splines' squares); cubic, quintic
+VALUE_NOISE = (0.764, 0.843)
+SLOPE_NOISE = (1.392, 1.894)
+WHITE_ROUGHNESS = 1.2  # mean squared gradient over variance that only white noise has
 
 
 @njit(nogil=True, error_model="numpy")
@@ -89,7 +94,8 @@ def compare(image, lens, m, order, ref, n, f2, box, p, sums, sum_j, sum_fj, leve
     if not y2 > 1e-12 * f2:
         levels[2] = 0.0
         levels[3] = 0.0
-        rhs[:] = 0.0
+        for i in range(9):
+            rhs[i] = 0.0
         return True
     c = math.sqrt(y2 / f2)
     nine_from_eight(sums[3:], rhs)
@@ -215,24 +221,40 @@ def corner_motion(blocks, offsets, step, images, box, scale_x, scale_y):
 
 
 @njit(nogil=True, error_model="numpy")
-def residual_variance(levels, images, n, f2, unknowns):
-    """Variance of one image's noise, in reference grey levels squared, from all residuals."""
-    total, expected = 0.0, 0.0
+def residual_variance(levels, images, n, f2, unknowns, order):
+    """Variance of one image's noise, in reference grey levels squared, from the residuals.
+
+    Of three comparisons the quietest counts: what raises the others' residuals are small differences of the views,
+    which do not pull the solution as noise does.
+    """
+    value_noise = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
+    smallest = np.inf
     for k in range(images):
         s = min(max(levels[k, 3], 0.05), 20.0)
-        total += 2.0 * f2 * (1.0 - levels[k, 2])
-        expected += 1.0 + INTERPOLATED_NOISE / (s * s)
-    return total / expected / max(n - 2.0 - unknowns / images, 1.0)
+        smallest = min(smallest, 2.0 * f2 * (1.0 - levels[k, 2]) / (1.0 + value_noise / (s * s)))
+    return max(smallest, 0.0) / max(n - 2.0 - unknowns / images, 1.0)
 
 
 @njit(nogil=True, error_model="numpy")
-def too_rough(hessian, lens1, xc, yc, f2):
-    """Whether the reference's gradients are those of white noise, or none at all."""
+def noise_share(variance, roughness, f2, n, order):
+    """Share of noise in the reference's squared gradients of this roughness, hence in the Hessian.
+
+    The Hessian H is larger than the sensitivity H (1 - share) that turns a shift into its right-hand side, so the
+    covariance is sigma^2 H^-1 / (1 - share)^2: the sandwich.
+    """
+    slope_noise = SLOPE_NOISE[0] if order == 3 else SLOPE_NOISE[1]
+    return slope_noise * variance * n / (roughness * f2)
+
+
+@njit(nogil=True, error_model="numpy")
+def texture_roughness(hessian, lens1, xc, yc, f2):
+    """Squared gradient (per px) over the grey levels' variance: mean over directions, and in the weakest direction."""
     j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
-    gxx = hessian[3, 3] / (j11 * j11 + j21 * j21)
-    gyy = hessian[6, 6] / (j12 * j12 + j22 * j22)
-    roughness = 0.5 * (gxx + gyy) / f2
-    return not (1e-6 < roughness < WHITE_ROUGHNESS)
+    xx, yy = j11 * j11 + j21 * j21, j12 * j12 + j22 * j22
+    gxx, gyy = hessian[3, 3] / xx, hessian[6, 6] / yy
+    gxy = hessian[3, 6] / math.sqrt(xx * yy)
+    mean = 0.5 * (gxx + gyy)
+    return mean / f2, (mean - math.sqrt(0.25 * (gxx - gyy) ** 2 + gxy * gxy)) / f2
 
 
 @njit(nogil=True, error_model="numpy")
@@ -242,3 +264,15 @@ def settled(motion, previous, tolerance):
         return True
     rate = FIRST_RATE if previous == 0.0 else motion / previous
     return rate < 0.9 and motion * rate / (1.0 - rate) < tolerance
+
+
+@njit(nogil=True, error_model="numpy")
+def texture_status(status, share, sigma_px, max_sigma_px, zncc):
+    """Final status: a point that settled, or did not, on noise taken for texture or on a match that scatters."""
+    if status == OK and share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:
+        return OK
+    if zncc > 0.5 and not share < MAX_NOISE_SHARE:
+        return LOW_TEXTURE
+    if status == OK:
+        return LOW_TEXTURE if zncc > 0.5 else LOW_CORRELATION
+    return status

@@ -69,7 +69,9 @@ def set_up_reference(pixels, grad_x, grad_y, lens, x_px, y_px, subset, ref, box,
         return False, 0.0, 0.0, 0.0
     xc, yc = undistort(lens, x_px, y_px)
     half = 0.5 * (subset - 1)
-    poly[:] = 0.0
+    for j in range(10):
+        poly[0, j] = 0.0
+        poly[1, j] = 0.0
     for i in range(16):
         u, v = undistort(lens, left + half + half * _NODES[0, i], top + half + half * _NODES[1, i])
         for j in range(10):

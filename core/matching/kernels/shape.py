@@ -16,15 +16,18 @@ from core.matching.kernels.point import (
     OUTSIDE_IMAGE,
     REFREEZE_PX,
     SINGULAR,
+    WHITE_ROUGHNESS,
     compare,
     corner_motion,
     epipolar_shift,
     image_matrices,
     jacobian_blocks,
     joint_weights,
+    noise_share,
     residual_variance,
     settled,
-    too_rough,
+    texture_roughness,
+    texture_status,
 )
 from core.matching.kernels.reference import reference_sums, set_up_reference
 
@@ -58,7 +61,8 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     if not f2 > 0.0:
         return LOW_TEXTURE, 0
     reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    if too_rough(hessian, lens1, xc, yc, f2):
+    roughness, weakest = texture_roughness(hessian, lens1, xc, yc, f2)
+    if not 1e-6 < roughness < WHITE_ROUGHNESS:
         return LOW_TEXTURE, 0
     w = vectors[0]
     w[0], w[1], w[2] = start[0], start[1], start[2]
@@ -92,7 +96,8 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
         small = vectors[3]
         small[0], small[1], small[2], small[3] = -rhs13[0], -rhs13[4], -rhs13[8], -rhs13[12]
         solve(reduced, small, 4)
-        step[:] = 0.0
+        for i in range(13):
+            step[i] = 0.0
         step[0], step[4], step[8], step[12] = small[0], small[1], small[2], small[3]
         motion = corner_motion(blocks, offsets, step, 1, box, lens1[1], lens1[2])
         cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
@@ -110,7 +115,9 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
         return OUTSIDE_IMAGE, iterations
     out[0], out[1], out[2], out[3], out[4] = w[0], w[1], w[2], e, levels[0, 2]
-    variance = residual_variance(levels, 1, n, f2, 4.0)
+    variance = residual_variance(levels, 1, n, f2, 4.0, order)
+    share = noise_share(variance, roughness, f2, n, order)
+    inflated = variance / max(1.0 - share, 0.01) ** 2
     joint_weights(levels, 1, weights)
     if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
         return SINGULAR, iterations
@@ -120,11 +127,12 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     column = vectors[3]
     column[0], column[1], column[2], column[3] = 1.0, 0.0, 0.0, 0.0
     solve(reduced, column, 4)
-    c00, c01 = column[0] * variance, column[3] * variance
+    c00, c01 = column[0] * inflated, column[3] * inflated
     column[0], column[1], column[2], column[3] = 0.0, 0.0, 0.0, 1.0
     solve(reduced, column, 4)
-    out[5] = math.sqrt(max(variance, 0.0))
-    out[6], out[7], out[8] = c00, c01, column[3] * variance
-    if status == OK and math.sqrt(c00) * along > max_sigma:
-        status = LOW_TEXTURE
+    out[5] = math.sqrt(variance)
+    out[6], out[7], out[8] = c00, c01, column[3] * inflated
+    sigma = max(math.sqrt(c00) * along, math.sqrt(out[8]))
+    share = noise_share(variance, weakest, f2, n, order)
+    status = texture_status(status, share, sigma, max_sigma, levels[0, 2])
     return status, iterations

@@ -1,0 +1,134 @@
+"""``stereorig measure``: shape and displacement from image files, without a service."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from pathlib import Path
+
+from core.errors import FileFormatError, ImageError, InputError
+from server.cli.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
+from server.cli.region import check_odd, check_region, parse_rectangle
+from server.cli.sequence import CheckedPair, MeasureJob, measure_sequence
+from server.cli.terminal import ProgressLine
+from server.io.calibration_any import LoadedCalibration, load_calibration
+from server.io.images import decode_image, read_file
+
+SUBSET_RANGE_PX = (7, 301)
+STEP_RANGE_PX = (1, 1000)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add = parser.add_argument
+    add("folder", nargs="?", metavar="FOLDER", help="a test's folder: steps/<nnnn>/cam1.tif ..., calibration.json")
+    add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern or several paths")
+    add("--cam2", nargs="+", metavar="GLOB", help="camera 2's images; files are paired in sorted order")
+    add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
+    add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
+    add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
+    add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
+    add("--step", default="10", metavar="PX", help="distance of the points (10)")
+    add("--patch", choices=("stretch", "rigid"), default="stretch", help="how a patch may move (stretch)")
+    add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
+    add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
+    add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; return the exit status."""
+    progress = ProgressLine()
+    try:
+        measure_sequence(_prepare(args, progress), progress)
+    finally:
+        progress.close()
+    return 0
+
+
+def _missing(option: str) -> InputError:
+    return InputError(f"{option} is missing.", code="option_missing", remedy="See stereorig measure --help.")
+
+
+def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
+    if args.folder is not None:
+        if args.cam1 or args.cam2:
+            raise InputError("Both a test folder and --cam1/--cam2 are given.", code="option_conflict",
+                             remedy="Give one or the other.")  # fmt: skip
+        return pairs_of_test_folder(Path(args.folder))
+    for option in ("cam1", "cam2", "calibration", "roi", "out"):
+        if getattr(args, option) is None:
+            raise _missing(f"--{option}")
+    lists = []
+    for option in ("cam1", "cam2"):
+        files, note = expand(f"--{option}", getattr(args, option))
+        lists.append(files)
+        if note:
+            progress.note(f"note: {note}")
+    return pair_up(*lists)
+
+
+def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
+    """Check everything that can be checked before anything is computed or written."""
+    subset = check_odd("--subset", args.subset, low=SUBSET_RANGE_PX[0], high=SUBSET_RANGE_PX[1], odd=True)
+    step = check_odd("--step", args.step, low=STEP_RANGE_PX[0], high=STEP_RANGE_PX[1], odd=False)
+    rectangle = None if args.roi is None else parse_rectangle(args.roi)
+    files = _pairs(args, progress)
+    folder = None if args.folder is None else Path(args.folder)
+    calibration_file = Path(args.calibration) if args.calibration or folder is None else folder / "calibration.json"
+    calibration = load_calibration(calibration_file)
+    out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
+    shapes = _checked_shapes(files[0], calibration)
+    if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
+        rows, cols = shapes[0]
+        margin = float(subset // 2 + 2)
+        rectangle = (margin, margin, cols - 1 - margin, rows - 1 - margin)
+    mask_file = None if args.mask is None else Path(args.mask)
+    region = check_region(rectangle, image_shape=shapes[0], subset_px=subset, step_px=step,
+                          mask_path=mask_file, seeds=args.seed)  # fmt: skip
+    pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    return MeasureJob(
+        calibration=calibration, calibration_file=calibration_file, pairs=pairs, region=region, subset_px=subset,
+        step_px=step, patch=args.patch, interpolation=args.interpolation, mask_file=mask_file, out=out,
+    )  # fmt: skip
+
+
+def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
+    """(rows, cols) of both cameras' images, which the calibration must agree with where it says."""
+    shapes = []
+    for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
+        rows, cols = decode_image(read_file(path), name=str(path)).shape
+        if size is not None and size != (cols, rows):
+            raise ImageError(
+                f"{path} is {cols} x {rows} px, the calibration is for {size[0]} x {size[1]} px.",
+                code="image_size_mismatch",
+                remedy="Give the images of the calibrated cameras, uncropped and unscaled.",
+            )
+        shapes.append((rows, cols))
+    return shapes[0], shapes[1]
+
+
+def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> CheckedPair:
+    """Read both images of a step once, so that a bad one is found before hours of work on the others."""
+    hashes, images = [], []
+    for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
+        data = read_file(path)
+        hashes.append(hashlib.sha256(data).hexdigest())
+        if recorded is not None and hashes[-1] != recorded:
+            raise FileFormatError(f"{path} does not match the checksum in its step.json.", code="checksum_mismatch",
+                                  remedy="Restore the file, or leave this step out.")  # fmt: skip
+        image = decode_image(data, name=str(path))
+        if image.shape != shape:
+            is_px, first_px = f"{image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px"
+            raise ImageError(
+                f"{path} (step {step}) is {is_px}, the first image {first_px}.",
+                code="image_size_mismatch",
+                remedy="All images of one camera must have one size.",
+            )
+        if int(image.max()) == int(image.min()):
+            raise ImageError(f"{path} (step {step}) is blank: every pixel is {int(image.max())}.", code="image_blank",
+                             remedy="Check exposure, lens cap and trigger, then take the step again.")  # fmt: skip
+        images.append(image)
+    if hashes[0] == hashes[1]:
+        raise InputError(f"{pair.cam1} and {pair.cam2} (step {step}) hold the same image.", code="same_image",
+                         remedy="Give each camera its own images.")  # fmt: skip
+    return CheckedPair(pair, (hashes[0], hashes[1]))

@@ -1,0 +1,204 @@
+"""The measurement of a sequence of pairs: one step in memory at a time, one file a step, a summary at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from core.errors import MeasurementError
+from core.field.result import Field
+from server.cli.image_lists import ImagePair
+from server.cli.region import RegionRequest
+from server.cli.terminal import ProgressLine, duration
+from server.io.calibration_any import LoadedCalibration
+from server.io.files import make_folder, sha256_of, write_bytes
+from server.io.images import read_image
+from server.io.netcdf import Provenance, write_field
+from server.io.summary import summarise, to_json
+from server.version import software_version
+
+_SEEDS_SHARE = 0.15  # of a step's time, as a rule
+_RESULT = re.compile(r"step_\d{4}\.nc")
+
+
+@dataclass(frozen=True)
+class CheckedPair:
+    """One step's files and the hashes of what was found in them."""
+
+    files: ImagePair
+    sha256: tuple[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureJob:
+    """Everything that ``stereorig measure`` was asked to do, checked."""
+
+    calibration: LoadedCalibration
+    calibration_file: Path
+    pairs: list[CheckedPair]
+    region: RegionRequest
+    subset_px: int
+    step_px: int
+    patch: Literal["stretch", "rigid"]
+    interpolation: Literal["cubic", "quintic"]
+    mask_file: Path | None
+    out: Path
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the result depends on besides its inputs."""
+        seeds = self.region.seeds_px
+        return {
+            "roi": list(self.region.rectangle_px), "subset_px": self.subset_px, "step_px": self.step_px,
+            "patch": self.patch, "interpolation": self.interpolation,
+            "seeds": None if seeds is None else seeds.tolist(),
+            "mask": None if self.mask_file is None else str(self.mask_file),
+        }  # fmt: skip
+
+
+def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
+    """Measure every step; write the results and ``summary.json``; return the summary.
+
+    Raises
+    ------
+    StereorigError
+        As the measurement raises them. Results of steps that were finished before stay; no summary is written.
+    """
+    started = time.monotonic()
+    with _output_folder(job.out):
+        runner = _Runner(job, progress)
+        steps = [runner.step(n) for n in range(len(job.pairs))]
+    seconds = round(time.monotonic() - started, 3)
+    summary = {
+        "software_version": software_version(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "calibration": {"file": str(job.calibration_file), "sha256": job.calibration.sha256,
+                        "source": job.calibration.source},
+        "settings": job.settings(),
+        "seconds": seconds,
+        "steps": steps,
+    }  # fmt: skip
+    write_bytes(job.out / "summary.json", to_json(summary))
+    progress.note(f"{len(steps)} steps in {duration(seconds)}: {job.out / 'summary.json'}")
+    return summary
+
+
+@contextlib.contextmanager
+def _output_folder(out: Path) -> Iterator[None]:
+    """Make the output folder before hours of work, and take it away again if nothing came into it."""
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    make_folder(out)
+    try:
+        yield
+    except BaseException:
+        for folder in made:
+            if next(folder.iterdir(), None) is not None:
+                break
+            folder.rmdir()
+        raise
+
+
+def _kernels_are_compiled() -> bool:
+    """Whether numba finds compiled matching kernels beside the code or in its cache folder."""
+    from core.matching import kernels
+
+    places = [Path(path) for path in kernels.__path__]
+    if "NUMBA_CACHE_DIR" in os.environ:
+        places.append(Path(os.environ["NUMBA_CACHE_DIR"]))
+    return any(next(place.rglob("*.nbi"), None) is not None for place in places)
+
+
+class _Runner:
+    """Measures the steps in order; keeps the reference, its shape and the last field, whatever the number of steps."""
+
+    def __init__(self, job: MeasureJob, progress: ProgressLine) -> None:
+        # the kernels' modules take seconds to load: after the input was checked is early enough
+        from core import measure
+
+        self._job = job
+        self._progress = progress
+        if not _kernels_are_compiled():
+            progress.note("compiling kernels, once per machine ...")
+        self._options = measure.MeasureOptions(
+            subset_px=job.subset_px, patch=job.patch, interpolation=job.interpolation
+        )
+        first = job.pairs[0].files
+        self._reference = measure.ReferencePair(job.calibration.pair, read_image(first.cam1), read_image(first.cam2))
+        self._shape: Field | None = None
+        self._last: Field | None = None
+        self._done = 0.0
+
+    def step(self, n: int) -> dict[str, Any]:
+        """Measure one step, write its file, return its summary."""
+        started = time.monotonic()
+        pair = self._job.pairs[n]
+        result = self._shape_of_reference() if n == 0 else self._motion(n)
+        if not result.valid.any():
+            raise MeasurementError(
+                f"No point of step {n} ({pair.files.cam1.name}, {pair.files.cam2.name}) could be measured.",
+                code="nothing_measured",
+                remedy="Check that both cameras see the same textured surface, in this order, and the region.",
+            )
+        if n == 0:
+            self._remove_older()
+        name = f"step_{n:04d}.nc"
+        write_field(self._job.out / name, result, self._provenance(n))
+        summary = {
+            "step": n, "file": name, "cam1": str(pair.files.cam1), "cam2": str(pair.files.cam2),
+            "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]}, **summarise(result),
+            "seconds": round(time.monotonic() - started, 3),
+        }  # fmt: skip
+        rms = summary["epipolar_rms_px"]
+        self._progress.note(
+            f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
+            f"epipolar rms {rms:.3f} px, {duration(summary['seconds'])}"
+        )
+        return summary
+
+    def _shape_of_reference(self) -> Field:
+        region = self._job.region
+        self._shape = self._reference.shape(region.grid, self._options, seeds=region.seeds_px, progress=self._shower(0))
+        return self._shape
+
+    def _motion(self, n: int) -> Field:
+        files, region = self._job.pairs[n].files, self._job.region
+        self._last = self._reference.motion(
+            read_image(files.cam1), read_image(files.cam2), region.grid, self._options,
+            shape=self._shape, previous=self._last, seeds=region.seeds_px, progress=self._shower(n),
+        )  # fmt: skip
+        return self._last
+
+    def _shower(self, n: int) -> Any:
+        count = len(self._job.pairs)
+
+        def show(stage: str, done: int, total: int) -> None:
+            share = done / total if total > 0 else 0.0
+            part = _SEEDS_SHARE * share if stage == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
+            self._done = max(self._done, (n + part) / count)
+            self._progress.show(f"step {n} of {count - 1}: {stage}", self._done)
+
+        return show
+
+    def _provenance(self, n: int) -> Provenance:
+        job, first, now = self._job, self._job.pairs[0], self._job.pairs[n]
+        inputs = {"calibration": job.calibration.sha256, "reference_cam1": first.sha256[0],
+                  "reference_cam2": first.sha256[1], "cam1": now.sha256[0], "cam2": now.sha256[1]}  # fmt: skip
+        if job.mask_file is not None:
+            inputs["mask"] = sha256_of(job.mask_file)
+        return Provenance(
+            settings=job.settings(), inputs=inputs, software_version=software_version(), step=n,
+            frame="target" if job.calibration.source == "calibration_json" else "camera1",
+            extra={"cam1_file": str(now.files.cam1), "cam2_file": str(now.files.cam2)},
+        )  # fmt: skip
+
+    def _remove_older(self) -> None:
+        """Remove an earlier run's results: more steps than now, or its summary, would pass for this one's."""
+        for path in self._job.out.iterdir():
+            if path.name == "summary.json" or _RESULT.fullmatch(path.name):
+                path.unlink()

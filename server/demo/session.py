@@ -1,0 +1,133 @@
+"""What the three experiments share: the running service, the rig's truth, the folder for what they find."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.field.result import Field
+from server.demo.client import AnalysisHandle, ServiceClient
+from server.io.files import make_folder, write_bytes
+from server.io.netcdf import read_field
+from sim.rig import SimRig
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure with its truth and its limit.
+
+    Attributes
+    ----------
+    name, unit
+        What it is.
+    found, true
+        The figure and the truth; ``true`` is None where the figure is itself an error or a count.
+    error, limit
+        What must not exceed what.
+    """
+
+    name: str
+    unit: str
+    found: float
+    true: float | None
+    error: float
+    limit: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within the limit; NaN never is."""
+        return bool(abs(self.error) <= self.limit)
+
+
+@dataclass
+class Outcome:
+    """What an experiment found.
+
+    Attributes
+    ----------
+    checks
+        Figures with limits; the demo fails if one is missed.
+    lines
+        Text of the table, ready to print.
+    pictures
+        Files with what each shows.
+    data
+        Further figures for ``report.json``.
+    """
+
+    checks: list[Check] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
+    pictures: dict[str, str] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Session:
+    """One demo run.
+
+    Parameters
+    ----------
+    client
+        Speaks with the service.
+    rig
+        The truth, read from the same rig file; used for comparing only.
+    config
+        The rig file.
+    out
+        Folder for pictures and results.
+    say
+        Prints a line.
+    """
+
+    client: ServiceClient
+    rig: SimRig
+    config: Path
+    out: Path
+    say: Callable[[str], None]
+
+    def nominal(self) -> dict[str, Any]:
+        """Return the rig file's tables, as a user knows the rig."""
+        return tomllib.loads(self.config.read_text())
+
+    def calibrate(self) -> dict[str, Any]:
+        """Calibrate before the grid; save and return the calibration's document."""
+        self.client.set_scene("grid")
+        document = self.client.calibrate()
+        content = self.client.call("GET", f"/calibrations/{document['id']}/file").content
+        write_bytes(self.out / "calibration.json", content)
+        return document
+
+    def fetch(self, analysis: AnalysisHandle, steps: Sequence[int], folder: str = "results") -> list[Field]:
+        """Fetch the result files of an analysis over HTTP, keep them, and read them."""
+        make_folder(self.out / folder)
+        fields = []
+        for step in steps:
+            path = self.out / folder / f"step_{step:04d}.nc"
+            write_bytes(path, self.client.export(analysis, step))
+            fields.append(read_field(path))
+        return fields
+
+    def reference_image(self, test_id: str, step: int = 0) -> NDArray[Any]:
+        """Fetch camera 1's image of a step."""
+        from server.io.images import decode_image
+
+        data = self.client.call("GET", f"/tests/{test_id}/steps/{step}/cam1", params={"format": "tiff"}).content
+        return decode_image(data, name=f"step {step} of {test_id}")
+
+
+def pixels_of(result: Field) -> NDArray[np.float64]:
+    """Return the points' places (r, c, 2) in camera 1's reference image."""
+    return np.stack([result.x_px, result.y_px], axis=-1)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lay out columns, numbers to the right."""
+    widths = [max(len(str(row[k])) for row in [head, *rows]) for k in range(len(head))]
+    lines = ["  ".join(str(cell).rjust(w) for cell, w in zip(row, widths, strict=True)) for row in [head, *rows]]
+    return [lines[0], "-" * len(lines[0]), *lines[1:]]

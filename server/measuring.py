@@ -1,0 +1,175 @@
+"""One step of an analysis, in the worker: images by path, the result as a file in the analysis' folder.
+
+What the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of points, the
+last two fields) is kept between tasks; a fresh worker makes it again from the files, so a step measured anywhere
+gives the same result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from core.camera import Camera
+from core.errors import FileFormatError, ImageError
+from core.field.region import PointGrid
+from core.field.result import Field
+from core.field.seeds import Seed
+from core.measure import MeasureOptions, ReferencePair
+from core.stereo import StereoPair
+from core.threads import set_threads
+from server.io.calibration_any import LoadedCalibration, load_calibration
+from server.io.images import GrayImage, read_image, read_mask
+from server.io.netcdf import Provenance, read_field, write_field
+from server.io.summary import summarise
+from server.regions import make_grid
+from server.tasks import StepTask
+from server.version import software_version
+from server.worker_process import current_task
+
+_KEPT = 2
+
+
+@dataclass(eq=False)
+class _Context:
+    """What the steps of one analysis share."""
+
+    reference: ReferencePair
+    grid: PointGrid
+    options: MeasureOptions
+    fields: dict[int, Field] = field(default_factory=dict)
+
+
+_contexts: OrderedDict[str, _Context] = OrderedDict()
+
+
+def measure_step(task: StepTask) -> dict[str, Any]:
+    """Measure one step and write ``step_<nnnn>.nc``; returns its summary.
+
+    Raises
+    ------
+    InputError
+        Images, calibration or region that do not fit together.
+    SeedError
+        No start was found.
+    Cancelled
+        The service asked for it.
+    """
+    channel = current_task()
+    began = time.perf_counter()
+    context = _context_of(task)
+    seeds = task.settings["seeds"]
+    more: dict[str, Any] = {"progress": channel.progress, "cancel": channel}
+    if seeds is not None:
+        more["seeds"] = np.asarray(seeds, dtype=np.float64)
+    if task.kind == "shape":
+        result = context.reference.shape(context.grid, context.options, **more)
+    else:
+        shape = _field(task, context, task.reference)
+        previous = None if task.previous in (None, task.reference) else _field(task, context, task.previous)
+        result = context.reference.motion(
+            _image(task, "cur1"), _image(task, "cur2"), context.grid, context.options,
+            shape=shape, previous=previous, **more,
+        )  # fmt: skip
+    computed = time.perf_counter()
+    extra = {"label": task.label, "test_step": str(task.n), "reference_step": str(task.reference)}
+    if task.load_n is not None:
+        extra["load_n"] = repr(task.load_n)
+    provenance = Provenance(
+        settings=task.settings, inputs=task.inputs, software_version=software_version(), step=task.n, extra=extra
+    )
+    write_field(_result_path(task, task.n), result, provenance)
+    # the next step needs these two, nobody the others
+    context.fields = {n: f for n, f in context.fields.items() if n == task.reference} | {task.n: result}
+    summary = summarise(result)
+    return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
+
+
+def _context_of(task: StepTask) -> _Context:
+    key = hashlib.sha256(
+        json.dumps([task.folder, task.calibration, task.images["ref1"], task.images["ref2"], task.settings]).encode()
+    ).hexdigest()
+    if key not in _contexts:
+        _contexts[key] = _make_context(task)
+        while len(_contexts) > _KEPT:
+            _contexts.popitem(last=False)
+    _contexts.move_to_end(key)
+    return _contexts[key]
+
+
+def _make_context(task: StepTask) -> _Context:
+    settings = task.settings
+    calibration = load_calibration(task.calibration)
+    one, two = _image(task, "ref1"), _image(task, "ref2")
+    _check_sizes(calibration, one, two)
+    options = MeasureOptions(
+        subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"]
+    )
+    return _Context(ReferencePair(calibration.pair, one, two), _grid(task, one), options)
+
+
+def _check_sizes(calibration: LoadedCalibration, one: GrayImage, two: GrayImage) -> None:
+    for cam, image, size in (("cam1", one, calibration.image_size1_px), ("cam2", two, calibration.image_size2_px)):
+        found = (image.shape[1], image.shape[0])
+        if size is not None and tuple(size) != found:
+            raise ImageError(
+                f"The image of {cam} is {found[0]} x {found[1]} px, its calibration is for {size[0]} x {size[1]} px.",
+                code="image_size",
+                remedy="Measure images of the cameras that were calibrated, unscaled.",
+            )
+
+
+def _grid(task: StepTask, image: GrayImage) -> PointGrid:
+    mask_path = Path(task.folder) / "mask.png"
+    mask = read_mask(mask_path) if mask_path.exists() else None
+    return make_grid(task.settings, mask, (image.shape[0], image.shape[1]))
+
+
+def _image(task: StepTask, which: str) -> GrayImage:
+    return read_image(task.images[which])
+
+
+def _result_path(task: StepTask, n: int) -> Path:
+    return Path(task.folder) / f"step_{n:04d}.nc"
+
+
+def _field(task: StepTask, context: _Context, n: int | None) -> Field:
+    assert n is not None
+    if n not in context.fields:
+        path = _result_path(task, n)
+        if not path.exists():
+            raise FileFormatError(
+                f"The result of step {n} is missing.", code="file_missing", remedy="Start the analysis again."
+            )
+        context.fields[n] = read_field(path)
+    return context.fields[n]
+
+
+def warm_up(threads: int) -> None:
+    """Load the kernels of the default settings and run them once on a small pair of images."""
+    set_threads(threads)
+    # a plane seen by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
+    rng = np.random.default_rng(1)
+    noise = cv2.GaussianBlur(rng.normal(size=(128, 150)), (0, 0), 1.3)
+    texture = np.clip(128.0 + 45.0 * noise / noise.std(), 0, 255).astype(np.uint8)
+    left, right = texture[:, 6:134].copy(), texture[:, 12:140].copy()
+    common = {
+        "phd_px": 1000.0, "cx_px": 64.0, "cy_px": 64.0, "kappa_per_px2": 0.0, "aspect": 1.0,
+        "alpha_rad": 0.0, "beta_rad": 0.0, "gamma_rad": 0.0, "y0_mm": 0.0, "z0_mm": 100.0,
+    }  # fmt: skip
+    pair = StereoPair(Camera.from_paper(**common, x0_mm=0.0), Camera.from_paper(**common, x0_mm=-0.6))
+    grid = PointGrid.rectangle(40.0, 40.0, 88.0, 88.0, step_px=8.0)
+    seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
+    # the other patch and interpolation compile when first asked for; compiled kernels are kept on disk
+    options = MeasureOptions(subset_px=21)
+    reference = ReferencePair(pair, left, right)
+    shape = reference.shape(grid, options, seeds=seeds)
+    reference.motion(left.copy(), right.copy(), grid, options, shape=shape)

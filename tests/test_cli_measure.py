@@ -1,0 +1,300 @@
+"""``stereorig measure`` end to end on rendered images with a known truth, and every bad input in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+
+from server.cli import main
+from server.io.images import read_image, write_image
+from sim.render import RenderOptions, render
+from sim.rig import CAMERA_NAMES, SimRig
+from sim.scenes import make_scene
+from sim.truth import truth_at
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZE = (230, 200)
+LOADS = (0.0, 0.5, 1.0)
+ROI = "50,45,180,155"
+
+
+def small_rig() -> SimRig:
+    """The paper's rig with smaller sensors: the same rays, fewer pixels."""
+    tables = tomllib.loads((ROOT / "config" / "sim_paper.toml").read_text())
+    for name in CAMERA_NAMES:
+        tables[name]["image_size_px"] = list(SIZE)
+        tables["sim"][name] |= {"cx_px": SIZE[0] / 2 + 3.0, "cy_px": SIZE[1] / 2 - 2.0}
+    return SimRig.from_dict(tables)
+
+
+@pytest.fixture(scope="module")
+def rig() -> SimRig:
+    return small_rig()
+
+
+@pytest.fixture(scope="module")
+def originals(rig: SimRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with three pairs of a moving block and the true calibration."""
+    folder = tmp_path_factory.mktemp("block")
+    rng = np.random.default_rng(1)
+    for n, load in enumerate(LOADS):
+        scene = make_scene(rig, "block", load=load)
+        for name in CAMERA_NAMES:
+            sim = rig.camera(name)
+            seen = render(scene, sim.camera, sim.size_px, options=RenderOptions(blur_px=rig.blur_px, threads=1))
+            write_image(folder / f"{name}_{n}.tif", sim.sensor.expose(sim.lighting.apply(seen), rng, exposure=1.0))
+    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERA_NAMES}
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    return folder
+
+
+@pytest.fixture
+def folder(originals: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    shutil.copytree(originals, tmp_path / "in")
+    return tmp_path / "in"
+
+
+def command(folder: Path, results: Path, **changes: str | list[str] | None) -> list[str]:
+    options: dict[str, Any] = {
+        "cam1": str(folder / "cam1_*.tif"), "cam2": str(folder / "cam2_*.tif"),
+        "calibration": str(folder / "calibration.json"), "roi": ROI, "subset": "21", "out": str(results),
+    }  # fmt: skip
+    options.update(changes)
+    arguments = ["measure"]
+    for name, value in options.items():
+        if value is not None:
+            arguments += [f"--{name}", *([value] if isinstance(value, str) else value)]
+    return arguments
+
+
+@pytest.fixture(scope="module")
+def measured(originals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "new" / "folder"
+    assert main(command(originals, out)) == 0
+    return out
+
+
+def test_shape_and_displacement_agree_with_the_truth(measured: Path, rig: SimRig) -> None:
+    assert sorted(p.name for p in measured.iterdir()) == [*(f"step_000{n}.nc" for n in range(3)), "summary.json"]
+    for n, load in enumerate(LOADS):
+        with xr.open_dataset(measured / f"step_000{n}.nc") as data:
+            np.testing.assert_array_equal(data["x_px"][0], np.arange(50, 181, 10))
+            np.testing.assert_array_equal(data["y_px"][:, 0], np.arange(45, 156, 10))
+            xy = np.stack([data["x_px"], data["y_px"]], axis=-1)
+            truth = truth_at(make_scene(rig, "block"), rig.cam1.camera, xy, now=make_scene(rig, "block", load=load))
+            ok = data["status"].values == 0
+            assert ok.mean() > 0.99
+            # noise of 2 of 255 at 21 px gives 0.2 to 0.3 um; the true calibration adds nothing
+            xyz = np.stack([data["x_mm"], data["y_mm"], data["z_mm"]], axis=-1)
+            assert np.sqrt(np.mean((xyz - truth.xyz_mm)[ok] ** 2)) < 0.4e-3
+            if n == 0:
+                assert "u_mm" not in data
+                assert data.attrs["kind"] == "shape"
+                continue
+            uvw = np.stack([data["u_mm"], data["v_mm"], data["w_mm"]], axis=-1)
+            assert np.sqrt(np.mean((uvw - truth.uvw_mm)[ok] ** 2)) < 0.5e-3
+            assert np.abs(uvw - truth.uvw_mm)[ok].max() < 3e-3
+            assert data.attrs["kind"] == "displacement"
+            assert json.loads(data.attrs["settings"])["subset_px"] == 21
+
+
+def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> None:
+    summary = json.loads((measured / "summary.json").read_text())
+    assert [step["step"] for step in summary["steps"]] == [0, 1, 2]
+    assert summary["settings"]["roi"] == [50.0, 45.0, 180.0, 155.0]
+    assert summary["calibration"]["source"] == "calibration_json"
+    for step in summary["steps"]:
+        assert step["points"] == 14 * 12
+        assert step["valid"] == sum(v for k, v in step["status"].items() if k in ("ok", "extrapolated"))
+        assert step["epipolar_rms_px"] < 0.05
+        assert min(step["zncc_median"].values()) > 0.95
+        assert Path(step["cam1"]).name == f"cam1_{step['step']}.tif"
+    assert summary["steps"][0]["plane_residual_rms_mm"] < 0.5e-3  # the block's face is flat
+
+
+def test_several_paths_a_mask_seeds_and_the_other_models(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    mask[40:160, 45:121] = 255
+    Image.fromarray(mask).save(folder / "mask.png")
+    out = tmp_path / "out"
+    (tmp_path / "out").mkdir()
+    (out / "step_0007.nc").write_text("of an earlier, longer run")
+    (out / "notes.txt").write_text("the user's own")
+    code = main(command(
+        folder, out, cam1=[str(folder / "cam1_0.tif"), str(folder / "cam1_1.tif")],
+        cam2=[str(folder / "cam2_1.tif"), str(folder / "cam2_0.tif")], mask=str(folder / "mask.png"),
+        patch="rigid", interpolation="quintic", seed="80,85",
+    ))  # fmt: skip
+    assert code == 0
+    assert sorted(p.name for p in out.iterdir()) == ["notes.txt", "step_0000.nc", "step_0001.nc", "summary.json"]
+    with xr.open_dataset(out / "step_0001.nc") as data:
+        masked = data["status"].values == 2
+        np.testing.assert_array_equal(masked, np.broadcast_to(np.arange(50, 181, 10) > 120, masked.shape))
+        assert np.isnan(data["w_mm"].values[masked]).all()
+        assert (data["status"].values[~masked] == 0).mean() > 0.99
+        assert json.loads(data.attrs["settings"])["patch"] == "rigid"
+        assert "mask" in json.loads(data.attrs["inputs_sha256"])
+    assert "step 1 of 1" in capfd.readouterr().err
+
+
+def test_a_test_folder_copied_by_hand(folder: Path, tmp_path: Path, measured: Path) -> None:
+    test = tmp_path / "t000001"
+    hashes = json.loads((measured / "summary.json").read_text())["steps"]
+    for n in range(2):
+        step = test / "steps" / f"{n:04d}"
+        step.mkdir(parents=True)
+        for cam in CAMERA_NAMES:
+            shutil.copy(folder / f"{cam}_{n}.tif", step / f"{cam}.tif")
+        (step / "step.json").write_text(json.dumps({"n": n, "sha256": hashes[n]["sha256"]}))
+    shutil.copy(folder / "calibration.json", test)
+    assert main(["measure", str(test), "--subset", "21", "--step", "20"]) == 0
+    summary = json.loads((test / "exports" / "measure" / "summary.json").read_text())
+    for step in summary["steps"]:  # camera 2 does not see the rim of camera 1's image
+        assert step["valid"] > 70
+        assert set(step["status"]) <= {"ok", "outside_image"}
+
+
+@pytest.mark.fault(4)
+def test_a_flipped_bit_in_a_test_folder_is_named(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    step = tmp_path / "t" / "steps" / "0000"
+    step.mkdir(parents=True)
+    for cam in CAMERA_NAMES:
+        shutil.copy(folder / f"{cam}_0.tif", step / f"{cam}.tif")
+    (step / "step.json").write_text(json.dumps({"sha256": {"cam1": "0" * 64}}))
+    shutil.copy(folder / "calibration.json", tmp_path / "t")
+    fails(["measure", str(tmp_path / "t")], "checksum_mismatch", "cam1.tif", capfd)
+
+
+def fails(arguments: list[str], code: str, word: str, capfd: Any) -> None:
+    assert main(arguments) == 1
+    err = capfd.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("stereorig: ")]
+    assert len(lines) == 1, err
+    assert lines[0].startswith(f"stereorig: {code}: ")
+    assert word in lines[0]
+    assert " Remedy: " in lines[0]
+    assert "Traceback" not in err
+
+
+BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
+    ({"cam1": "IN/none_*.tif"}, "file_missing", "none_"),
+    ({"cam2": ["IN/cam2_0.tif", "IN/none.tif"]}, "file_missing", "none.tif"),
+    ({"cam2": ["IN/cam2_0.tif"]}, "counts_differ", "3 images"),
+    ({"cam2": "IN/cam1_*.tif"}, "same_image", "cam1_0.tif"),
+    ({"calibration": "IN/none.json"}, "file_missing", "none.json"),
+    ({"calibration": "IN/cam1_0.tif"}, "calibration_unreadable", "cam1_0.tif"),
+    ({"roi": "300,20,400,100"}, "region_outside_image", "230 x 200"),
+    ({"roi": "-20,20,100,100"}, "region_outside_image", "230 x 200"),
+    ({"roi": "180,155,50,45"}, "region_unusable", "empty"),
+    ({"roi": "50,50,50,50"}, "region_unusable", "empty"),
+    ({"roi": "nan,45,180,155"}, "region_unusable", "finite"),
+    ({"roi": "50,45,60,155"}, "region_too_small", "smaller"),
+    ({"mask": "IN/none.png"}, "file_missing", "none.png"),
+    ({"mask": "IN/wrong.png"}, "mask_size", "100 x 100"),
+    ({"mask": "IN/black.png"}, "region_empty", "white"),
+    ({"subset": "20"}, "option_out_of_range", "20"),
+    ({"subset": "zwanzig"}, "option_out_of_range", "zwanzig"),
+    ({"step": "0"}, "option_out_of_range", "--step"),
+    ({"seed": "10,10"}, "seed_outside", "10,10"),
+    ({"seed": "1000,90"}, "seed_outside", "1000,90"),
+    ({"roi": None}, "option_missing", "--roi"),
+    ({"out": "IN/cam1_0.tif"}, "output_unusable", "cam1_0.tif"),
+]
+
+
+@pytest.mark.parametrize(("changes", "code", "word"), BAD_OPTIONS, ids=lambda v: str(v)[:40])
+def test_bad_options(folder: Path, tmp_path: Path, capfd: Any, changes: dict[str, Any], code: str, word: str) -> None:
+    Image.fromarray(np.full((100, 100), 255, np.uint8)).save(folder / "wrong.png")
+    Image.fromarray(np.zeros((SIZE[1], SIZE[0]), np.uint8)).save(folder / "black.png")
+    place = {
+        k: [s.replace("IN", str(folder), 1) for s in v] if isinstance(v, list)
+        else v if v is None else v.replace("IN", str(folder), 1)
+        for k, v in changes.items()
+    }  # fmt: skip
+    before = sorted(folder.iterdir())
+    fails(command(folder, tmp_path / "out", **place), code, word, capfd)
+    assert not (tmp_path / "out").exists()
+    assert sorted(folder.iterdir()) == before
+
+
+def test_bad_images(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    good = read_image(folder / "cam2_1.tif")
+    for data, code, word in (
+        (good[:, :-1], "image_size_mismatch", "229 x 200"), (np.full_like(good, 90), "image_blank", "90"),
+        (good[:50], "image_size_mismatch", "step 1"),
+    ):  # fmt: skip
+        write_image(folder / "cam2_1.tif", data)
+        fails(command(folder, tmp_path / "out"), code, word, capfd)
+    (folder / "cam2_1.tif").write_bytes((folder / "cam2_0.tif").read_bytes()[:2000])
+    fails(command(folder, tmp_path / "out"), "image_unreadable", "cam2_1.tif", capfd)
+    Image.fromarray(np.stack([good, good // 2, good], axis=-1)).save(folder / "cam2_1.tif")
+    fails(command(folder, tmp_path / "out"), "image_unsupported", "colour", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_calibrations(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    content = json.loads((folder / "calibration.json").read_text())
+    path = folder / "calibration.json"
+    for changes, code in (
+        ({"phd_px": float("nan")}, "calibration_invalid"),
+        ({"aspect": None}, "calibration_unreadable"),
+    ):
+        path.write_text(json.dumps({**content, "cam2": {**content["cam2"], **changes}}))
+        fails(command(folder, tmp_path / "out"), code, next(iter(changes)), capfd)
+    path.write_text(json.dumps({**content, "image_size_px": {"cam1": [512, 480], "cam2": [512, 480]}}))
+    fails(command(folder, tmp_path / "out"), "image_size_mismatch", "512 x 480", capfd)
+    path.write_text(json.dumps({"cam1": content["cam1"], "cam2": content["cam1"]}))
+    fails(command(folder, tmp_path / "out"), "calibration_invalid", "same place", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+def test_swapped_cameras_are_refused(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    swapped = command(folder, tmp_path / "out", cam1=str(folder / "cam2_*.tif"), cam2=str(folder / "cam1_*.tif"))
+    fails(swapped, "cameras_swapped", "", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+def test_noise_without_texture_is_refused(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    rng = np.random.default_rng(2)
+    for cam in CAMERA_NAMES:
+        write_image(folder / f"{cam}_0.tif", rng.normal(120, 2, (SIZE[1], SIZE[0])).round().astype(np.uint8))
+    fails(command(folder, tmp_path / "out"), "image_blank", "noise only", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system that takes no new folders")
+def test_a_folder_that_cannot_be_made(folder: Path, capfd: Any) -> None:
+    fails(command(folder, Path("/proc/stereorig/out")), "output_unusable", "/proc/stereorig", capfd)
+
+
+@pytest.mark.specimen
+def test_the_specimen(specimen_dir: Path, tmp_path: Path) -> None:
+    code = main([
+        "measure", "--cam1", str(specimen_dir / "*_0.tif"), "--cam2", str(specimen_dir / "*_1.tif"),
+        "--calibration", str(specimen_dir / "calibration_dice.xml"), "--roi", "340,430,1560,690",
+        "--out", str(tmp_path / "out"),
+    ])  # fmt: skip
+    assert code == 0
+    steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
+    assert len(steps) == 3
+    for step in steps:
+        assert step["points"] == 123 * 27
+        assert step["valid_fraction"] >= 0.97
+        # the calibration that came with the images is off by 0.09 px across the epipolar lines
+        assert step["epipolar_sd_px"] <= 0.08
+        assert abs(step["epipolar_mean_px"]) <= 0.1
+        assert step["plane_residual_rms_mm"] <= 0.015
+        # nothing wrong among the valid: no point far from the epipolar line
+        with xr.open_dataset(tmp_path / "out" / step["file"]) as data:
+            ok = np.isin(data["status"], (0, 10))
+            off = data["epipolar_px"].values[ok] - np.median(data["epipolar_px"].values[ok])
+            assert np.abs(off).max() <= 5 * 0.08

@@ -1,0 +1,44 @@
+"""Tasks for the compute worker's tests; the worker's process imports this module."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import cv2
+
+from core.errors import RegionError
+from server.worker_process import current_task
+
+
+def add(a: int, b: int) -> int:
+    return a + b
+
+
+def refuse(value: int) -> None:
+    raise RegionError(f"value {value} is no region.", code="region_empty", value=value)
+
+
+def facts() -> dict[str, object]:
+    return {"pid": os.getpid(), "cv2_threads": cv2.getNumThreads(), "numba": os.environ["NUMBA_NUM_THREADS"]}
+
+
+def count(n: int, pause_s: float) -> int:
+    task = current_task()
+    for index in range(n):
+        task.check()
+        task.progress("counting", index + 1, n)
+        time.sleep(pause_s)
+    return n
+
+
+def deaf(seconds: float) -> None:
+    """Work on without looking at the token."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(0.01)
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
