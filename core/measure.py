@@ -278,6 +278,7 @@ class _Run:
         self.points = PointFits.empty(len(self.xy_px), self.fitter.comparisons)
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
+        self.checked = False  # whether every point that stands went through the gates
         rows, cols = np.clip(np.rint(self.xy_px[:, ::-1]).astype(int), 0, np.array(self.ref1.shape) - 1).T
         self.texture = self.ref1.subset_variance(self.options.subset_px)[rows, cols]
 
@@ -436,10 +437,8 @@ class _Run:
                 remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
                 "these images, or give a seed point.",
             )
-        self._grow()
-        self._gate()
-        for _ in range(2):
-            if self._grow() == 0:
+        for _ in range(3):
+            if self._grow() == 0 and self.checked:
                 break
             self._gate()
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
@@ -454,13 +453,16 @@ class _Run:
         return float(untouched.sum()) / max(int(self.usable.sum()), 1)
 
     def _grow(self) -> int:
-        return grow(
+        added = grow(
             self.fitter, self.points, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
             progress=self.progress, cancel=self.cancel,
         )  # fmt: skip
+        self.checked = self.checked and added == 0
+        return added
 
-    def _gate(self) -> int:
-        return apply_gates(
+    def _gate(self) -> None:
+        apply_gates(
             self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
             options=self.options.gates,
         )  # fmt: skip
+        self.checked = True
