@@ -7,11 +7,10 @@ so whoever calls one holds :data:`kernel_lock` and calls :func:`apply_threads` f
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numba
 
@@ -79,23 +78,27 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int) -> None:
                 return
             function(*item)
 
-    helpers = min(_threads, (n + size - 1) // size) - 1
-    pending = [_executor().submit(work) for _ in itertools.repeat(None, helpers)] if helpers > 0 else []
+    pending = _submit(work, min(_threads, (n + size - 1) // size) - 1)
     try:
         work()
     finally:
         for future in pending:
-            future.exception()
+            # nothing is left for a helper that has not begun; one that has is waited for, since it writes results
+            if not future.cancel():
+                future.exception()
     for future in pending:
-        future.result()
+        if not future.cancelled():
+            future.result()
 
 
-def _executor() -> ThreadPoolExecutor:
+def _submit(work: Callable[[], None], helpers: int) -> list[Future[None]]:
     global _pool
+    if helpers < 1:
+        return []
     with _state_lock:
         if _pool is None:
             _pool = ThreadPoolExecutor(max_workers=max(1, _threads - 1), thread_name_prefix="stereorig-compute")
-        return _pool
+        return [_pool.submit(work) for _ in range(helpers)]
 
 
 _threads: int = available_threads()

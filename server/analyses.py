@@ -10,16 +10,15 @@ from core.errors import (
     Cancelled,
     InputError,
     MeasurementError,
-    RegionError,
     StateError,
     StereorigError,
     StorageError,
 )  # fmt: skip
-from server.api.models import AnalysisRequest
 from server.compute import run_task
 from server.io.files import sha256_of
 from server.io.images import decode_mask, read_image
 from server.jobs import Job, problem_of
+from server.regions import make_grid
 from server.service import Service
 from server.store.durable import without_nan
 from server.tasks import StepTask, measure_step
@@ -61,48 +60,10 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
     }
 
 
-def check_region(service: Service, test_id: str, reference: int, body: AnalysisRequest, mask: bytes | None) -> None:
-    """Refuse a region that leaves nothing to measure, before a job is made of it.
-
-    Raises
-    ------
-    RegionError
-        ``region_empty``, ``region_outside``, ``subset_too_large``, ``seed_outside`` or ``mask_size``.
-    """
+def check_region(service: Service, test_id: str, reference: int, settings: dict[str, Any], mask: bytes | None) -> None:
+    """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
     image = read_image(service.tests.step(test_id, reference).cam1)
-    rows, cols = image.shape
-    inside = f"Camera 1's image is {cols} x {rows} px."
-    if body.subset_px > min(rows, cols):
-        raise RegionError(f"A subset of {body.subset_px} px does not fit. {inside}", code="subset_too_large",
-                          remedy="Take a smaller subset.")  # fmt: skip
-    if body.region.rectangle is not None:
-        x0, y0, x1, y1 = body.region.rectangle
-        if x1 <= x0 or y1 <= y0:
-            raise RegionError(f"The rectangle from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) is empty.", code="region_empty",
-                              remedy="Give the upper left corner first, then the lower right one.")  # fmt: skip
-        corners = [(x0, y0), (x1, y1)]
-    else:
-        corners = list(body.region.polygon or [])
-    _check_inside("region", corners, cols, rows)
-    _check_inside("seed", list(body.seeds or []), cols, rows)
-    if mask is not None:
-        found = decode_mask(mask)
-        if found.shape != (rows, cols):
-            raise RegionError(f"The mask is {found.shape[1]} x {found.shape[0]} px. {inside}", code="mask_size",
-                              remedy="Draw the mask over camera 1's reference image.")  # fmt: skip
-        if not found.any():
-            raise RegionError("The mask is black everywhere.", code="region_empty",
-                              remedy="Paint white where points may lie.")  # fmt: skip
-
-
-def _check_inside(what: str, points: list[tuple[float, float]], cols: int, rows: int) -> None:
-    for x, y in points:
-        if not (0.0 <= x <= cols - 1 and 0.0 <= y <= rows - 1):
-            raise RegionError(
-                f"The {what}'s point ({x:g}, {y:g}) lies outside camera 1's image of {cols} x {rows} px.",
-                code=f"{what}_outside",
-                remedy="Stay inside camera 1's reference image.",
-            )
+    make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
 
 
 class StepsFailedError(MeasurementError):

@@ -30,6 +30,7 @@ from server.io.calibration_any import LoadedCalibration, load_calibration
 from server.io.images import GrayImage, read_image, read_mask
 from server.io.netcdf import Provenance, read_field, write_field
 from server.io.summary import summarise
+from server.regions import make_grid
 from server.tasks import StepTask
 from server.version import software_version
 from server.worker_process import current_task
@@ -127,20 +128,9 @@ def _check_sizes(calibration: LoadedCalibration, one: GrayImage, two: GrayImage)
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:
-    region, step = task.settings["region"], float(task.settings["step_px"])
     mask_path = Path(task.folder) / "mask.png"
     mask = read_mask(mask_path) if mask_path.exists() else None
-    if mask is not None and mask.shape != image.shape:
-        raise ImageError(f"The mask is {mask.shape[1]} x {mask.shape[0]} px, the image {image.shape[1]} x "
-                         f"{image.shape[0]} px.", code="mask_size")  # fmt: skip
-    if region["rectangle"] is not None:
-        grid = PointGrid.rectangle(*region["rectangle"], step_px=step)
-    elif region["polygon"] is not None:
-        grid = PointGrid.polygon(np.asarray(region["polygon"], dtype=np.float64), step_px=step)
-    else:
-        assert mask is not None  # the request has one of the three
-        return PointGrid.mask(mask, step_px=step)
-    return grid if mask is None else grid.within_mask(mask)
+    return make_grid(task.settings, mask, (image.shape[0], image.shape[1]))
 
 
 def _image(task: StepTask, which: str) -> GrayImage:

@@ -103,7 +103,7 @@ def tiny_config(**replacements: str) -> RigConfig:
 @contextlib.contextmanager
 def served(service: Service) -> Iterator[httpx.Client]:
     """Serve on a free loopback port in a thread of this process; yields a client."""
-    listener = socket.socket()
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.bind(("127.0.0.1", 0))
     settings = uvicorn.Config(create_app(service, close_service=False), log_level="error", timeout_graceful_shutdown=2)
     server = uvicorn.Server(settings)

@@ -103,6 +103,20 @@ def test_noise_stays_within_the_study_and_is_reported():
     assert 0.85 < np.sqrt(np.mean(offset_variance)) / np.sqrt(np.var(offset, axis=0, ddof=1).mean()) < 1.15
 
 
+def test_strong_noise_biases_little():
+    pair, rng = paper_pair(), np.random.default_rng(6)
+    w, G = starts("moved")
+    error = []
+    for _ in range(20):
+        fit = fit_motion(
+            pair, *noisy("rest", 6.0, rng), *noisy("moved", 6.0, rng), XY, w, G, MatchOptions(subset_px=21)
+        )
+        assert (fit.status == 0).all()
+        error.append(1e3 * (motion_geometry(pair, XY, fit.w, fit.G).uvw_mm - truth("moved")[1]))
+    assert abs(np.mean(error, axis=(0, 1))[2]) < 0.15
+    assert abs(np.mean(fit.noise) - 6.0) < 0.6
+
+
 def test_shape_noise_and_its_covariance():
     pair, rng = paper_pair(), np.random.default_rng(2)
     w, _ = starts("rest")
@@ -162,6 +176,30 @@ def test_points_that_cannot_be_matched_say_why():
     far = fit_shape(pair, one, two, xy[1:2], w[1:2] * [1.5, 1.0, 1.0])
     assert far.status[0] != 0
     assert np.isnan(far.w).all()
+
+
+@pytest.mark.fault(36)
+def test_too_little_texture_is_refused():
+    pair, rng = paper_pair(), np.random.default_rng(7)
+    w, G = starts("rest")
+    plane = PLANES["rest"]
+    x, y = np.meshgrid(np.arange(160.0), np.arange(160.0))
+
+    def stripes(camera):
+        return 120.0 + 80.0 * np.sin(12.0 * plane.material(camera, np.stack([x, y], -1)) @ [0.707, -0.707])
+
+    for weak in (
+        [120.0 + 0.01 * (image - 120.0) for image in images("rest")],  # half a grey level of texture under the noise
+        [stripes(pair.cam1), stripes(pair.cam2)],
+    ):
+        one, two = (digitise(image, noise=2.0, rng=rng) for image in weak)
+        one_t, two_t = (digitise(image, noise=2.0, rng=rng) for image in weak)
+        shape = fit_shape(pair, one, two, XY, w, MatchOptions(subset_px=21))
+        motion = fit_motion(pair, one, two, one_t, two_t, XY, w, G, MatchOptions(subset_px=21))
+        for fit in (shape, motion):
+            assert (fit.status != 0).all()
+            assert (fit.status == 4).mean() > 0.5
+            assert np.isnan(fit.w).all()
 
 
 def test_prepared_and_raw_images_give_the_same():
@@ -241,6 +279,15 @@ def test_ranges_cover_everything_once_and_hand_errors_on():
 
     run_ranges(count, 1001, 7)
     assert (done == 1).all()
+
+    nested = np.zeros((40, 50), int)
+
+    def outer(first, last):
+        for row in range(first, last):
+            run_ranges(lambda a, b, row=row: nested[row].__setitem__(slice(a, b), 1), 50, 3)
+
+    run_ranges(outer, 40, 2)  # a range may itself run ranges
+    assert (nested == 1).all()
 
     def fail(first, last):
         if first >= 500:

@@ -385,6 +385,36 @@ def test_events_are_numbered_and_resume(service: Service, client: httpx.Client) 
     assert events[0].number == first + 1
 
 
+def test_event_stream_sends_what_came_after_the_last_number_seen(service: Service, client: httpx.Client) -> None:
+    before = service.hub.last_number
+    test_id = new_test(client)
+    with client.stream("GET", f"{API}/events", headers={"Last-Event-ID": str(before)}) as answer:
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        lines = []
+        for line in answer.iter_lines():
+            lines.append(line)
+            if line == "":
+                break
+    assert f"id: {before + 1}" in lines
+    assert "event: test" in lines
+    assert any(test_id in line for line in lines)
+
+
+def test_live_view_is_a_stream_of_jpegs(client: httpx.Client) -> None:
+    with client.stream("GET", f"{API}/cameras/cam1/stream.mjpg", params={"rate_hz": 20}) as answer:
+        assert answer.headers["content-type"] == "multipart/x-mixed-replace; boundary=frame"
+        content = b""
+        for chunk in answer.iter_bytes():
+            content += chunk
+            if content.count(b"--frame") >= 3:
+                break
+    first = content.split(b"--frame")[1].partition(b"\r\n\r\n")[2]
+    image = np.asarray(Image.open(io.BytesIO(first)))
+    assert image.shape == (144, 160)
+    refused = client.get(f"{API}/cameras/cam1/stream.mjpg", params={"rate_hz": 1000})
+    assert_problem(refused, 422, "invalid_request")
+
+
 def test_job_events_end_with_the_job(client: httpx.Client) -> None:
     job = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 0.5}}).json()["job"]
     with client.stream("GET", f"{API}/jobs/{job['id']}/events") as answer:

@@ -159,13 +159,14 @@ def test_results_come_as_npy_file_and_probe(
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        ({"region": {"rectangle": [100, 100, 100, 100]}}, "region_empty"),
+        ({"region": {"rectangle": [100, 100, 100, 100]}}, "region_too_small"),
+        ({"region": {"rectangle": [100, 60, 100, 170]}}, "region_too_small"),
         ({"region": {"rectangle": [100, 100, 90, 120]}}, "region_empty"),
-        ({"region": {"rectangle": [100, 100, 400, 120]}}, "region_outside"),
+        ({"region": {"rectangle": [100, 100, 400, 120]}}, "region_outside_image"),
         ({"region": {"polygon": [[10, 10], [20, 20]]}}, "invalid_request"),
         ({"region": {}}, "invalid_request"),
         ({"region": {"rectangle": RECTANGLE}, "subset_px": 24}, "invalid_request"),
-        ({"region": {"rectangle": RECTANGLE}, "subset_px": 251}, "subset_too_large"),
+        ({"region": {"rectangle": RECTANGLE}, "subset_px": 251}, "region_too_small"),
         ({"region": {"rectangle": RECTANGLE}, "seeds": [[300, 10]]}, "seed_outside"),
         ({"region": {"rectangle": RECTANGLE}, "steps": [1, 9]}, "step_missing"),
         ({"region": {"mask_png_base64": "!!"}}, "mask_unreadable"),

@@ -103,5 +103,5 @@ def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quinti
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         raise ImageError("the image holds NaN or infinite grey levels.")
     coefficients = ndimage.spline_filter(pixels.astype(np.float64), order=order, output=np.float64, mode="mirror")
-    padded = np.pad(coefficients, PAD, mode="reflect").astype(np.float32)
+    padded = np.pad(coefficients.astype(np.float32), PAD, mode="reflect")
     return ImageData(padded, np.array(pixels, dtype=np.float32, order="C"), order)

@@ -31,8 +31,8 @@ class MatchOptions:
         Motion of the subset's corners that may remain unmade when the iteration stops, px. Its own noise is some ten
         times larger at the default.
     max_sigma_px
-        Points whose match is predicted to scatter more than this (standard deviation of camera 2's position, px)
-        have too little texture.
+        Points whose match is predicted to scatter more than this in any image and direction (standard deviation, px)
+        have too little texture. A texture of stripes fails so too.
     max_step_px
         A Gauss-Newton step that moves a corner of the subset further is cut down to this, px.
     """

@@ -36,13 +36,13 @@ def create_analysis(
     calibration = service.tests.calibration_file(test_id)
     steps = analyses.steps_to_measure(service, test_id, body.reference, body.steps)
     mask = _mask_bytes(body)
-    analyses.check_region(service, test_id, steps[0], body, mask)
+    settings = body.model_dump(exclude={"kind", "label", "steps"})
+    settings["region"].pop("mask_png_base64")
+    analyses.check_region(service, test_id, steps[0], settings, mask)
     request = mark(f"tests/{test_id}/analyses", key, body)
 
     def make() -> dict[str, Any]:
         made: dict[str, Any] = {}
-        settings = body.model_dump(exclude={"kind", "label", "steps"})
-        settings["region"].pop("mask_png_base64")
         document = {
             "kind": body.kind,
             "label": body.label,

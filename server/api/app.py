@@ -78,6 +78,8 @@ def _name_problem(app: FastAPI) -> None:
                 components.pop(name, None)
             for path in schema["paths"].values():
                 for operation in path.values():
+                    # the guard's, before any operation sees the request
+                    operation.setdefault("responses", {}).update(problems.errors(403))
                     invalid = operation.get("responses", {}).get("422")
                     if invalid is not None and "application/json" in invalid.get("content", {}):
                         operation["responses"]["422"] = problems.errors(422)[422]

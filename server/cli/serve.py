@@ -74,7 +74,8 @@ def check_host(host: str) -> None:
 
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    # asyncio switches Nagle's delay off only where the protocol is named
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
@@ -95,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     import uvicorn
 
     from server.api.app import create_app
+    from server.api.guard import LOOPBACK_NAMES
     from server.config import load_config
     from server.service import Service
 
@@ -105,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     except BaseException:
         listener.close()
         raise
-    app = create_app(service)
+    app = create_app(service, hosts=LOOPBACK_NAMES | {args.host})
     name = f"[{args.host}]" if ":" in args.host else args.host
     url = f"http://{name}:{listener.getsockname()[1]}"
 

@@ -180,7 +180,7 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         return LOW_TEXTURE, 0
     sum_j, sum_fj = sum_both[0], sum_both[1]
     reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    roughness = texture_roughness(hessian, lens1, xc, yc, f2)
+    roughness, weakest = texture_roughness(hessian, lens1, xc, yc, f2)
     if not 1e-6 < roughness < WHITE_ROUGHNESS:
         return LOW_TEXTURE, 0
     w, step, rhs13, small = vectors[0], vectors[1], vectors[2], vectors[3]
@@ -268,6 +268,8 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         if settled(motion, previous, tolerance):
             status = OK
         previous = motion
+    if not w[0] > 0.0:  # behind camera 1
+        return NOT_CONVERGED, iterations
     for j in range(3):
         out[j] = w[j]
         out[13 + j] = levels[j, 2]
@@ -286,7 +288,9 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         for b in range(4):
             out[17 + 5 * a + b] = small[b] * inflated
         out[21 + 5 * a] = small[free - 1] * inflated
-    sigma = max(math.sqrt(out[17]) * along, math.sqrt(out[23]) * lens1[1] / G[2, 0])
-    if status == OK:
-        status = texture_status(share, sigma, max_sigma, min(levels[0, 2], levels[1, 2], levels[2, 2]))
+    # px: along and across camera 2's epipolar line, and both ways in camera 1 at t
+    sigma = max(math.sqrt(out[17]) * along, math.sqrt(out[41]))
+    sigma = max(sigma, math.sqrt(max(out[23], out[29])) * lens1[1] / G[2, 0])
+    share = noise_share(variance, weakest, f2, n, order)
+    status = texture_status(status, share, sigma, max_sigma, min(levels[0, 2], levels[1, 2], levels[2, 2]))
     return status, iterations

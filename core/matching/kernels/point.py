@@ -237,7 +237,7 @@ def residual_variance(levels, images, n, f2, unknowns, order):
 
 @njit(nogil=True, error_model="numpy")
 def noise_share(variance, roughness, f2, n, order):
-    """Share of noise in the reference's squared gradients, hence in the Hessian.
+    """Share of noise in the reference's squared gradients of this roughness, hence in the Hessian.
 
     The Hessian H is larger than the sensitivity H (1 - share) that turns a shift into its right-hand side, so the
     covariance is sigma^2 H^-1 / (1 - share)^2: the sandwich.
@@ -248,11 +248,13 @@ def noise_share(variance, roughness, f2, n, order):
 
 @njit(nogil=True, error_model="numpy")
 def texture_roughness(hessian, lens1, xc, yc, f2):
-    """Mean squared gradient (per px) over the grey levels' variance."""
+    """Squared gradient (per px) over the grey levels' variance: mean over directions, and in the weakest direction."""
     j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
-    gxx = hessian[3, 3] / (j11 * j11 + j21 * j21)
-    gyy = hessian[6, 6] / (j12 * j12 + j22 * j22)
-    return 0.5 * (gxx + gyy) / f2
+    xx, yy = j11 * j11 + j21 * j21, j12 * j12 + j22 * j22
+    gxx, gyy = hessian[3, 3] / xx, hessian[6, 6] / yy
+    gxy = hessian[3, 6] / math.sqrt(xx * yy)
+    mean = 0.5 * (gxx + gyy)
+    return mean / f2, (mean - math.sqrt(0.25 * (gxx - gyy) ** 2 + gxy * gxy)) / f2
 
 
 @njit(nogil=True, error_model="numpy")
@@ -265,8 +267,12 @@ def settled(motion, previous, tolerance):
 
 
 @njit(nogil=True, error_model="numpy")
-def texture_status(share, sigma_px, max_sigma_px, zncc):
-    """Status of a point whose iteration settled: noise taken for texture, or a match that scatters too much."""
-    if share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:
+def texture_status(status, share, sigma_px, max_sigma_px, zncc):
+    """Final status: a point that settled, or did not, on noise taken for texture or on a match that scatters."""
+    if status == OK and share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:
         return OK
-    return LOW_TEXTURE if zncc > 0.5 else LOW_CORRELATION
+    if zncc > 0.5 and not share < MAX_NOISE_SHARE:
+        return LOW_TEXTURE
+    if status == OK:
+        return LOW_TEXTURE if zncc > 0.5 else LOW_CORRELATION
+    return status

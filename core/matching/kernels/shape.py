@@ -61,7 +61,7 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     if not f2 > 0.0:
         return LOW_TEXTURE, 0
     reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    roughness = texture_roughness(hessian, lens1, xc, yc, f2)
+    roughness, weakest = texture_roughness(hessian, lens1, xc, yc, f2)
     if not 1e-6 < roughness < WHITE_ROUGHNESS:
         return LOW_TEXTURE, 0
     w = vectors[0]
@@ -114,6 +114,8 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
     if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
         return OUTSIDE_IMAGE, iterations
+    if not w[0] > 0.0:  # behind camera 1
+        return NOT_CONVERGED, iterations
     out[0], out[1], out[2], out[3], out[4] = w[0], w[1], w[2], e, levels[0, 2]
     variance = residual_variance(levels, 1, n, f2, 4.0, order)
     share = noise_share(variance, roughness, f2, n, order)
@@ -132,6 +134,7 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     solve(reduced, column, 4)
     out[5] = math.sqrt(variance)
     out[6], out[7], out[8] = c00, c01, column[3] * inflated
-    if status == OK:
-        status = texture_status(share, math.sqrt(c00) * along, max_sigma, levels[0, 2])
+    sigma = max(math.sqrt(c00) * along, math.sqrt(out[8]))
+    share = noise_share(variance, weakest, f2, n, order)
+    status = texture_status(status, share, sigma, max_sigma, levels[0, 2])
     return status, iterations
