@@ -7,10 +7,8 @@ reading the stage's state and stopping it do not.
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from core.errors import DeviceError, InputError, StageError, StateError, StereorigError
@@ -18,8 +16,8 @@ from drivers.frames import CameraSettings
 from drivers.stage import MoveResult
 from server.config import CameraName, RigConfig
 from server.hardware import HardwareGate
-from server.jobs import problem_of
-from server.rig.build import Devices, open_devices
+from server.problem import problem_of
+from server.rig.build import Devices, first_settings, open_devices
 from server.rig.cameras import CAMERAS, CameraPair, PairShot
 
 _log = logging.getLogger("stereorig.rig")
@@ -41,6 +39,8 @@ class Rig:
         self.gate = gate
         self._devices: Devices | None = None
         self._fault: dict[str, Any] | None = {"code": "not_connected", "cause": "The rig was not opened yet."}
+        # what the cameras were last set to, so that a reconnected one gets it again
+        self._settings = {cam: first_settings(config, cam) for cam in CAMERAS}
         self.scene: dict[str, Any] | None = None
 
     # opening and closing ----------------------------------------------------------------------------------------
@@ -48,7 +48,7 @@ class Rig:
     def open(self) -> None:
         """Open cameras and stage; a fault is kept and shown, and :meth:`reconnect` tries again."""
         try:
-            self._devices = open_devices(self.config)
+            self._devices = open_devices(self.config, self._settings)
             self._fault = None
             if self._devices.world is not None and self.scene is None:
                 self.scene = {"scene": "grid", "load": 0.0}
@@ -153,7 +153,9 @@ class Rig:
     def configure(self, cam: CameraName, settings: CameraSettings) -> CameraSettings:
         """Change settings on the owner thread; returns what the device really took."""
         pair = self.pair
-        return self.gate.call(lambda: pair.configure(cam, settings))
+        taken = self.gate.call(lambda: pair.configure(cam, settings))
+        self._settings[cam] = replace(taken, region_px=None)
+        return taken
 
     def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs; call on the owner thread, with the hold."""
@@ -259,22 +261,3 @@ class Rig:
     def stop(self) -> None:
         """Stop every axis, now, from any thread."""
         self._ready().stage.stop()
-
-    def stop_again_soon(self) -> None:
-        """Stop once more in 50 ms.
-
-        A job that passed its last check before it was cancelled may start a motion a moment after the first stop.
-        """
-
-        def again() -> None:
-            devices = self._devices
-            if devices is not None:
-                devices.stage.stop()
-
-        timer = threading.Timer(0.05, again)
-        timer.daemon = True
-        timer.start()
-
-    def wait_settled(self) -> None:
-        """Wait as long as the rig file says after a motion of the scene."""
-        time.sleep(self.config.stage.settle_ms / 1000.0)
