@@ -16,7 +16,7 @@ from core.calibration import (
     calibrate,
     check_known_distance,
 )
-from core.errors import CalibrationError, CalibrationInputError, StereorigError
+from core.errors import CalibrationError, CalibrationInputError
 from tests.calibration_truth import PAPER, Array, Grid, nodes, project
 
 NOISE_PX = 0.0022
@@ -162,10 +162,15 @@ def half_turned(xy: Array) -> Array:
 
 
 @pytest.mark.fault(29)
-def test_swapped_cameras_are_named() -> None:
-    views = [dataclasses.replace(v, camera="cam2" if v.camera == "cam1" else "cam1") for v in make_views()]
+@pytest.mark.parametrize("angles", [(-29.0, 31.0), (1.0, 24.0), (-4.2, 4.1)])
+def test_swapped_cameras_are_named(angles: tuple[float, float]) -> None:
+    cameras = [{**c, "gamma": np.radians(a)} for c, a in zip(PAPER, angles, strict=True)]
+    nominal = tuple(dataclasses.replace(n, angle_deg=round(a)) for n, a in zip(NOMINAL, angles, strict=True))
+    views = make_views(cameras=cameras)
+    assert calibrate(views, Grid(), (nominal[0], nominal[1])).fitted.mean.rbe_px < 0.003
+    views = [dataclasses.replace(v, camera="cam2" if v.camera == "cam1" else "cam1") for v in views]
     with pytest.raises(CalibrationInputError, match="swapped") as caught:
-        calibrate(views, Grid(), NOMINAL)
+        calibrate(views, Grid(), (nominal[0], nominal[1]))
     assert caught.value.code == "cameras_swapped"
 
 
@@ -305,6 +310,37 @@ def test_nothing_usable_comes_from_numbers_that_are_not() -> None:
         calibrate(bad, Grid(), NOMINAL)
     assert caught.value.code == "view_not_finite"
     collapsed = [dataclasses.replace(v, xy_px=np.full_like(v.xy_px, 200.0)) for v in views]
-    with pytest.raises((CalibrationError, CalibrationInputError)) as other:
+    with pytest.raises(CalibrationInputError) as other:
         calibrate(collapsed, Grid(), NOMINAL)
-    assert isinstance(other.value, StereorigError)
+    assert other.value.code == "view_degenerate"
+
+
+@pytest.mark.fault(33)
+@pytest.mark.parametrize("seed", range(6))
+def test_nonsense_is_never_called_usable(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scale = (3.0, 20.0, 100.0)[seed % 3]
+    views = [
+        dataclasses.replace(v, xy_px=np.clip(v.xy_px + scale * rng.standard_normal(v.xy_px.shape), 0.0, 479.0))
+        for v in make_views()
+    ]
+    try:
+        result = calibrate(views, Grid(node_tolerance_mm=0.004), NOMINAL, HELD)
+    except (CalibrationError, CalibrationInputError):
+        return  # refused: the other right outcome
+    assert result.verdict.level == "failed"
+
+
+@pytest.mark.fault(33)
+def test_a_solver_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr("core.calibration.solve.adjust", fails)
+    with pytest.raises(CalibrationError, match="Eigenvalues did not converge") as caught:
+        calibrate(make_views(), Grid(), NOMINAL)
+    assert caught.value.code == "calibration_singular"
+    monkeypatch.undo()
+    with pytest.raises(CalibrationError, match="did not settle in 1 iterations") as other:
+        calibrate(make_views(noise=0.5), Grid(node_tolerance_mm=0.1), NOMINAL, CalibrationOptions(max_iterations=1))
+    assert other.value.code == "calibration_not_converged"

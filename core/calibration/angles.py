@@ -44,15 +44,16 @@ def check_angles(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -
                 camera=n,
                 **context,
             )
+    crossed = abs(gamma["cam1"] - nominal["cam2"]), abs(gamma["cam2"] - nominal["cam1"])
+    # nominal angles may be 8 degrees off, but hardly so that exchanging them makes both fit
+    if max(off.values()) > 5.0 and max(crossed) < (0.5 if max(off.values()) > 10.0 else 0.25) * max(off.values()):
+        raise CalibrationInputError(
+            f"The cameras seem swapped: {found} degrees.",
+            code="cameras_swapped",
+            remedy="Exchange the images or the nominal angles of cam1 and cam2 (or both images are mirrored).",
+            **context,
+        )
     if max(off.values()) > 10.0:
-        crossed = abs(gamma["cam1"] - nominal["cam2"]), abs(gamma["cam2"] - nominal["cam1"])
-        if max(crossed) < 0.5 * max(off.values()):
-            raise CalibrationInputError(
-                f"The cameras seem swapped: {found} degrees.",
-                code="cameras_swapped",
-                remedy="Exchange the images or the nominal angles of cam1 and cam2 (or both images are mirrored).",
-                **context,
-            )
         for n in gamma:
             if off[n] > 10.0 and abs(gamma[n] + nominal[n]) < 0.5 * off[n]:
                 raise CalibrationInputError(
