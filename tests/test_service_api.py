@@ -138,6 +138,7 @@ def test_move_reads_positions_back(client: httpx.Client) -> None:
         ('{"positions_mm": {"1": 6.5}}', "out_of_limits"),
         ('{"by_mm": {"1": -50}}', "out_of_limits"),
         ('{"dz_mm": {"cam2": 7}}', "out_of_limits"),
+        ('{"positions_mm": {"1": -6.0}}', "out_of_limits"),  # no room left to arrive from below
         ('{"positions_mm": {"3": 1}}', "invalid_axis"),
         ('{"positions_mm": {"1": NaN}}', "invalid_request"),
         ('{"positions_mm": {"1": Infinity}}', "invalid_request"),
@@ -181,12 +182,12 @@ def test_second_client_gets_the_holder_and_stop_works_during_a_move(client: http
 
 
 def test_cancelling_a_move_stops_the_axis(client: httpx.Client) -> None:
-    job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": -6.0}}).json()["job"]
+    job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": -5.5}}).json()["job"]
     assert client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
     assert wait_for_job(client, job)["state"] == "cancelled"
     axis = client.get(f"{API}/stage").json()["axes"][1]
     assert axis["moving"] is False
-    assert axis["position_mm"] > -5.9
+    assert axis["position_mm"] > -5.4
     assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
 
 

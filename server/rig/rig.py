@@ -229,7 +229,7 @@ class Rig:
                     target_mm=target,
                     limits_mm=[limits.low_mm, limits.high_mm],
                 )
-        for axis in targets_mm:
+        for axis, target in targets_mm.items():
             status = stage.state(axis)
             if status.state.value in ("not_homed", "motor_off", "fault", "configuration"):
                 code = status.state.value if status.state.value in ("not_homed", "motor_off") else "stage_not_ready"
@@ -239,6 +239,23 @@ class Rig:
                     remedy="POST /stage/home first.",
                     axis=axis,
                 )
+            self._check_room_to_arrive(axis, status.position_mm, target)
+
+    def _check_room_to_arrive(self, axis: int, here_mm: float, target_mm: float) -> None:
+        """Refuse a target that could only be arrived at from the wrong side; the driver would, but in mid-job."""
+        section, limits = self.config.stage, self._ready().stage.limits(axis)
+        sign = 1.0 if section.approach_from == "below" else -1.0
+        turn = target_mm - sign * section.backlash_mm
+        needed = section.backlash_mm > 0.0 and sign * (target_mm - here_mm) < section.backlash_mm
+        if needed and not limits.low_mm <= turn <= limits.high_mm:
+            raise StageError(
+                f"Axis {axis} cannot arrive at {target_mm:g} mm from {section.approach_from}: it would turn at {turn:g} mm, "
+                f"outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                code="out_of_limits",
+                remedy=f"Stay the backlash ({section.backlash_mm:g} mm) inside the limit.",
+                axis=axis,
+                target_mm=target_mm,
+            )
 
     def positions_mm(self, axes: tuple[int, ...] | None = None) -> dict[int, float]:
         """Read positions back."""
