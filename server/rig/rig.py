@@ -249,8 +249,8 @@ class Rig:
         needed = section.backlash_mm > 0.0 and sign * (target_mm - here_mm) < section.backlash_mm
         if needed and not limits.low_mm <= turn <= limits.high_mm:
             raise StageError(
-                f"Axis {axis} cannot arrive at {target_mm:g} mm from {section.approach_from}: it would turn at {turn:g} mm, "
-                f"outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                f"Axis {axis} cannot arrive at {target_mm:g} mm from {section.approach_from}: it would turn at "
+                f"{turn:g} mm, outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
                 code="out_of_limits",
                 remedy=f"Stay the backlash ({section.backlash_mm:g} mm) inside the limit.",
                 axis=axis,
