@@ -35,6 +35,7 @@ from core.field.seeds import (
     swept_places,
 )
 from core.field.starts import Starts
+from core.field.unreached import mark_outside
 from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
@@ -441,9 +442,11 @@ class _Run:
             if self._grow() == 0 and self.checked:
                 break
             self._gate()
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
             self._grow()
             self._gate()
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
         return assemble(self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape)
 
