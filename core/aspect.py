@@ -29,6 +29,7 @@ _BLOCK = 5
 _CENTRE_PRIOR = 0.04  # of the image's width: the image centre is never far from the middle, and hardly matters
 _KAPPA_PRIOR = 0.1  # kappa r^2 at the image's corner
 _SIGMA_FLOOR_PX = 1e-4
+_LEAST_MOVED = 3
 _LEAST_SCALE_CHANGE = 1e-3
 _NAMES = (
     "phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect", "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm",
@@ -44,12 +45,12 @@ class AspectResult:
     ----------
     aspect, sigma
         The best value and its standard deviation: the refined one where there is one, else the first.
-    first, first_sigma
+    first_estimate, first_estimate_sigma
         Mean over blocks and images of the diagonals' ratio; scatter of the images' means over the root of their number.
     blocks
         (images, block positions along X_sys, along Y_sys) ratio of each 5 x 5 block.
     refined, refined_sigma
-        From the fit over translated images; None without known travel.
+        From the fit over translated images; None from fewer than three without known travel.
     tilt_rad
         (about the rows, about the columns) of the grid, from that fit; None without it. Without it, lambda is right to
         half of the tilt's square only.
@@ -57,8 +58,8 @@ class AspectResult:
 
     aspect: float
     sigma: float
-    first: float
-    first_sigma: float
+    first_estimate: float
+    first_estimate_sigma: float
     blocks: Float
     refined: float | None
     refined_sigma: float | None
@@ -104,7 +105,9 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
         Detections of one target by one camera; the paper takes twenty.
     dz_mm
         Travel of the camera along its axis at each view, away from the target. With travel the estimate is refined by
-        a fit of the whole camera over the translated images, which frees it from the tilt.
+        a fit of the whole camera over the translated images, which frees it from the tilt. Without it, and with three
+        views or more, all intersections of all views are fitted with one aspect ratio and one distortion, the axis
+        being normal to the grid: that averages the noise and takes the distortion out, but not the tilt.
 
     Raises
     ------
@@ -121,13 +124,16 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
     first = float(per_image.mean())
     n = len(views)
     if n > 1:
-        first_sigma = float(per_image.std(ddof=1) / np.sqrt(n))
+        first_estimate_sigma = float(per_image.std(ddof=1) / np.sqrt(n))
     else:
         # one image: its intersections' own noise; a diagonal has two ends, and the blocks share most of them
         span = float(np.median(np.abs(views[0].xy_px[_BLOCK - 1 :, : 1 - _BLOCK] - views[0].xy_px[: 1 - _BLOCK, 4:])))
-        first_sigma = 2.0 * float(np.median(views[0].sigma_px)) / max(span, 1.0)
+        first_estimate_sigma = 2.0 * float(np.median(views[0].sigma_px)) / max(span, 1.0)
     if dz_mm is None:
-        return AspectResult(first, first_sigma, first, first_sigma, blocks, None, None, None)
+        if n < _LEAST_MOVED:
+            return AspectResult(first, first_estimate_sigma, first, first_estimate_sigma, blocks, None, None, None)
+        value, sigma = _refine_moved(views, first)
+        return AspectResult(value, sigma, first, first_estimate_sigma, blocks, value, sigma, None)
     dz = np.asarray(dz_mm, dtype=np.float64)
     if dz.shape != (n,) or not np.isfinite(dz).all():
         raise CalibrationInputError(f"{n} views need {n} finite positions, got {list(dz_mm)}", code="aspect_views")
@@ -136,7 +142,7 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
             f"all views stand at dZ = {dz[0]:g} mm: without travel the tilt stays unknown", code="aspect_views"
         )
     refined, sigma, tilt = _refine(views, dz, first)
-    return AspectResult(refined, sigma, first, first_sigma, blocks, refined, sigma, tilt)
+    return AspectResult(refined, sigma, first, first_estimate_sigma, blocks, refined, sigma, tilt)
 
 
 def _refine(views: Sequence[GridView], dz: Float, first: float) -> tuple[float, float, tuple[float, float]]:
@@ -176,6 +182,34 @@ def _refine(views: Sequence[GridView], dz: Float, first: float) -> tuple[float, 
         float(np.sqrt(covariance[4, 4]) * scale[4]),
         (float(best[6]), float(best[7])),
     )
+
+
+def _refine_moved(views: Sequence[GridView], first: float) -> tuple[float, float]:
+    """Fit one aspect ratio and one Seidel term over all views, each seen along the grid's normal."""
+    size = views[0].image_size_px
+    middle = 0.5 * (np.array(size) - 1.0)
+    corner2 = 0.25 * float(size[0] ** 2 + size[1] ** 2)
+    plane = views[0].object_points_mm.reshape(-1, 2) @ np.array([1.0, 1.0j])
+    xy = np.stack([v.xy_px.reshape(-1, 2) for v in views]) - middle
+    sigma = np.maximum(np.stack([v.sigma_px.reshape(-1, 2) for v in views]), _SIGMA_FLOOR_PX)
+    n = len(views)
+
+    def residuals(p: Float) -> Float:
+        motion = p[2:].reshape(n, 4, 1)
+        s = (motion[:, 0] + 1j * motion[:, 1]) * plane + motion[:, 2] + 1j * motion[:, 3]
+        bar = s / (1.0 + p[1] / corner2 * np.abs(s) ** 2)
+        off = np.stack([bar.real, p[0] * bar.imag], axis=-1) - xy
+        return np.concatenate([(off / sigma).ravel(), [p[1] / _KAPPA_PRIOR]])
+
+    start = [first, 0.0]
+    for w in xy @ np.array([[1.0], [1.0j / first]]):
+        a = np.vdot(plane, w[:, 0]) / np.vdot(plane, plane)
+        b = w.mean()  # the inner intersections are centred on the origin
+        start += [a.real, a.imag, b.real, b.imag]
+    fit = least_squares(residuals, np.array(start), method="trf", x_scale="jac", xtol=1e-13, ftol=1e-13)
+    left, jac = np.asarray(fit.fun), np.asarray(fit.jac)
+    variance = max(1.0, float(left @ left) / max(left.size - len(start), 1))
+    return float(fit.x[0]), float(np.sqrt(np.linalg.inv(jac.T @ jac)[0, 0] * variance))
 
 
 def _plane_points(target: GridTarget) -> Float:

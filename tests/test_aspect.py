@@ -54,7 +54,7 @@ def test_tilt_moves_the_first_estimate_by_half_its_square_and_the_refined_one_no
     cameras = [paper_camera(0.0, beta_deg=1.5).moved(z) for z in positions]
     views = [_view_at_truth(c, 0.002, k) for k, c in enumerate(cameras)]
     result = measure_aspect(views, dz_mm=positions)
-    assert result.first / TRUE_ASPECT - 1.0 == pytest.approx(-(tilt**2) / 2.0, rel=0.15)
+    assert result.first_estimate / TRUE_ASPECT - 1.0 == pytest.approx(-(tilt**2) / 2.0, rel=0.15)
     assert result.refined is not None
     assert result.refined == pytest.approx(TRUE_ASPECT, abs=3e-5)
     assert result.refined_sigma is not None
@@ -100,3 +100,18 @@ def test_unusable_views_are_refused() -> None:
     near, far = _view_at_truth(paper_camera(0.0), 0.002, 0), _view_at_truth(paper_camera(0.0).moved(5.0), 0.002, 0)
     with pytest.raises(CalibrationInputError, match="shrink"):
         measure_aspect([near, far], dz_mm=[5.0, 0.0])  # the sign of dZ exchanged
+
+
+def test_images_moved_about_without_known_travel_average_the_noise_and_the_distortion() -> None:
+    rng = np.random.default_rng(5)
+    views = []
+    for k in range(20):
+        camera = paper_camera(
+            rng.uniform(-0.3, 0.3), beta_deg=rng.uniform(-0.3, 0.3), alpha_deg=rng.uniform(44.0, 46.0),
+            kappa_per_px2=1.3e-8, offset_mm=(rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8)),
+        )  # fmt: skip
+        views.append(_view_at_truth(camera, 0.002, k))
+    result = measure_aspect(views)
+    assert result.aspect == pytest.approx(TRUE_ASPECT, abs=3e-5)  # half of 0.3 degrees squared is 1.4e-5
+    assert result.first_estimate == pytest.approx(TRUE_ASPECT, abs=1e-4)
+    assert result.tilt_rad is None
