@@ -77,8 +77,8 @@ def calibration(figures: Path) -> Section:
     ):
         seeds = NODE_SEEDS
         runs = [_calibrate(rig, tolerance, seed, localiser) for seed in seeds]
-        held = [run.result.held_out.rbe_px for run in runs if run.result.held_out is not None]
-        fitted = [run.result.fitted.rbe_px for run in runs]
+        held = [run.result.held_out.mean.rbe_px for run in runs if run.result.held_out is not None]
+        fitted = [run.result.fitted.mean.rbe_px for run in runs]
         space = np.array([_space_error_um(rig, run) for run in runs])
         label = f"{localiser} localiser, {'exact grid' if tolerance == 0 else '4 um grid'}"
         rows += [
