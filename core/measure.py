@@ -35,6 +35,7 @@ from core.field.seeds import (
     swept_places,
 )
 from core.field.starts import Starts
+from core.field.unreached import mark_outside
 from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
@@ -278,6 +279,7 @@ class _Run:
         self.points = PointFits.empty(len(self.xy_px), self.fitter.comparisons)
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
+        self.checked = False  # whether every point that stands went through the gates
         rows, cols = np.clip(np.rint(self.xy_px[:, ::-1]).astype(int), 0, np.array(self.ref1.shape) - 1).T
         self.texture = self.ref1.subset_variance(self.options.subset_px)[rows, cols]
 
@@ -436,15 +438,15 @@ class _Run:
                 remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
                 "these images, or give a seed point.",
             )
-        self._grow()
-        self._gate()
-        for _ in range(2):
-            if self._grow() == 0:
+        for _ in range(3):
+            if self._grow() == 0 and self.checked:
                 break
             self._gate()
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
             self._grow()
             self._gate()
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
         return assemble(self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape)
 
@@ -454,13 +456,16 @@ class _Run:
         return float(untouched.sum()) / max(int(self.usable.sum()), 1)
 
     def _grow(self) -> int:
-        return grow(
+        added = grow(
             self.fitter, self.points, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
             progress=self.progress, cancel=self.cancel,
         )  # fmt: skip
+        self.checked = self.checked and added == 0
+        return added
 
-    def _gate(self) -> int:
-        return apply_gates(
+    def _gate(self) -> None:
+        apply_gates(
             self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
             options=self.options.gates,
         )  # fmt: skip
+        self.checked = True

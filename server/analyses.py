@@ -17,7 +17,8 @@ from core.errors import (
 from server.compute import run_task
 from server.io.files import sha256_of
 from server.io.images import decode_mask, read_image
-from server.jobs import Job, problem_of
+from server.jobs import Job
+from server.problem import problem_of
 from server.regions import make_grid
 from server.service import Service
 from server.store.durable import without_nan

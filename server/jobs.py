@@ -20,6 +20,7 @@ from core.errors import Cancelled, StateError, StereorigError, StorageError
 from server.errors import NotFoundError, QueueFullError
 from server.events import EventHub
 from server.hardware import HardwareGate
+from server.problem import RESTART, problem_of
 from server.store.catalog import Catalog
 from server.store.durable import without_nan
 from server.store.folder import IdMaker, is_id, now_utc
@@ -29,25 +30,6 @@ _log = logging.getLogger("stereorig.jobs")
 State = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
 FINAL: tuple[State, ...] = ("succeeded", "failed", "cancelled", "interrupted")
 ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
-RESTART = StateError(
-    "The service ended while the job was not finished.",
-    code="interrupted",
-    remedy="What was finished has been kept; start the job again for the rest.",
-)
-
-
-def problem_of(error: BaseException) -> dict[str, Any]:
-    """Describe an error as a job's ``problem``: code, cause, remedy and the values that a program may want."""
-    if isinstance(error, StereorigError):
-        context = {k: v for k, v in error.context.items() if isinstance(v, str | int | float | bool | list | dict)}
-        described = {"code": error.code, "cause": error.cause, "remedy": error.remedy, "context": context}
-        return dict(without_nan(described))
-    return {
-        "code": "internal_error",
-        "cause": f"{type(error).__name__}: {error}",
-        "remedy": "Report this with the service's log.",
-        "context": {},
-    }
 
 
 @dataclass(frozen=True)
@@ -79,8 +61,9 @@ class Job:
     #: called with the final state before that state is shown (writes summaries)
     on_end: Callable[[Job, State], None] | None = None
     #: called at once when the job is cancelled, from whatever thread asks (stops the stage)
-    on_cancel: Callable[[], None] | None = None
+    on_cancel: Callable[[Job], None] | None = None
     saving: threading.Lock = field(default_factory=threading.Lock)
+    ended: bool = False
     _pace_from: tuple[float, int] | None = None
     _last_shown: float = 0.0
     _cancel: threading.Event = field(default_factory=threading.Event)
@@ -180,7 +163,7 @@ class JobManager:
         *,
         prepare: Callable[[], dict[str, Any]] | None = None,
         on_end: Callable[[Job, State], None] | None = None,
-        on_cancel: Callable[[], None] | None = None,
+        on_cancel: Callable[[Job], None] | None = None,
     ) -> Job:
         """Acknowledge a job and start it.
 
@@ -290,7 +273,7 @@ class JobManager:
                 state=state,
             )
         if job.on_cancel is not None:
-            job.on_cancel()
+            job.on_cancel(job)
         if waiting:
             self._end(job, "cancelled", Cancelled(f"The {job.kind} was cancelled before it began."))
         else:
@@ -380,16 +363,24 @@ class JobManager:
             except Exception as second:  # noqa: BLE001 - a result that was not kept is no success
                 _log.exception("closing job %s failed", job.id)
                 state, job.problem = "failed", problem_of(second)
-        job.state, job.finished_utc = state, now_utc()
-        self._save(job)
+        ended = now_utc()
+        # nobody sees a job's end before it is on disk
+        self._save(job, state=state, finished_utc=ended)
         with self._lock:
+            job.state, job.finished_utc = state, ended
             self._active.pop(job.id, None)
         self._show(job, "state")
 
-    def _save(self, job: Job) -> None:
+    def _save(self, job: Job, **final: Any) -> None:
         try:
             with job.saving:  # the newest document is the last one written
-                self._catalog.put_job(job.id, job.state, job.document())
+                if job.ended:
+                    return
+                job.ended = bool(final)
+                document = job.document() | final
+                if final:
+                    document["progress"]["eta_s"] = None
+                self._catalog.put_job(job.id, document["state"], document)
         except StorageError:
             _log.exception("the state of job %s could not be written", job.id)
 
@@ -409,5 +400,5 @@ class JobManager:
         for job in active:
             job._cancel.set()
             if job.on_cancel is not None:
-                job.on_cancel()
+                job.on_cancel(job)
         self._thread.join(timeout=5.0)

@@ -14,7 +14,7 @@ from core.errors import StateError
 from server.config import RigConfig
 from server.events import EventHub
 from server.hardware import HardwareGate
-from server.jobs import JobManager
+from server.jobs import Job, JobManager
 from server.rig import Rig
 from server.rig.build import check_config
 from server.store.calibrations import CalibrationStore
@@ -80,9 +80,28 @@ class Service:
         # so that the first request finds the rig; a device that hangs must not keep the service from starting
         opened.wait(timeout=_OPEN_WAIT_S)
 
-    def stop_if_moving(self) -> None:
-        """Stop the stage if a motion runs; for cancelled jobs that may or may not be moving."""
-        if self.rig.fault is None and self.gate.holder is not None:
+    def stop_job(self, job: Job) -> None:
+        """Stop the stage for a job that is being cancelled, if it holds the hardware."""
+        holder = self.gate.holder
+        if holder is not None and holder.get("job_id") == job.id and self.rig.fault is None:
+            self.rig.stop()
+            self.stop_until_released(job.id)
+
+    def stop_until_released(self, job_id: str) -> None:
+        """Go on stopping in the background, see :meth:`_stop_until_released`."""
+        threading.Thread(target=self._stop_until_released, args=(job_id,), name="stop again", daemon=True).start()
+
+    def _stop_until_released(self, job_id: str) -> None:
+        """Stop the stage until a cancelled job has let the hardware go.
+
+        A job that passed its last check just before it was cancelled may start a motion just after the first stop.
+        Once it has let go, the next motion is somebody else's and must not be touched.
+        """
+        for _ in range(100):
+            time.sleep(0.02)
+            holder = self.gate.holder
+            if holder is None or holder.get("job_id") != job_id or self.closing:
+                return
             self.rig.stop()
 
     def stop_streams(self) -> None:

@@ -61,7 +61,7 @@ kernel_threads = 1
 [sim]
 seed = 7
 speckle_mm = 0.45
-time_scale = 10.0
+time_scale = 2.5
 [sim.noise]
 read_noise_e = 280.0
 full_well_e = 40000.0

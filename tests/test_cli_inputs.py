@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from core.errors import FileFormatError, ImageError, InputError, RegionError
 from server.cli import main
 from server.cli.image_lists import expand, pair_up, pairs_of_test_folder
 from server.cli.region import check_odd, check_region, parse_rectangle
-from server.cli.terminal import duration
+from server.cli.terminal import ProgressLine, duration
 
 SHAPE = (480, 512)
 
@@ -173,10 +174,36 @@ def test_wrong_usage_is_one_line(arguments: list[str], capsys: pytest.CaptureFix
 
 
 def test_durations_read_as_people_say_them() -> None:
-    assert [duration(s) for s in (0.4, 59.4, 61.0, 3600.0, 7500.0)] == [
-        "0 s",
-        "59 s",
-        "1 min 01 s",
-        "1 h 00 min",
-        "2 h 05 min",
-    ]
+    said = [duration(s) for s in (0.4, 59.4, 61.0, 3600.0, 7500.0)]
+    assert said == ["0.4 s", "59 s", "1 min 01 s", "1 h 00 min", "2 h 05 min"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_estimates_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("server.cli.terminal.time.monotonic", lambda: clock[0])
+    stream = Terminal()
+    line = ProgressLine(stream)
+    clock[0] += 30.0  # loading, which says nothing about the pace
+    line.show("step 0 of 1", 0.0)
+    clock[0] += 10.0
+    line.show("step 0 of 1", 0.25)
+    assert "25 % of all, about 30 s left" in stream.getvalue()
+    line.close()
+    assert stream.getvalue().endswith("\r")
+
+
+def test_progress_is_sparing_where_nobody_watches(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("server.cli.terminal.time.monotonic", lambda: clock[0])
+    stream = io.StringIO()
+    line = ProgressLine(stream)
+    for k in range(601):
+        clock[0] = 0.1 * k
+        line.show("step", k / 600)
+    assert 2 <= len(stream.getvalue().splitlines()) <= 5
+    assert "\r" not in stream.getvalue()

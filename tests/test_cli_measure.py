@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import tomllib
@@ -13,7 +14,8 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from server.cli import main
+from core.measure import MeasureOptions
+from server.cli import main, measure
 from server.io.images import read_image, write_image
 from sim.render import RenderOptions, render
 from sim.rig import CAMERA_NAMES, SimRig
@@ -132,7 +134,7 @@ def test_several_paths_a_mask_seeds_and_the_other_models(folder: Path, tmp_path:
     code = main(command(
         folder, out, cam1=[str(folder / "cam1_0.tif"), str(folder / "cam1_1.tif")],
         cam2=[str(folder / "cam2_1.tif"), str(folder / "cam2_0.tif")], mask=str(folder / "mask.png"),
-        patch="rigid", interpolation="quintic", seed="80,85",
+        patch="rigid", interpolation="cubic", seed="80,85",
     ))  # fmt: skip
     assert code == 0
     assert sorted(p.name for p in out.iterdir()) == ["notes.txt", "step_0000.nc", "step_0001.nc", "summary.json"]
@@ -172,6 +174,17 @@ def test_a_flipped_bit_in_a_test_folder_is_named(folder: Path, tmp_path: Path, c
     (step / "step.json").write_text(json.dumps({"sha256": {"cam1": "0" * 64}}))
     shutil.copy(folder / "calibration.json", tmp_path / "t")
     fails(["measure", str(tmp_path / "t")], "checksum_mismatch", "cam1.tif", capfd)
+
+
+def test_defaults_are_the_measurements_own() -> None:
+    parser = argparse.ArgumentParser()
+    measure.add_arguments(parser)
+    defaults, own = parser.parse_args([]), MeasureOptions()
+    assert (int(defaults.subset), defaults.patch, defaults.interpolation) == (
+        own.subset_px,
+        own.patch,
+        own.interpolation,
+    )
 
 
 def fails(arguments: list[str], code: str, word: str, capfd: Any) -> None:

@@ -7,6 +7,7 @@ import io
 import json
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -137,6 +138,7 @@ def test_move_reads_positions_back(client: httpx.Client) -> None:
         ('{"positions_mm": {"1": 6.5}}', "out_of_limits"),
         ('{"by_mm": {"1": -50}}', "out_of_limits"),
         ('{"dz_mm": {"cam2": 7}}', "out_of_limits"),
+        ('{"positions_mm": {"1": -6.0}}', "out_of_limits"),  # no room left to arrive from below
         ('{"positions_mm": {"3": 1}}', "invalid_axis"),
         ('{"positions_mm": {"1": NaN}}', "invalid_request"),
         ('{"positions_mm": {"1": Infinity}}', "invalid_request"),
@@ -163,7 +165,7 @@ def test_bad_targets_are_refused_before_any_byte_goes_out(
 
 @pytest.mark.fault(28)
 def test_second_client_gets_the_holder_and_stop_works_during_a_move(client: httpx.Client) -> None:
-    # 6 mm at 5 mm/s on a clock ten times faster: 0.12 s is too short, so go slowly back and forth
+    # 6 mm at 5 mm/s on a clock 2.5 times faster: half a second to interfere
     job = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 6.0}}).json()["job"]
     problem = assert_problem(client.post(f"{API}/stage/moves", json={"positions_mm": {"2": 1.0}}), 409, "hardware_busy")
     assert problem["holder"]["job_id"] == job["id"]  # type: ignore[index]
@@ -177,6 +179,16 @@ def test_second_client_gets_the_holder_and_stop_works_during_a_move(client: http
     home = client.post(f"{API}/stage/home").json()["job"]
     assert wait_for_job(client, home)["state"] == "succeeded"
     assert client.get(f"{API}/stage").json()["axes"][0]["position_mm"] == pytest.approx(0.0, abs=0.002)
+
+
+def test_cancelling_a_move_stops_the_axis(client: httpx.Client) -> None:
+    job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": -5.5}}).json()["job"]
+    assert client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert wait_for_job(client, job)["state"] == "cancelled"
+    axis = client.get(f"{API}/stage").json()["axes"][1]
+    assert axis["moving"] is False
+    assert axis["position_mm"] > -5.4
+    assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
 
 
 def test_stop_without_a_job_is_fine(client: httpx.Client) -> None:
@@ -430,3 +442,82 @@ def test_cancelling_a_finished_job_says_its_state(client: httpx.Client) -> None:
     wait_for_job(client, job)
     problem = assert_problem(client.post(f"{API}/jobs/{job['id']}/cancel"), 409, "job_finished")
     assert problem["state"] == "succeeded"
+
+
+# devices that fail ----------------------------------------------------------------------------------------------
+
+
+def faults_of(service: Service, cam: str) -> object:
+    return service.rig.pair.units[cam].grabber.faults  # type: ignore[attr-defined,index]
+
+
+@pytest.mark.fault(16)
+def test_a_pair_with_too_much_skew_is_refused_with_the_figure(service: Service, client: httpx.Client) -> None:
+    test_id = new_test(client)
+    faults_of(service, "cam2").skew_ms = 3.0  # type: ignore[attr-defined]
+    try:
+        problem = assert_problem(client.post(f"{API}/tests/{test_id}/steps", json={}), 409, "skew_too_large")
+        assert problem["skew_ms"] == pytest.approx(3.0, abs=0.01)
+    finally:
+        faults_of(service, "cam2").skew_ms = 0.0  # type: ignore[attr-defined]
+    assert client.get(f"{API}/tests/{test_id}").json()["steps"] == []
+    assert client.post(f"{API}/tests/{test_id}/steps", json={}).json()["n"] == 0
+
+
+@pytest.mark.fault(15)
+def test_an_incomplete_frame_is_never_stored(service: Service, client: httpx.Client) -> None:
+    test_id = new_test(client)
+    faults_of(service, "cam1").incomplete = 1  # type: ignore[attr-defined]
+    assert_problem(client.post(f"{API}/tests/{test_id}/steps", json={}), 503, "frame_incomplete")
+    assert client.get(f"{API}/tests/{test_id}").json()["steps"] == []
+    assert client.post(f"{API}/tests/{test_id}/steps", json={}).json()["quality"]["code"] == "ok"
+    assert client.get(f"{API}/cameras/cam1/stats").json()["frames"]["incomplete"] == 1
+
+
+@pytest.mark.fault(11)
+def test_a_lost_camera_is_shown_and_comes_back_by_reconnecting(service: Service, client: httpx.Client) -> None:
+    test_id = new_test(client)
+    client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 8.0})
+    faults_of(service, "cam2").gone = True  # type: ignore[attr-defined]
+    began = time.monotonic()
+    assert_problem(client.post(f"{API}/tests/{test_id}/steps", json={}), 503, "camera_lost")
+    assert time.monotonic() - began < 1.0
+    while (fault := client.get(f"{API}/rig").json()["cameras"]["cam2"]["fault"]) is None:
+        assert time.monotonic() - began < 1.0
+    assert fault["code"] == "camera_lost"
+    assert wait_for_job(client, client.post(f"{API}/rig/reconnect").json()["job"])["state"] == "succeeded"
+    wait_for_rig(client)
+    assert client.get(f"{API}/rig").json()["cameras"]["cam2"]["fault"] is None
+    assert client.get(f"{API}/cameras/cam2").json()["settings"]["exposure_ms"] == 8.0
+    client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 10.0})
+    assert client.post(f"{API}/tests/{test_id}/steps", json={}).status_code == 201
+
+
+@pytest.mark.fault(24)
+def test_a_jammed_axis_ends_move_and_calibration_with_a_fault(service: Service, client: httpx.Client) -> None:
+    devices = service.rig._devices
+    assert devices is not None
+    assert devices.controller is not None
+    axis = devices.controller.axis(2)
+    axis.faults.jam_mm = (-0.2, 0.2)
+    try:
+        job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": 1.0}}).json()["job"]
+        assert wait_for_job(client, job)["problem"]["code"] == "motion_fault"
+    finally:
+        axis.faults.jam_mm = None
+    assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+
+
+@pytest.mark.fault(23)
+def test_moves_before_homing_are_refused(tmp_path: Path) -> None:
+    made = Service(tiny_config(settle_ms="settle_ms = 0\nhome_at_start = false"), tmp_path / "data")
+    try:
+        with served(made) as own:
+            # the simulated controller powers up with its motors off and knows no position
+            assert_problem(own.post(f"{API}/stage/moves", json={"positions_mm": {"1": 1.0}}), 409, "motor_off")
+            assert_problem(own.post(f"{API}/calibrations"), 409, "motor_off")
+            assert wait_for_job(own, own.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+            job = own.post(f"{API}/stage/moves", json={"positions_mm": {"1": 1.0}}).json()["job"]
+            assert wait_for_job(own, job)["state"] == "succeeded"
+    finally:
+        made.close()

@@ -53,8 +53,15 @@ def assemble(points: PointFits, *, pair: StereoPair, grid: PointGrid, fits_image
         else:
             covariance = scatter(covariance_xyz(pair, xy, w, points.covariance[index]), 3, 3)
     if shape is not None:
-        # a material point's reference position is the same in every step
-        xyz = np.where((valid & shape.valid)[..., None], shape.xyz_mm, xyz)
+        # a material point's reference position is the same in every step. Its covariance goes with it; that with the
+        # displacement stays, since the shape alone is the joint estimate plus an error independent of it
+        known = valid & shape.valid
+        xyz = np.where(known[..., None], shape.xyz_mm, xyz)
+        larger = known & (
+            np.trace(shape.covariance[..., :3, :3], axis1=-2, axis2=-1)
+            > np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1)
+        )
+        covariance[larger, :3, :3] = shape.covariance[larger][:, :3, :3]
     return Field(
         x_px=grid.x_px,
         y_px=grid.y_px,

@@ -45,7 +45,7 @@ def detect(
     *,
     mask: NDArray[np.bool_] | None = None,
     halve: bool = False,
-    max_keypoints: int = MAX_KEYPOINTS,
+    max_keypoints: int | None = None,
 ) -> Features:
     """Find keypoints and describe them.
 
@@ -58,8 +58,10 @@ def detect(
     halve
         Work on the image at half its size: a quarter of the time, good to half a pixel.
     max_keypoints
-        The strongest ones are kept.
+        The strongest ones are kept; :data:`MAX_KEYPOINTS`, or five eighths of it at half size, when left out.
     """
+    if max_keypoints is None:
+        max_keypoints = MAX_KEYPOINTS * 5 // 8 if halve else MAX_KEYPOINTS
     if mask is not None and mask.any():
         # work on the mask's bounding box only, with a rim for the filters
         rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))

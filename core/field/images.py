@@ -106,19 +106,25 @@ class MeasureImage:
 def largest_structure(pixels: NDArray[Any]) -> float:
     """Return the largest correlation between neighbouring pixels over tiles of 48 px, slow shading taken out.
 
-    White camera noise gives 0 +- 0.02, a pattern that a camera resolves 0.5 and more.
+    White camera noise gives 0 +- 0.02, a pattern that a camera resolves 0.5 and more. Tiles from the middle outwards;
+    the search ends with the first one that leaves no doubt.
     """
-    p = pixels.astype(np.float32)
-    p = p - ndimage.gaussian_filter(p, _BAND_PX, mode="nearest")
+    tile = min(_TILE, *pixels.shape)
+    places = [
+        (y, x) for y in range(0, pixels.shape[0] - tile + 1, tile) for x in range(0, pixels.shape[1] - tile + 1, tile)
+    ]
+    middle = ((pixels.shape[0] - tile) / 2, (pixels.shape[1] - tile) / 2)
+    places.sort(key=lambda place: (place[0] - middle[0]) ** 2 + (place[1] - middle[1]) ** 2)
     best = 0.0
-    tile = min(_TILE, *p.shape)
-    for y in range(0, p.shape[0] - tile + 1, tile):
-        for x in range(0, p.shape[1] - tile + 1, tile):
-            t = p[y : y + tile, x : x + tile]
-            variance = float(np.mean(t * t))
-            if variance > 1e-4:
-                lag = 0.5 * float(np.mean(t[:, 1:] * t[:, :-1]) + np.mean(t[1:] * t[:-1]))
-                best = max(best, lag / variance)
+    for y, x in places:
+        t = pixels[y : y + tile, x : x + tile].astype(np.float32)
+        t = t - ndimage.gaussian_filter(t, _BAND_PX, mode="nearest")
+        variance = float(np.mean(t * t))
+        if variance > 1e-4:
+            lag = 0.5 * float(np.mean(t[:, 1:] * t[:, :-1]) + np.mean(t[1:] * t[:-1]))
+            best = max(best, lag / variance)
+        if best > 2.0 * _LEAST_STRUCTURE:
+            break
     return best
 
 

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from core.grid.pieces import Pieces
-from core.lens import Float
+from core.lens import Bool, Float
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens
+_MOST_ROUNDS = 40
+_MOST_LINES = 150
+_MOST_TURN = 0.15  # rad between a piece and its line
 _LEAST_SHARE = 0.25  # of the longest line's seen length; shorter ones are clutter
 
 
@@ -53,23 +54,53 @@ class CoarseLine:
 
 
 def link(pieces: Pieces) -> list[CoarseLine]:
-    """Join pieces that prolong each other."""
+    """Join pieces that prolong each other: a line grows from its heaviest piece, outwards, by whatever lies on it."""
     n = len(pieces)
     if n < 3:
         return []
+    free = np.ones(n, dtype=bool)
     typical = float(np.median(pieces.length_px))
-    delta = pieces.centre_px[None, :, :] - pieces.centre_px[:, None, :]
-    along = np.abs(np.einsum("ijk,ik->ij", delta, pieces.direction))
-    across = np.abs(delta[..., 1] * pieces.direction[:, None, 0] - delta[..., 0] * pieces.direction[:, None, 1])
-    # the gap between the ends, not the centres: pieces may be long
-    gap = along - 0.5 * (pieces.length_px[:, None] + pieces.length_px[None, :])
-    tolerance = 1.0 + 0.07 * along
-    near = (gap < 2.0 * typical) & (across < tolerance) & (across.T < tolerance.T)
-    i, j = np.nonzero(near)
-    _, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)
-    lines = [_fit(pieces.take(np.flatnonzero(label == k))) for k in np.unique(label)]
+    lines: list[CoarseLine] = []
+    for seed in np.argsort(-pieces.weight):
+        if free[seed] and len(lines) < _MOST_LINES:
+            members = _grow(pieces, int(seed), free, typical)
+            free[members] = False
+            lines.append(_fit(pieces.take(members)))
     longest = max(line.seen_px for line in lines)
     return [line for line in lines if line.seen_px >= _LEAST_SHARE * longest]
+
+
+def _grow(pieces: Pieces, seed: int, free: Bool, typical: float) -> NDArray[np.intp]:
+    members = np.array([seed])
+    for _ in range(_MOST_ROUNDS):
+        line = _fit(pieces.take(members))
+        t, off, turn = _against(line, pieces)
+        beyond = np.maximum(np.maximum(t - line.span_px[1], line.span_px[0] - t), 0.0)
+        on_line = (
+            free
+            & (beyond - 0.5 * pieces.length_px < 2.0 * typical)
+            & (np.abs(off) < 1.2 + 0.07 * beyond)
+            & (np.abs(turn) < _MOST_TURN)
+        )
+        on_line[seed] = True
+        grown = np.flatnonzero(on_line)
+        if np.array_equal(grown, members):
+            break
+        members = grown
+    return members
+
+
+def _against(line: CoarseLine, pieces: Pieces) -> tuple[Float, Float, Float]:
+    """Distance along a line, offset from it and turn against it, of each piece, (n,) each."""
+    d = pieces.centre_px - line.centre_px
+    t = d @ line.direction
+    normal = np.array([-line.direction[1], line.direction[0]])
+    # a parabola is not trusted far beyond its own points
+    inside = np.clip(t, line.span_px[0], line.span_px[1])
+    slope = line.bend[1] + 2.0 * line.bend[2] * inside
+    expected = line.bend[0] + inside * (line.bend[1] + inside * line.bend[2]) + slope * (t - inside)
+    across, along = pieces.direction @ normal, pieces.direction @ line.direction
+    return t, d @ normal - expected, across / np.maximum(np.abs(along), 0.1) * np.sign(along) - slope
 
 
 def _fit(pieces: Pieces) -> CoarseLine:
@@ -79,14 +110,14 @@ def _fit(pieces: Pieces) -> CoarseLine:
     weight = np.tile(pieces.length_px, 2)
     centre = np.average(ends, axis=0, weights=weight)
     d = ends - centre
-    _, vectors = np.linalg.eigh((d * weight[:, None]).T @ d)
+    _, vectors = np.linalg.eigh(np.einsum("ni,nj->ij", d * weight[:, None], d))
     direction = vectors[:, 1]
     if direction @ pieces.direction.sum(axis=0) < 0.0:
         direction = -direction
     t = d @ direction
     off = d @ np.array([-direction[1], direction[0]])
     bend = np.zeros(3)
-    degree = 2 if len(pieces) >= 4 else 1
+    degree = 2 if len(pieces) >= 5 else 1
     bend[: degree + 1] = np.polynomial.polynomial.polyfit(t, off, degree, w=np.sqrt(weight))
     half = 0.1 * pieces.length_px.max()
     return CoarseLine(

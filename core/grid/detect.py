@@ -126,6 +126,13 @@ def _coarse(grey: NDArray[np.float32], target: GridTarget) -> tuple[Lattice, flo
     failure: TargetError | None = None
     for factor in coarse_factors((grey.shape[1], grey.shape[0]), target):
         picture = line_picture(grey, target, factor)
+        # what closing fills by chance lies well below the noise's own standard deviation
+        if picture.threshold < picture.noise / max(factor, 1.0):
+            failure = failure or not_found(
+                f"no lines: the deepest structures stand out by {picture.threshold:.3g} grey levels from a noise of"
+                f" {picture.noise:.3g}"
+            )
+            continue
         try:
             lattice = find_lattice(picture, directions(picture))
         except TargetError as error:

@@ -22,6 +22,7 @@ from core.lens import Float
 _COARSE = ("centre_px", "direction", "bend")
 _LEAST_CROSSING_RAD = np.radians(40.0)
 _LEAST_LINES = 4
+_LEAST_SEEN = 0.4
 _STRAY_END = 0.1  # of the pitch; an end line that is off by more is an edge or a frame
 
 
@@ -133,8 +134,19 @@ def _try_pair(
     counts = (len(chain_a.lines), len(chain_b.lines))
     if min(counts) < _LEAST_LINES:
         return None, 0.0, counts
+    lattice = _lattice(chain_a, chain_b)
+    if _seen_share(lattice, chain_a, chain_b) < _LEAST_SEEN:
+        return None, 0.0, (0, 0)
     seen = sum(line.seen_px for line in chain_a.lines) + sum(line.seen_px for line in chain_b.lines)
-    return _lattice(chain_a, chain_b), seen, counts
+    return lattice, seen, counts
+
+
+def _seen_share(lattice: Lattice, chain_a: Chain, chain_b: Chain) -> float:
+    """Median share of the lines' length that was seen; noise makes lines of few pieces that happen to lie in a row."""
+    a = np.linalg.norm(np.diff(lattice.nodes_px, axis=1), axis=-1).sum(axis=1)[chain_a.number]
+    b = np.linalg.norm(np.diff(lattice.nodes_px, axis=0), axis=-1).sum(axis=0)[chain_b.number]
+    seen = [line.seen_px for line in (*chain_a.lines, *chain_b.lines)]
+    return float(np.median(np.array(seen) / np.concatenate([a, b])))
 
 
 def _without_stray_ends(chain_a: Chain, chain_b: Chain) -> tuple[Chain, Chain]:

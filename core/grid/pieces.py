@@ -18,7 +18,7 @@ from core.lens import Float
 
 _COHERENCE = 0.5
 _FAMILY_REACH_DEG = 22.0
-_MOST_PIECES = 6000
+_MOST_PIECES = 1500  # a family of 20 lines has 380
 _MOST_PEAKS = 5
 _PEAK_SHARE = 0.08  # of the strongest direction; weaker ones are not half of a grid
 

@@ -146,6 +146,35 @@ def _search(image: NDArray[np.float32], piece: Float, guard: float, sign: float)
 
 
 @njit(cache=True, nogil=True)
+def _solve(M: Float, b: Float, x: Float) -> bool:
+    """Solve M x = b by Cholesky, overwriting M; False where M is not positive definite (a saturated or empty piece)."""
+    n = M.shape[0]
+    for i in range(n):
+        top = M[i, i]
+        for j in range(i + 1):
+            total = M[i, j]
+            for k in range(j):
+                total -= M[i, k] * M[j, k]
+            if i == j:
+                if not total > 1e-13 * top:
+                    return False
+                M[i, i] = sqrt(total)
+            else:
+                M[i, j] = total / M[j, j]
+    for i in range(n):
+        total = b[i]
+        for k in range(i):
+            total -= M[i, k] * x[k]
+        x[i] = total / M[i, i]
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, n):
+            total -= M[k, i] * x[k]
+        x[i] = total / M[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True)
 def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
     out[:] = np.nan
     out[15] = 0.0
@@ -180,6 +209,8 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
                 n += 1
     if n < _LEAST_PIXELS:
         return
+    out[7] = gs[:n].mean()  # kept also where the fit fails: it tells glare from dirt
+    out[14] = brightest
     scale = 1.0 / max(piece[4], 1.0)
     par = np.zeros(_N)
     par[0] = c0
@@ -204,6 +235,8 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
     g = np.zeros(_N)
     J = np.zeros(_N)
     trial = par.copy()
+    delta = np.zeros(_N)
+    C = np.zeros((_N, _N))
     lam = 0.0
     best = np.inf
     kept = False
@@ -261,7 +294,8 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
             M[i, i] *= 1.0 + lam
             if not M[i, i] > 0.0:
                 return
-        delta = np.linalg.solve(M, g)
+        if not _solve(M, g, delta):
+            return
         lam *= 0.2
         for i in range(_N):
             trial[i] = par[i] + delta[i]
@@ -270,7 +304,13 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
         trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
     dof = n - (_N if fit_width else _N - 1)
     variance = best / dof
-    C = np.linalg.inv(accepted)
+    for j in range(_N):  # inverse, column by column
+        M = accepted.copy()
+        J[:] = 0.0
+        J[j] = 1.0
+        if not _solve(M, J, delta):
+            return
+        C[:, j] = delta
     peak, _, _, _ = profile_terms(0.0, par[7], par[6], a, b)
     out[0] = par[0]
     out[1] = par[1] * scale

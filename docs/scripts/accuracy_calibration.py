@@ -6,9 +6,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from core.aspect import measure_aspect
 from numpy.typing import NDArray
 
+from core.aspect import measure_aspect
 from core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
 from core.calibration.inputs import CalibrationOptions, NominalCamera
 from core.camera import Camera, RigidTransform, rotation_from_angles

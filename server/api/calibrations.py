@@ -68,7 +68,7 @@ def create_calibration(
             [Phase("hardware", hardware), Phase("compute", compute)],
             prepare=prepare,
             on_end=lambda job, state: close(service, job, made["calibration_id"], state),
-            on_cancel=service.stop_if_moving,
+            on_cancel=service.stop_job,
         )
         return {**made, "job_id": job.id}
 

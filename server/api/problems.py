@@ -22,7 +22,7 @@ from core.errors import (
     StorageError,
 )
 from server.errors import NotFoundError, QueueFullError, TooLargeError
-from server.jobs import problem_of
+from server.problem import problem_of
 
 _log = logging.getLogger("stereorig.api")
 

@@ -86,7 +86,7 @@ def home(service: ServiceDep, body: HomeRequest | None = None, key: KeyHeader = 
 
 
 def _motion(service: Service, kind: str, what: str, subject: dict[str, Any], run: Any) -> str:
-    job = service.jobs.submit(kind, what, subject, [Phase("hardware", run)], on_cancel=service.rig.stop)
+    job = service.jobs.submit(kind, what, subject, [Phase("hardware", run)], on_cancel=service.stop_job)
     return job.id
 
 
@@ -99,6 +99,6 @@ async def stop(request: Request) -> dict[str, Any]:
     await asyncio.get_running_loop().run_in_executor(service.stop_thread, service.rig.stop)
     elapsed_ms = (time.perf_counter() - arrived) * 1e3
     if cancelled is not None:
-        service.rig.stop_again_soon()
+        service.stop_until_released(cancelled)
     service.hub.publish("stage", {"stopped": True, "cancelled_job": cancelled})
     return {"stopped": True, "elapsed_ms": round(elapsed_ms, 3), "cancelled_job": cancelled}

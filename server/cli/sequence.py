@@ -24,6 +24,7 @@ from server.io.netcdf import Provenance, write_field
 from server.io.summary import summarise, to_json
 from server.version import software_version
 
+_SEEDS_SHARE = 0.15  # of a step's time, as a rule
 _RESULT = re.compile(r"step_\d{4}\.nc")
 
 
@@ -131,6 +132,7 @@ class _Runner:
         self._reference = measure.ReferencePair(job.calibration.pair, read_image(first.cam1), read_image(first.cam2))
         self._shape: Field | None = None
         self._last: Field | None = None
+        self._done = 0.0
 
     def step(self, n: int) -> dict[str, Any]:
         """Measure one step, write its file, return its summary."""
@@ -176,8 +178,10 @@ class _Runner:
         count = len(self._job.pairs)
 
         def show(stage: str, done: int, total: int) -> None:
-            part = done / total if total > 0 else 0.0
-            self._progress.show(f"step {n} of {count - 1}: {stage}", (n + part) / count)
+            share = done / total if total > 0 else 0.0
+            part = _SEEDS_SHARE * share if stage == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
+            self._done = max(self._done, (n + part) / count)
+            self._progress.show(f"step {n} of {count - 1}: {stage}", self._done)
 
         return show
 

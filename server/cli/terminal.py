@@ -8,10 +8,13 @@ from typing import TextIO
 
 _REDRAW_S = 0.2
 _QUIET_S = 15.0
+_TELLING = 0.03  # of all the work must be done before an estimate means something
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as a person would: ``8 s``, ``2 min 05 s``, ``1 h 10 min``."""
+    """Write a duration as a person would: ``0.4 s``, ``12 s``, ``2 min 05 s``, ``1 h 10 min``."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
     s = round(seconds)
     if s < 60:
         return f"{s} s"
@@ -32,7 +35,8 @@ class ProgressLine:
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream
         self._live = self._stream.isatty()
-        self._start = self._last = time.monotonic()
+        self._last = time.monotonic()
+        self._start: tuple[float, float] | None = None
         self._width = 0
 
     def note(self, text: str) -> None:
@@ -44,12 +48,16 @@ class ProgressLine:
     def show(self, text: str, fraction: float) -> None:
         """Say where the work is; ``fraction`` of all of it is done."""
         now = time.monotonic()
+        if self._start is None:  # loading and checking before the first report says nothing about the pace
+            self._start = (now, fraction)
         if now - self._last < (_REDRAW_S if self._live else _QUIET_S):
             return
         self._last = now
         line = f"{text}, {100 * fraction:.0f} % of all"
-        if fraction > 0.02:
-            line += f", about {duration((now - self._start) * (1 - fraction) / fraction)} left"
+        began, before = self._start
+        if fraction - before > _TELLING:
+            left = (now - began) * (1.0 - fraction) / (fraction - before)
+            line += f", about {duration(max(1.0, left))} left"
         self._draw(line)
 
     def status(self, text: str) -> None:

@@ -40,10 +40,16 @@ class ServiceClient:
         ``http://127.0.0.1:port``.
     on_progress
         Called with (stage, done, total, seconds left or None) while a job runs.
+    transport
+        Carries the requests; the network when left out.
     """
 
-    def __init__(self, base_url: str, on_progress: OnProgress | None = None) -> None:
-        self._http = httpx.Client(base_url=f"{base_url}/api/v1", timeout=_REQUEST_TIMEOUT_S, trust_env=False)
+    def __init__(
+        self, base_url: str, on_progress: OnProgress | None = None, *, transport: httpx.BaseTransport | None = None
+    ) -> None:
+        self._http = httpx.Client(
+            base_url=f"{base_url}/api/v1", timeout=_REQUEST_TIMEOUT_S, trust_env=False, transport=transport
+        )
         self._on_progress = on_progress
 
     def close(self) -> None:

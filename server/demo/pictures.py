@@ -33,6 +33,18 @@ def upright_mm(xyz_mm: Float) -> tuple[Float, Float]:
     return half * (xyz_mm[..., 0] - xyz_mm[..., 1]), half * (xyz_mm[..., 0] + xyz_mm[..., 1])
 
 
+def _places(values: Float, valid: NDArray[np.bool_], *, axis: int) -> Float:
+    """One place for every column (axis 0) or row (axis 1): contours need places where points failed, too."""
+    lines = np.moveaxis(np.where(valid, values, np.nan), axis, -1)
+    known = np.isfinite(lines).any(axis=-1)
+    k = np.arange(len(lines))
+    medians = np.array([np.nanmedian(line) for line in lines[known]])
+    slope, offset = np.polyfit(k[known], medians, 1)
+    places: Float = np.asarray(slope * k + offset)
+    places[known] = medians
+    return places
+
+
 def _save(figure: Any, path: Path) -> None:
     figure.savefig(path)
     plt.close(figure)
@@ -146,7 +158,7 @@ def plate(
         figure.tight_layout()
         _save(figure, out / "plate_maps.png")
 
-        figure, axes = plt.subplots(2, 5, figsize=(13.0, 5.4))
+        figure, axes = plt.subplots(2, 5, figsize=(13.0, 4.8))
         low = min(1e3 * float(np.nanmin(f.uvw_mm[..., 2])) for f in fields)  # type: ignore[index]
         for axis, result, pressure in zip(axes.flat, fields, pressures_kpa, strict=False):
             _map(axis, result, 1e3 * result.uvw_mm[..., 2], f"w at {pressure:.1f} kPa", "um", cmap=_HEIGHT,  # type: ignore[index]
@@ -199,12 +211,10 @@ def panel(
     """Draw the panel's out-of-plane displacement at every load, as in the paper's Fig. 10, and its error."""
     found = region(out, image, roi_px, fields[0], "Cracked panel")
     with plt.rc_context(_STYLE):
-        figure, axes = plt.subplots(2, 2, figsize=(9.0, 7.6))
+        figure, axes = plt.subplots(2, 2, figsize=(9.4, 6.8), layout="constrained")
         for axis, result, load, letter in zip(axes.flat, fields, loads_kn, "abcd", strict=False):
             x, y = upright_mm(result.xyz_mm)
-            # contours need places for every point: failed ones get theirs from the rows and columns they stand in
-            px = np.nanmedian(x, axis=0)
-            py = np.nanmedian(y, axis=1)
+            px, py = _places(x, result.valid, axis=0), _places(y, result.valid, axis=1)
             w = -result.uvw_mm[..., 2]  # type: ignore[index]
             drawn = axis.contourf(px, py, np.ma.masked_invalid(w), levels=14, cmap=_HEIGHT)
             axis.contour(px, py, np.ma.masked_invalid(w), levels=14, colors="black", linewidths=0.3)
@@ -213,12 +223,11 @@ def panel(
             axis.set_title(f"({letter}) {load:g} kN")
             axis.set_xlabel("along the crack, mm")
             axis.set_ylabel("along the load, mm")
-            bar = figure.colorbar(drawn, ax=axis, fraction=0.046, pad=0.03)
+            bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.03)
             bar.set_label("towards the cameras, mm")
-        figure.tight_layout()
         _save(figure, out / "panel_w.png")
 
-        figure, axes = plt.subplots(2, len(fields), figsize=(3.4 * len(fields), 6.0))
+        figure, axes = plt.subplots(2, len(fields), figsize=(3.4 * len(fields), 5.6), squeeze=False)
         for k, (result, comparison, load) in enumerate(zip(fields, comparisons, loads_kn, strict=True)):
             opening = result.uvw_mm @ np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
             _map(axes[0, k], result, opening, f"along the load, {load:g} kN", "mm", cmap=_HEIGHT)

@@ -20,7 +20,7 @@ ROI_PX = (86.0, 70.0, 426.0, 410.0)  # 341 x 341 px, as in the paper
 SUBSET_PX, STEP_PX = 21, 10
 CENTRE_LIMIT_UM = 0.5
 RADIUS_LIMIT_PERCENT = 0.5
-_CENTRE_REACH_MM = 3.0
+_CENTRE_REACH_MM = 5.0  # an even polynomial of degree four is Eq. (18) itself
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def fit_plate(fields: list[Field], pressures_kpa: list[float], plate: CircularPl
 
 
 def centre_deflection_um(result: Field, centre_mm: tuple[float, float]) -> float:
-    """Deflection towards the cameras at the centre: an even polynomial through the points within 3 mm of it."""
+    """Deflection towards the cameras at the centre: an even polynomial through the points within 5 mm of it."""
     if result.uvw_mm is None:
         raise ValueError("the result is a shape, not a displacement")
     r2 = (result.xyz_mm[..., 0] - centre_mm[0]) ** 2 + (result.xyz_mm[..., 1] - centre_mm[1]) ** 2

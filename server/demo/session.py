@@ -117,7 +117,7 @@ class Session:
         """Fetch camera 1's image of a step."""
         from server.io.images import decode_image
 
-        data = self.client.call("GET", f"/tests/{test_id}/steps/{step}/images/cam1", params={"format": "tiff"}).content
+        data = self.client.call("GET", f"/tests/{test_id}/steps/{step}/cam1", params={"format": "tiff"}).content
         return decode_image(data, name=f"step {step} of {test_id}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,8 +38,16 @@ class Devices:
         self._exit.close()
 
 
-def open_devices(config: RigConfig) -> Devices:
-    """Open stage and cameras, push the rig file's settings.
+def first_settings(config: RigConfig, cam: CameraName) -> CameraSettings:
+    """Return the settings that the rig file gives."""
+    section = config.camera(cam)
+    return CameraSettings(
+        exposure_ms=section.exposure_ms, gain_db=section.gain_db, bit_depth=section.bit_depth, trigger="software"
+    )
+
+
+def open_devices(config: RigConfig, settings: Mapping[CameraName, CameraSettings]) -> Devices:
+    """Open stage and cameras, push the cameras' settings.
 
     Raises
     ------
@@ -55,17 +64,9 @@ def open_devices(config: RigConfig) -> Devices:
             world = SimWorld(SimRig.from_dict(_tables(config)), controller.true_position_mm)
         units = []
         for cam in CAMERAS:
-            section = config.camera(cam)
             unit = CameraUnit(cam, _grabber(config, cam, world))
             stack.callback(unit.close)
-            unit.open(
-                CameraSettings(
-                    exposure_ms=section.exposure_ms,
-                    gain_db=section.gain_db,
-                    bit_depth=section.bit_depth,
-                    trigger="software",
-                )
-            )
+            unit.open(settings[cam])
             units.append(unit)
         stage = open_stage(config.stage.driver, url, _axis_options(config))
         stack.callback(stage.close)

@@ -7,10 +7,8 @@ reading the stage's state and stopping it do not.
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from core.errors import DeviceError, InputError, StageError, StateError, StereorigError
@@ -18,8 +16,8 @@ from drivers.frames import CameraSettings
 from drivers.stage import MoveResult
 from server.config import CameraName, RigConfig
 from server.hardware import HardwareGate
-from server.jobs import problem_of
-from server.rig.build import Devices, open_devices
+from server.problem import problem_of
+from server.rig.build import Devices, first_settings, open_devices
 from server.rig.cameras import CAMERAS, CameraPair, PairShot
 
 _log = logging.getLogger("stereorig.rig")
@@ -41,6 +39,8 @@ class Rig:
         self.gate = gate
         self._devices: Devices | None = None
         self._fault: dict[str, Any] | None = {"code": "not_connected", "cause": "The rig was not opened yet."}
+        # what the cameras were last set to, so that a reconnected one gets it again
+        self._settings = {cam: first_settings(config, cam) for cam in CAMERAS}
         self.scene: dict[str, Any] | None = None
 
     # opening and closing ----------------------------------------------------------------------------------------
@@ -48,7 +48,7 @@ class Rig:
     def open(self) -> None:
         """Open cameras and stage; a fault is kept and shown, and :meth:`reconnect` tries again."""
         try:
-            self._devices = open_devices(self.config)
+            self._devices = open_devices(self.config, self._settings)
             self._fault = None
             if self._devices.world is not None and self.scene is None:
                 self.scene = {"scene": "grid", "load": 0.0}
@@ -153,7 +153,9 @@ class Rig:
     def configure(self, cam: CameraName, settings: CameraSettings) -> CameraSettings:
         """Change settings on the owner thread; returns what the device really took."""
         pair = self.pair
-        return self.gate.call(lambda: pair.configure(cam, settings))
+        taken = self.gate.call(lambda: pair.configure(cam, settings))
+        self._settings[cam] = replace(taken, region_px=None)
+        return taken
 
     def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs; call on the owner thread, with the hold."""
@@ -227,7 +229,7 @@ class Rig:
                     target_mm=target,
                     limits_mm=[limits.low_mm, limits.high_mm],
                 )
-        for axis in targets_mm:
+        for axis, target in targets_mm.items():
             status = stage.state(axis)
             if status.state.value in ("not_homed", "motor_off", "fault", "configuration"):
                 code = status.state.value if status.state.value in ("not_homed", "motor_off") else "stage_not_ready"
@@ -237,6 +239,23 @@ class Rig:
                     remedy="POST /stage/home first.",
                     axis=axis,
                 )
+            self._check_room_to_arrive(axis, status.position_mm, target)
+
+    def _check_room_to_arrive(self, axis: int, here_mm: float, target_mm: float) -> None:
+        """Refuse a target that could only be arrived at from the wrong side; the driver would, but in mid-job."""
+        section, limits = self.config.stage, self._ready().stage.limits(axis)
+        sign = 1.0 if section.approach_from == "below" else -1.0
+        turn = target_mm - sign * section.backlash_mm
+        needed = section.backlash_mm > 0.0 and sign * (target_mm - here_mm) < section.backlash_mm
+        if needed and not limits.low_mm <= turn <= limits.high_mm:
+            raise StageError(
+                f"Axis {axis} cannot arrive at {target_mm:g} mm from {section.approach_from}: it would turn at "
+                f"{turn:g} mm, outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+                code="out_of_limits",
+                remedy=f"Stay the backlash ({section.backlash_mm:g} mm) inside the limit.",
+                axis=axis,
+                target_mm=target_mm,
+            )
 
     def positions_mm(self, axes: tuple[int, ...] | None = None) -> dict[int, float]:
         """Read positions back."""
@@ -259,22 +278,3 @@ class Rig:
     def stop(self) -> None:
         """Stop every axis, now, from any thread."""
         self._ready().stage.stop()
-
-    def stop_again_soon(self) -> None:
-        """Stop once more in 50 ms.
-
-        A job that passed its last check before it was cancelled may start a motion a moment after the first stop.
-        """
-
-        def again() -> None:
-            devices = self._devices
-            if devices is not None:
-                devices.stage.stop()
-
-        timer = threading.Timer(0.05, again)
-        timer.daemon = True
-        timer.start()
-
-    def wait_settled(self) -> None:
-        """Wait as long as the rig file says after a motion of the scene."""
-        time.sleep(self.config.stage.settle_ms / 1000.0)

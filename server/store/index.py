@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from core.errors import FileFormatError
+from server.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
@@ -54,6 +55,9 @@ def rebuild(catalog: Catalog, folder: DataFolder, calibrations: CalibrationStore
     for calibration_id in calibrations.ids():
         folder.ids.seen(calibration_id)
         try:
+            if calibrations.read(calibration_id)["state"] == "unfinished":
+                # nobody works on it any more: the job that did ended with the last service
+                calibrations.put_failure(calibration_id, problem_of(RESTART))
             entries.append(("calibration", "", calibration_id, calibration_entry(calibrations, calibration_id)))
         except (FileFormatError, KeyError) as error:
             trouble.append(f"calibration {calibration_id}: {error}")

@@ -268,6 +268,8 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         if settled(motion, previous, tolerance):
             status = OK
         previous = motion
+    if not w[0] > 0.0:  # behind camera 1
+        return NOT_CONVERGED, iterations
     for j in range(3):
         out[j] = w[j]
         out[13 + j] = levels[j, 2]

@@ -114,6 +114,8 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
     if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
         return OUTSIDE_IMAGE, iterations
+    if not w[0] > 0.0:  # behind camera 1
+        return NOT_CONVERGED, iterations
     out[0], out[1], out[2], out[3], out[4] = w[0], w[1], w[2], e, levels[0, 2]
     variance = residual_variance(levels, 1, n, f2, 4.0, order)
     share = noise_share(variance, roughness, f2, n, order)
