@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from core.camera import Camera
 from core.errors import FileFormatError
@@ -71,6 +72,33 @@ def test_plain_yaml_lists(tmp_path: Path, head: str) -> None:
     text = head + "\n".join([*lines, f"R: {R.tolist()}", f"T: {T.tolist()}", "imageSize: [1920, 1200]"]) + "\n"
     (tmp_path / "a.yaml").write_text(text)
     check_against_opencv(load_calibration(tmp_path / "a.yaml"))
+
+
+@pytest.mark.parametrize("head", ["", "%YAML:1.0\n---\n"])
+@pytest.mark.parametrize("flow", [None, False, True])
+@pytest.mark.parametrize("form", ["lists", "matrices", "matrices without a type"])
+def test_yaml_as_pyyaml_writes_it(tmp_path: Path, head: str, flow: bool | None, form: str) -> None:
+    content: dict[str, object] = {"imageSize": [1920, 1200]}
+    values = {"cameraMatrix1": K1, "distCoeffs1": D1, "cameraMatrix2": K2, "distCoeffs2": D2, "R": R, "T": T}
+    for key, value in values.items():
+        matrix = np.atleast_2d(value)
+        as_map = {"rows": matrix.shape[0], "cols": matrix.shape[1], "dt": "d", "data": matrix.ravel().tolist()}
+        if form == "matrices without a type":
+            del as_map["dt"]
+        content[key] = value.tolist() if form == "lists" else as_map
+    (tmp_path / "a.yaml").write_text(head + yaml.dump(content, default_flow_style=flow))
+    loaded = load_calibration(tmp_path / "a.yaml")
+    check_against_opencv(loaded)
+    assert loaded.image_size2_px == (1920, 1200)
+
+
+def test_yaml_bombs_and_objects_are_refused(tmp_path: Path) -> None:
+    rows = "\n".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 30))
+    bomb = f"a0: &a0 [1, 1]\n{rows}\ncameraMatrix1: *a29\n"
+    for k, text in enumerate((bomb, "cameraMatrix1: !!python/object/apply:os.getcwd []\n")):
+        path = tmp_path / f"{k}.yaml"
+        path.write_text(text)
+        assert refused(path).code == "calibration_unreadable"
 
 
 @pytest.mark.parametrize("length", [4, 5, 8, 14])

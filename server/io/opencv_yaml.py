@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from core.lens import OpenCVLens
@@ -21,6 +22,7 @@ ImageSize = tuple[int, int] | None
 KEYS = ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "R", "T")
 _LENGTHS = (4, 5, 8, 12, 14)
 _ORDER = ("k1", "k2", "p1", "p2", "k3")
+_MOST_NUMBERS = 100
 _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
 
 
@@ -29,43 +31,92 @@ def looks_like_opencv(data: bytes) -> bool:
     return b"cameraMatrix1" in data[:_MAX_BYTES]
 
 
-def _values(node: Any) -> Any:
-    """Turn a file node into numbers: nested lists for sequences, an array for a matrix, None for what is neither."""
+class _Loader(yaml.SafeLoader):
+    """Plain YAML, and OpenCV's matrices as the mappings they are."""
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
+
+
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix)
+
+
+def _load(name: str, text: str) -> dict[str, Any]:
+    """Read YAML, JSON or XML text to plain lists, mappings and numbers."""
+    try:
+        if text.lstrip().startswith("<"):
+            return _load_xml(text)
+        # OpenCV's own first line, %YAML:1.0, is not the directive that YAML knows
+        lines = [line for line in text.splitlines(keepends=True) if not line.startswith("%YAML")]
+        content = yaml.load("".join(lines), Loader=_Loader)
+    except (yaml.YAMLError, cv2.error, SystemError, ValueError, RecursionError) as error:
+        raise unreadable(name, f"it is damaged ({type(error).__name__})") from error
+    if not isinstance(content, dict):
+        raise unreadable(name, "it names no values")
+    return content
+
+
+def _load_xml(text: str) -> dict[str, Any]:
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    try:
+        nodes = {key: storage.getNode(key) for key in (*KEYS, "imageSize")}
+        return {key: _plain(node) for key, node in nodes.items() if not node.isNone()}
+    finally:
+        storage.release()
+
+
+def _plain(node: Any) -> Any:
     if node.isReal() or node.isInt():
         return node.real()
     if node.isSeq():
-        return [_values(node.at(i)) for i in range(node.size())]
-    if node.isMap():
-        if not node.getNode("dt").isNone():
-            return node.mat()
-        rows, cols, data = node.getNode("rows"), node.getNode("cols"), node.getNode("data")
-        if not (rows.isNone() or cols.isNone() or data.isNone()):
-            return np.reshape(np.asarray(_values(data), dtype=np.float64), (int(rows.real()), int(cols.real())))
-    return None
+        return [_plain(node.at(i)) for i in range(node.size())]
+    return node.mat().tolist() if node.isMap() else node.string()
 
 
-def _array(name: str, storage: Any, key: str) -> NDArray[np.float64]:
-    node = storage.getNode(key)
-    if node.isNone():
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or value is None:
+        raise ValueError("not a number")
+    if isinstance(value, str):  # YAML 1.1 takes 1e-5 and .Nan for text
+        value = value.strip().lower().replace(".nan", "nan").replace(".inf", "inf")
+    return float(value)
+
+
+def _flat(value: Any, depth: int = 0) -> list[float]:
+    if not isinstance(value, list):
+        return [_number(value)]
+    if depth > 2 or len(value) > _MOST_NUMBERS:
+        raise ValueError("nested too deeply or too long")
+    return [number for part in value for number in _flat(part, depth + 1)]
+
+
+def _array(name: str, content: dict[str, Any], key: str) -> NDArray[np.float64]:
+    if content.get(key) is None:
         raise unreadable(name, f"{key} is missing")
+    value = content[key]
     try:
-        array = np.asarray(_values(node), dtype=np.float64)
-    except (ValueError, TypeError, cv2.error) as error:
+        if isinstance(value, dict):
+            shape = value["sizes"] if "sizes" in value else [value["rows"], value["cols"]]
+            array = np.reshape(_flat(value["data"]), [int(n) for n in shape])
+        else:
+            rows = len(value) if isinstance(value, list) and value and isinstance(value[0], list) else None
+            array = np.array(_flat(value))
+            array = array if rows is None else array.reshape(rows, -1)
+    except (ValueError, TypeError, KeyError) as error:
         raise unreadable(name, f"{key} is not a matrix of numbers") from error
-    if array.ndim == 0 and np.isnan(array):
-        raise unreadable(name, f"{key} is not a matrix of numbers")
     if not np.isfinite(array).all():
         raise invalid(name, f"{key} holds a number that is not finite")
     return array
 
 
-def _lens(name: str, storage: Any, which: int) -> OpenCVLens:
-    K = _array(name, storage, f"cameraMatrix{which}")
+def _lens(name: str, content: dict[str, Any], which: int) -> OpenCVLens:
+    K = _array(name, content, f"cameraMatrix{which}")
     if K.shape != (3, 3):
         raise unreadable(name, f"cameraMatrix{which} has the shape {K.shape}, not (3, 3)")
     if K[1, 0] != 0.0 or K[2, 0] != 0.0 or K[2, 1] != 0.0 or K[2, 2] != 1.0:
         raise invalid(name, f"cameraMatrix{which} is not of the form [fx s cx; 0 fy cy; 0 0 1]")
-    d = _array(name, storage, f"distCoeffs{which}").ravel()
+    d = _array(name, content, f"distCoeffs{which}").ravel()
     if d.size not in _LENGTHS:
         raise unreadable(name, f"distCoeffs{which} has {d.size} values; OpenCV has {_LENGTHS}")
     if np.any(d[5:]):
@@ -94,21 +145,12 @@ def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise unreadable(name, "it is not text") from error
-    if not text.lstrip().startswith(("%YAML", "{", "<?xml")):
-        text = "%YAML:1.0\n---\n" + text.removeprefix("---\n")  # plain YAML, which OpenCV asks to be announced
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError) as error:
-        raise unreadable(name, "OpenCV's reader finds it damaged") from error
-    try:
-        lens1, lens2 = _lens(name, storage, 1), _lens(name, storage, 2)
-        pair = pair_of(name, lens1, lens2, _array(name, storage, "R"), _array(name, storage, "T"))
-        size: ImageSize = None
-        if not storage.getNode("imageSize").isNone():
-            numbers = _array(name, storage, "imageSize").ravel()
-            if numbers.size != 2 or numbers.min() < 1 or np.any(numbers % 1):
-                raise invalid(name, f"imageSize is {numbers.tolist()}, not (width, height)")
-            size = (int(numbers[0]), int(numbers[1]))
-    finally:
-        storage.release()
-    return pair, size
+    content = _load(name, text)
+    lens1, lens2 = _lens(name, content, 1), _lens(name, content, 2)
+    pair = pair_of(name, lens1, lens2, _array(name, content, "R"), _array(name, content, "T"))
+    if content.get("imageSize") is None:
+        return pair, None
+    size = _array(name, content, "imageSize").ravel()
+    if size.size != 2 or size.min() < 1 or np.any(size % 1):
+        raise invalid(name, f"imageSize is {size.tolist()}, not (width, height)")
+    return pair, (int(size[0]), int(size[1]))
