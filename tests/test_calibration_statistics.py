@@ -70,7 +70,7 @@ def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
     np.testing.assert_allclose(sigma_of, np.sqrt(np.diagonal(covariance)), rtol=0.01)
 
 
-def monte_carlo(tolerance: float, runs: int) -> tuple[Array, list[Array], list[Array], Array]:
+def monte_carlo(tolerance: float, runs: int, degree: int | None) -> tuple[Array, list[Array], list[Array], Array]:
     grid = Grid(node_tolerance_mm=tolerance)
     found, claimed, shapes = [], [], []
     points = np.stack(np.meshgrid(*[np.linspace(-4, 4, 3)] * 2, [-1.0, 1.0]), -1).reshape(-1, 3)
@@ -80,7 +80,16 @@ def monte_carlo(tolerance: float, runs: int) -> tuple[Array, list[Array], list[A
         rng = np.random.default_rng(1000 + seed)
         # Gaussian node errors with the same variance as the bound's box, so that theory and draw agree
         error = rng.standard_normal((9, 9, 2)) * tolerance / math.sqrt(3.0)
-        result = calibrate(make_views((0.0, 5.0), grid=grid, error_mm=error, seed=seed), grid, NOMINAL)
+        views = make_views((0.0, 5.0), grid=grid, error_mm=error, seed=seed)
+        if degree is not None:
+            clean = make_views((0.0, 5.0), grid=grid, error_mm=error, noise=0.0)
+            views = [
+                dataclasses.replace(
+                    v, xy_px=c.xy_px + through_lines(v.xy_px - c.xy_px, degree), correlation=9.0 / (degree + 1)
+                )
+                for v, c in zip(views, clean, strict=True)
+            ]
+        result = calibrate(views, grid, NOMINAL)
         found.append(ten_of(result) - truth_vector())
         claimed.append(result.covariance)
         shapes.append(result.pair.triangulate(*seen).xyz_mm - points)
@@ -88,10 +97,20 @@ def monte_carlo(tolerance: float, runs: int) -> tuple[Array, list[Array], list[A
     return np.array(found), claimed, shapes, np.array(sigma_shape)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.004])
-def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float) -> None:
+def through_lines(error: Array, degree: int) -> Array:
+    """What a polynomial fitted to each line leaves of independent errors of its points."""
+    out = error.copy()
+    t = np.arange(9.0)
+    for k in range(9):
+        out[k, :, 0] = np.polyval(np.polyfit(t, error[k, :, 0], degree), t)
+        out[:, k, 1] = np.polyval(np.polyfit(t, error[:, k, 1], degree), t)
+    return out
+
+
+@pytest.mark.parametrize(("tolerance", "degree"), [(0.0, None), (0.004, None), (0.0, 1), (0.0, 2)])
+def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float, degree: int | None) -> None:
     runs = 30
-    found, claimed, shapes, sigma_shape = monte_carlo(tolerance, runs)
+    found, claimed, shapes, sigma_shape = monte_carlo(tolerance, runs, degree)
     covariance = np.mean(claimed, axis=0)
     ratio = found.std(axis=0) / np.sqrt(np.diagonal(covariance))
     # sd of a sd from 30 runs is 13 %; three of those over 20 correlated figures

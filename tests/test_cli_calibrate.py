@@ -115,9 +115,9 @@ def test_a_toleranced_grid_stays_within_the_band() -> None:
     options = CalibrationOptions(held_out_mm=(2.0,))
     found = calibrate_views(views, target, nominal, options, progress=lambda *s: stages.append(s))
     assert found.result.held_out is not None
-    # against the corrected nodes; the nominal grid's own figure profits from straight lines only
-    assert found.result.held_out.mean.rbe_px < 0.0045
-    assert found.result.held_out.nominal_mean.rbe_px < 0.045
+    # against the corrected nodes; the nominal grid's own figure stays what 4 um at 33 um/px make
+    assert found.result.held_out.mean.rbe_px < 0.02
+    assert 0.06 < found.result.held_out.nominal_mean.rbe_px < 0.11
     assert volume_error_um(found.result.pair) < 1.5
     assert stages[0] == ("grid", 0, 7)
     assert stages[-1] == ("calibration", 7, 7)

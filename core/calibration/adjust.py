@@ -148,7 +148,9 @@ def adjust(
         return _assemble(lins, observations, x_, d_, noise_, mean, prior, tau)
 
     noise = np.ones(2)
-    counts = np.array([o.count for o in observations], dtype=np.float64)
+    # correlated observations lose more of their scatter to the ten parameters than independent ones do
+    lost = 10.0 * (np.array([o.correlation for o in observations]) - 1.0)
+    counts = np.array([o.count for o in observations], dtype=np.float64) - lost
     noise = _noise(evaluate(x, d, noise), counts - 10.0)
     if node_sigma_mm > 0.0:
         # what the nominal grid left over is mostly the nodes' error; start from what a localiser reaches
@@ -193,7 +195,7 @@ def _assemble(
     W, V, h = np.zeros((n, _P, 2)), np.zeros((2, n, 2, 2)), np.zeros((n, 2))
     squares = np.zeros(2)
     for c in range(len(CAMERAS)):
-        lin, w = lins[c], observations[c].weight / noise_px[c] ** 2
+        lin, w = lins[c], observations[c].weight / (noise_px[c] ** 2 * observations[c].correlation)
         span = slice(c * N_CAMERA, (c + 1) * N_CAMERA)
         weighted = lin.by_camera * w[..., None, None]
         U[c] = np.einsum("vnip,vniq->pq", weighted, lin.by_camera, optimize=True)
@@ -202,7 +204,8 @@ def _assemble(
         V[c] = np.einsum("vn,vnij,vnik->njk", w, lin.by_node, lin.by_node, optimize=True)
         h += np.einsum("vn,vnij,vni->nj", w, lin.by_node, lin.residual_px, optimize=True)
         squares[c] = np.sum(observations[c].weight[..., None] * lin.residual_px**2)
-    cost = float(np.sum(squares / noise_px**2) + np.sum(prior * (mean - x) ** 2))
+    correlation = np.array([o.correlation for o in observations])
+    cost = float(np.sum(squares / (noise_px**2 * correlation)) + np.sum(prior * (mean - x) ** 2))
     if np.isfinite(tau):
         h -= tau * d
         cost += float(tau * np.sum(d**2))

@@ -79,6 +79,9 @@ class CalibrationView:
         Only ratios matter: the noise level is estimated from the residuals.
     name
         Name used in messages (a file name, for instance).
+    correlation
+        Observed coordinates per independent one. A fit over whole lines gives every intersection on a line the
+        line's own error, so that 162 coordinates of 18 straight lines know no more than 36 independent ones.
     """
 
     camera: CameraName
@@ -86,6 +89,7 @@ class CalibrationView:
     xy_px: Float
     sigma_px: float | Float | None = None
     name: str = ""
+    correlation: float = 1.0
 
     @property
     def label(self) -> str:

@@ -29,12 +29,15 @@ class Observations:
         (v, n).
     weight
         (v, n), mean 1 over what was found; 0 where not found.
+    correlation
+        Observed coordinates per independent one.
     """
 
     dz_mm: Float
     xy_px: Float
     found: Bool
     weight: Float
+    correlation: float = 1.0
 
     @property
     def count(self) -> int:
@@ -55,7 +58,11 @@ def collect(views: Sequence[CalibrationView]) -> Observations:
     else:
         weight = found.astype(np.float64)
     return Observations(
-        np.array([v.dz_mm for v in views]), np.where(found[..., None], xy, np.nan), found, weight / weight[found].mean()
+        np.array([v.dz_mm for v in views]),
+        np.where(found[..., None], xy, np.nan),
+        found,
+        weight / weight[found].mean(),
+        float(np.mean([v.correlation for v in views])),
     )
 
 

@@ -49,7 +49,7 @@ class GateOptions:
     epipolar_sigmas: float = 5.0
     epipolar_floor_px: float = 0.002
     correlation_sigmas: float = 6.0
-    correlation_least_factor: float = 2.5
+    correlation_least_factor: float = 1.35
     correlation_most_factor: float = 12.0
     neighbour_sigmas: float = 6.0
     neighbour_floor_px: float = 0.05
