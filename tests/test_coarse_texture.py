@@ -48,9 +48,8 @@ def test_what_noise_adds_to_the_hessian_is_known(interpolation: str) -> None:
     assert np.abs((left - truth) / scale).max() < 0.025
 
 
-@pytest.mark.slow
 def test_the_covariance_of_coarse_texture_tells_the_truth() -> None:
-    pair, texture = paper_pair(), Texture(blob_mm=0.17)
+    pair, texture = paper_pair(), Texture(blob_mm=0.22)
     before, after = Plane(), Plane(np.array([0.0123, -0.0241, 0.0371]))
     clean = [render(c, p, texture) for p in (before, after) for c in (pair.cam1, pair.cam2)]
     axis = np.linspace(30.0, clean[0].shape[0] - 31.0, 12)
@@ -58,9 +57,9 @@ def test_the_covariance_of_coarse_texture_tells_the_truth() -> None:
     w, G = true_w(pair.cam1, before, xy), true_g(pair.cam1, before, after, xy)
     options = MatchOptions(subset_px=SUBSET)
     scores, shares = [], []
-    for seed in range(3):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
-        images = [prepare(digitise(image, noise=4.0, rng=rng)) for image in clean]
+        images = [prepare(digitise(image, noise=3.0, rng=rng)) for image in clean]
         fit = fit_motion(pair, *images, xy, w, G, options)
         ok = fit.status == 0
         shares.append(ok.mean())
@@ -70,8 +69,8 @@ def test_the_covariance_of_coarse_texture_tells_the_truth() -> None:
         scores.append(((uvw - after.origin) / sigma)[ok])
     z = np.concatenate(scores)
     print(f"valid {np.mean(shares):.3f}, error over sigma rms {np.sqrt((z**2).mean(0))}")
-    assert np.mean(shares) > 0.85
-    assert (np.sqrt((z**2).mean(0)) < 1.3).all()
+    assert np.mean(shares) > 0.8
+    assert (np.sqrt((z**2).mean(0)) < 1.25).all()
 
 
 def test_a_message_is_one_line_of_sentences() -> None:
