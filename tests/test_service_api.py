@@ -144,6 +144,7 @@ def test_move_reads_positions_back(client: httpx.Client) -> None:
         ('{"positions_mm": {"1": Infinity}}', "invalid_request"),
         ('{"positions_mm": {"1": 1e308}}', "invalid_request"),
         ('{"positions_mm": {"1": "far"}}', "invalid_request"),
+        ('{"positions_mm": {"1": true}}', "invalid_request"),
         ('{"positions_mm": {}}', "invalid_request"),
         ('{"positions_mm": {"1": 1}, "speed": 3}', "invalid_request"),
         ('{"positions_mm": {"1": 1}, "by_mm": {"1": 1}}', "invalid_request"),
@@ -306,6 +307,11 @@ def test_import_keeps_pixels_to_the_bit_and_refuses_what_is_no_pair(client: http
     truncated = png(two)[:200]
     answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", truncated)})
     assert_problem(answer, 422, "image_unreadable")
+    blank = png(np.full_like(two, 77))
+    answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", blank)})
+    assert "cam2" in str(assert_problem(answer, 422, "image_blank")["detail"])
+    answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", png(one))})
+    assert_problem(answer, 422, "same_image")
     assert len(client.get(f"{API}/tests/{test_id}").json()["steps"]) == 1
 
 
