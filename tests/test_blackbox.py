@@ -63,7 +63,7 @@ def test_calibrate_finds_the_rig_from_pictures(tmp_path: Path, localiser: str) -
     grid = LineGrid(1.0, (11, 11), 0.03)
     for i, dz in enumerate((0.0, 2.0, 4.0, 5.0)):
         for j, (name, cam) in enumerate((("cam1", CAM1), ("cam2", CAM2))):
-            image = render(cam, grid, dz=dz, n=8, seed=10 * i + j)
+            image = render(cam, grid, dz=dz, n=8, low=15.0, high=230.0, seed=10 * i + j)  # backlit: high contrast
             tifffile.imwrite(views / f"{name}_{dz:+.3f}mm.tif", image)
     (tmp_path / "target.toml").write_text(TARGET)
     (tmp_path / "rig.toml").write_text(RIG)

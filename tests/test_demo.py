@@ -224,7 +224,11 @@ def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "server.cli", "demo", "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True,
+        # a shell's background job ignores Ctrl-C, and so would its children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     assert process.stderr is not None
     port = None
     for line in process.stderr:

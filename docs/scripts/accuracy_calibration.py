@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -12,15 +13,16 @@ from core.aspect import measure_aspect
 from core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
 from core.calibration.inputs import CalibrationOptions, NominalCamera
 from core.camera import Camera, RigidTransform, rotation_from_angles
-from core.grid import detect_grid
+from core.grid import Localiser, detect_grid
 from core.lens import SeidelLens
+from core.stereo import StereoPair
 from core.target import GridTarget
-from docs.scripts.paper_rig import Rig, load_rig
+from docs.scripts.paper_rig import ROOT
 from docs.scripts.table import Row, Section
 from sim.render import RenderOptions, render
-from sim.scene import Scene
-from sim.surface import flat
-from sim.texture import line_grid
+from sim.rig import CAMERA_NAMES, SimRig
+from sim.scenes import make_scene
+from sim.world import SimWorld
 
 Float = NDArray[np.float64]
 POSITIONS = (0.0, 5.0, 2.0, 4.0)
@@ -30,33 +32,36 @@ NOMINALS = (
     NominalCamera((512, 480), 12300.0, 404.0, -30.0, 0.9617),
     NominalCamera((512, 480), 12300.0, 404.0, 30.0, 0.9617),
 )
-FORTY_FIVE = rotation_from_angles(0.0, 0.0, 0.0)
+RIG = SimRig.from_toml(ROOT / "config" / "sim_paper.toml")
 
 
 def _target(tolerance_mm: float) -> GridTarget:
     return GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03, node_tolerance_mm=tolerance_mm, dark_lines=True)
 
 
-def _scene(tolerance_mm: float, seed: int) -> Scene:
-    texture = line_grid(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03, node_tolerance_mm=tolerance_mm, seed=seed)
-    return Scene(name="grid", surface=flat(), texture=texture, background=0.8)
-
-
-def _calibrate(rig: Rig, tolerance_mm: float, seed: int, localiser: str) -> CalibrationFromImages:
-    scene = _scene(tolerance_mm, seed)
+def _calibrate(
+    tolerance_mm: float, seed: int, localiser: Localiser, *, nodes: bool, frames: int
+) -> CalibrationFromImages:
+    stage = {1: 0.0, 2: 0.0}
+    world = SimWorld(replace(RIG, seed=seed), lambda axis: stage[axis], threads=2)
+    world.set_scene("grid", node_tolerance_mm=tolerance_mm)
+    rng = np.random.default_rng(seed)
     images = []
-    for k, dz in enumerate(POSITIONS):
-        for c, name in enumerate(("cam1", "cam2")):
-            (picture,) = rig.shoot(scene, noise=2.0, seed=100 * seed + 10 * k + c, cam=c, dz_mm=dz)
-            images.append(ImageOfTarget(name, dz, picture))  # type: ignore[arg-type]
-    options = CalibrationOptions(held_out_mm=HELD_OUT)
-    return calibrate_views(images, _target(tolerance_mm), NOMINALS, options, localiser=localiser)  # type: ignore[arg-type]
+    for dz in POSITIONS:
+        stage[1] = stage[2] = dz
+        for name in CAMERA_NAMES:
+            shots = [world.expose(name, exposure_ms=10.0, rng=rng) for _ in range(frames)]
+            mean = shots[0] if frames == 1 else np.mean(shots, axis=0, dtype=np.float32)
+            images.append(ImageOfTarget(name, dz, mean))
+    options = CalibrationOptions(held_out_mm=HELD_OUT, estimate_nodes=nodes)
+    return calibrate_views(images, _target(tolerance_mm), NOMINALS, options, localiser=localiser)
 
 
-def _space_error_um(rig: Rig, found: CalibrationFromImages) -> tuple[float, float]:
+def _space_error_um(found: CalibrationFromImages) -> tuple[float, float]:
     """Rms error of triangulated points of a 9 x 9 x 2 mm volume: as it is, and with a rigid motion taken out."""
     points = np.stack(np.meshgrid(*[np.linspace(-4.5, 4.5, 7)] * 2, [-1.0, 0.0, 1.0]), -1).reshape(-1, 3)
-    got = found.result.pair.triangulate(rig.pair.cam1.project(points).xy, rig.pair.cam2.project(points).xy).xyz_mm
+    true = StereoPair(RIG.cam1.camera, RIG.cam2.camera)
+    got = found.result.pair.triangulate(true.cam1.project(points).xy, true.cam2.project(points).xy).xyz_mm
     raw = got - points
     a, b = points - points.mean(0), got - got.mean(0)
     u, _, vt = np.linalg.svd(a.T @ b)
@@ -66,21 +71,23 @@ def _space_error_um(rig: Rig, found: CalibrationFromImages) -> tuple[float, floa
 
 def calibration(figures: Path) -> Section:
     """Held-out RBE for the exact and the toleranced grid, both localisers."""
-    rig = load_rig()
     rows, notes = [], []
     shown: CalibrationFromImages | None = None
-    for localiser, tolerance, limit in (
-        ("profile", 0.0, 0.0035),
-        ("paper", 0.0, 0.006),
-        ("profile", 0.004, 0.045),
-        ("paper", 0.004, None),
+    for localiser, tolerance, nodes, frames, limit in (
+        ("profile", 0.0, False, 1, 0.0035),
+        ("paper", 0.0, False, 1, 0.006),
+        ("profile", 0.004, True, 1, 0.045),
+        ("profile", 0.004, False, 1, 0.045),
+        ("profile", 0.004, True, 4, 0.045),
+        ("paper", 0.004, True, 1, None),
     ):
         seeds = NODE_SEEDS
-        runs = [_calibrate(rig, tolerance, seed, localiser) for seed in seeds]
+        runs = [_calibrate(tolerance, seed, localiser, nodes=nodes, frames=frames) for seed in seeds]
         held = [run.result.held_out.mean.rbe_px for run in runs if run.result.held_out is not None]
         fitted = [run.result.fitted.mean.rbe_px for run in runs]
-        space = np.array([_space_error_um(rig, run) for run in runs])
-        label = f"{localiser} localiser, {'exact grid' if tolerance == 0 else '4 um grid'}"
+        space = np.array([_space_error_um(run) for run in runs])
+        target = "exact grid" if tolerance == 0 else f"4 um grid, nodes {'corrected' if nodes else 'as nominal'}"
+        label = f"{localiser} localiser, {target}, {frames} frame{'s' if frames > 1 else ''}"
         rows += [
             Row(f"held-out RBE, {label}, worst of {len(seeds)}", max(held), "px", limit),
             Row(f"fitted RBE, {label}, mean", float(np.mean(fitted)), "px"),
@@ -91,9 +98,7 @@ def calibration(figures: Path) -> Section:
             shown = runs[0]
     assert shown is not None
     fig, axes = plt.subplots(2, 4, figsize=(12, 6), layout="constrained", sharex=True, sharey=True)
-    for ax, view in zip(
-        axes.T.ravel() if len(shown.result.views) != 8 else axes.ravel(), shown.result.views, strict=False
-    ):
+    for ax, view in zip(axes.ravel(), shown.result.views, strict=False):
         grid = next(g for g, k in zip(shown.grids, _order(), strict=True) if k == (view.camera, round(view.dz_mm, 3)))
         xy, r = grid.xy_px.reshape(-1, 2), view.residual_px.reshape(-1, 2)
         q = ax.quiver(xy[:, 0], xy[:, 1], r[:, 0], r[:, 1], angles="xy", scale_units="xy", scale=2e-4, width=0.004)
@@ -112,7 +117,7 @@ def calibration(figures: Path) -> Section:
     )
     return Section(
         "Calibration",
-        "Grid pictures of both cameras at four positions, one frame each, noise 2 of 255.",
+        "Grid pictures of both cameras at four positions, noise 2 of 255 a frame, from the simulated cameras.",
         rows,
         [("accuracy_calibration.png", "Residuals of one calibration on the exact grid")],
         notes,
@@ -128,15 +133,19 @@ def aspect(figures: Path) -> Section:
     rng = np.random.default_rng(5)
     lens = SeidelLens(12062.0, 261.4, 234.8, 1.3e-8, 0.9617)
     views = []
-    for k in range(20):
+    for _ in range(20):
         # normal to the axis but for half a degree of carelessness, moved about by up to a millimetre
         angles = np.radians([45.0 + rng.uniform(-1, 1), rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)])
         place = np.array([rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), 400.0])
         camera = Camera(lens, RigidTransform(rotation_from_angles(*angles), place))
-        clean = render(_scene(0.0, 1), camera, (512, 480), options=RenderOptions(blur_px=0.55, threads=2))
+        clean = render(
+            make_scene(RIG, "grid", node_tolerance_mm=0.0),
+            camera,
+            (512, 480),
+            options=RenderOptions(blur_px=RIG.blur_px, threads=2),
+        )
         picture = np.clip(np.round(20 + 215 * clean + rng.normal(0, 2.0, clean.shape)), 0, 255).astype(np.uint8)
         views.append(detect_grid(picture, _target(0.0)))
-        del k
     result = measure_aspect(views)
     per_image = np.asarray(result.per_image)
     fig, ax = plt.subplots(figsize=(6, 3), layout="constrained")
