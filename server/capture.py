@@ -24,6 +24,8 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
     rig = service.rig
     with service.gate.hold("the capture of a step", test_id=test_id):
         shot, positions = service.gate.call(lambda: (rig.shoot(frames), rig.positions_mm()))
+        sizes: dict[str, list[int]] = {cam: [*reversed(shot.pixels[cam].shape)] for cam in CAMERAS}
+        _check_sizes(service, test_id, sizes)
         depth = {cam: 16 if shot.scale > 1 else shot.bit_depth[cam] for cam in CAMERAS}
         quality = pair_quality(*(image_quality(shot.pixels[cam], depth[cam]) for cam in CAMERAS))
         dz = {cam: rig.dz_of(cam, positions[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
@@ -42,9 +44,8 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
             "dz_mm": dz,
             "scene": rig.scene,
             "quality": quality,
-            "image_size_px": {cam: [shot.pixels[cam].shape[1], shot.pixels[cam].shape[0]] for cam in CAMERAS},
+            "image_size_px": sizes,
         }
-        _check_sizes(service, test_id, document["image_size_px"])
         images: dict[str, bytes] = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
         step = service.tests.add_step(test_id, images, document)
     return _announce(service, step)
@@ -60,7 +61,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
         ``same_image``.
     """
     images: dict[str, GrayImage] = {cam: decode_image(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
-    sizes = {cam: [images[cam].shape[1], images[cam].shape[0]] for cam in CAMERAS}
+    sizes: dict[str, list[int]] = {cam: [*reversed(images[cam].shape)] for cam in CAMERAS}
     _check_sizes(service, test_id, sizes)
     _check_content(images)
     depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
@@ -103,14 +104,13 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
         known |= {cam: ("the test's others are", list(size)) for cam, size in first.items()}
     if service.tests.is_calibrated(test_id):
         calibration = load_calibration(service.tests.calibration_file(test_id))
-        for cam, size in zip(CAMERAS, (calibration.image_size1_px, calibration.image_size2_px), strict=True):
-            if size is not None:
-                known[cam] = ("the test's calibration is for", list(size))
-    for cam, size in sizes.items():
-        what, other = known.get(cam, ("", size))
+        theirs = {"cam1": calibration.image_size1_px, "cam2": calibration.image_size2_px}
+        known |= {cam: ("the test's calibration is for", [*wh]) for cam, wh in theirs.items() if wh is not None}
+    for name, size in sizes.items():
+        what, other = known.get(name, ("", size))
         if other != size:
             raise ImageError(
-                f"The image of {cam} is {size[0]} x {size[1]} px, {what} {other[0]} x {other[1]} px.",
+                f"The image of {name} is {size[0]} x {size[1]} px, {what} {other[0]} x {other[1]} px.",
                 code="image_size",
                 remedy="Use images of the cameras that were calibrated, unscaled and uncropped.",
             )
