@@ -56,7 +56,8 @@ class StereorigError(Exception):
         self.context: dict[str, Any] = context
 
     def __str__(self) -> str:
-        return f"{self.code}: {self.cause} Remedy: {self.remedy}"
+        stop = "" if self.cause.endswith((".", "!", "?")) else "."
+        return f"{self.code}: {self.cause}{stop} Remedy: {self.remedy}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         # keyword-only arguments would be lost on the way back from a worker process

@@ -182,6 +182,14 @@ def test_a_mirrored_image_is_named(camera: str) -> None:
     assert caught.value.code == "image_mirrored"
 
 
+@pytest.mark.parametrize("alphas", [(30.0, 52.0), (36.0, 57.0), (62.0, 40.0)])
+def test_cameras_rolled_against_each_other_are_no_fault(alphas: tuple[float, float]) -> None:
+    cameras = [{**c, "alpha": np.radians(a)} for c, a in zip(PAPER, alphas, strict=True)]
+    result = calibrate(make_views(cameras=cameras), Grid(), NOMINAL)
+    assert result.verdict.level != "failed"
+    assert result.fitted.mean.rbe_px < 0.003
+
+
 @pytest.mark.fault(29)
 def test_an_image_upside_down_is_named() -> None:
     with pytest.raises(CalibrationInputError, match=r"cam2 .* mirrored or turned by 180 degrees") as caught:

@@ -142,6 +142,20 @@ def test_glare_is_refused_and_a_glint_does_no_harm() -> None:
     assert _refusal(overexposed).code == "target_glare"
 
 
+def test_glare_that_hides_lines_is_called_glare() -> None:
+    refused = _refusal(_with_disc(_grey(FAR), 250.0, 230.0, 110.0, 300.0))
+    assert refused.code == "target_glare"
+    assert "saturated" in refused.cause
+
+
+def test_clipped_peaks_of_the_noise_are_no_glare() -> None:
+    grey = 249.0 - 200.0 * _plain_cover(False)
+    noisy = np.clip(np.rint(grey + np.random.default_rng(1).normal(0.0, 3.0, grey.shape)), 0, 255).astype(np.uint8)
+    assert (noisy == 255).sum() > 2000
+    error = detect_grid(noisy, PAPER_TARGET).xy_px - truth_px(CAMERA, PAPER_TARGET)
+    assert np.abs(error).max() < 0.03
+
+
 @pytest.mark.parametrize(
     "extra",
     [

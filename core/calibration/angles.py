@@ -9,6 +9,8 @@ from core.camera import angles_from_rotation
 from core.errors import CalibrationInputError
 from core.lens import Float
 
+_FLIP_DEG = 3.0  # how far a flipped camera's alpha may lie from the mirrored one of its partner
+
 
 def check_angles(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -> None:
     """Compare the fitted viewing directions with the nominal angles and between the cameras.
@@ -83,7 +85,8 @@ def check_angles(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -
             **context,
         )
     roll = abs((alpha["cam1"] - alpha["cam2"] + 180.0) % 360.0 - 180.0)
-    if roll > 20.0:
+    # a flip takes alpha to 90 - alpha; cameras that are rolled against each other otherwise are no fault
+    if roll > 25.0 and abs(alpha["cam1"] + alpha["cam2"] - 90.0) < _FLIP_DEG:
         raise CalibrationInputError(
             f"The grid is turned by {alpha['cam1']:+.1f} degrees in cam1 and {alpha['cam2']:+.1f} in cam2: one image "
             "seems flipped, or the cameras index different corners.",

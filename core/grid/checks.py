@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +22,7 @@ _LEAST_INSIDE_PX = 3.0
 _DEPTH_RANGE = (0.4, 2.2)  # of what the neighbours show
 _LEAST_CERTAIN = 0.25  # standard deviation of a piece's place, as part of the line's width and blur
 _RMS_RATIO = 3.0
+_GLARING_SHARE = 0.0005  # of the image's pixels, in spots; a glare large enough to hide lines has such a core
 _GLARE_RISE = 0.5  # ground above its neighbours', as part of the lines' depth
 
 
@@ -122,6 +124,22 @@ def saturation_level(image: NDArray[Any]) -> float:
     return float(top) if top in full and np.count_nonzero(array == top) > 20 else float("inf")
 
 
+def blame_glare(error: TargetError, grey: NDArray[np.float32], saturation: float) -> TargetError:
+    """The same refusal, but named after the glare where saturated pixels can have hidden the lines."""
+    expected, found = error.context.get("expected"), error.context.get("found")
+    too_many = expected is not None and found is not None and sum(found) > sum(expected)
+    # what a 5 x 5 px square fits into is no clipped noise
+    share = float(cv2.erode((grey >= saturation).astype(np.uint8), np.ones((5, 5), np.uint8)).mean())
+    if share < _GLARING_SHARE or too_many or error.code == "target_rotated":
+        return error
+    return TargetError(
+        f"{error.cause}; {share:.2%} of the image is saturated, which can hide lines",
+        code="target_glare",
+        remedy="Take the reflection or the overexposure away: light the grid from behind, close the aperture.",
+        **{**error.context, "saturated": share},
+    )
+
+
 def judge_pieces(
     table: PieceTable, fits: Float, target: GridTarget, saturation: float
 ) -> tuple[Bool, NDArray[np.str_]]:
@@ -142,7 +160,9 @@ def judge_pieces(
         fits_shape = rms < _RMS_RATIO * np.nanmedian(rms) + 0.02 * np.abs(typical)
         seen = (depth > _DEPTH_RANGE[0] * typical) & (depth < _DEPTH_RANGE[1] * typical)
         certain = np.sqrt(fits[:, OUT["var_c0"]]) < _LEAST_CERTAIN * (fits[:, OUT["width"]] + fits[:, OUT["blur"]])
-        saturated = fits[:, OUT["brightest"]] >= saturation
+        # clipped peaks of the noise do no harm; a level that is itself within the noise of the limit does
+        level = fits[:, OUT["ground"]] + (0.0 if target.dark_lines else depth)
+        saturated = (fits[:, OUT["brightest"]] >= saturation) & ~(level + rms < saturation)
         glaring = saturated | (~seen & (fits[:, OUT["ground"]] - ground > _GLARE_RISE * np.abs(typical)))
     good = ok & fits_shape & seen & certain & ~saturated
     cause = np.where(good, "", np.where(glaring, "glare", "dirt"))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import TargetError
-from core.grid.checks import check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
+from core.grid.checks import blame_glare, check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
 from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
 from core.grid.lines import LineFit, fit_lines
@@ -75,11 +75,13 @@ def detect_grid(
         raise ValueError(f"the paper's localiser fits parabolas; line_model {model!r} needs the profile localiser")
     grey = checked_image(image)
     size = (grey.shape[1], grey.shape[0])
-    lattice, threshold = _coarse(grey, target)
-    check_lattice(lattice, target, size, opts)
-    nodes = lattice.nodes_px
-
     saturation = opts.saturation if opts.saturation is not None else saturation_level(image)
+    try:
+        lattice, threshold = _coarse(grey, target)
+        check_lattice(lattice, target, size, opts)
+    except TargetError as error:
+        raise blame_glare(error, grey, saturation) from error
+    nodes = lattice.nodes_px
     try:
         # first from the coarse lines, with a search across; then from the fitted lines, with their blur
         coarse = _measure(grey, nodes, target, saturation, opts, model="straight", blur_px=None, floor_px=0.05)

@@ -9,6 +9,7 @@ from numba import njit
 
 from core.matching.kernels.linear import assemble, factor, gradient, solve
 from core.matching.kernels.point import (
+    CREEPING,
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -25,7 +26,9 @@ from core.matching.kernels.point import (
     joint_weights,
     noise_share,
     residual_variance,
+    sandwich,
     settled,
+    take_noise_out,
     texture_roughness,
     texture_status,
 )
@@ -33,6 +36,8 @@ from core.matching.kernels.reference import reference_sums, set_up_reference
 
 N_MOTION_OUT = 42
 N_RIGID = 10
+_STRETCH_POSE = np.array([0, 1, 2, 3, 12])  # w0, G00, G10, G20, e among the free unknowns
+_RIGID_POSE = np.array([0, 1, 2, 3, N_RIGID - 1])
 
 
 @njit(nogil=True, error_model="numpy")
@@ -170,7 +175,7 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
     """
     subset, order, max_iterations, tolerance, max_sigma, max_step, rigid = setting
     (ref, p, sums, box, poly, work, sum_both, hessian, rhs, levels, weights, M, blocks, offsets, normal, half, vectors,
-     reduced, chain, inverse, G, rotation) = space  # fmt: skip
+     reduced, chain, inverse, G, rotation, denoised, noisy, columns) = space  # fmt: skip
     n = subset * subset
     grad_x, grad_y = gradients
     inside, xc, yc, f2 = set_up_reference(reference, grad_x, grad_y, lens1, xy[0], xy[1], subset, ref, box, poly)
@@ -208,6 +213,7 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
     status = NOT_CONVERGED
     iterations = 0
     last = False
+    quiet = False
     while True:
         image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 3, M)
         inside = compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0])
@@ -222,16 +228,28 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
         if levels[0, 3] == 0.0 or levels[1, 3] == 0.0 or levels[2, 3] == 0.0:
             return LOW_TEXTURE, iterations
         last = status == OK or iterations == max_iterations
+        if iterations == CREEPING and not last:
+            variance = residual_variance(levels, 3, n, f2, float(free), order)
+            take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised)
+            quiet, moved = True, np.inf
         if last or moved > REFREEZE_PX:
             joint_weights(levels, 3, weights)
             if not jacobian_blocks(R, t, e, nu_x, nu_y, 3, M, inverse, blocks, offsets):
                 return SINGULAR, iterations
-            assemble(weights, blocks, offsets, hessian, 3, normal, half)
             if rigid:
                 rigid_chain(xc, yc, w, rotation, G, chain)
-            free = _reduce(normal, chain, rigid, half, reduced)
-            if not factor(reduced, free):
-                return LOW_TEXTURE, iterations
+            if quiet and not last:
+                assemble(weights, blocks, offsets, denoised, 3, normal, half)
+                free = _reduce(normal, chain, rigid, half, reduced)
+                quiet = factor(reduced, free)
+            if last or not quiet:
+                assemble(weights, blocks, offsets, hessian, 3, normal, half)
+                free = _reduce(normal, chain, rigid, half, reduced)
+                for i in range(free):
+                    for j in range(free):
+                        noisy[i, j] = reduced[i, j]
+                if not factor(reduced, free):
+                    return LOW_TEXTURE, iterations
             moved = 0.0
         if last:
             break
@@ -278,16 +296,20 @@ def motion_point(reference, gradients, image2, image1t, image2t, lens1, lens2, R
     out[12] = e
     variance = residual_variance(levels, 3, n, f2, float(free), order)
     share = noise_share(variance, roughness, f2, n, order)
-    inflated = variance / max(1.0 - share, 0.01) ** 2
     out[16] = math.sqrt(variance)
-    for a in range(5):
-        for b in range(13):
-            small[b] = 0.0
-        small[a if a < 4 else free - 1] = 1.0
-        solve(reduced, small, free)
-        for b in range(4):
-            out[17 + 5 * a + b] = small[b] * inflated
-        out[21 + 5 * a] = small[free - 1] * inflated
+    inflation = variance
+    take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised)
+    assemble(weights, blocks, offsets, denoised, 3, normal, half)
+    _reduce(normal, chain, rigid, half, reduced)
+    if not factor(reduced, free):  # some deformation is seen by noise alone: the mean share has to do
+        inflation = variance / max(1.0 - share, 0.01) ** 2
+        for i in range(free):
+            for j in range(free):
+                reduced[i, j] = noisy[i, j]
+        factor(reduced, free)
+    sandwich(reduced, noisy, _RIGID_POSE if rigid else _STRETCH_POSE, free, columns, out[17:42])
+    for i in range(17, 42):
+        out[i] *= inflation
     # px: along and across camera 2's epipolar line, and both ways in camera 1 at t
     sigma = max(math.sqrt(out[17]) * along, math.sqrt(out[41]))
     sigma = max(sigma, math.sqrt(max(out[23], out[29])) * lens1[1] / G[2, 0])

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numba import njit
 
-from core.matching.kernels.linear import invert3
+from core.matching.kernels.linear import invert3, solve
 from core.matching.kernels.loops import N_SUMS, sums_cubic, sums_quintic
 from core.matching.kernels.reference import N_REFERENCE, nine_from_eight
 from core.matching.kernels.warp import N_WARP, lens_jacobian, set_up_warp
@@ -32,6 +32,7 @@ NOT_SEEDED = int(PointStatus.NOT_SEEDED)
 LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 
 REFREEZE_PX = 0.5  # corner motion after which the frozen Hessian is set up anew
+CREEPING = 8  # iterations after which the noise is taken out of the Hessian that makes the steps
 FIRST_RATE = 0.3  # convergence rate assumed before two steps have shown it
 MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
 # white noise of variance 1 behind a spline: variance of the value, mean over all sub-pixel places, and of the
@@ -67,6 +68,9 @@ def work_space(subset, images):
         np.empty((3, 3)),  # 19 inverse
         np.empty((3, 3)),  # 20 G
         np.empty((3, 3)),  # 21 rotation
+        np.empty((9, 9)),  # 22 denoised
+        np.empty((13, 13)),  # 23 noisy
+        np.empty((5, 13)),  # 24 columns
     )
 
 
@@ -244,6 +248,69 @@ def noise_share(variance, roughness, f2, n, order):
     """
     slope_noise = SLOPE_NOISE[0] if order == 3 else SLOPE_NOISE[1]
     return slope_noise * variance * n / (roughness * f2)
+
+
+@njit(nogil=True, error_model="numpy")
+def take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised):
+    """The Gram matrix less the share that white noise of this variance in the reference has in it.
+
+    What is left is how far a shift really pulls the right-hand side. The noise's share is largest in the patch's
+    least certain deformations, where Gauss-Newton with the noisy matrix creeps and its inverse is too small.
+
+    Parameters
+    ----------
+    hessian, denoised
+        (9, 9) from ``reference_sums``, and the result.
+    box
+        Range of X and of Y, for the moments of the subset's pixels.
+    variance
+        Of the noise, grey levels squared.
+    """
+    j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
+    n = subset * subset
+    noise = (SLOPE_NOISE[0] if order == 3 else SLOPE_NOISE[1]) * variance * n
+    vx, vy = noise * (j11 * j11 + j21 * j21), noise * (j12 * j12 + j22 * j22)
+    s2 = float(n)
+    dx2, dy2 = ((box[1] - box[0]) / (subset - 1)) ** 2, ((box[3] - box[2]) / (subset - 1)) ** 2
+    m2, m4 = (s2 - 1.0) / 12.0, (s2 - 1.0) * (3.0 * s2 - 7.0) / 240.0
+    x2, y2, x4, y4 = m2 * dx2, m2 * dy2, m4 * dx2 * dx2, m4 * dy2 * dy2
+    for i in range(9):
+        for j in range(9):
+            denoised[i, j] = hessian[i, j]
+    denoised[0, 0] -= vx * x2 + vy * y2
+    denoised[1, 1] -= vx * x4 + vy * x2 * y2
+    denoised[2, 2] -= vx * x2 * y2 + vy * y4
+    for j in range(3):
+        moment = 1.0 if j == 0 else (x2 if j == 1 else y2)
+        denoised[3 + j, 3 + j] -= vx * moment
+        denoised[6 + j, 6 + j] -= vy * moment
+    for i, j, v in ((0, 4, vx * x2), (1, 3, vx * x2), (0, 8, vy * y2), (2, 6, vy * y2)):
+        denoised[i, j] += v
+        denoised[j, i] += v
+
+
+@njit(nogil=True, error_model="numpy")
+def sandwich(factor_s, noisy, wanted, free, columns, out):
+    """``S^-1 H S^-1`` for some unknowns, from the Cholesky factor of S and H itself.
+
+    ``wanted`` (m,) are their indices, ``columns`` (m, free) work space, ``out`` (m * m,) the result.
+    """
+    m = len(wanted)
+    for a in range(m):
+        for b in range(free):
+            columns[a, b] = 0.0
+        columns[a, wanted[a]] = 1.0
+        solve(factor_s, columns[a], free)
+    for a in range(m):
+        for b in range(a, m):
+            s = 0.0
+            for i in range(free):
+                t = 0.0
+                for j in range(free):
+                    t += noisy[i, j] * columns[b, j]
+                s += columns[a, i] * t
+            out[m * a + b] = s
+            out[m * b + a] = s
 
 
 @njit(nogil=True, error_model="numpy")

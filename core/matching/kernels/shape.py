@@ -9,6 +9,7 @@ from numba import njit
 
 from core.matching.kernels.linear import assemble, factor, gradient, solve
 from core.matching.kernels.point import (
+    CREEPING,
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -25,13 +26,16 @@ from core.matching.kernels.point import (
     joint_weights,
     noise_share,
     residual_variance,
+    sandwich,
     settled,
+    take_noise_out,
     texture_roughness,
     texture_status,
 )
 from core.matching.kernels.reference import reference_sums, set_up_reference
 
 N_SHAPE_OUT = 9
+_WANTED = np.array([0, 3])  # w0 and e among the four
 
 
 @njit(nogil=True, error_model="numpy")
@@ -51,7 +55,7 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     """
     subset, order, max_iterations, tolerance, max_sigma, max_step = setting
     (ref, p, sums, box, poly, work, sum_both, hessian, rhs, levels, weights, M, blocks, offsets, normal, half, vectors,
-     reduced, _, inverse, G, _) = space  # fmt: skip
+     reduced, _, inverse, G, _, denoised, noisy, columns) = space  # fmt: skip
     n = subset * subset
     grad_x, grad_y = gradients
     inside, xc, yc, f2 = set_up_reference(reference, grad_x, grad_y, lens1, xy[0], xy[1], subset, ref, box, poly)
@@ -77,6 +81,7 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     moved, previous = np.inf, 0.0
     status = NOT_CONVERGED
     iterations = 0
+    quiet = False
     while iterations < max_iterations:
         image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
         if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
@@ -84,13 +89,21 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
         iterations += 1
         if levels[0, 3] == 0.0:
             return LOW_TEXTURE, iterations
+        if iterations == CREEPING:
+            variance = residual_variance(levels, 1, n, f2, 4.0, order)
+            take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised)
+            quiet, moved = True, np.inf
         if moved > REFREEZE_PX:
             joint_weights(levels, 1, weights)
             if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
                 return SINGULAR, iterations
-            shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
-            if not factor(reduced, 4):
-                return LOW_TEXTURE, iterations
+            if quiet:
+                shape_normal(weights, blocks, offsets, denoised, normal, half, reduced)
+                quiet = factor(reduced, 4)
+            if not quiet:
+                shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
+                if not factor(reduced, 4):
+                    return LOW_TEXTURE, iterations
             moved = 0.0
         gradient(weights, blocks, offsets, rhs, 1, rhs13)
         small = vectors[3]
@@ -119,21 +132,24 @@ def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, set
     out[0], out[1], out[2], out[3], out[4] = w[0], w[1], w[2], e, levels[0, 2]
     variance = residual_variance(levels, 1, n, f2, 4.0, order)
     share = noise_share(variance, roughness, f2, n, order)
-    inflated = variance / max(1.0 - share, 0.01) ** 2
+    inflation = variance
     joint_weights(levels, 1, weights)
     if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
         return SINGULAR, iterations
-    shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
-    if not factor(reduced, 4):
-        return LOW_TEXTURE, iterations
-    column = vectors[3]
-    column[0], column[1], column[2], column[3] = 1.0, 0.0, 0.0, 0.0
-    solve(reduced, column, 4)
-    c00, c01 = column[0] * inflated, column[3] * inflated
-    column[0], column[1], column[2], column[3] = 0.0, 0.0, 0.0, 1.0
-    solve(reduced, column, 4)
+    shape_normal(weights, blocks, offsets, hessian, normal, half, noisy)
+    take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised)
+    shape_normal(weights, blocks, offsets, denoised, normal, half, reduced)
+    if not factor(reduced, 4):  # some deformation is seen by noise alone: the mean share has to do
+        inflation = variance / max(1.0 - share, 0.01) ** 2
+        shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
+        if not factor(reduced, 4):
+            return LOW_TEXTURE, iterations
+    covariance = vectors[3]
+    sandwich(reduced, noisy, _WANTED, 4, columns, covariance)
     out[5] = math.sqrt(variance)
-    out[6], out[7], out[8] = c00, c01, column[3] * inflated
+    for i in range(3):
+        out[6 + i] = covariance[i if i < 2 else 3] * inflation
+    c00 = out[6]
     sigma = max(math.sqrt(c00) * along, math.sqrt(out[8]))
     share = noise_share(variance, weakest, f2, n, order)
     status = texture_status(status, share, sigma, max_sigma, levels[0, 2])
