@@ -64,7 +64,7 @@ _SHAPE = (
         "pixel",
         "full offset across the epipolar line in camera 2; half of it is left in each image when both share it",
         "f4",
-    ),  # fmt: skip
+    ),
     _Variable("noise_grey", "noise_grey", None, "count", "noise of the reference image, from the residuals", "f4"),
 )
 _MOTION = (
