@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from core.errors import ImageError
+from server.io.calibration_any import load_calibration
 from server.io.images import GrayImage, decode_image, encode_tiff
 from server.quality import image_quality, pair_quality
 from server.rig.cameras import CAMERAS
@@ -21,6 +24,8 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
     rig = service.rig
     with service.gate.hold("the capture of a step", test_id=test_id):
         shot, positions = service.gate.call(lambda: (rig.shoot(frames), rig.positions_mm()))
+        sizes: dict[str, list[int]] = {cam: [*reversed(shot.pixels[cam].shape)] for cam in CAMERAS}
+        _check_sizes(service, test_id, sizes)
         depth = {cam: 16 if shot.scale > 1 else shot.bit_depth[cam] for cam in CAMERAS}
         quality = pair_quality(*(image_quality(shot.pixels[cam], depth[cam]) for cam in CAMERAS))
         dz = {cam: rig.dz_of(cam, positions[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
@@ -39,7 +44,7 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
             "dz_mm": dz,
             "scene": rig.scene,
             "quality": quality,
-            "image_size_px": {cam: [shot.pixels[cam].shape[1], shot.pixels[cam].shape[0]] for cam in CAMERAS},
+            "image_size_px": sizes,
         }
         images: dict[str, bytes] = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
         step = service.tests.add_step(test_id, images, document)
@@ -52,21 +57,13 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
     Raises
     ------
     ImageError
-        A file is no gray image, or its size is not that of the test's other images.
+        A file is no gray image, or its size is not that of the test's calibration or other images; ``image_blank``,
+        ``same_image``.
     """
     images: dict[str, GrayImage] = {cam: decode_image(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
-    numbers = service.tests.step_numbers(test_id)
-    if numbers:
-        known = service.tests.step(test_id, numbers[0]).document.get("image_size_px", {})
-        for cam in CAMERAS:
-            size = [images[cam].shape[1], images[cam].shape[0]]
-            if known.get(cam, size) != size:
-                raise ImageError(
-                    f"The image of {cam} is {size[0]} x {size[1]} px, the test's others are "
-                    f"{known[cam][0]} x {known[cam][1]} px.",
-                    code="image_size",
-                    remedy="Import images of the same cameras, unscaled.",
-                )
+    sizes: dict[str, list[int]] = {cam: [*reversed(images[cam].shape)] for cam in CAMERAS}
+    _check_sizes(service, test_id, sizes)
+    _check_content(images)
     depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
     document = {
         **facts,
@@ -75,10 +72,48 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
         "skew_ms": None,
         "bit_depth": depth,
         "quality": pair_quality(*(image_quality(images[cam], depth[cam]) for cam in CAMERAS)),
-        "image_size_px": {cam: [images[cam].shape[1], images[cam].shape[0]] for cam in CAMERAS},
+        "image_size_px": sizes,
     }
     data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
     return _announce(service, service.tests.add_step(test_id, data, document))
+
+
+def _check_content(images: dict[str, GrayImage]) -> None:
+    """Refuse files that no camera pair can have taken; a capture of a dark scene is kept and flagged instead."""
+    for cam in CAMERAS:
+        if images[cam].min() == images[cam].max():
+            raise ImageError(
+                f"The image of {cam} is blank: every pixel is {int(images[cam].max())}.",
+                code="image_blank",
+                remedy="Check which files were exported, then import the pair again.",
+            )
+    if np.array_equal(images["cam1"], images["cam2"]):
+        raise ImageError(
+            "The images of cam1 and cam2 are the same, pixel by pixel.",
+            code="same_image",
+            remedy="Give each camera its own image.",
+        )
+
+
+def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) -> None:
+    """Refuse images that cannot be measured with the test's calibration, or with its other images."""
+    known: dict[str, tuple[str, list[int]]] = {}
+    numbers = service.tests.step_numbers(test_id)
+    if numbers:
+        first = service.tests.step(test_id, numbers[0]).document.get("image_size_px", {})
+        known |= {cam: ("the test's others are", list(size)) for cam, size in first.items()}
+    if service.tests.is_calibrated(test_id):
+        calibration = load_calibration(service.tests.calibration_file(test_id))
+        theirs = {"cam1": calibration.image_size1_px, "cam2": calibration.image_size2_px}
+        known |= {cam: ("the test's calibration is for", [*wh]) for cam, wh in theirs.items() if wh is not None}
+    for name, size in sizes.items():
+        what, other = known.get(name, ("", size))
+        if other != size:
+            raise ImageError(
+                f"The image of {name} is {size[0]} x {size[1]} px, {what} {other[0]} x {other[1]} px.",
+                code="image_size",
+                remedy="Use images of the cameras that were calibrated, unscaled and uncropped.",
+            )
 
 
 def _announce(service: Service, step: dict[str, Any]) -> dict[str, Any]:

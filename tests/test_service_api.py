@@ -144,6 +144,7 @@ def test_move_reads_positions_back(client: httpx.Client) -> None:
         ('{"positions_mm": {"1": Infinity}}', "invalid_request"),
         ('{"positions_mm": {"1": 1e308}}', "invalid_request"),
         ('{"positions_mm": {"1": "far"}}', "invalid_request"),
+        ('{"positions_mm": {"1": true}}', "invalid_request"),
         ('{"positions_mm": {}}', "invalid_request"),
         ('{"positions_mm": {"1": 1}, "speed": 3}', "invalid_request"),
         ('{"positions_mm": {"1": 1}, "by_mm": {"1": 1}}', "invalid_request"),
@@ -306,6 +307,11 @@ def test_import_keeps_pixels_to_the_bit_and_refuses_what_is_no_pair(client: http
     truncated = png(two)[:200]
     answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", truncated)})
     assert_problem(answer, 422, "image_unreadable")
+    blank = png(np.full_like(two, 77))
+    answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", blank)})
+    assert "cam2" in str(assert_problem(answer, 422, "image_blank")["detail"])
+    answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", png(one))})
+    assert_problem(answer, 422, "same_image")
     assert len(client.get(f"{API}/tests/{test_id}").json()["steps"]) == 1
 
 
@@ -342,7 +348,10 @@ def test_unknown_ids_are_not_found(client: httpx.Client, path: str) -> None:
 def test_bad_bodies_name_the_field(client: httpx.Client, content: str) -> None:
     answer = client.post(f"{API}/tests", content=content, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422, answer.text
-    assert answer.json()["detail"]
+    problem = answer.json()
+    assert problem["detail"]
+    if problem["code"] != "malformed_request":  # what cannot be parsed has no fields
+        assert problem["fields"][0]["field"]
 
 
 def test_load_must_be_a_number(client: httpx.Client) -> None:
@@ -503,6 +512,17 @@ def test_a_jammed_axis_ends_move_and_calibration_with_a_fault(service: Service, 
     try:
         job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": 1.0}}).json()["job"]
         assert wait_for_job(client, job)["problem"]["code"] == "motion_fault"
+        axis.faults.jam_mm = None
+        assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+        axis.faults.jam_mm = (-0.5, 2.5)  # on the way to 5 mm
+        plan = {"positions_mm": [0, 5], "held_out_mm": [], "frames": 1}
+        answer = client.post(f"{API}/calibrations", json=plan)
+        assert answer.status_code == 202, answer.text
+        accepted = answer.json()
+        assert wait_for_job(client, accepted["job"])["problem"]["code"] == "motion_fault"
+        calibration = client.get(f"{API}/calibrations/{accepted['calibration_id']}").json()
+        assert calibration["state"] == "failed"
+        assert calibration["problem"]["code"] == "motion_fault"
     finally:
         axis.faults.jam_mm = None
     assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"

@@ -213,10 +213,15 @@ def test_blank_step_fails_alone(client: httpx.Client, calibration_id: str, plate
         client.get(f"{API}/tests/{plate_test}/steps/{n}/{cam}").content for n in (0, 2) for cam in ("cam1", "cam2")
     ]
     blank = io.BytesIO()
-    Image.fromarray(np.full((240, 256), 90, dtype=np.uint8)).save(blank, "TIFF")
+    dull = np.full((240, 256), 90, dtype=np.uint8)
+    dull[0, 0] = 91  # outside the region; without it the import itself is refused
+    Image.fromarray(dull).save(blank, "TIFF")
+    dull[0, 1] = 91
+    other = io.BytesIO()
+    Image.fromarray(dull).save(other, "TIFF")
     test_id = client.post(f"{API}/tests", json={"name": "blank", "calibration_id": calibration_id}).json()["id"]
     codes = []
-    for one, two in ((images[0], images[1]), (blank.getvalue(), blank.getvalue()), (images[2], images[3])):
+    for one, two in ((images[0], images[1]), (blank.getvalue(), other.getvalue()), (images[2], images[3])):
         answer = client.post(f"{API}/tests/{test_id}/steps:import", files={"cam1": ("a", one), "cam2": ("b", two)})
         codes.append(answer.json()["quality"]["code"])
     assert codes == ["ok", "blank", "ok"]

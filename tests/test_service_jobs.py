@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import sqlite3
 import subprocess
@@ -210,9 +212,26 @@ def test_an_unusable_data_folder_is_refused_with_the_reason(tmp_path: Path) -> N
     assert caught.value.code == "data_folder_unusable"
 
 
+@pytest.mark.fault(8)
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_data_folder_whose_disk_does_not_keep_its_promises_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, call, fails)
+    with pytest.raises(StorageError, match="Read-only") as caught:
+        DataFolder(tmp_path)
+    assert caught.value.code == "data_folder_unusable"
+    monkeypatch.undo()
+    DataFolder(tmp_path).close()  # the refusal let go of the lock
+
+
 # the whole service ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault(5)
 def test_index_is_rebuilt_and_keys_still_count_after_the_catalogue_is_lost(tmp_path: Path) -> None:
     key = {"Idempotency-Key": "only-once"}
     service = Service(tiny_config(), tmp_path / "data")

@@ -6,17 +6,27 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, File, Form, Query, UploadFile
 from fastapi.responses import FileResponse, Response
 
 from core.errors import StateError
 from server.api.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
-from server.api.models import CalibrationAccepted, CalibrationList, CalibrationReply, CalibrationRequest, CameraName
+from server.api.models import (
+    CalibrationAccepted,
+    CalibrationList,
+    CalibrationReply,
+    CalibrationRequest,
+    CameraName,
+    Label,
+)
 from server.api.problems import errors
 from server.calibration_sequence import CalibrationPlan, check_plan, close, fit, plan_document, take_views, targets_of
+from server.errors import NotFoundError
+from server.io.calibration_any import imported_content
 from server.io.images import read_image
 from server.jobs import Job, Phase
 from server.results import read_residuals
+from server.store.index import calibration_entry
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -88,6 +98,36 @@ def get_calibration(service: ServiceDep, calibration_id: CalibrationId) -> dict[
     return service.calibrations.read(calibration_id)
 
 
+@router.post(
+    ":import",
+    summary="Import a calibration made elsewhere",
+    response_model=CalibrationReply,
+    status_code=201,
+    responses=errors(409, 413, 422, 507),
+)
+def import_calibration(
+    service: ServiceDep,
+    file: Annotated[UploadFile, File(description="calibration.json, DICe XML or OpenCV YAML of a stereo pair.")],
+    label: Annotated[Label, Form(description="Free text.")] = "",
+    key: KeyHeader = None,
+) -> dict[str, Any]:
+    """Store another program's stereo calibration, or one of another data folder, to measure imported steps with."""
+    data = file.file.read()
+    request = mark("calibrations:import", key, None, data, label.encode())
+
+    def make() -> dict[str, Any]:
+        content = imported_content(data, name="The file")
+        plan = {"source": "import", "label": label, **request.document()}
+        calibration_id = service.calibrations.add_imported(plan, content)
+        entry = calibration_entry(service.calibrations, calibration_id)
+        service.catalog.put_entry("calibration", "", calibration_id, entry)
+        service.hub.publish("calibration", {"calibration_id": calibration_id})
+        return {"calibration_id": calibration_id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return service.calibrations.read(made["calibration_id"])
+
+
 def _complete(service: ServiceDep, calibration_id: str) -> Path:
     path = service.calibrations.path(calibration_id)
     if not (path / "calibration.json").exists():
@@ -108,7 +148,10 @@ def list_views(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, 
 @router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))
 def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
     """Return, for each view, where every intersection was found and by how much the model misses it."""
-    return read_residuals(_complete(service, calibration_id) / "residuals.nc")
+    path = _complete(service, calibration_id) / "residuals.nc"
+    if not path.is_file():
+        raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
+    return read_residuals(path)
 
 
 @router.get(

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
 
-Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+
+def _not_a_truth_value(value: Any) -> Any:
+    # true would be taken for 1: an axis would move by a millimetre
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+Real = Annotated[float, BeforeValidator(_not_a_truth_value)]
+Whole = Annotated[int, BeforeValidator(_not_a_truth_value)]
+Number = Annotated[Real, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 Label = Annotated[str, StringConstraints(max_length=300)]
 CameraName = Literal["cam1", "cam2"]
-Pixel = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
+Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
 
 
@@ -78,19 +88,19 @@ class Accepted(Reply):
 class SettingsPatch(Request):
     """Camera settings to change; what is left out stays."""
 
-    exposure_ms: Annotated[float, Field(gt=0.0, le=60000.0)] | None = Field(None, description="Exposure time.")
-    gain_db: Annotated[float, Field(ge=-100.0, le=100.0)] | None = Field(None, description="Gain.")
-    frame_rate_hz: Annotated[float, Field(gt=0.0, le=10000.0)] | None = Field(None, description="Free-run rate.")
-    bit_depth: Annotated[int, Field(ge=8, le=16)] | None = Field(None, description="Significant bits per pixel.")
+    exposure_ms: Annotated[Real, Field(gt=0.0, le=60000.0)] | None = Field(None, description="Exposure time.")
+    gain_db: Annotated[Real, Field(ge=-100.0, le=100.0)] | None = Field(None, description="Gain.")
+    frame_rate_hz: Annotated[Real, Field(gt=0.0, le=10000.0)] | None = Field(None, description="Free-run rate.")
+    bit_depth: Annotated[Whole, Field(ge=8, le=16)] | None = Field(None, description="Significant bits per pixel.")
 
 
 class MoveRequest(Request):
     """Where to move: axes by number, or cameras by their travel dZ."""
 
-    positions_mm: dict[Annotated[int, Field(ge=1, le=6)], Number] | None = Field(
+    positions_mm: dict[Annotated[Whole, Field(ge=1, le=6)], Number] | None = Field(
         None, description="Absolute position of each axis.", examples=[{"1": 5.0, "2": 5.0}], min_length=1, max_length=6
     )
-    by_mm: dict[Annotated[int, Field(ge=1, le=6)], Number] | None = Field(
+    by_mm: dict[Annotated[Whole, Field(ge=1, le=6)], Number] | None = Field(
         None, description="Travel of each axis from where it stands.", min_length=1, max_length=6
     )
     dz_mm: dict[CameraName, Number] | None = Field(
@@ -107,7 +117,7 @@ class MoveRequest(Request):
 class HomeRequest(Request):
     """Which axes to home."""
 
-    axes: list[Annotated[int, Field(ge=1, le=6)]] | None = Field(
+    axes: list[Annotated[Whole, Field(ge=1, le=6)]] | None = Field(
         None, description="Axis numbers; all that the cameras use if left out.", min_length=1, max_length=6
     )
 
@@ -146,7 +156,7 @@ class CalibrationRequest(Request):
     held_out_mm: list[Number] | None = Field(
         None, description="dZ of the positions kept for the check.", max_length=100
     )
-    frames: Annotated[int, Field(ge=1, le=256)] | None = Field(None, description="Frames averaged at each position.")
+    frames: Annotated[Whole, Field(ge=1, le=256)] | None = Field(None, description="Frames averaged at each position.")
     localiser: Literal["profile", "paper"] | None = Field(None, description="Grid line localiser.")
     label: Label = Field("", description="Free text.")
 
@@ -231,7 +241,7 @@ class StepRequest(Request):
     channels: dict[Annotated[str, StringConstraints(min_length=1, max_length=100)], Number] = Field(
         default_factory=dict, description="Any further scalar readings.", max_length=50
     )
-    frames: Annotated[int, Field(ge=1, le=256)] = Field(
+    frames: Annotated[Whole, Field(ge=1, le=256)] = Field(
         1, description="Frames averaged; 1 stores the frame as it came."
     )
 
@@ -280,17 +290,17 @@ class AnalysisRequest(Request):
         "displacement", description="Shape only, or shape and displacement."
     )
     region: Region = Field(description="Where points may lie.")
-    subset_px: Annotated[int, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
-    step_px: Annotated[int, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
+    subset_px: Annotated[Whole, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
+    step_px: Annotated[Whole, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
     patch: Literal["stretch", "rigid"] = Field("stretch", description="Patch model of the motion.")
     interpolation: Literal["cubic", "quintic"] = Field("quintic", description="B-spline order.")
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
     )
-    steps: Annotated[list[Annotated[int, Field(ge=0, le=9999)]], Field(min_length=1, max_length=10000)] | None = Field(
-        None, description="Steps to measure; all if left out. The reference is always measured."
+    steps: Annotated[list[Annotated[Whole, Field(ge=0, le=9999)]], Field(min_length=1, max_length=10000)] | None = (
+        Field(None, description="Steps to measure; all if left out. The reference is always measured.")
     )
-    reference: Annotated[int, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
+    reference: Annotated[Whole, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
     label: Label = Field("", description="Free text.")
 
     @model_validator(mode="after")

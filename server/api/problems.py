@@ -108,7 +108,9 @@ def install(app: FastAPI) -> None:
         for item in error.errors()[:20]:
             place = [str(part) for part in item["loc"]]
             field = ".".join(place[1:] or place)[:200]
-            fields.append({"field": field, "in": place[0], "problem": str(item["msg"])[:300]})
+            fields.append(
+                {"field": field, "in": place[0], "problem": str(item["msg"]).removeprefix("Value error, ")[:300]}
+            )
         first = fields[0]
         return problem_response(
             422,
@@ -125,7 +127,9 @@ def install(app: FastAPI) -> None:
         status = 422 if error.status_code == 400 else error.status_code
         code = codes.get(error.status_code, "http_error")
         headers = dict(error.headers) if error.headers else None
-        return problem_response(status, code, f"{error.detail}.", "See /docs for the API.", headers=headers)
+        return problem_response(
+            status, code, f"{str(error.detail).rstrip('.')}.", "See /docs for the API.", headers=headers
+        )
 
     @app.exception_handler(Exception)
     async def _unknown(_request: Request, error: Exception) -> JSONResponse:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ class LoadedCalibration:
     sha256
         Of the file's bytes.
     details
-        The whole content of a calibration.json, empty for the imports.
+        The whole content of a calibration.json, empty for other programs' files.
     """
 
     pair: StereoPair
@@ -49,6 +49,45 @@ class LoadedCalibration:
     source: str
     sha256: str
     details: dict[str, Any]
+
+
+IMPORTED = "imported"
+_DEEPEST = 30  # levels of nesting; our own files have six
+
+
+def imported_content(data: bytes, *, name: str) -> dict[str, Any]:
+    """Return the content of a ``calibration.json`` that carries the bytes of any calibration file.
+
+    A calibration of this program is carried over as it is. Another program's text is wrapped whole, so that no digit
+    and no lens term is lost on the way; :func:`parse_calibration` reads either.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`load_calibration`.
+    """
+    loaded = parse_calibration(data, name=name)
+    if loaded.details:
+        if _nested_deeper(loaded.details, _DEEPEST):
+            raise unreadable(name, f"it is nested more than {_DEEPEST} levels deep")
+        return loaded.details
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise unreadable(name, "it is not UTF-8 text") from error
+    sizes = {"cam1": loaded.image_size1_px, "cam2": loaded.image_size2_px}
+    return {
+        IMPORTED: {"kind": loaded.source, "sha256": loaded.sha256, "text": text},
+        "image_size_px": {cam: list(size) for cam, size in sizes.items() if size is not None},
+    }
+
+
+def _nested_deeper(value: Any, limit: int) -> bool:
+    layer = [value]
+    for _ in range(limit):
+        parts = [list(v.values()) if isinstance(v, dict) else v for v in layer if isinstance(v, dict | list)]
+        layer = [inner for part in parts for inner in part]
+    return bool(layer)
 
 
 def _camera(name: str, which: str, content: Any) -> Camera:
@@ -79,9 +118,29 @@ def _size(content: dict[str, Any], which: str) -> tuple[int, int] | None:
     return None
 
 
+def _wraps_another(data: bytes) -> bool:
+    # the wrapped text would be taken for the file itself: our own layout is looked for first
+    return data.lstrip()[:1] == b"{" and f'"{IMPORTED}"'.encode() in data
+
+
+def _unwrapped(data: bytes, digest: str, name: str) -> LoadedCalibration:
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise unreadable(name, "it is damaged JSON") from error
+    part = content.get(IMPORTED)
+    text = part.get("text") if isinstance(part, dict) else None
+    known = text.encode("utf-8", "replace") if isinstance(text, str) else b""
+    if _wraps_another(known) or not (looks_like_dice(known) or looks_like_opencv(known)):
+        raise unreadable(name, "what it says was imported is no calibration")
+    return replace(parse_calibration(known, name=name), sha256=digest, details=content)
+
+
 def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     """Recognise and read the bytes of a calibration file, see :func:`load_calibration`."""
     digest = hashlib.sha256(data).hexdigest()
+    if _wraps_another(data):
+        return _unwrapped(data, digest, name)
     if looks_like_dice(data):
         pair, size1, size2 = parse_dice_xml(data, name=name)
         return LoadedCalibration(pair, size1, size2, "dice_xml", digest, {})

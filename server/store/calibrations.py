@@ -51,6 +51,16 @@ class CalibrationStore:
         write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
         return calibration_id
 
+    def add_imported(self, plan: dict[str, Any], content: dict[str, Any]) -> str:
+        """Store a calibration that was made elsewhere, complete at once; return its id."""
+        calibration_id = self._folder.ids.new("c")
+        path = self._folder.calibrations / calibration_id
+        make_folder(path)
+        # plan.json is what makes the folder one of ours: after it, nothing is missing
+        write_json(path / "calibration.json", content)
+        write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
+        return calibration_id
+
     def put_view(self, calibration_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
         """Store one view; return its file name and checksum."""
         name = f"{index:03d}_{cam}.tif"
@@ -71,7 +81,8 @@ class CalibrationStore:
         document: dict[str, Any] = {"id": calibration_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
         document["taken"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
         if (path / "calibration.json").exists():
-            document |= {**read_json(path / "calibration.json"), "id": calibration_id, "state": "complete"}
+            # a file from elsewhere may hold anything; what the service itself says comes last
+            document = {**read_json(path / "calibration.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
         return document

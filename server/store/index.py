@@ -58,6 +58,9 @@ def rebuild(catalog: Catalog, folder: DataFolder, calibrations: CalibrationStore
             if calibrations.read(calibration_id)["state"] == "unfinished":
                 # nobody works on it any more: the job that did ended with the last service
                 calibrations.put_failure(calibration_id, problem_of(RESTART))
+            document = calibrations.read(calibration_id)
+            if document["plan"].get("source") == "import":  # the others' requests were for jobs that are gone
+                requests.append((document["plan"], {"calibration_id": calibration_id}))
             entries.append(("calibration", "", calibration_id, calibration_entry(calibrations, calibration_id)))
         except (FileFormatError, KeyError) as error:
             trouble.append(f"calibration {calibration_id}: {error}")

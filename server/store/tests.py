@@ -85,6 +85,10 @@ class TestStore:
             write_json(self.path(test_id) / "test.json", document)
         return document
 
+    def is_calibrated(self, test_id: str) -> bool:
+        """Whether the test has a calibration to measure with."""
+        return (self.path(test_id) / "calibration.json").is_file()
+
     def calibration_file(self, test_id: str) -> Path:
         """The test's own copy of its calibration.
 
