@@ -155,9 +155,10 @@ class _Runner:
             "seconds": round(time.monotonic() - started, 3),
         }  # fmt: skip
         rms = summary["epipolar_residual_rms_px"]
+        residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
             f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
-            f"epipolar residual {rms:.3f} px, {duration(summary['seconds'])}"
+            f"{residual}{duration(summary['seconds'])}"
         )
         return summary
 
