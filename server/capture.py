@@ -111,7 +111,7 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
         if other != size:
             raise ImageError(
                 f"The image of {name} is {size[0]} x {size[1]} px, {what} {other[0]} x {other[1]} px.",
-                code="image_size",
+                code="image_size_mismatch",
                 remedy="Use images of the cameras that were calibrated, unscaled and uncropped.",
             )
 

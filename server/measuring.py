@@ -122,7 +122,7 @@ def _check_sizes(calibration: LoadedCalibration, one: GrayImage, two: GrayImage)
         if size is not None and tuple(size) != found:
             raise ImageError(
                 f"The image of {cam} is {found[0]} x {found[1]} px, its calibration is for {size[0]} x {size[1]} px.",
-                code="image_size",
+                code="image_size_mismatch",
                 remedy="Measure images of the cameras that were calibrated, unscaled.",
             )
 

@@ -1,15 +1,16 @@
 """The scenes by name: what stands in front of the cameras, and in which state.
 
-=========  ======================================================
-======================================================= name       what
-load =========  ======================================================
-======================================================= grid       the calibration target, nodes off by its tolerance
-none steel      ground steel plate, Ra 1.775 um                         none plate      clamped circular plate, Eq.
-(18)                        pressure, kPa panel      centre-cracked panel in tension                         force, kN
-block      rigid block                                             share of its motion (``translation_mm``,
-``rotation_rad``) strip      stretched strip                                         strain along the strip, per cent
-sphere     sphere of 30 mm radius                                  share of its motion, as the block's =========
-======================================================  =======================================================
+======  ==================================================  =================================================
+name    what                                                load
+======  ==================================================  =================================================
+grid    the calibration target, nodes off by its tolerance  none
+steel   ground steel plate, Ra 1.775 um                     none
+plate   clamped circular plate, Eq. (18)                    pressure, kPa
+panel   centre-cracked panel in tension                     force, kN
+block   rigid block                                         share of its ``translation_mm``, ``rotation_rad``
+strip   stretched strip                                     strain along the strip, per cent
+sphere  sphere of 30 mm radius                              share of its motion, as the block's
+======  ==================================================  =================================================
 
 Specimens lie near Z_sys = 0, centred on the system's origin, x to the right in the images and y down. Every scene takes
 ``translation_mm`` and ``rotation_rad`` (a rotation vector about the origin, both in the system frame) as a rigid

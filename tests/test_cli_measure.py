@@ -117,7 +117,7 @@ def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> Non
     for step in summary["steps"]:
         assert step["points"] == 14 * 12
         assert step["valid"] == sum(v for k, v in step["status"].items() if k in ("ok", "extrapolated"))
-        assert step["epipolar_rms_px"] < 0.05
+        assert step["epipolar_offset_rms_px"] < 0.05
         assert min(step["zncc_median"].values()) > 0.95
         assert Path(step["cam1"]).name == f"cam1_{step['step']}.tif"
     assert summary["steps"][0]["plane_residual_rms_mm"] < 0.5e-3  # the block's face is flat
@@ -303,8 +303,8 @@ def test_the_specimen(specimen_dir: Path, tmp_path: Path) -> None:
         assert step["points"] == 123 * 27
         assert step["valid_fraction"] >= 0.97
         # the calibration that came with the images is off by 0.09 px across the epipolar lines
-        assert step["epipolar_sd_px"] <= 0.08
-        assert abs(step["epipolar_mean_px"]) <= 0.1
+        assert step["epipolar_offset_sd_px"] <= 0.08
+        assert abs(step["epipolar_offset_mean_px"]) <= 0.1
         assert step["plane_residual_rms_mm"] <= 0.015
         # nothing wrong among the valid: no point far from the epipolar line
         with xr.open_dataset(tmp_path / "out" / step["file"]) as data:

@@ -180,7 +180,7 @@ def test_blank_identical_and_odd_images_are_refused_with_their_code() -> None:
 
     assert code(first, np.full_like(second, 200)) == "image_blank"
     assert code(noise, second) == "image_blank"
-    assert code(first, first) == "images_identical"
+    assert code(first, first) == "same_image"
     assert code(np.dstack([first] * 3), second) == "image_shape"
     assert code(first.astype(bool), second) == "image_type"
     holed = first.astype(np.float64)

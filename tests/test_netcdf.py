@@ -160,7 +160,8 @@ def test_the_summary_counts_and_measures() -> None:
     assert summary["valid"] == ROWS * COLS - 2
     assert summary["status"] == {"ok": ROWS * COLS - 3, "masked": 1, "low_correlation": 1, "extrapolated": 1}
     valid = field.epipolar_px[np.isfinite(field.epipolar_px)]
-    assert summary["epipolar_rms_px"] == pytest.approx(np.sqrt(np.mean(valid**2)))
+    assert summary["epipolar_offset_rms_px"] == pytest.approx(np.sqrt(np.mean(valid**2)))
+    assert summary["epipolar_residual_rms_px"] == pytest.approx(np.sqrt(np.mean(valid**2)) / 2)
     assert summary["displacement_mm"]["w"]["max"] == pytest.approx(np.nanmax(field.uvw_mm[..., 2]))  # type: ignore[index]
     json.loads(to_json(summary))
 
@@ -180,5 +181,5 @@ def test_a_field_without_valid_points_has_a_summary() -> None:
     field = dataclasses.replace(a_field(motion=True), status=np.full((ROWS, COLS), PointStatus.NOT_SEEDED, np.int8))
     summary = json.loads(to_json(summarise(field)))
     assert summary["valid"] == 0
-    assert summary["epipolar_rms_px"] is None
+    assert summary["epipolar_offset_rms_px"] is None
     assert summary["displacement_mm"] == {"u": None, "v": None, "w": None}

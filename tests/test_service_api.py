@@ -303,7 +303,7 @@ def test_import_keeps_pixels_to_the_bit_and_refuses_what_is_no_pair(client: http
     assert_problem(client.post(url, files={"cam1": ("x", png(one))}), 422, "invalid_request")
     assert_problem(client.post(url, files={"cam1": ("x", b"no"), "cam2": ("y", png(two))}), 422, "image_unreadable")
     small = png(two[:20])
-    assert_problem(client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", small)}), 422, "image_size")
+    assert_problem(client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", small)}), 422, "image_size_mismatch")
     truncated = png(two)[:200]
     answer = client.post(url, files={"cam1": ("x", png(one)), "cam2": ("y", truncated)})
     assert_problem(answer, 422, "image_unreadable")

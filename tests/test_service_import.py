@@ -141,6 +141,6 @@ def test_images_of_another_size_than_the_calibrations_are_refused_when_they_come
     for shapes in (((128, 128), (128, 120)), ((100, 90), (100, 90))):
         images = [encode_tiff(rng.integers(0, 255, shape, dtype=np.uint8)) for shape in shapes]
         files = {cam: (cam, image) for cam, image in zip(("cam1", "cam2"), images, strict=True)}
-        refused(client.post(f"{API}/tests/{test_id}/steps:import", files=files), 422, "image_size")
-    refused(client.post(f"{API}/tests/{test_id}/steps", json={}), 422, "image_size")
+        refused(client.post(f"{API}/tests/{test_id}/steps:import", files=files), 422, "image_size_mismatch")
+    refused(client.post(f"{API}/tests/{test_id}/steps", json={}), 422, "image_size_mismatch")
     assert client.get(f"{API}/tests/{test_id}").json()["steps"] == []

@@ -139,11 +139,11 @@ def same_size(a: MeasureImage, b: MeasureImage) -> None:
 
 
 def different(a: MeasureImage, b: MeasureImage) -> None:
-    """Raise ``images_identical`` if both cameras are said to have taken the very same image."""
+    """Raise ``same_image`` if both cameras are said to have taken the very same image."""
     if a.pixels is b.pixels or np.array_equal(a.pixels, b.pixels):
         raise ImageError(
             f"{a.name} and {b.name} are the same image, grey level by grey level.",
-            code="images_identical",
+            code="same_image",
             remedy="Give camera 1's image as camera 1 and camera 2's as camera 2.",
         )
 

@@ -154,10 +154,11 @@ class _Runner:
             "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]}, **summarise(result),
             "seconds": round(time.monotonic() - started, 3),
         }  # fmt: skip
-        rms = summary["epipolar_rms_px"]
+        rms = summary["epipolar_residual_rms_px"]
+        residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
             f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
-            f"epipolar rms {rms:.3f} px, {duration(summary['seconds'])}"
+            f"{residual}{duration(summary['seconds'])}"
         )
         return summary
 

@@ -57,7 +57,14 @@ _SHAPE = (
     _Variable("theta_rad", "theta_rad", None, "rad", "angle of the patch's normal to X_cam1, Eq. (12)"),
     _Variable("phi_rad", "phi_rad", None, "rad", "angle of the patch's normal to Y_cam1, Eq. (12)"),
     _Variable("zp_mm", "zp_mm", None, "mm", "where camera 1's axis meets the patch's plane, Eq. (12)"),
-    _Variable("epipolar_px", "epipolar_px", None, "pixel", "offset across the epipolar line in camera 2", "f4"),
+    _Variable(
+        "epipolar_px",
+        "epipolar_px",
+        None,
+        "pixel",
+        "full offset across the epipolar line in camera 2; half of it is left in each image when both share it",
+        "f4",
+    ),
     _Variable("noise_grey", "noise_grey", None, "count", "noise of the reference image, from the residuals", "f4"),
 )
 _MOTION = (

@@ -31,9 +31,11 @@ def summarise(result: Field) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``points`` (in the region), ``valid``, ``valid_fraction``, ``status`` (counts by name), ``epipolar_mean_px``
-        (what the calibration is off across the epipolar lines), ``epipolar_rms_px``, ``epipolar_sd_px`` (about the
-        mean), ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
+        ``points`` (in the region), ``valid``, ``valid_fraction``, ``status`` (counts by name), then of the full offset
+        across the epipolar line in camera 2, ``epipolar_px``: ``epipolar_offset_mean_px`` (what the calibration is
+        off), ``epipolar_offset_rms_px`` and ``epipolar_offset_sd_px`` (about the mean); ``epipolar_residual_rms_px``
+        (the error left in each image when both cameras share the misfit equally: half of
+        ``epipolar_offset_rms_px``), ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
         ``sigma_median_mm``, for displacements also ``displacement_mm`` (mean, min, max of u, v, w). What cannot be
         told is None.
     """
@@ -49,9 +51,10 @@ def summarise(result: Field) -> dict[str, Any]:
         "valid": n,
         "valid_fraction": n / points if points else None,
         "status": {s.name.lower(): int((status == s).sum()) for s in PointStatus if (status == s).any()},
-        "epipolar_mean_px": float(epipolar.mean()) if n else None,
-        "epipolar_rms_px": _rms(epipolar),
-        "epipolar_sd_px": float(epipolar.std()) if n else None,
+        "epipolar_offset_mean_px": float(epipolar.mean()) if n else None,
+        "epipolar_offset_rms_px": _rms(epipolar),
+        "epipolar_offset_sd_px": float(epipolar.std()) if n else None,
+        "epipolar_residual_rms_px": _rms(epipolar / 2),
         "plane_residual_rms_mm": _rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
         "zncc_median": {
             name: float(np.median(result.zncc[valid][:, k])) if n else None
