@@ -254,6 +254,18 @@ def test_residuals_are_judged_by_the_bands(noise: float, level: str) -> None:
     assert any("Held-out RBE of cam1" in r and limit in r for r in result.verdict.reasons)
 
 
+def test_a_stage_that_travels_off_the_optical_axis_is_suspected() -> None:
+    # 20 mrad across cam1's axis: the whole image moves in proportion to dZ, which the residuals cannot tell
+    shift = 12000.0 * 0.02 / 400.0
+    views = [
+        dataclasses.replace(v, xy_px=v.xy_px + np.array([0.0, shift * v.dz_mm])) if v.camera == "cam1" else v
+        for v in make_views()
+    ]
+    verdict = calibrate(views, Grid(), NOMINAL, HELD).verdict
+    assert verdict.level == "warning"
+    assert any("principal point of cam1" in reason and "off the optical axis" in reason for reason in verdict.reasons)
+
+
 @pytest.mark.fault(34)
 def test_the_worst_view_is_named() -> None:
     views = make_views()

@@ -77,6 +77,10 @@ def build_result(
         node_corrections_mm=corrections if nodes_estimated else None,
         node_tolerance_mm=target.node_tolerance_mm,
         options=options,
+        centres=[
+            (camera.paper_parameters(), nominal.image_size_px)
+            for camera, nominal in zip((pair.cam1, pair.cam2), nominals, strict=True)
+        ],
     )
     return CalibrationResult(
         pair=pair,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from core.calibration.uncertainty import VolumeUncertainty
 from core.lens import Float
 
 GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
+#: lenses sit within some per cent of the sensor's centre; a share of the image's diagonal
+CENTRE_SHARE = 0.15
 _ORDER: tuple[Level, Level, Level] = ("good", "warning", "failed")
 
 
@@ -37,6 +39,7 @@ def judge(
     node_corrections_mm: Float | None,
     node_tolerance_mm: float,
     options: CalibrationOptions,
+    centres: Sequence[tuple[Mapping[str, float], tuple[int, int]]] = (),
 ) -> Verdict:
     """Judge by the held-out RBE of each camera, the predicted uncertainty and the node corrections."""
     level: Level = "good"
@@ -79,6 +82,15 @@ def judge(
             reasons.append(
                 f"Node corrections reach {1e3 * largest:.1f} um against a tolerance of {1e3 * node_tolerance_mm:.1f} "
                 "um: the target, its tolerance or the aspect ratio may be wrong."
+            )
+    for name, (camera, size) in zip(("cam1", "cam2"), centres, strict=False):
+        off = np.hypot(camera["cx_px"] - 0.5 * (size[0] - 1), camera["cy_px"] - 0.5 * (size[1] - 1))
+        if off > CENTRE_SHARE * np.hypot(*size):
+            # an axis off the optical axis moves the principal point by phd * angle, and no residual shows it
+            level = worst(level, "warning")
+            reasons.append(
+                f"The principal point of {name} lies {off:.0f} px from the image's centre: its stage may travel "
+                f"{1e3 * off / camera['phd_px']:.0f} mrad off the optical axis, or the image is a part of the sensor's."
             )
     return Verdict(level, tuple(reasons))
 
