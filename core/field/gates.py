@@ -120,11 +120,12 @@ def _gate_epipolar(points: PointFits, xy_px: Float, options: GateOptions) -> Non
             return
         e = points.epipolar_px[ok]
         r, sigma = _robust_residual(_smooth_terms(xy_px[ok]), e)
-        # the plain mean and standard deviation too: the figure that a reader recomputes from the file
-        plain = np.abs(e - e.mean()) / max(float(e.std()), 1e-12)
-        bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | (
-            (plain > options.epipolar_sigmas) & (np.abs(e - e.mean()) > options.epipolar_floor_px)
-        )
+        # plain and robust scatter about the field's middle too: the figures that a reader recomputes from the file
+        about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
+        plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
+        scatter = _MAD_TO_SIGMA * float(np.median(about_median))
+        middle = (about_median > options.epipolar_sigmas * scatter) & (about_median > options.epipolar_floor_px)
+        bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
         if not bad.any():
             return
         points.refuse(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)

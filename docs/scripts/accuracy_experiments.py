@@ -32,7 +32,9 @@ def _demo(name: str, figures: Path) -> Section:
             target = f"demo_{name}_{file}" if not file.startswith(name) else f"demo_{file}"
             (figures / target).write_bytes((Path(folder) / file).read_bytes())
             pictures.append((target, caption))
-    rows = [Row(c["name"], abs(c["error"]), c["unit"], c["limit"]) for c in report["checks"]]
+    rows = [
+        Row(f"{c['name']}: error", abs(c["error"]), c["error_unit"] or c["unit"], c["limit"]) for c in report["checks"]
+    ]
     rows.append(Row("whole demo, from start to table", seconds, "s"))
     titles = {"plate": "Clamped plate", "steel": "Ground steel plate", "panel": "Cracked panel"}
     how = (

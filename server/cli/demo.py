@@ -109,7 +109,7 @@ def _finish(out: Path, experiment: str, title: str, outcome: Outcome, seconds: f
 
 def _as_dict(check: Check) -> dict[str, Any]:
     return {"name": check.name, "unit": check.unit, "found": check.found, "true": check.true, "error": check.error,
-            "limit": check.limit, "passed": check.passed}  # fmt: skip
+            "limit": check.limit, "error_unit": check.error_unit or check.unit, "passed": check.passed}  # fmt: skip
 
 
 class _Teller:

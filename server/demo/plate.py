@@ -113,7 +113,7 @@ def _judge(
         ])  # fmt: skip
     percent = 100.0 * (fit.radius_mm / plate.radius_mm - 1.0)
     outcome.checks.append(
-        Check("radius fitted to Eq. (18)", "mm", fit.radius_mm, plate.radius_mm, percent, RADIUS_LIMIT_PERCENT)
+        Check("radius fitted to Eq. (18)", "mm", fit.radius_mm, plate.radius_mm, percent, RADIUS_LIMIT_PERCENT, "%")
     )
     wrong = sum(int(c.wrong.sum()) for c in comparisons) + int(compare_shape(shape, session.rig, "plate").sum())
     valid = int(shape.valid.sum()) + sum(int(f.valid.sum()) for f in fields)

@@ -25,11 +25,13 @@ class Check:
     Attributes
     ----------
     name, unit
-        What it is.
+        What it is, and the unit of ``found`` and ``true``.
     found, true
         The figure and the truth; ``true`` is None where the figure is itself an error or a count.
     error, limit
         What must not exceed what.
+    error_unit
+        Unit of these two, where it is not ``unit``.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Check:
     true: float | None
     error: float
     limit: float
+    error_unit: str = ""
 
     @property
     def passed(self) -> bool:

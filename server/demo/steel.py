@@ -45,7 +45,9 @@ def run(session: Session, calibration_id: str) -> Outcome:
 
     outcome = Outcome()
     outcome.checks = [
-        Check("mean deviation from the best plane, noise taken out", "um", clean_um, truth_um, percent, LIMIT_PERCENT),
+        Check(
+            "mean deviation from the best plane, noise taken out", "um", clean_um, truth_um, percent, LIMIT_PERCENT, "%"
+        ),
         Check("wrong points among the valid", "points", wrong, None, wrong, 0),
     ]
     rows = [
