@@ -33,7 +33,7 @@ class GateOptions:
     epipolar_sigmas
         Allowed distance from the field's smooth epipolar offset, in its robust standard deviations.
     epipolar_floor_px
-        Added to it.
+        Added to it, so that a noise-free field keeps its second-best points.
     correlation_sigmas
         Allowed excess of log(1 - zncc) over what texture and place predict, in robust standard deviations.
     correlation_least_factor, correlation_most_factor
@@ -47,7 +47,7 @@ class GateOptions:
     """
 
     epipolar_sigmas: float = 5.0
-    epipolar_floor_px: float = 0.002
+    epipolar_floor_px: float = 0.005
     correlation_sigmas: float = 6.0
     correlation_least_factor: float = 1.35
     correlation_most_factor: float = 12.0
