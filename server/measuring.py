@@ -19,14 +19,15 @@ import cv2
 import numpy as np
 
 from core.camera import Camera
-from core.errors import FileFormatError, ImageError
+from core.errors import FileFormatError
+from core.field.images import check_calibrated_size
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
 from core.stereo import StereoPair
 from core.threads import set_threads
-from server.io.calibration_any import LoadedCalibration, load_calibration
+from server.io.calibration_any import load_calibration
 from server.io.images import GrayImage, read_image, read_mask
 from server.io.netcdf import Provenance, read_field, write_field
 from server.io.summary import summarise
@@ -109,22 +110,12 @@ def _make_context(task: StepTask) -> _Context:
     settings = task.settings
     calibration = load_calibration(task.calibration)
     one, two = _image(task, "ref1"), _image(task, "ref2")
-    _check_sizes(calibration, one, two)
+    check_calibrated_size("The image of cam1", one.shape, calibration.image_size1_px)
+    check_calibrated_size("The image of cam2", two.shape, calibration.image_size2_px)
     options = MeasureOptions(
         subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"]
     )
     return _Context(ReferencePair(calibration.pair, one, two), _grid(task, one), options)
-
-
-def _check_sizes(calibration: LoadedCalibration, one: GrayImage, two: GrayImage) -> None:
-    for cam, image, size in (("cam1", one, calibration.image_size1_px), ("cam2", two, calibration.image_size2_px)):
-        found = (image.shape[1], image.shape[0])
-        if size is not None and tuple(size) != found:
-            raise ImageError(
-                f"The image of {cam} is {found[0]} x {found[1]} px, its calibration is for {size[0]} x {size[1]} px.",
-                code="image_size_mismatch",
-                remedy="Measure images of the cameras that were calibrated, unscaled.",
-            )
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:

@@ -148,14 +148,14 @@ def different(a: MeasureImage, b: MeasureImage) -> None:
         )
 
 
-def check_calibrated_size(image: MeasureImage, size_px: tuple[int, int] | None) -> None:
-    """Raise ``image_size_mismatch`` if an image has not the (width, height) that its camera was calibrated with."""
-    if size_px is not None and (image.shape[1], image.shape[0]) != tuple(size_px):
+def check_calibrated_size(name: str, shape: tuple[int, ...], size_px: tuple[int, int] | None) -> None:
+    """Raise ``image_size_mismatch`` if an image of (rows, cols) has not its calibration's (width, height), if known."""
+    rows, cols = shape
+    if size_px is not None and (cols, rows) != tuple(size_px):
         raise ImageError(
-            f"{image.name} is {image.shape[1]} x {image.shape[0]} px, its camera was calibrated at "
-            f"{size_px[0]} x {size_px[1]} px.",
+            f"{name} is {cols} x {rows} px, the calibration is for {size_px[0]} x {size_px[1]} px.",
             code="image_size_mismatch",
-            remedy="Use the calibration made with this camera and this image format.",
+            remedy="Give the images of the calibrated cameras, uncropped and unscaled.",
         )
 
 

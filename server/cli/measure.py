@@ -7,6 +7,7 @@ import hashlib
 from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
+from core.field.images import check_calibrated_size
 from server.cli.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.region import check_odd, check_region, parse_rectangle
 from server.cli.sequence import CheckedPair, MeasureJob, measure_sequence
@@ -97,12 +98,7 @@ def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[t
     shapes = []
     for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
         rows, cols = decode_image(read_file(path), name=str(path)).shape
-        if size is not None and size != (cols, rows):
-            raise ImageError(
-                f"{path} is {cols} x {rows} px, the calibration is for {size[0]} x {size[1]} px.",
-                code="image_size_mismatch",
-                remedy="Give the images of the calibrated cameras, uncropped and unscaled.",
-            )
+        check_calibrated_size(str(path), (rows, cols), size)
         shapes.append((rows, cols))
     return shapes[0], shapes[1]
 

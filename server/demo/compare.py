@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.result import Field
+from core.stereo import StereoPair
 from server.demo.session import pixels_of
 from sim.rig import SimRig
 from sim.scenes import make_scene
@@ -69,16 +70,11 @@ def compare_shape(result: Field, rig: SimRig, scene: str, load: float = 0.0) -> 
     """Return (r, c): valid points whose height over the best plane is wrong, by the same measure."""
     truth = truth_at(make_scene(rig, scene, load=load), rig.cam1.camera, pixels_of(result))
     difference = heights_mm(result.xyz_mm, result.valid) - heights_mm(truth.xyz_mm, result.valid)
-    limit = WRONG_PX * pixel_mm(rig) / np.sin(0.5 * stereo_angle_rad(rig)) + WRONG_SIGMA * result.sigma_mm[..., 2]
+    angle_rad = StereoPair(rig.cam1.camera, rig.cam2.camera).stereo_angle_rad
+    limit = WRONG_PX * pixel_mm(rig) / np.sin(0.5 * angle_rad) + WRONG_SIGMA * result.sigma_mm[..., 2]
     with np.errstate(invalid="ignore"):
         within = np.abs(difference) <= limit
     return np.asarray(result.valid & ~within)
-
-
-def stereo_angle_rad(rig: SimRig) -> float:
-    """Angle between the cameras' axes."""
-    axes = [rig.camera(name).camera.cam_from_sys.rotation[2] for name in ("cam1", "cam2")]
-    return float(np.arccos(np.clip(axes[0] @ axes[1], -1.0, 1.0)))
 
 
 def heights_mm(xyz_mm: Float, use: NDArray[np.bool_]) -> Float:

@@ -37,7 +37,8 @@ def storage_error(error: OSError, path: Path) -> StorageError:
     return StorageError(f"Writing {path} failed ({reason}).")
 
 
-def _sync(path: Path) -> None:
+def fsync_path(path: Path) -> None:
+    """Make a file's content, or a folder's renames and new names, durable."""
     fd = os.open(path, os.O_RDONLY)
     try:
         os.fsync(fd)
@@ -59,9 +60,9 @@ def written_aside(path: Path) -> Iterator[Path]:
     aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         yield aside
-        _sync(aside)
+        fsync_path(aside)
         aside.replace(path)
-        _sync(path.parent)
+        fsync_path(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
     finally:

@@ -9,21 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError
-from server.io.files import storage_error, written_aside
-
-
-def fsync_folder(folder: Path) -> None:
-    """Make renames and new names in ``folder`` durable."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+from server.io.files import fsync_path, storage_error, written_aside
 
 
 def make_folder(folder: Path) -> None:
@@ -36,7 +26,7 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir()
-        fsync_folder(folder.parent)
+        fsync_path(folder.parent)
     except OSError as error:
         raise storage_error(error, folder) from error
 
