@@ -36,11 +36,17 @@ class ImageData:
         (rows, cols) float32 grey levels.
     order
         3 or 5.
+    weights
+        (rows, cols) float32 relative inverse noise variance of the pixels, mean about 1; None: all alike.
+    noise_variance
+        Variance of the noise of a pixel of weight 1, grey levels squared; None: to be estimated from residuals.
     """
 
     coefficients: Float32
     pixels: Float32
     order: int
+    weights: Float32 | None = None
+    noise_variance: float | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

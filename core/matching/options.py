@@ -8,7 +8,7 @@ from typing import Literal
 from core.errors import InputError
 
 Interpolation = Literal["cubic", "quintic"]
-Patch = Literal["rigid", "stretch"]
+Patch = Literal["rigid", "stretch", "curved"]
 
 SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
 
@@ -48,8 +48,10 @@ class MatchOptions:
     def __post_init__(self) -> None:
         if not 5 <= self.subset_px <= 401:
             raise InputError(f"subset_px is {self.subset_px}, it must lie in 5 to 401.", code="option_out_of_range")
-        if self.patch not in ("rigid", "stretch"):
-            raise InputError(f"patch is {self.patch!r}, it must be 'rigid' or 'stretch'.", code="option_out_of_range")
+        if self.patch not in ("rigid", "stretch", "curved"):
+            raise InputError(
+                f"patch is {self.patch!r}, it must be 'rigid', 'stretch' or 'curved'.", code="option_out_of_range"
+            )
         if self.interpolation not in SPLINE_ORDER:
             raise InputError(
                 f"interpolation is {self.interpolation!r}, it must be 'cubic' or 'quintic'.", code="option_out_of_range"
