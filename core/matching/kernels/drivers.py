@@ -39,7 +39,7 @@ def shape_points(degree: int) -> Any:
     def run_shape(first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        space = work_space(setting[0], 1)
+        space = work_space(setting[0])
         for i in range(first, last):
             status[i], iterations[i] = shape_point(
                 reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
@@ -59,7 +59,7 @@ def motion_points(degree: int) -> Any:
                    out, status, iterations):  # fmt: skip
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        space = work_space(setting[0], 3)
+        space = work_space(setting[0])
         for i in range(first, last):
             status[i], iterations[i] = motion_point(
                 reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,

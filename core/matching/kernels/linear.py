@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from core.matching.kernels.loops import data
+from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
+
+QUAD = 4
+
+
+@njit(nogil=True, error_model="numpy")
+def padded(n):
+    """Row length for ``n`` unknowns: whole vectors of doubles."""
+    return (n + QUAD - 1) // QUAD * QUAD
 
 
 
@@ -32,33 +47,111 @@ def invert3(m, out):
     return True
 
 
-@njit(nogil=True, error_model="numpy")
-def factor(a, n):
-    """Cholesky factor U, ``a = U^T U``, of the leading (n, n) in place (upper, with 1 / diagonal on the diagonal).
+def _vectors(builder: Any, pointer: Any, parts: int) -> list[Vec]:
+    return [load(builder, at(builder, pointer, LONG(QUAD * c)), QUAD, DOUBLE) for c in range(parts)]
 
-    False if not positive definite; the test is relative to each diagonal entry, so it does not depend on the unknowns'
-    units. Row-wise updates of whole rows: entries below the diagonal are left with rubbish.
+
+def make_product(row: int) -> Any:
+    """Compile ``c[i, :] = sum over r of a[r, i] b[r, :]`` for rows of ``row`` doubles, a multiple of four.
+
+    Two i at a time: with an odd number, one more row is read and written. Arguments: a, its row length; b, its row
+    length; c, its row length; number of r, number of i.
     """
-    for j in range(n):
-        original = a[j, j]
-        for k in range(j):
-            original += a[k, j] * a[k, j]
-        if not a[j, j] > 1e-11 * original:
-            return False
-        inverse = 1.0 / math.sqrt(a[j, j])
-        for c in range(j + 1, n):
-            a[j, c] *= inverse
-        a[j, j] = inverse
-        for i in range(j + 1, n):
-            f = a[j, i]
-            for c in range(i, n):
-                a[i, c] -= f * a[j, c]
-    return True
+    parts = row // QUAD
+
+    @intrinsic
+    def product(_typingctx: Any, a: Any, a_row: Any, b: Any, b_row: Any, c: Any, c_row: Any, n_r: Any, n_i: Any) -> Any:
+        sig = types.void(a, a_row, b, b_row, c, c_row, n_r, n_i)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            a, b, c = (data(context, builder, sig, args, i) for i in (0, 2, 4))
+            vector = ir.VectorType(DOUBLE, QUAD)
+            sums = [[cgutils.alloca_once(builder, vector) for _ in range(parts)] for _ in range(2)]
+            pairs = builder.sdiv(builder.add(args[7], LONG(1)), LONG(2))
+            with cgutils.for_range(builder, pairs) as outer:
+                i = builder.mul(outer.index, LONG(2))
+                for one in (*sums[0], *sums[1]):
+                    builder.store(ir.Constant(vector, [0.0] * QUAD), one)
+                with cgutils.for_range(builder, args[6]) as inner:
+                    row_b = _vectors(builder, at(builder, b, builder.mul(inner.index, args[3])), parts)
+                    factors = at(builder, a, builder.add(builder.mul(inner.index, args[1]), i))
+                    for which in range(2):
+                        f = spread(builder, builder.load(at(builder, factors, LONG(which))), QUAD)
+                        for one, value in zip(sums[which], row_b, strict=True):
+                            builder.store((Vec(builder, builder.load(one)) + f * value).value, one)
+                for which in range(2):
+                    target = at(builder, c, builder.mul(builder.add(i, LONG(which)), args[5]))
+                    for part, one in enumerate(sums[which]):
+                        store(Vec(builder, builder.load(one)), at(builder, target, LONG(QUAD * part)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    return product
+
+
+def make_factor(row: int) -> Any:
+    """Compile the Cholesky factor for matrices with rows of ``row`` doubles."""
+    parts = row // QUAD
+
+    @intrinsic
+    def eliminate(_typingctx: Any, a: Any, i: Any) -> Any:
+        """Row i less what the rows above explain: ``a[i, :] -= a[j, i] a[j, :]`` for all j < i."""
+        sig = types.void(a, i)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            a = data(context, builder, sig, args, 0)
+            own = at(builder, a, builder.mul(args[1], LONG(row)))
+            sums = [cgutils.alloca_once(builder, ir.VectorType(DOUBLE, QUAD)) for _ in range(parts)]
+            for one, value in zip(sums, _vectors(builder, own, parts), strict=True):
+                builder.store(value.value, one)
+            with cgutils.for_range(builder, args[1]) as above:
+                other = at(builder, a, builder.mul(above.index, LONG(row)))
+                f = spread(builder, builder.load(at(builder, other, args[1])), QUAD)
+                for one, value in zip(sums, _vectors(builder, other, parts), strict=True):
+                    builder.store((Vec(builder, builder.load(one)) - f * value).value, one)
+            for part, one in enumerate(sums):
+                store(Vec(builder, builder.load(one)), at(builder, own, LONG(QUAD * part)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    @intrinsic
+    def scale_row(_typingctx: Any, a: Any, i: Any, factor: Any) -> Any:
+        sig = types.void(a, i, factor)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            own = at(builder, data(context, builder, sig, args, 0), builder.mul(args[1], LONG(row)))
+            f = spread(builder, args[2], QUAD)
+            for part, value in enumerate(_vectors(builder, own, parts)):
+                store(value * f, at(builder, own, LONG(QUAD * part)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    @njit(nogil=True, error_model="numpy")
+    def factor(a, n):
+        """Cholesky factor U, ``a = U^T U``, of the leading (n, n) in place; reads and fills the upper triangle.
+
+        The diagonal gets its inverse. False if not positive definite; the test is relative to each diagonal entry, so
+        it does not depend on the unknowns' units. Entries below the diagonal are left with rubbish.
+        """
+        for i in range(n):
+            original = a[i, i]
+            eliminate(a, np.int64(i))
+            if not a[i, i] > 1e-11 * original:
+                return False
+            inverse = 1.0 / math.sqrt(a[i, i])
+            scale_row(a, np.int64(i), inverse)
+            a[i, i] = inverse
+        return True
+
+    return factor
 
 
 @njit(nogil=True, error_model="numpy")
 def solve(u, b, n):
-    """Solve ``U^T U x = b`` in place with the factor from :func:`factor`."""
+    """Solve ``U^T U x = b`` in place with the factor from :func:`make_factor`."""
     for i in range(n):
         s = b[i] * u[i, i]
         b[i] = s
@@ -73,7 +166,7 @@ def solve(u, b, n):
 
 @njit(nogil=True, error_model="numpy")
 def covariance_of_last(u, n, m, work, out):
-    """Inverse's trailing (m, m) block from :func:`factor`, row by row into ``out``: the others drop out by themselves."""
+    """Inverse's trailing (m, m) block from :func:`make_factor`, row by row into ``out``: the others drop out by themselves."""
     first = n - m
     for j in range(m):  # columns of the trailing block's inverse, upper triangular
         for i in range(m):

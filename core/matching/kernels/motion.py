@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from core.matching.kernels.linear import covariance_of_last, factor, solve
+from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.loops import LANES
 from core.matching.kernels.point import (
     CONTRAST,
@@ -45,16 +45,16 @@ def n_motion_out(terms: int) -> int:
 
 def make_motion(degree: int) -> Any:
     """Compile the fit for plane (degree 1, stretch or rigid) or curved (2) patches."""
-    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, gradient, moves_of, predict, roughness,
-     few) = make_point(degree)  # fmt: skip
+    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
+     roughness, few) = make_point(degree, 3)  # fmt: skip
     unknowns = 4 * few + 1
 
     @njit(nogil=True, error_model="numpy")
-    def compare_all(images, lenses, M, order, ref, known, sums_of, warp_space, levels, rhs):
+    def compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs):
         """All three comparisons; status."""
         for k in range(3):
             lens = lenses[0] if k == 1 else lenses[1]
-            if not compare(images[k], lens, M[k], order, ref, known, sums_of, warp_space, levels[k], rhs[k]):
+            if not compare(images[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
                 return OUTSIDE_IMAGE
         for k in range(3):
             if levels[k, CONTRAST] == 0.0:
@@ -62,47 +62,47 @@ def make_motion(degree: int) -> Any:
         return OK
 
     @njit(nogil=True, error_model="numpy")
-    def freeze(R, t, e, nu_x, nu_y, M, levels, weights, inverse, blocks, columns, gram, half, normal, chain, rigid):
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations, chain, rigid):
         """Set up and factor the normal equations; status."""
+        weights, block, columns, half, _, normal = equations
         joint_weights(levels, 3, weights)
-        if not jacobian(R, t, e, nu_x, nu_y, 3, M, inverse, blocks, columns):
+        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
         n = unknowns
         if few == 3 and rigid:
             n = N_RIGID
             for k in range(3):
                 for r in range(2 * few):
-                    row = half[0, 0, 0]
+                    free = half[0, 0]
                     for i in range(n):
                         s = 0.0
                         for c in range(unknowns):
                             s += columns[k, r, c] * chain[c, i]
-                        row[i] = s
-                    for i in range(n):
-                        columns[k, r, i] = row[i]
-        assemble(weights, columns, gram, 3, n, half, normal)
+                        free[i] = s
+                    for i in range(unknowns):
+                        columns[k, r, i] = free[i] if i < n else 0.0
+        assemble(equations, of_reference[7])
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @njit(nogil=True, error_model="numpy")
     def motion_point(reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, known_variance, rigid = setting
-        (ref, of_reference, warp_space, rhs, levels, weights, M, blocks, columns, half, normal, moves, vectors, inverse,
-         G, rotation, chain, work) = space  # fmt: skip
-        _, _, powers, basis, _, sum_g, sum_fg, gram = of_reference
+        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain,
+         work) = space  # fmt: skip
+        gram, columns, normal = of_reference[7], equations[2], equations[5]
         inside, xc, yc, p, offset, f2 = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
         if not inside:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
-        if not 1e-6 < roughness(gram, lens1, xc, yc, f2) < WHITE_ROUGHNESS:
+        if not 1e-6 < roughness(gram, f2) < WHITE_ROUGHNESS:
             return LOW_TEXTURE, 0
-        w, step, reach, small = vectors[0], vectors[1], vectors[2], vectors[3]
+        w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
         for j in range(few):
             w[j] = start_w[j]
             total += w[j]
-            reach[j] = np.abs(powers[j]).max()
             for i in range(3):
                 G[i, j] = start_g[i, j]
                 total += G[i, j]
@@ -121,8 +121,6 @@ def make_motion(degree: int) -> Any:
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
-        sums_of = (powers, basis, slopes, sum_g, sum_fg)
-        scale = (lens1[1], lens1[2])
         e = 0.0
         for k in range(3):
             levels[k, GAIN], levels[k, SHIFT] = 1.0, 0.0
@@ -130,8 +128,8 @@ def make_motion(degree: int) -> Any:
         status = NOT_CONVERGED
         iterations = 0
         while iterations < max_iterations:
-            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 3, M)
-            result = compare_all(images, lenses, M, order, ref, known, sums_of, warp_space, levels, rhs)
+            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+            result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
             if result != OK:
                 return result, iterations
             iterations += 1
@@ -139,14 +137,14 @@ def make_motion(degree: int) -> Any:
                 if few == 3 and rigid:
                     rigid_chain(xc, yc, w, rotation, G, chain)
                 result = freeze(
-                    R, t, e, nu_x, nu_y, M, levels, weights, inverse, blocks, columns, gram, half, normal, chain, rigid
+                    R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations, chain, rigid
                 )
                 if result != OK:
                     return result, iterations
                 moved = 0.0
-            gradient(weights, columns, rhs, 3, n, small)
+            gradient(equations, rhs, n, small)
             solve(normal, small, n)
-            motion = moves_of(columns, small, 3, n, reach, scale, moves)
+            motion = moves_of(columns, small, moves)
             cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
             if few == 3 and rigid:
                 for r in range(unknowns):
@@ -173,10 +171,10 @@ def make_motion(degree: int) -> Any:
                 break
             previous = last
         if last < PREDICTED_PX:
-            predict(moves, 1.0, rhs, gram, f2, 3, levels)
+            predict(moves, rhs, gram, f2, levels)
         else:
-            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 3, M)
-            result = compare_all(images, lenses, M, order, ref, known, sums_of, warp_space, levels, rhs)
+            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+            result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
             if result != OK:
                 return result, iterations
         if not w[0] > 0.0:  # behind camera 1

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from core.matching.kernels.linear import invert3
+from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
 from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
 from core.matching.kernels.reference import make_reference, set_up_tables, width
 from core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
@@ -129,27 +129,41 @@ def texture_status(status, sigma_px, max_sigma_px, zncc):
     return status
 
 
-def make_point(degree: int) -> Any:
-    """Compile what the fits share, for patches of this degree (1 plane, 2 curved)."""
+def make_point(degree: int, images: int) -> Any:
+    """Compile what the fits share, for patches of this degree (1 plane, 2 curved) and one or three comparisons."""
     few = len(monomials(degree))
-    set_up_reference, to_rays, n_columns, n_raw = make_reference(degree)
+    each = 4 if images == 3 else 1  # unknowns a monomial: w_j, and G_0j, G_1j, G_2j
+    unknowns = each * few + 1
+    row = (unknowns + QUAD - 1) // QUAD * QUAD
+    set_up_reference, n_columns, n_raw = make_reference(degree)
     cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    product, factor = make_product(row), make_factor(row)
 
     @njit(nogil=True, error_model="numpy")
-    def work_space(subset, images):
+    def work_space(subset):
         """Everything one thread needs, so that no point allocates."""
         ref = np.empty((N_ROWS, width(subset)), np.float32)
         set_up_tables(subset, ref)
-        unknowns = 4 * few + 1
+        basis = np.zeros((few, few))
+        basis[0, 0] = 1.0
         reference = (
             np.empty(n_raw),
-            np.empty((2, N_NODES)),
+            np.empty(22),
             np.empty((few, N_NODES)),
-            np.empty((few, few)),
-            np.empty((few, few)),
+            basis,
+            np.empty(3),
             np.empty(n_columns),
             np.empty(n_columns),
             np.empty((n_columns, n_columns)),
+        )
+        # four of what there is one of for each image: the products work on pairs
+        equations = (
+            np.zeros((4, 4)),  # weights
+            np.zeros((3, 5)),  # what an image's matrix makes of a unit of each unknown
+            np.zeros((4, n_columns, row)),  # columns
+            np.zeros((4, n_columns, row)),  # Gram matrix times columns
+            np.zeros((4, n_columns, row)),  # the same, weighted
+            np.zeros((row, row)),  # normal equations, then their factor
         )
         return (
             ref,
@@ -157,30 +171,26 @@ def make_point(degree: int) -> Any:
             (np.zeros(N_WARP, np.float32), np.empty(26), np.empty(3 + n_columns)),  # warp, places, sums
             np.empty((images, n_columns)),  # rhs
             np.empty((images, 5)),  # levels
-            np.empty((images, images)),  # weights
             np.empty((images, 3, few)),  # M
-            np.empty((images, 3, 5)),  # blocks
-            np.empty((images, n_columns, unknowns)),  # columns
-            np.empty((2, images, n_columns, unknowns)),  # half
-            np.empty((unknowns, unknowns)),  # normal
+            equations,
             np.empty((images, n_columns)),  # moves
-            np.empty((6, unknowns)),  # vectors
+            np.zeros((4, row)),  # vectors
             np.empty((3, 3)),  # inverse
             np.empty((3, few)),  # G
             np.empty((3, 3)),  # rotation
             np.zeros((unknowns, unknowns)),  # chain
-            np.empty((unknowns, unknowns)),  # work
+            np.empty((5, 5)),  # work
         )
 
     @njit(nogil=True, error_model="numpy")
-    def compare(image, lens, m, order, ref, known, sums_of, space, levels, rhs):
+    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
         """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
 
         Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
         """
         coefficients, rows, cols, stride = image
         blocks, p, offset, f2 = known
-        powers, basis, slopes, sum_g, sum_fg = sums_of
+        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
         warp, places, sums = space
         base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
         if base < 0:
@@ -196,14 +206,13 @@ def make_point(degree: int) -> Any:
         mean = sums[0] / p
         fd = sums[1] - offset * sums[0]
         y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
-        to_rays(sums[3:], basis, slopes[0], slopes[1], slopes[2], slopes[3], rhs)
         if not y2 > 1e-12 * f2:
             levels[ZNCC] = 0.0
             levels[CONTRAST] = 0.0
             return True
         c = math.sqrt(y2 / f2)
         for i in range(n_columns):
-            rhs[i] = (rhs[i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
+            rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
         levels[GAIN] = gain / c
         levels[SHIFT] = (shift + mean + offset) / c - offset
         levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
@@ -212,7 +221,7 @@ def make_point(degree: int) -> Any:
         return True
 
     @njit(nogil=True, error_model="numpy")
-    def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, images, M):
+    def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M):
         """The matrices through which the images see the patch."""
         for i in range(3):
             for j in range(few):
@@ -230,24 +239,22 @@ def make_point(degree: int) -> Any:
                 M[k, 1, j] += e * nu_y * M[k, 2, j]
 
     @njit(nogil=True, error_model="numpy")
-    def jacobian(R, t, e, nu_x, nu_y, images, M, inverse, blocks, columns):
-        """What each unknown does to the patch, as coefficients of dX and dY; False if an M is singular.
+    def jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
+        """What each unknown does to the patch, px in the reference, as coefficients of ``columns``; False if singular.
 
-        ``columns`` (images, 2 M, unknowns) out.
+        ``slopes`` are d(px) / d(ray) of camera 1 at the point.
         """
-        last = 4 * few
+        _, _, _, basis, place, _, _, _ = of_reference
+        last = each * few
+        j11, j12, j21, j22 = slopes
         for k in range(images):
             if not invert3(M[k], inverse):
                 return False
-            out = columns[k]
-            out[:] = 0.0
-            block = blocks[k]
             for a in range(3):
                 if k == 1:
-                    block[a, 0] = 0.0
                     for i in range(3):
                         block[a, 1 + i] = inverse[a, i]
-                    block[a, 4] = 0.0
+                    block[a, 0], block[a, 4] = 0.0, 0.0
                     continue
                 s0, s1 = inverse[a, 0], inverse[a, 1]
                 s2 = inverse[a, 2] + e * (nu_x * s0 + nu_y * s1)  # row a of M^-1 S(e)
@@ -255,109 +262,106 @@ def make_point(degree: int) -> Any:
                 for i in range(3):
                     block[a, 1 + i] = (s0 * R[0, i] + s1 * R[1, i] + s2 * R[2, i]) if k == 2 else 0.0
                 block[a, 4] = nu_x * s0 + nu_y * s1
+            for i in range(5):
+                x, y = block[1, i], block[2, i]
+                block[1, i], block[2, i] = j11 * x + j12 * y, j21 * x + j22 * y
+            out = columns[k]
+            for r in range(n_columns):
+                for c in range(row):
+                    out[r, c] = 0.0
             for j in range(few):
-                at = 4 * (j - 1) if j > 0 else last - 4
-                for i in range(4):
-                    out[j, at + i] = block[1, i]
-                    out[few + j, at + i] = block[2, i]
-                # dM of e is the shift times M's last row
-                out[j, last] += block[1, 4] * M[k, 2, j]
-                out[few + j, last] += block[2, 4] * M[k, 2, j]
-                if few == 3 and j > 0:
-                    continue
-                if j > 2:
-                    continue
-                # - X d_0 and - Y d_0: the monomials one degree higher
-                x, y = (1, 2) if j == 0 else ((3, 4) if j == 1 else (4, 5))
-                for i in range(4):
-                    out[x, at + i] -= block[0, i]
-                    out[few + y, at + i] -= block[0, i]
-                out[x, last] -= block[0, 4] * M[k, 2, j]
-                out[few + y, last] -= block[0, 4] * M[k, 2, j]
+                at = each * (j - 1) if j > 0 else last - each
+                degree_of_m = 1 if j == 0 else (3 if j < 3 else 6)  # coefficients of monomial j of the ray
+                for m in range(degree_of_m):
+                    b, from_e = basis[j, m], basis[j, m] * M[k, 2, j]  # dM of e is the shift times M's last row
+                    for i in range(each):
+                        out[m, at + i] += block[1, i] * b
+                        out[few + m, at + i] += block[2, i] * b
+                    out[m, last] += block[1, 4] * from_e
+                    out[few + m, last] += block[2, 4] * from_e
+                # - X d_0 and - Y d_0 have one degree more; X and Y in px are the pixel's place
+                if j == 0 or (few == 6 and j < 3):
+                    for m in range(degree_of_m):
+                        b = basis[j, m]
+                        if b == 0.0:
+                            continue
+                        by_x, by_y = (1, 2) if m == 0 else ((3, 4) if m == 1 else (4, 5))
+                        for i in range(each + 1):
+                            c = at + i if i < each else last
+                            d = block[0, i] * b if i < each else block[0, 4] * b * M[k, 2, j]
+                            out[m, c] -= d * place[0]
+                            out[by_x, c] -= d * place[2]
+                            out[few + m, c] -= d * place[1]
+                            out[few + by_y, c] -= d * place[2]
         return True
 
     @njit(nogil=True, error_model="numpy")
-    def assemble(weights, columns, gram, images, n, half, normal):
-        """Normal equations (upper triangle): sum over comparisons k, o of ``weights_ko columns_k^T gram columns_o``."""
+    def assemble(equations, gram):
+        """Normal equations: sum over comparisons k, o of ``weights_ko columns_k^T gram columns_o``."""
+        weights, _, columns, half, weighted, normal = equations
+        wide = n_columns * row
         for k in range(images):
-            a = half[0, k]
+            product(gram, n_columns, columns[k], row, half[k], row, n_columns, n_columns)
+        if images == 1:
             for r in range(n_columns):
-                for c in range(n):
-                    a[r, c] = 0.0
-                for i in range(n_columns):
-                    g = gram[r, i]
-                    for c in range(n):
-                        a[r, c] += g * columns[k, i, c]
-        for k in range(images):
-            b = half[1, k]
+                for c in range(row):
+                    weighted[0, r, c] = weights[0, 0] * half[0, r, c]
+        else:
             for r in range(n_columns):
-                for c in range(n):
-                    b[r, c] = weights[k, 0] * half[0, 0, r, c]
-                for o in range(1, images):
-                    for c in range(n):
-                        b[r, c] += weights[k, o] * half[0, o, r, c]
-        for i in range(n):
-            for c in range(i, n):
-                normal[i, c] = 0.0
-            for k in range(images):
-                for r in range(n_columns):
-                    f = columns[k, r, i]
-                    if f != 0.0:
-                        for c in range(i, n):
-                            normal[i, c] += f * half[1, k, r, c]
+                product(weights, 4, half[0, r:], wide, weighted[0, r:], wide, images, images)
+        product(columns[0], row, weighted[0], row, normal, row, images * n_columns, unknowns)
 
     @njit(nogil=True, error_model="numpy")
-    def gradient(weights, columns, rhs, images, n, out):
+    def gradient(equations, rhs, n, out):
         """Right-hand side in the unknowns from each image's sums ``rhs``, with the sign of a step downhill."""
-        for c in range(n):
+        weights, columns = equations[0], equations[2]
+        for c in range(row):
             out[c] = 0.0
         for k in range(images):
             for r in range(n_columns):
                 s = 0.0
                 for o in range(images):
                     s -= weights[k, o] * rhs[o, r]
-                for c in range(n):
+                for c in range(row):
                     out[c] += columns[k, r, c] * s
 
     @njit(nogil=True, error_model="numpy")
-    def moves_of(columns, step, images, n, reach, scale, moves):
+    def moves_of(columns, step, moves):
         """Each image's motion of the patch (coefficients) for a step; returns the largest corner motion, camera 1 px.
 
-        The sum of the coefficients' sizes at the subset's corners bounds it.
+        The sum of the coefficients' sizes bounds it.
         """
         largest = 0.0
         for k in range(images):
             x, y = 0.0, 0.0
             for j in range(few):
                 a, b = 0.0, 0.0
-                for c in range(n):
+                for c in range(unknowns):
                     a += columns[k, j, c] * step[c]
                     b += columns[k, few + j, c] * step[c]
                 moves[k, j], moves[k, few + j] = a, b
-                x += abs(a) * reach[j]
-                y += abs(b) * reach[j]
-            largest = max(largest, math.hypot(x * scale[0], y * scale[1]))
-        return largest
+                x += abs(a)
+                y += abs(b)
+            largest = max(largest, x * x + y * y)
+        return math.sqrt(largest)
 
     @njit(nogil=True, error_model="numpy")
-    def predict(moves, cut, rhs, gram, f2, images, levels):
+    def predict(moves, rhs, gram, f2, levels):
         """Correlations after a small last step, from the quadratic form that the step was found with."""
         for k in range(images):
             change = 0.0
             for r in range(n_columns):
                 s = 2.0 * rhs[k, r]
                 for c in range(n_columns):
-                    s += gram[r, c] * (cut * moves[k, c])
-                change += s * (cut * moves[k, r])
+                    s += gram[r, c] * moves[k, c]
+                change += s * moves[k, r]
             levels[k, MISFIT] = max(levels[k, MISFIT] + change, 0.0)
             levels[k, ZNCC] = 1.0 - 0.5 * levels[k, MISFIT] / f2
 
     @njit(nogil=True, error_model="numpy")
-    def roughness(gram, lens1, xc, yc, f2):
+    def roughness(gram, f2):
         """Squared gradient (per px) over the grey levels' variance, mean over directions."""
-        j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
-        gxx, gyy = gram[0, 0] / (j11 * j11 + j21 * j21), gram[few, few] / (j12 * j12 + j22 * j22)
-        return 0.5 * (gxx + gyy) / f2
+        return 0.5 * (gram[0, 0] + gram[few, few]) / f2
 
-    return (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, gradient, moves_of, predict,
-            roughness, few)  # fmt: skip
+    return (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of,
+            predict, roughness, few)  # fmt: skip

@@ -1,8 +1,8 @@
 """The reference subset: grey levels, gradients, and the sums that the normal equations are made of.
 
-A step of the unknowns displaces the patch, as any image sees it, by ``dX = a . m, dY = b . m`` in its own coordinates
-(rays of camera 1 relative to the point's, ``m`` the monomials 1, X, Y or those up to second order), and an image's grey
-levels by contrast times ``gX dX + gY dY`` with the *reference's* gradient (gX, gY). So the columns ``gX m_j, gY m_j``,
+A step of the unknowns displaces the patch, as any image sees it, by ``dx = a . m, dy = b . m`` px in the reference
+image (``m`` the monomials 1, x, y, or those up to second order, of a pixel's place in the subset), and an image's grey
+levels by contrast times ``gx dx + gy dy`` with the *reference's* gradient (gx, gy). So the columns ``gx m_j, gy m_j``,
 which know nothing of any image, make every Jacobian. Terms of higher degree, that perspective adds, are left out of the
 Jacobian (not of the warp): they are some thousandths of the others, and change where Gauss-Newton goes, not where it
 ends.
@@ -22,7 +22,7 @@ from numba.extending import intrinsic
 
 from core.matching.kernels.loops import F, GX, GY, WEIGHT, X, Y, data, monomials, sum_reference
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
-from core.matching.kernels.warp import NODES, lens_jacobian, set_up_nodes, undistort
+from core.matching.kernels.warp import set_up_nodes, undistort
 
 
 @njit(nogil=True, error_model="numpy")
@@ -81,14 +81,6 @@ def set_up_tables(subset, ref):
             ref[WEIGHT, i] = 1.0
 
 
-@njit(nogil=True, error_model="numpy")
-def powers_of(x, y, out):
-    """Monomials of one place into ``out`` (3 or 6,)."""
-    out[0], out[1], out[2] = 1.0, x, y
-    if len(out) == 6:
-        out[3], out[4], out[5] = x * x, x * y, y * y
-
-
 def _product_table(degree: int) -> np.ndarray:
     many, few = monomials(2 * degree), monomials(degree)
     return np.array([[many.index((a[0] + b[0], a[1] + b[1])) for b in few] for a in few])
@@ -103,33 +95,6 @@ def make_reference(degree: int) -> Any:
     sum_all = sum_reference[degree]
 
     @njit(nogil=True, error_model="numpy")
-    def to_rays(sums, basis, j11, j12, j21, j22, out):
-        """Sums over gx m, gy m in the subset's places -> over gX m, gY m in rays."""
-        for j in range(few):
-            x, y = 0.0, 0.0
-            for k in range(few):
-                x += basis[j, k] * sums[k]
-                y += basis[j, k] * sums[few + k]
-            out[j] = j11 * x + j21 * y
-            out[few + j] = j12 * x + j22 * y
-
-    @njit(nogil=True, error_model="numpy")
-    def _both_sides(block, basis, half):
-        """``basis block basis^T`` in place."""
-        for j in range(few):
-            for k in range(few):
-                s = 0.0
-                for i in range(few):
-                    s += basis[j, i] * block[i, k]
-                half[j, k] = s
-        for j in range(few):
-            for k in range(few):
-                s = 0.0
-                for i in range(few):
-                    s += half[j, i] * basis[k, i]
-                block[j, k] = s
-
-    @njit(nogil=True, error_model="numpy")
     def set_up_reference(reference, lens, x_px, y_px, subset, ref, space):
         """Copy the subset nearest to (x_px, y_px) and sum it.
 
@@ -142,9 +107,10 @@ def make_reference(degree: int) -> Any:
         ref
             The subset's array, see ``loops``.
         space
-            Tuple of work space: raw sums, node rays (2, 16), node monomials (M, 16), the change of basis (M, M) from
-            the subset's places to rays, another (M, M), and the results: sum of each column, sum of f times it (both (2 M,)), and the
-            Gram matrix (2 M, 2 M), all with gain and offset projected out but the first.
+            Work space: raw sums, a vector for the nodes; and results: node monomials (M, 16), the change of basis
+            (M, M) from monomials of a pixel's place to those of its ray, the middle of the subset's pixels from the
+            point and half its width (3,) px, sum of each column (2 M,), of f times it (2 M,), and the Gram matrix
+            (2 M, 2 M); gain and offset are projected out of the last two.
 
         Returns
         -------
@@ -153,7 +119,7 @@ def make_reference(degree: int) -> Any:
             squares of f about it.
         """
         pixels, grad_x, grad_y, weights = reference
-        raw, rays, powers, basis, half_way, sum_g, sum_fg, gram = space
+        raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
         nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
@@ -163,10 +129,9 @@ def make_reference(degree: int) -> Any:
         xc, yc = undistort(lens, x_px, y_px)
         if not np.isfinite(xc + yc):
             return nothing
-        if not set_up_nodes(lens, x_px, y_px, (left + half, top + half), half, xc, yc, rays):
+        place[0], place[1], place[2] = left + half - x_px, top + half - y_px, half
+        if not set_up_nodes(lens, place[0], place[1], half, xc, yc, node_work, powers):
             return nothing
-        for n in range(NODES.shape[1]):
-            powers_of(rays[0, n], rays[1, n], powers[:, n])
         _copy(pixels, top, left, subset, ref, F)
         _copy(grad_x, top, left, subset, ref, GX)
         _copy(grad_y, top, left, subset, ref, GY)
@@ -175,50 +140,44 @@ def make_reference(degree: int) -> Any:
         mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
         for i in range(subset):
             mean += pixels[top + i, left + i]
-        for i in range(subset * subset, len(ref[F])):
+        for i in range(subset * subset, ref.shape[1]):
             ref[F, i] = 0.0
         sum_all(ref, np.int64((subset * subset + LANES - 1) // LANES), np.float32(mean / subset), raw)
         p, offset = raw[0], raw[1] / raw[0]
         f2 = raw[2] - raw[1] * offset
-        # places -> rays: m(X, Y) = basis m(place), with the lens's slope at the point
-        j11, j12, j21, j22 = lens_jacobian(lens, xc, yc)
-        det = j11 * j22 - j12 * j21
-        a1, a2, b1, b2 = j22 / det * half, -j12 / det * half, -j21 / det * half, j11 / det * half
-        dx, dy = (left + half - x_px) / half, (top + half - y_px) / half
-        a0, b0 = a1 * dx + a2 * dy, b1 * dx + b2 * dy
-        basis[:] = 0.0
-        basis[0, 0] = 1.0
-        basis[1, 0], basis[1, 1], basis[1, 2] = a0, a1, a2
-        basis[2, 0], basis[2, 1], basis[2, 2] = b0, b1, b2
-        if few == 6:
-            u, v = basis[1], basis[2]
-            for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
-                basis[row, 0] = s[0] * t[0]
-                basis[row, 1] = s[0] * t[1] + s[1] * t[0]
-                basis[row, 2] = s[0] * t[2] + s[2] * t[0]
-                basis[row, 3] = s[1] * t[1]
-                basis[row, 4] = s[1] * t[2] + s[2] * t[1]
-                basis[row, 5] = s[2] * t[2]
-        to_rays(raw[first_g:], basis, j11, j12, j21, j22, sum_g)
-        to_rays(raw[first_fg:], basis, j11, j12, j21, j22, sum_fg)
         for i in range(n_columns):
-            sum_fg[i] -= offset * sum_g[i]
-        # the same for the products: gX = j11 gx + j21 gy, gY = j12 gx + j22 gy
+            sum_g[i] = raw[first_g + i]
+            sum_fg[i] = raw[first_fg + i] - offset * raw[first_g + i]
         for j in range(few):
             for k in range(few):
-                xx = raw[first_gg + product[j, k]]
-                xy = raw[first_gg + many + product[j, k]]
-                yy = raw[first_gg + 2 * many + product[j, k]]
-                gram[j, k] = j11 * j11 * xx + 2.0 * j11 * j21 * xy + j21 * j21 * yy
-                gram[j, few + k] = j11 * j12 * xx + (j11 * j22 + j12 * j21) * xy + j21 * j22 * yy
-                gram[few + j, few + k] = j12 * j12 * xx + 2.0 * j12 * j22 * xy + j22 * j22 * yy
-        for a in range(2):
-            for b in range(a, 2):
-                _both_sides(gram[few * a : few * (a + 1), few * b : few * (b + 1)], basis, half_way)
+                m = product[j, k]
+                gram[j, k] = raw[first_gg + m]
+                gram[j, few + k] = gram[few + j, k] = raw[first_gg + many + m]
+                gram[few + j, few + k] = raw[first_gg + 2 * many + m]
+        per_weight, per_f2 = 1.0 / p, 1.0 / f2
         for i in range(n_columns):
-            for j in range(i, n_columns):
-                gram[i, j] -= sum_g[i] * sum_g[j] / p + sum_fg[i] * sum_fg[j] / f2
-                gram[j, i] = gram[i, j]
+            a, b = sum_g[i] * per_weight, sum_fg[i] * per_f2
+            for j in range(n_columns):
+                gram[i, j] -= a * sum_g[j] + b * sum_fg[j]
+        # places -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
+        u, v = basis[1], basis[2]
+        u[1], u[2], v[1], v[2] = half * node_work[16], half * node_work[17], half * node_work[18], half * node_work[19]
+        u[0] = (u[1] * place[0] + u[2] * place[1]) / half
+        v[0] = (v[1] * place[0] + v[2] * place[1]) / half
+        if few == 6:
+            for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
+                times(s, t, basis[row])
         return True, xc, yc, p, offset, f2
 
-    return set_up_reference, to_rays, n_columns, first_gg + 3 * many
+    return set_up_reference, n_columns, first_gg + 3 * many
+
+
+@njit(nogil=True, error_model="numpy")
+def times(s, t, out):
+    """Product of two linear polynomials (the first three entries of each) in x and y: six coefficients."""
+    out[0] = s[0] * t[0]
+    out[1] = s[0] * t[1] + s[1] * t[0]
+    out[2] = s[0] * t[2] + s[2] * t[0]
+    out[3] = s[1] * t[1]
+    out[4] = s[1] * t[2] + s[2] * t[1]
+    out[5] = s[2] * t[2]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from core.matching.kernels.linear import covariance_of_last, factor, solve
+from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.loops import LANES
 from core.matching.kernels.point import (
     CONTRAST,
@@ -41,44 +41,38 @@ def n_shape_out(terms: int) -> int:
 
 def make_shape(degree: int) -> Any:
     """Compile the fit for plane (degree 1) or curved (2) patches."""
-    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, gradient, moves_of, predict, roughness,
-     few) = make_point(degree)  # fmt: skip
+    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
+     roughness, few) = make_point(degree, 1)  # fmt: skip
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @njit(nogil=True, error_model="numpy")
-    def freeze(R, t, e, nu_x, nu_y, M, levels, weights, inverse, blocks, columns, gram, half, normal):
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations):
         """Set up and factor the normal equations; status."""
+        weights, block, columns, _, _, normal = equations
         joint_weights(levels, 1, weights)
-        if not jacobian(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, columns):
+        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
-        out = columns[0]
-        for r in range(2 * few):
-            for j in range(few):
-                out[r, j] = out[r, 4 * j]
-            out[r, few] = out[r, 4 * few]
-        assemble(weights, columns, gram, 1, n, half, normal)
+        assemble(equations, of_reference[7])
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @njit(nogil=True, error_model="numpy")
     def shape_point(reference, image2, lens1, lens2, R, t, xy, start, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, known_variance = setting
-        (ref, of_reference, warp_space, rhs, levels, weights, M, blocks, columns, half, normal, moves, vectors, inverse,
-         G, _, _, work) = space  # fmt: skip
-        _, _, powers, basis, _, sum_g, sum_fg, gram = of_reference
+        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
+        gram, columns, normal = of_reference[7], equations[2], equations[5]
         inside, xc, yc, p, offset, f2 = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
         if not inside:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
-        if not 1e-6 < roughness(gram, lens1, xc, yc, f2) < WHITE_ROUGHNESS:
+        if not 1e-6 < roughness(gram, f2) < WHITE_ROUGHNESS:
             return LOW_TEXTURE, 0
-        w, step, reach, small = vectors[0], vectors[1], vectors[2], vectors[3]
+        w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
         for i in range(few):
             w[i] = start[i]
             total += w[i]
-            reach[i] = np.abs(powers[i]).max()
         if not np.isfinite(total):
             return NOT_SEEDED, 0
         nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
@@ -87,28 +81,26 @@ def make_shape(degree: int) -> Any:
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
-        sums_of = (powers, basis, slopes, sum_g, sum_fg)
-        scale = (lens1[1], lens1[2])
         e = 0.0
         levels[0, GAIN], levels[0, SHIFT] = 1.0, 0.0
         moved, previous, last = np.inf, 0.0, np.inf
         status = NOT_CONVERGED
         iterations = 0
         while iterations < max_iterations:
-            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
-            if not compare(image2, lens2, M[0], order, ref, known, sums_of, warp_space, levels[0], rhs[0]):
+            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+            if not compare(image2, lens2, M[0], order, ref, known, of_reference, warp_space, levels[0], rhs[0]):
                 return OUTSIDE_IMAGE, iterations
             iterations += 1
             if levels[0, CONTRAST] == 0.0:
                 return LOW_TEXTURE, iterations
             if moved > REFREEZE_PX:
-                result = freeze(R, t, e, nu_x, nu_y, M, levels, weights, inverse, blocks, columns, gram, half, normal)
+                result = freeze(R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations)
                 if result != OK:
                     return result, iterations
                 moved = 0.0
-            gradient(weights, columns, rhs, 1, n, step)
+            gradient(equations, rhs, n, step)
             solve(normal, step, n)
-            motion = moves_of(columns, step, 1, n, reach, scale, moves)
+            motion = moves_of(columns, step, moves)
             cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
             for j in range(1, few):
                 w[j] += cut * step[j - 1]
@@ -121,10 +113,10 @@ def make_shape(degree: int) -> Any:
                 break
             previous = last
         if last < PREDICTED_PX:
-            predict(moves, 1.0, rhs, gram, f2, 1, levels)
+            predict(moves, rhs, gram, f2, levels)
         else:
-            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
-            if not compare(image2, lens2, M[0], order, ref, known, sums_of, warp_space, levels[0], rhs[0]):
+            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+            if not compare(image2, lens2, M[0], order, ref, known, of_reference, warp_space, levels[0], rhs[0]):
                 return OUTSIDE_IMAGE, iterations
         if not w[0] > 0.0:  # behind camera 1
             return NOT_CONVERGED, iterations

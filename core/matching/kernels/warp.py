@@ -110,24 +110,84 @@ NODES, _FIT = _nodes()
 N_NODES = 16
 
 
+@intrinsic
+def _node_rays(_typingctx: Any, q: Any, iterations: Any, powers: Any) -> Any:
+    """Undistort the nodes by Newton's method with the Jacobian at the centre.
+
+    Parameters
+    ----------
+    q
+        (22,) offset of the subset's centre x, y, half its width, px; the centre's ray; the lens expansion l1, l2, l3,
+        h11, h12, h22, p1, p2, fx, fy, skew; inverse Jacobian row by row; out: largest last error, px, and largest
+        squared radius.
+    iterations
+        int64.
+    powers
+        (M, 16) out: monomials of the nodes' rays.
+    """
+    sig = types.void(q, iterations, powers)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer, out = (data(context, builder, sig, args, i) for i in (0, 2))
+        number = [spread(builder, builder.load(at(builder, pointer, LONG(i))), N_NODES) for i in range(20)]
+        dx, dy, half, xc, yc, l1, l2, l3, h11, h12, h22, p1, p2, fx, fy, fs, i11, i12, i21, i22 = number
+        vector = ir.VectorType(DOUBLE, N_NODES)
+        x, y = (
+            centre + half * Vec(builder, ir.Constant(vector, [float(c) for c in NODES[axis]]))
+            for axis, centre in enumerate((dx, dy))
+        )
+        state = [cgutils.alloca_once(builder, vector) for _ in range(3)]
+
+        def put(u: Vec, v: Vec, error: Vec) -> None:
+            for one, value in zip(state, (u, v, error), strict=True):
+                builder.store(value.value, one)
+
+        put(i11 * x + i12 * y, i21 * x + i22 * y, x)
+        with cgutils.for_range(builder, args[1]):
+            u, v = (Vec(builder, builder.load(one)) for one in state[:2])
+            uu, vv, uv = u * u, v * v, u * v
+            rho = 2.0 * (xc * u + yc * v) + uu + vv
+            dl = rho * (l1 + rho * (l2 + rho * l3))
+            xd = (u + xc) * dl + h11 * u + h12 * v + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
+            yd = (v + yc) * dl + h12 * u + h22 * v + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)
+            ex, ey = x - (fx * xd + fs * yd), y - fy * yd
+            put(u + (i11 * ex + i12 * ey), v + (i21 * ex + i22 * ey), ex * ex + ey * ey)
+        u, v, error = (Vec(builder, builder.load(one)) for one in state)
+        one = Vec(builder, ir.Constant(vector, [1.0] * N_NODES))
+        curved = builder.icmp_signed(
+            "==", builder.extract_value(context.make_array(sig.args[2])(context, builder, args[2]).shape, 0), LONG(6)
+        )
+        for row, value in enumerate((one, u, v)):
+            store(value, at(builder, out, LONG(N_NODES * row)))
+        with builder.if_then(curved):
+            for row, value in enumerate((u * u, u * v, v * v)):
+                store(value, at(builder, out, LONG(N_NODES * (3 + row))))
+        reach = (u + xc) * (u + xc) + (v + yc) * (v + yc)
+        for place, value in ((20, error), (21, reach)):
+            builder.store(value.reduce("fmax"), at(builder, pointer, LONG(place)))
+        return context.get_dummy_value()
+
+    return sig, codegen
+
+
 @njit(nogil=True, error_model="numpy")
-def set_up_nodes(lens, x_px, y_px, centre, half, xc, yc, rays):
-    """Rays of the nodes in camera 1, relative to the ray of (x_px, y_px).
+def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
+    """Rays of the nodes in camera 1, relative to the point's.
 
     Parameters
     ----------
     lens
         Camera 1's.
-    x_px, y_px
-        The point.
-    centre
-        Middle of the subset's pixels, px; within half a pixel of the point.
+    dx, dy
+        Middle of the subset's pixels from the point, px; within half a pixel.
     half
         Half the distance of the outermost pixels.
     xc, yc
         The point's ray.
-    rays
-        (2, 16) out.
+    q
+        (22,) work space.
+    powers
+        (M, 16) out: the monomials of the rays.
 
     Returns
     -------
@@ -136,32 +196,17 @@ def set_up_nodes(lens, x_px, y_px, centre, half, xc, yc, rays):
     """
     _, _, l1, l2, l3, h11, h12, h22 = lens_expansion(lens, xc, yc)
     j11, j12, j21, j22 = lens_jacobian(lens, xc, yc)
-    p1, p2 = 0.0, 0.0
-    if lens[0] != SEIDEL:
-        p1, p2 = lens[8], lens[9]
     det = j11 * j22 - j12 * j21
-    i11, i12, i21, i22 = j22 / det, -j12 / det, -j21 / det, j11 / det
-    furthest = 0.0
-    for n in range(N_NODES):
-        dx, dy = centre[0] - x_px + half * NODES[0, n], centre[1] - y_px + half * NODES[1, n]
-        u, v = i11 * dx + i12 * dy, i21 * dx + i22 * dy
-        change = np.inf
-        for _ in range(_NEWTON_STEPS):  # Newton with the Jacobian at the centre
-            rho = 2.0 * (xc * u + yc * v) + u * u + v * v
-            dl = rho * (l1 + rho * (l2 + rho * l3))
-            xd = (u + xc) * dl + h11 * u + h12 * v + 2.0 * p1 * u * v + p2 * (3.0 * u * u + v * v)
-            yd = (v + yc) * dl + h12 * u + h22 * v + 2.0 * p2 * u * v + p1 * (u * u + 3.0 * v * v)
-            ex, ey = dx - (lens[1] * xd + lens[3] * yd), dy - lens[2] * yd
-            u += i11 * ex + i12 * ey
-            v += i21 * ex + i22 * ey
-            change = abs(ex) + abs(ey)
-            if change < 1e-9:
-                break
-        if not change < 1e-6:
-            return False
-        rays[0, n], rays[1, n] = u, v
-        furthest = max(furthest, (u + xc) ** 2 + (v + yc) ** 2)
-    return furthest < lens[11]
+    polynomial = lens[0] != SEIDEL
+    q[0], q[1], q[2], q[3], q[4] = dx, dy, half, xc, yc
+    q[5], q[6], q[7], q[8], q[9], q[10] = l1, l2, l3, h11, h12, h22
+    q[11], q[12] = (lens[8], lens[9]) if polynomial else (0.0, 0.0)
+    q[13], q[14], q[15] = lens[1], lens[2], lens[3]
+    q[16], q[17], q[18], q[19] = j22 / det, -j12 / det, -j21 / det, j11 / det
+    _node_rays(q, 3, powers)
+    if not q[20] < 1e-16:
+        _node_rays(q, 2 * _NEWTON_STEPS, powers)
+    return q[20] < 1e-12 and q[21] < lens[11]
 
 
 @intrinsic
