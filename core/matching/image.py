@@ -16,12 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import ImageError, InputError
 from core.matching.filters import correlate, derivative, prefilter
 from core.matching.options import SPLINE_ORDER, Interpolation
+from core.matching.slopes import SlopeFilter, slope_filter
 
 PAD = 4
 """Mirrored coefficients kept around the image, so that no tap needs a test (quintic: 2 left, 3 right, and rounding)."""
 
 Float32 = NDArray[np.float32]
 _ONE = np.ones(1)
+WIENER = False
+"""Whether gradients are those of :mod:`core.matching.slopes`, or the spline's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +63,25 @@ class ImageData:
         return np.ascontiguousarray(self.raw, dtype=np.float32)
 
     @cached_property
+    def slopes(self) -> SlopeFilter | None:
+        """The derivative that is best under this image's noise; None where the image shows nothing."""
+        return slope_filter(self.raw, self.noise_variance)
+
+    @property
+    def slope_noise(self) -> float:
+        """Variance of ``gradients`` per variance of white noise in the pixels, mean of both directions."""
+        return self.slopes.gain if WIENER and self.slopes else float((derivative(self.order) ** 2).sum())
+
+    @property
+    def slope_share(self) -> float:
+        """Share of noise in the squares of ``gradients``, over the image's texture, that is allowed for in them."""
+        return self.slopes.share if WIENER and self.slopes else 0.0
+
+    @cached_property
     def gradients(self) -> tuple[Float32, Float32]:
-        """The spline's derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
+        """Derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
+        if WIENER and self.slopes:
+            return self.slopes.apply(self.raw)
         slope = derivative(self.order)
         gx, gy = np.empty(self.shape, np.float32), np.empty(self.shape, np.float32)
         correlate(self.raw, _ONE, slope, gx)
