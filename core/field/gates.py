@@ -147,8 +147,8 @@ def neighbour_disagreement(
     compare_with_neighbours(
         points.ok.reshape(shape),
         np.ascontiguousarray(rays.reshape(rows, cols, 3)),
-        np.ascontiguousarray(points.w.reshape(rows, cols, 3)),
-        np.ascontiguousarray(points.G.reshape(rows, cols, 3, 3)),
+        np.ascontiguousarray(points.w[:, :3].reshape(rows, cols, 3)),
+        np.ascontiguousarray(points.G[:, :, :3].reshape(rows, cols, 3, 3)),
         motion,
         np.inf,
         difference,
