@@ -327,7 +327,9 @@ class _Run:
             if self._sample_holds(w, G):
                 if self.patch.patch == "curved":
                     self._refit_curved()
-                index = np.flatnonzero(self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2)))
+                # the sample stands already, fitted from these very starts
+                known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+                index = np.flatnonzero(self.usable & known & ~self.points.ok)
                 self.progress("previous", 0, len(index))
                 fit_in_batches(
                     self.fitter, self.points, index, self.xy_px, w[index], G[index], far_px=_SAMPLE_FAR_PX,

@@ -19,8 +19,8 @@ class ReadAhead(Generic[Item, Result]):
     """Results of ``read(item)`` in order; while one is in use, the next is being read.
 
     >>> with ReadAhead(str, [1, 2]) as ahead:
-    ...     ahead.take(), ahead.take()
-    ('1', '2')
+    ...     list(ahead)
+    ['1', '2']
 
     Parameters
     ----------
@@ -36,14 +36,11 @@ class ReadAhead(Generic[Item, Result]):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
         self._next = self._submit()
 
-    def take(self) -> Result:
-        """Return the next result, or raise what reading it raised; reading the one after it begins.
+    def __iter__(self) -> ReadAhead[Item, Result]:
+        return self
 
-        Raises
-        ------
-        StopIteration
-            If no item is left.
-        """
+    def __next__(self) -> Result:
+        """Return the next result, or raise what reading it raised; reading the one after it begins."""
         if self._next is None:
             raise StopIteration
         try:
