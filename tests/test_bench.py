@@ -10,8 +10,8 @@ import pytest
 
 from docs.scripts import bench_worker
 from docs.scripts.bench_ceilings import CompiledLoop, fma_ir, gather_ir, load_ir, rows_ir, vector_width
+from docs.scripts.bench_pairs import BenchScene, Request, judge, make_scene
 from docs.scripts.bench_peer import Run, peer_python, run_peer
-from docs.scripts.bench_scene import BenchScene, Request, judge, make_scene
 
 TINY = Request("tiny", "sim_paper", (150, 140), (46, 46, 106, 96), 10, 1)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from core.lens import OpenCVLens
-from docs.scripts.bench_scene import BenchScene, Errors, judge
+from docs.scripts.bench_pairs import BenchScene, Errors, judge
 
 ROOT = Path(__file__).resolve().parents[2]
 PEER_PYTHON = ROOT / ".venv-bench" / "bin" / "python"
