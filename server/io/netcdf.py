@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import FileFormatError
+from core.field.patch import PatchChoice
 from core.field.result import Field
 from core.status import STATUS_MEANINGS, PointStatus
 from server.io.files import written_aside
@@ -78,6 +79,12 @@ _MOTION = (
     _Variable("stretch_22", "stretch", 1, "1", "in-plane stretch of the patch, e22 in its tangent frame"),
     _Variable("stretch_12", "stretch", 2, "1", "in-plane stretch of the patch, e12 in its tangent frame"),
 )
+_CURVATURE = (
+    _Variable("curvature_1", "curvature_per_mm", 0, "mm-1",
+              "larger principal curvature of the reference's surface, positive where it bulges towards the cameras"),
+    _Variable("curvature_2", "curvature_per_mm", 1, "mm-1",
+              "smaller principal curvature of the reference's surface, positive where it bulges towards the cameras"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,7 +140,8 @@ def _fill(dataset: Any, result: Field, provenance: Provenance) -> None:
     rows, cols = result.shape
     for name, size in (("row", rows), ("col", cols), ("comparison", result.zncc.shape[-1])):
         dataset.createDimension(name, size)
-    for v in _SHAPE + (_MOTION if result.has_motion else ()):
+    curved = _CURVATURE if result.curvature_per_mm is not None else ()
+    for v in _SHAPE + (_MOTION if result.has_motion else ()) + curved:
         values = getattr(result, v.attribute)
         if v.component is not None:
             values = values[..., v.component]
@@ -146,6 +154,12 @@ def _fill(dataset: Any, result: Field, provenance: Provenance) -> None:
     dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
     _put_covariance(dataset, result)
     dataset.setncatts(_attributes(provenance, moved=result.has_motion))
+    if result.patch is not None:
+        dataset.setncatts({
+            "patch": result.patch.patch,
+            "patch_reason": result.patch.reason,
+            "patch_choice": json.dumps(result.patch.document(), sort_keys=True),
+        })  # fmt: skip
 
 
 def _put_covariance(dataset: Any, result: Field) -> None:
@@ -236,7 +250,8 @@ def read_field(path: str | Path) -> Field:
     with _open(path) as dataset:
         variables = dataset.variables
         shape = (dataset.dimensions["row"].size, dataset.dimensions["col"].size)
-        wanted = _SHAPE + (_MOTION if dataset.kind == "displacement" else ())
+        curved = _CURVATURE if _CURVATURE[0].name in variables else ()
+        wanted = _SHAPE + (_MOTION if dataset.kind == "displacement" else ()) + curved
         names = [v.name for v in wanted] + ["status", "iterations", "zncc", "covariance"]
         missing = [name for name in names if name not in variables]
         if missing:
@@ -247,18 +262,21 @@ def read_field(path: str | Path) -> Field:
             if v.component is None:
                 arrays[v.attribute] = values
             else:
-                arrays.setdefault(v.attribute, np.full((*shape, 3), np.nan))[..., v.component] = values
+                tail = 2 if v in _CURVATURE else 3
+                arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
+        choice = getattr(dataset, "patch_choice", None)
         return Field(
             **arrays,
             status=np.asarray(variables["status"][...], dtype=np.int8),
             iterations=np.asarray(variables["iterations"][...], dtype=np.int32),
             zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
             covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
+            patch=None if choice is None else PatchChoice.from_document(json.loads(choice)),
         )
 
 
 def read_attributes(path: str | Path) -> dict[str, Any]:
-    """Read a result file's global attributes; ``settings`` and ``inputs_sha256`` come back as objects.
+    """Read a result file's global attributes; ``settings``, ``inputs_sha256``, ``patch_choice`` come back as objects.
 
     Raises
     ------
@@ -267,6 +285,7 @@ def read_attributes(path: str | Path) -> dict[str, Any]:
     """
     with _open(Path(path)) as dataset:
         attributes = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
-    for name in ("settings", "inputs_sha256"):
-        attributes[name] = json.loads(attributes[name])
+    for name in ("settings", "inputs_sha256", "patch_choice"):
+        if name in attributes:
+            attributes[name] = json.loads(attributes[name])
     return attributes
