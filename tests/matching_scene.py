@@ -193,13 +193,15 @@ class Bent:
         frame = np.linalg.inv(np.column_stack([self.basis, self.normal]))
         c, d = frame @ (centre - self.origin), directions @ frame.T
         k11, k12, k22 = self.bend
-        da, db = d[..., 0], d[..., 1]
-        # height(c + t d) = c2 + t d2, as A t^2 - B t + C = 0; the root that the flat patch has too
-        A = self.height(da, db)
-        B = d[..., 2] - (k11 * c[0] * da + k12 * (c[0] * db + c[1] * da) + k22 * c[1] * db)
-        C = self.height(c[0], c[1]) - c[2]
+        a, b = d[..., 0], d[..., 1]
+        # from where the ray meets the tangent plane: of the two places on the bent surface the near one
+        p = c[:2] - (c[2] / d[..., 2])[..., None] * d[..., :2]
+        p1, p2 = p[..., 0], p[..., 1]
+        # height(p + t d) = t d2, as A t^2 - B t + C = 0
+        A, C = self.height(a, b), self.height(p1, p2)
+        B = d[..., 2] - (k11 * p1 * a + k12 * (p1 * b + p2 * a) + k22 * p2 * b)
         t = 2.0 * C / (B + np.copysign(np.sqrt(B * B - 4.0 * A * C), B))
-        return c[:2] + t[..., None] * d[..., :2]
+        return p + t[..., None] * d[..., :2]
 
     def place(self, ab: NDArray) -> NDArray:
         """System coordinates of material points."""

@@ -3,8 +3,8 @@
 It shares nothing with them: rays and images through the cameras' own functions, splines by ``ndimage``, all derivatives
 by central differences, and the solution is where the weighted sums vanish, found by Newton's method.
 
-Unknowns are (w, e) for a shape and (w, e, G row by row) for a motion: w and each row of G have 3 numbers for a plane patch,
-over (1, X, Y), and 6 for a curved one, over (1, X, Y, X^2, X Y, Y^2). How many there are tells which.
+Unknowns are (w, e) for a shape and (w, e, G row by row) for a motion: w and each row of G have 3 numbers for a plane
+patch, over (1, X, Y), and 6 for a curved one, over (1, X, Y, X^2, X Y, Y^2). How many there are tells which.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
 from core.stereo import StereoPair
-
 
 _W_STEPS = [1e-7, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
 _G_STEPS = [1e-6, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
@@ -108,7 +107,7 @@ class Twin:
         return np.stack(columns, -1)
 
     def equations(self, unknowns: NDArray, free: NDArray) -> tuple[NDArray, NDArray]:
-        """The weighted sums that vanish at the solution, and their Gauss-Newton matrix; ``free`` (unknowns, n) spans."""
+        """The weighted sums that vanish at the solution, and their Gauss-Newton matrix; ``free`` spans the steps."""
         count = len(self.splines) - 1
         terms = self.terms(unknowns)
         steps = np.array([*_W_STEPS[:terms], 1e-3, *(_G_STEPS[:terms] * 3)])[: len(unknowns)]
