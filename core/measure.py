@@ -20,6 +20,8 @@ from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
 from core.field.grow import fit_in_batches, grow
 from core.field.images import MeasureImage, different, same_size
+from core.field.patch import UsedPatch, asked_for
+from core.field.patch_choice import choose_patch
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
 from core.field.scatter import scattered_motion, scattered_shape
@@ -39,7 +41,7 @@ from core.field.unreached import mark_outside
 from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
-from core.matching.options import Interpolation, MatchOptions, Patch
+from core.matching.options import PATCH_SETTINGS, Interpolation, MatchOptions, Patch, PatchSetting
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.status import PointStatus
 from core.stereo import StereoPair
@@ -63,7 +65,9 @@ class MeasureOptions:
     subset_px
         Width of the square subset, odd, 9 or more.
     patch
-        ``stretch`` (default) or the paper's ``rigid``.
+        ``stretch`` (default) or the paper's ``rigid``: plane patches. ``curved``: second-order surface and
+        displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever errs less on the field
+        in all; shape and motion are decided apart, and a sequence that went over to curved patches keeps them.
     interpolation
         ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
     least_zncc
@@ -73,7 +77,7 @@ class MeasureOptions:
     """
 
     subset_px: int = 33
-    patch: Patch = "stretch"
+    patch: PatchSetting = "stretch"
     interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
@@ -82,11 +86,16 @@ class MeasureOptions:
         check_subset(self.subset_px)
         if not 0.0 < self.least_zncc < 1.0:
             raise InputError(f"least_zncc is {self.least_zncc}, it must lie in 0 to 1.", code="option_out_of_range")
+        if self.patch not in PATCH_SETTINGS:
+            raise InputError(
+                f"patch is {self.patch!r}, it must be one of {', '.join(PATCH_SETTINGS)}.", code="option_out_of_range"
+            )
         self.match_options()
 
     def match_options(self) -> MatchOptions:
-        """Return the point-level options."""
-        return MatchOptions(subset_px=self.subset_px, patch=self.patch, interpolation=self.interpolation)
+        """Return the point-level options, with plane patches: curved ones start from their results."""
+        patch: Patch = "rigid" if self.patch == "rigid" else "stretch"
+        return MatchOptions(subset_px=self.subset_px, patch=patch, interpolation=self.interpolation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +285,10 @@ class _Run:
             options=self.options.match_options(),
             least_zncc=self.options.least_zncc,
         )
-        self.points = PointFits.empty(len(self.xy_px), self.fitter.comparisons)
+        asked = self.options.patch
+        plane: UsedPatch = "plane" if cur1 is None else self.fitter.options.patch
+        self.patch = asked_for("curved" if asked == "curved" else plane, asked)
+        self.points = self.fitter.empty(len(self.xy_px))
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
         self.checked = False  # whether every point that stands went through the gates
@@ -299,19 +311,25 @@ class _Run:
         self.usable = self.usable & shape.valid.ravel()
         if not self.usable.any():
             return
+        self._keep_patch(previous)
         self.points.status[~self.usable & self.fits_image.ravel()] = shape.status.ravel()[
             ~self.usable & self.fits_image.ravel()
         ]
         if shape.starts is not None:
-            self.known_w = shape.starts.w.reshape(-1, 3)
+            self.known_w = shape.starts.w.reshape(len(self.xy_px), -1)
         if previous is not None:
             self.hoped_for = self.usable & previous.valid.ravel()
         else:
             self.hoped_for = self.usable
         if previous is not None and previous.starts is not None and previous.starts.G is not None:
-            w, G = previous.starts.w.reshape(-1, 3), previous.starts.G.reshape(-1, 3, 3)
+            n = len(self.xy_px)
+            w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
             if self._sample_holds(w, G):
-                index = np.flatnonzero(self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2)))
+                if self.patch.patch == "curved":
+                    self._refit_curved()
+                # the sample stands already, fitted from these very starts
+                known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+                index = np.flatnonzero(self.usable & known & ~self.points.ok)
                 self.progress("previous", 0, len(index))
                 fit_in_batches(
                     self.fitter, self.points, index, self.xy_px, w[index], G[index], far_px=_SAMPLE_FAR_PX,
@@ -438,17 +456,49 @@ class _Run:
                 remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
                 "these images, or give a seed point.",
             )
-        for _ in range(3):
-            if self._grow() == 0 and self.checked:
-                break
-            self._gate()
+        if self.patch.patch == "curved" and self.fitter.terms == 3:
+            self._refit_curved()
+        self._fill()
+        if self.options.patch == "auto" and not self.patch.kept:
+            self.patch = choose_patch(self.fitter, self.points, self.xy_px)
+            if self.patch.patch == "curved":
+                self._refit_curved()
+                self._fill()
         mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
             self._grow()
             self._gate()
         mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
-        return assemble(self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape)
+        return assemble(
+            self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape, patch=self.patch
+        )
+
+    def _fill(self) -> None:
+        """Grow, check, and grow into what the checks emptied."""
+        for _ in range(3):
+            if self._grow() == 0 and self.checked:
+                break
+            self._gate()
+
+    def _keep_patch(self, previous: Field | None) -> None:
+        """Where a sequence went over to curved patches by itself, it stays with them."""
+        choice = None if previous is None or not previous.has_motion else previous.patch
+        if self.options.patch == "auto" and choice is not None and choice.patch == "curved":
+            self.patch = choice.for_next_step()
+
+    def _refit_curved(self) -> None:
+        """Measure the points that stand anew with curved patches; the others keep their status and are tried again."""
+        flat = self.points
+        index = np.flatnonzero(flat.ok)
+        self.fitter = self.fitter.curved()
+        self.points = self.fitter.empty(len(flat.status))
+        self.points.status[:] = flat.status
+        G = None if self.fitter.comparisons == 1 else flat.G[index]
+        fit_in_batches(
+            self.fitter, self.points, index, self.xy_px, flat.w[index], G, far_px=_SAMPLE_FAR_PX, cancel=self.cancel
+        )
+        self.checked = False
 
     def _unreached(self) -> float:
         """Share of the usable points that nothing reached; those lost in an earlier step do not count again."""

@@ -6,6 +6,7 @@ closed form, 4 x 4 rays a pixel; nothing is warped or interpolated.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -115,7 +116,7 @@ class Plane:
         return self.origin + ab @ self.basis.T
 
 
-def render(camera: Camera, plane: Plane, texture: Texture, *, size: int = SIZE, samples: int = 4) -> NDArray:
+def render(camera: Camera, plane: Plane | Bent, texture: Texture, *, size: int = SIZE, samples: int = 4) -> NDArray:
     """Grey levels (size, size) without noise."""
     offset = (np.arange(samples) + 0.5) / samples - 0.5
     px = (np.arange(size)[:, None] + offset).ravel()
@@ -159,3 +160,85 @@ def grid(size: int = SIZE, *, margin: int = 30, count: int = 12) -> NDArray:
     v = np.linspace(margin, size - 1 - margin, count).round()
     x, y = np.meshgrid(v, v)
     return np.stack([x.ravel(), y.ravel()], -1)
+
+
+@dataclass(frozen=True)
+class Bent:
+    """Material point (a, b) lies at ``origin + basis (a, b) + normal (k11 a^2 + 2 k12 a b + k22 b^2) / 2`` in sys.
+
+    ``normal`` is the unit cross product of the basis, so that ``bend`` (k11, k12, k22), 1/mm, are the curvatures in the
+    origin if the basis is orthonormal. A ray meets it where a quadratic equation says: nothing is iterated.
+    """
+
+    bend: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: NDArray = field(default_factory=lambda: np.zeros(3))
+    basis: NDArray = field(default_factory=lambda: np.eye(3)[:, :2])
+
+    @property
+    def normal(self) -> NDArray:
+        n = np.cross(self.basis[:, 0], self.basis[:, 1])
+        return n / np.linalg.norm(n)
+
+    def height(self, a: NDArray, b: NDArray) -> NDArray:
+        k11, k12, k22 = self.bend
+        return 0.5 * (k11 * a * a + 2.0 * k12 * a * b + k22 * b * b)
+
+    def material(self, camera: Camera, xy: NDArray) -> NDArray:
+        """Material coordinates that a pixel position sees."""
+        rays = camera.rays_cam(xy).xyz_mm
+        return self.met(camera.centre_sys_mm, rays @ camera.cam_from_sys.rotation)
+
+    def met(self, centre: NDArray, directions: NDArray) -> NDArray:
+        """Material coordinates (..., 2) where rays from ``centre`` along ``directions`` (..., 3) meet the surface."""
+        frame = np.linalg.inv(np.column_stack([self.basis, self.normal]))
+        c, d = frame @ (centre - self.origin), directions @ frame.T
+        k11, k12, k22 = self.bend
+        a, b = d[..., 0], d[..., 1]
+        # from where the ray meets the tangent plane: of the two places on the bent surface the near one
+        p = c[:2] - (c[2] / d[..., 2])[..., None] * d[..., :2]
+        p1, p2 = p[..., 0], p[..., 1]
+        # height(p + t d) = t d2, as A t^2 - B t + C = 0
+        A, C = self.height(a, b), self.height(p1, p2)
+        B = d[..., 2] - (k11 * p1 * a + k12 * (p1 * b + p2 * a) + k22 * p2 * b)
+        t = 2.0 * C / (B + np.copysign(np.sqrt(B * B - 4.0 * A * C), B))
+        return p + t[..., None] * d[..., :2]
+
+    def place(self, ab: NDArray) -> NDArray:
+        """System coordinates of material points."""
+        return self.origin + ab @ self.basis.T + self.height(ab[..., 0], ab[..., 1])[..., None] * self.normal
+
+
+def true_w6(camera: Camera, surface: Bent, xy: NDArray) -> NDArray:
+    """Inverse depth as a second-order polynomial (N, 6) about the rays of pixels, by differences along the surface."""
+    return _second_order(lambda ray: 1.0 / _seen(camera, surface, surface, ray)[..., 2:], camera, xy)[..., 0]
+
+
+def true_g6(camera: Camera, before: Bent, after: Bent, xy: NDArray) -> NDArray:
+    """G (N, 3, 6) of the motion from one bent surface to the other, by differences along the surface."""
+
+    def homogeneous(ray: NDArray) -> NDArray:
+        return _seen(camera, before, after, ray) / _seen(camera, before, before, ray)[..., 2:]
+
+    return np.moveaxis(_second_order(homogeneous, camera, xy), 1, 2)
+
+
+def _seen(camera: Camera, before: Bent, after: Bent, ray: NDArray) -> NDArray:
+    """Where the material that camera rays (..., 3) meet on ``before`` lies on ``after``, camera frame."""
+    ab = before.met(camera.centre_sys_mm, ray @ camera.cam_from_sys.rotation)
+    return camera.cam_from_sys.apply(after.place(ab))
+
+
+def _second_order(function: Callable[[NDArray], NDArray], camera: Camera, xy: NDArray, h: float = 1e-3) -> NDArray:
+    """(N, 6, d) coefficients over 1, X, Y, X^2, X Y, Y^2 of a function of the ray, by central differences."""
+    rays = camera.rays_cam(xy).xyz_mm
+
+    def at(i: int, j: int) -> NDArray:
+        return function(rays + h * np.array([i, j, 0.0]))
+
+    f = at(0, 0)
+    return np.stack([
+        f, (at(1, 0) - at(-1, 0)) / (2 * h), (at(0, 1) - at(0, -1)) / (2 * h),
+        (at(1, 0) + at(-1, 0) - 2 * f) / (2 * h * h),
+        (at(1, 1) + at(-1, -1) - at(1, -1) - at(-1, 1)) / (4 * h * h),
+        (at(0, 1) + at(0, -1) - 2 * f) / (2 * h * h),
+    ], 1)  # fmt: skip

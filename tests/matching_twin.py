@@ -2,6 +2,9 @@
 
 It shares nothing with them: rays and images through the cameras' own functions, splines by ``ndimage``, all derivatives
 by central differences, and the solution is where the weighted sums vanish, found by Newton's method.
+
+Unknowns are (w, e) for a shape and (w, e, G row by row) for a motion: w and each row of G have 3 numbers for a plane
+patch, over (1, X, Y), and 6 for a curved one, over (1, X, Y, X^2, X Y, Y^2). How many there are tells which.
 """
 
 from __future__ import annotations
@@ -11,6 +14,20 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
 from core.stereo import StereoPair
+
+_W_STEPS = [1e-7, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
+_G_STEPS = [1e-6, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
+
+
+def monomials(XY: NDArray, terms: int) -> NDArray:
+    """(n, 3) of a plane patch or (n, 6) of a curved one."""
+    X, Y = XY[:, 0], XY[:, 1]
+    return np.stack([np.ones_like(X), X, Y, X * X, X * Y, Y * Y][:terms], -1)
+
+
+def pack(w: NDArray, e: float, G: NDArray | None = None) -> NDArray:
+    """The twin's unknowns from a fit's numbers at one point."""
+    return np.array([*w, e, *([] if G is None else G.ravel())])
 
 
 class Twin:
@@ -47,15 +64,20 @@ class Twin:
             self.splines[image], [xy[:, 1], xy[:, 0]], order=self.order, mode="mirror", prefilter=False
         )
 
+    def terms(self, unknowns: NDArray) -> int:
+        """3 for plane, 6 for curved patches."""
+        return (len(unknowns) - 1) // (1 if len(self.splines) == 2 else 4)
+
     def place(self, k: int, unknowns: NDArray, XY: NDArray) -> NDArray:
-        """Image points of comparison k for unknowns (w 3, e, G 9)."""
-        m = np.concatenate([np.ones((len(XY), 1)), XY], 1)
-        w, e = unknowns[:3], unknowns[3]
+        """Image points of comparison k for unknowns (w, e, G)."""
+        terms = self.terms(unknowns)
+        m = monomials(XY, terms)
+        w, e = unknowns[:terms], unknowns[terms]
         R, t = self.pair.cam2_from_cam1.rotation, self.pair.cam2_from_cam1.translation_mm
         if k == 0:
             q = np.concatenate([self.centre[:2] + XY, np.ones((len(XY), 1))], 1)
         else:
-            q = m @ unknowns[4:].reshape(3, 3).T
+            q = m @ unknowns[terms + 1 :].reshape(3, terms).T
         if k == 1:
             return self.pair.cam1.lens.image_from_normalised(q[:, :2] / q[:, 2:]).xy
         q = q @ R.T + (m @ w)[:, None] * t
@@ -85,9 +107,10 @@ class Twin:
         return np.stack(columns, -1)
 
     def equations(self, unknowns: NDArray, free: NDArray) -> tuple[NDArray, NDArray]:
-        """The weighted sums that vanish at the solution, and their Gauss-Newton matrix; ``free`` (13, n) spans."""
+        """The weighted sums that vanish at the solution, and their Gauss-Newton matrix; ``free`` spans the steps."""
         count = len(self.splines) - 1
-        steps = np.array([1e-7, 1e-5, 1e-5, 1e-3, *[1e-6] * 9])[: len(unknowns)]
+        terms = self.terms(unknowns)
+        steps = np.array([*_W_STEPS[:terms], 1e-3, *(_G_STEPS[:terms] * 3)])[: len(unknowns)]
         residuals, contrasts, _ = zip(*(self.residual(k, unknowns) for k in range(count)), strict=True)
         s2 = np.array(contrasts) ** 2
         W = np.diag(s2) - np.outer(s2, s2) / (1.0 + s2.sum())

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from core.field.features import detect, match
 from core.field.fitter import PointFits
 from core.field.gates import GateOptions, apply_gates, neighbour_disagreement
+from core.field.kernels import compare_with_neighbours, sorting_network
 from core.field.local_fit import consistent, robust_local_fits
 from core.field.scatter import combine
 from core.field.starts import faces_both_cameras, move_matrix, move_w, position_now
@@ -170,6 +171,43 @@ def test_the_neighbour_kernel_agrees_with_numpy(motion: bool) -> None:
             moved = move_matrix(points.G[near], offset)[:, :, 0]
             u = (moved - RAYS[i]) * (points.w[i, 0] / predicted)[:, None] - (points.G[i, :, 0] - RAYS[i])
             assert difference[i, 1] == pytest.approx(-np.median(u[:, 0]) * np.linalg.norm(J[i, :, 0]), rel=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(n=st.integers(1, 24), seed=st.integers(0, 1000))
+def test_the_sorting_network_sorts(n: int, seed: int) -> None:
+    values = np.random.default_rng(seed).integers(0, 9, n)
+    expected = np.sort(values)
+    for a, b in sorting_network(n):
+        if values[b] < values[a]:
+            values[[a, b]] = values[[b, a]]
+    np.testing.assert_array_equal(values, expected)
+
+
+def test_the_neighbour_kernel_knows_no_blocks() -> None:
+    # wider than two of the kernel's blocks; no slopes, so a neighbour predicts its own depth
+    rng = np.random.default_rng(5)
+    rows, cols = 5, 150
+    depth = 1.0 + 1e-3 * rng.standard_normal((rows, cols))
+    ok = rng.random((rows, cols)) < 0.5
+    w = np.zeros((rows, cols, 3))
+    w[..., 0] = depth
+    difference, spread = np.full((2, rows, cols, 4), np.nan)
+    count = np.zeros((rows, cols), np.int32)
+    arrays = (np.zeros((rows, cols, 3)), w, np.zeros((rows, cols, 3, 3)), False, difference, spread, count)
+    for r in range(rows):
+        compare_with_neighbours(r, r + 1, sorting_network(24), ok, *arrays)
+    for r, c in np.ndindex(rows, cols):
+        near = ok.copy()
+        near[r, c] = False
+        near = near[max(r - 2, 0) : r + 3, max(c - 2, 0) : c + 3]
+        values = depth[max(r - 2, 0) : r + 3, max(c - 2, 0) : c + 3][near] / depth[r, c] - 1.0
+        assert count[r, c] == (len(values) if ok[r, c] else 0)
+        if count[r, c]:
+            assert difference[r, c, 0] == pytest.approx(-np.median(values), rel=1e-6, abs=1e-9)
+            assert spread[r, c, 0] == pytest.approx(np.median(np.abs(values - np.median(values))), rel=1e-5, abs=1e-9)
+        else:
+            assert np.isnan(difference[r, c, 0])
 
 
 @pytest.mark.parametrize("motion", [False, True])

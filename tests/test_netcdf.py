@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 
 from core.errors import FileFormatError, StorageError
+from core.field.patch import PatchChoice
 from core.field.result import Field
 from core.status import PointStatus
 from server.io.netcdf import Provenance, read_attributes, read_field, write_field
@@ -24,7 +25,7 @@ PROVENANCE = Provenance(
 )  # fmt: skip
 
 
-def a_field(*, motion: bool) -> Field:
+def a_field(*, motion: bool, curved: bool = False) -> Field:
     rng = np.random.default_rng(5)
     n = 6 if motion else 3
     root = rng.normal(0, 1e-3, (ROWS, COLS, n, n))
@@ -45,13 +46,16 @@ def a_field(*, motion: bool) -> Field:
         phi_rad=numbers(), zp_mm=numbers(), zncc=numbers(3 if motion else 1), epipolar_px=numbers(),
         iterations=rng.integers(0, 9, (ROWS, COLS)).astype(np.int32), noise_grey=numbers(), covariance=covariance,
         uvw_mm=numbers(3) if motion else None, rotation_rad=numbers(3) if motion else None,
-        stretch=numbers(3) if motion else None,
+        stretch=numbers(3) if motion else None, curvature_per_mm=numbers(2) if curved else None,
+        patch=PatchChoice(patch="curved", asked="auto", reason="curved: Gründe", sample=200, plane_error_mm=1.8e-3)
+        if curved else None,
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("curved", [False, True], ids=["plane", "curved"])
 @pytest.mark.parametrize("motion", [False, True], ids=["shape", "displacement"])
-def test_what_was_written_comes_back(tmp_path: Path, motion: bool) -> None:
-    field = a_field(motion=motion)
+def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool) -> None:
+    field = a_field(motion=motion, curved=curved)
     write_field(tmp_path / "step_0007.nc", field, PROVENANCE)
     back = read_field(tmp_path / "step_0007.nc")
     single = {"zncc", "epipolar_px", "noise_grey", "covariance"}  # kept with seven digits
@@ -59,6 +63,8 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool) -> None:
         a, b = getattr(field, item.name), getattr(back, item.name)
         if a is None:
             assert b is None
+        elif item.name == "patch":
+            assert b == a
         elif item.name in single:
             np.testing.assert_allclose(b, a, rtol=1e-6)
         else:
@@ -69,6 +75,8 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool) -> None:
     assert attributes["inputs_sha256"] == PROVENANCE.inputs
     assert attributes["label"] == "Größe 1"
     assert attributes["step"] == 7
+    assert attributes.get("patch_reason") == ("curved: Gründe" if curved else None)
+    assert summarise(field)["patch"] == (field.patch.document() if field.patch else None)
 
 
 def test_xarray_understands_the_file(tmp_path: Path) -> None:

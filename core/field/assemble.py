@@ -5,16 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from core.field.fitter import PointFits
+from core.field.patch import PatchChoice
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.starts import Starts
 from core.lens import Bool, Float
-from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
+from core.matching.geometry import (
+    covariance_xyz,
+    covariance_xyzuvw,
+    motion_geometry,
+    principal_curvatures,
+    shape_geometry,
+)
 from core.status import PointStatus
 from core.stereo import StereoPair
 
 
-def assemble(points: PointFits, *, pair: StereoPair, grid: PointGrid, fits_image: Bool, shape: Field | None) -> Field:
+def assemble(
+    points: PointFits,
+    *,
+    pair: StereoPair,
+    grid: PointGrid,
+    fits_image: Bool,
+    shape: Field | None,
+    patch: PatchChoice | None = None,
+) -> Field:
     """Return the field in the system frame.
 
     Parameters
@@ -29,6 +44,8 @@ def assemble(points: PointFits, *, pair: StereoPair, grid: PointGrid, fits_image
         (r, c) where a point is allowed and its subset lies in the image.
     shape
         The reference's shape, whose positions every step shows; None for a shape.
+    patch
+        What the points were measured with.
     """
     rows, cols = grid.shape
     motion = points.zncc.shape[1] == 3
@@ -79,5 +96,7 @@ def assemble(points: PointFits, *, pair: StereoPair, grid: PointGrid, fits_image
         uvw_mm=scatter(m.uvw_mm, 3) if motion else None,
         rotation_rad=scatter(m.rotation_rad, 3) if motion else None,
         stretch=scatter(m.stretch, 3) if motion else None,
-        starts=Starts(scatter(w, 3), scatter(G, 3, 3) if motion else None),
+        curvature_per_mm=scatter(principal_curvatures(pair, xy, w), 2) if w.shape[1] == 6 else None,
+        patch=patch,
+        starts=Starts(scatter(w, w.shape[1]), scatter(G, 3, w.shape[1]) if motion else None),
     )

@@ -26,7 +26,7 @@ class PointFits:
     Attributes
     ----------
     w, G
-        (n, 3), (n, 3, 3); G of zeros for a shape.
+        (n, 3), (n, 3, 3), or (n, 6), (n, 3, 6) of curved patches; G of NaN for a shape.
     zncc
         (n, k) with k = 1 (shape) or 3 (motion).
     epipolar_px, epipolar_sigma_px, noise
@@ -50,12 +50,12 @@ class PointFits:
     status: NDArray[np.int8]
 
     @staticmethod
-    def empty(n: int, comparisons: int) -> PointFits:
-        """Return n points that nothing has reached yet."""
+    def empty(n: int, comparisons: int, terms: int = 3) -> PointFits:
+        """Return n points that nothing has reached yet; ``terms`` is 6 for curved patches."""
         q = 2 if comparisons == 1 else 5
         return PointFits(
-            w=np.full((n, 3), np.nan),
-            G=np.full((n, 3, 3), np.nan),
+            w=np.full((n, terms), np.nan),
+            G=np.full((n, 3, terms), np.nan),
             zncc=np.full((n, comparisons), np.nan),
             epipolar_px=np.full(n, np.nan),
             epipolar_sigma_px=np.full(n, np.nan),
@@ -114,18 +114,32 @@ class Fitter:
         """1 for a shape, 3 for a motion."""
         return 1 if self.cur1 is None else 3
 
+    @property
+    def terms(self) -> int:
+        """Numbers in a point's ``w`` and in each row of its ``G``: 3 for a plane patch, 6 for a curved one."""
+        return 6 if self.options.patch == "curved" else 3
+
+    def empty(self, n: int) -> PointFits:
+        """Return n points that nothing has reached yet."""
+        return PointFits.empty(n, self.comparisons, self.terms)
+
     def shape_only(self) -> Fitter:
         """Return the fitter of the reference's shape."""
         return replace(self, cur1=None, cur2=None)
 
+    def curved(self) -> Fitter:
+        """Return the same matcher with curved patches."""
+        return replace(self, options=replace(self.options, patch="curved"))
+
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and refuse those that cannot be right on their own."""
         n = len(xy_px)
+        w, G = self._terms_of(w), None if G is None else self._terms_of(G)
         if self.cur1 is None or self.cur2 is None:
             s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options)
             fits = PointFits(
-                s.w, np.full((n, 3, 3), np.nan), s.zncc, s.epipolar_px, s.epipolar_sigma_px, s.noise, s.covariance,
-                s.iterations, s.status,
+                s.w, np.full((n, 3, self.terms), np.nan), s.zncc, s.epipolar_px, s.epipolar_sigma_px, s.noise,
+                s.covariance, s.iterations, s.status,
             )  # fmt: skip
         else:
             m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options)
@@ -154,6 +168,12 @@ class Fitter:
                 far |= ~(np.linalg.norm(a - b, axis=1) * scale < limit_px)
         return np.asarray(far)
 
+    def _terms_of(self, start: Float) -> Float:
+        """A start without the terms that the patch does not have, zeros for those that the start does not have."""
+        if start.shape[-1] >= self.terms:
+            return start[..., : self.terms]
+        return np.concatenate([start, np.zeros((*start.shape[:-1], self.terms - start.shape[-1]))], axis=-1)
+
     def _plausible(self, xy_px: Float, w: Float, G: Float) -> Bool:
         rays = self.pair.cam1.rays_cam(xy_px).xyz_mm
         good = faces_both_cameras(self.pair, rays, w)
@@ -161,7 +181,7 @@ class Fitter:
             return np.asarray(good)
         # at t: in front of the camera, not mirrored, and no stretch that a patch could not bear
         depth = G[:, 2, 0]
-        columns = G[:, :2, 1:] - G[:, :2, :1] * (G[:, 2:, 1:] / depth[:, None, None])
+        columns = G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth[:, None, None])
         affine = columns / depth[:, None, None]  # camera 1's image at t over its image at t0, normalised
         det = np.linalg.det(affine)
         size = np.linalg.norm(affine, axis=(1, 2)) / np.sqrt(2.0)

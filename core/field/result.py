@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.patch import PatchChoice
 from core.field.starts import Starts
 from core.status import PointStatus
 
@@ -48,6 +49,11 @@ class Field:
         (r, c, 3) rotation vector of the patch, system frame, or None.
     stretch
         (r, c, 3) in-plane stretch e11, e22, e12 in the patch's tangent frame, or None.
+    curvature_per_mm
+        (r, c, 2) principal curvatures of the reference's surface, the larger first, positive where it bulges towards
+        the cameras; None unless the patches were curved.
+    patch
+        What patch the field was measured with, and why; None in a field from an older file.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
@@ -69,6 +75,8 @@ class Field:
     uvw_mm: Float | None = None
     rotation_rad: Float | None = None
     stretch: Float | None = None
+    curvature_per_mm: Float | None = None
+    patch: PatchChoice | None = None
     starts: Starts | None = None
 
     @property

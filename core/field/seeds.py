@@ -158,7 +158,7 @@ def seeds_from_matches(
 ) -> int:
     """Put refined seeds into ``points``, spread over the region; returns how many stand.
 
-    ``known_w`` (n, 3) is the shape where it was measured before (NaN elsewhere).
+    ``known_w`` (n, 3 or 6) is the shape where it was measured before (NaN elsewhere).
     """
     if len(shape.xy_px) < 4 and known_w is None:
         return 0
@@ -201,7 +201,7 @@ def starts_at(
     w = shape_starts(pair, shape, xy_px).w
     if known_w is not None:
         measured = np.isfinite(known_w).all(axis=1)
-        w[measured] = known_w[measured]
+        w[measured] = known_w[measured, :3]
     if motion is None or shape_now is None:
         return Starts(w)
     return motion_starts(pair, w, motion, shape_now, xy_px)

@@ -3,7 +3,8 @@
 The unknowns are those of the matching: inverse depth and its slopes ``w = (w0, w1, w2)`` over camera 1's normalised
 ray offsets (X, Y) from the point's own ray, and the 3 x 3 matrix ``G`` through which camera 1 sees the patch at t. The
 point on the patch at offset (X, Y) lies at ``(Xc + X, Yc + Y, 1) / w(X, Y)`` at t0 and at ``G (1, X, Y) / w(X, Y)`` at
-t, both in camera 1's frame. Both are linear, so a patch's own unknowns give a neighbour's on the same plane exactly.
+t, both in camera 1's frame. Both are linear for a plane patch, so a patch's own unknowns give a neighbour's on the same
+plane exactly. A curved patch has the terms X^2, X Y and Y^2 besides: ``w`` has 6 numbers, ``G`` 3 x 6.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ class Starts:
     Attributes
     ----------
     w
-        (..., 3) inverse depth 1/mm, and slopes.
+        (..., 3) inverse depth 1/mm, and slopes; (..., 6) with a curved patch's second-order terms.
     G
-        (..., 3, 3), or None for a shape.
+        (..., 3, 3) or (..., 3, 6), or None for a shape.
     """
 
     w: Float
@@ -33,16 +34,20 @@ class Starts:
 
 
 def move_w(w: Float, offset: Float) -> Float:
-    """Return ``w`` (n, 3) about points ``offset`` (n, 2) further on in normalised coordinates."""
-    moved = w.copy()
-    moved[:, 0] += w[:, 1] * offset[:, 0] + w[:, 2] * offset[:, 1]
-    return moved
+    """Return ``w`` (n, 3 or 6) about points ``offset`` (n, 2) further on in normalised coordinates."""
+    return move_matrix(w[:, None, :], offset)[:, 0]
 
 
 def move_matrix(G: Float, offset: Float) -> Float:
-    """Return ``G`` (n, 3, 3) about points ``offset`` (n, 2) further on."""
+    """Return ``G`` (n, 3, 3 or 6) about points ``offset`` (n, 2) further on."""
+    x, y = offset[:, :1], offset[:, 1:]
     moved = G.copy()
-    moved[:, :, 0] += G[:, :, 1] * offset[:, :1] + G[:, :, 2] * offset[:, 1:]
+    moved[:, :, 0] += G[:, :, 1] * x + G[:, :, 2] * y
+    if G.shape[2] == 6:
+        xx, xy, yy = G[:, :, 3], G[:, :, 4], G[:, :, 5]
+        moved[:, :, 0] += xx * x**2 + xy * x * y + yy * y**2
+        moved[:, :, 1] += 2.0 * xx * x + xy * y
+        moved[:, :, 2] += xy * x + 2.0 * yy * y
     return moved
 
 

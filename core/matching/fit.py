@@ -134,7 +134,7 @@ def fit_shape(
     out = np.full((n, n_shape_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     pose = pair.cam2_from_cam1
-    setting = _setting(options, images[0])
+    setting = _setting(options, images)
     fixed = (
         _reference(images[0]), _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation),
         _own(pose.translation_mm), xy, w, setting, out, status, iterations,
@@ -207,7 +207,7 @@ def fit_motion(
     out = np.full((n, n_motion_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     pose = pair.cam2_from_cam1
-    setting = (*_setting(options, images[0]), options.patch == "rigid")
+    setting = (*_setting(options, images), options.patch == "rigid")
     fixed = (
         _reference(images[0]), _flat(images[1]), _flat(images[2]), _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2),
         _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out, status, iterations,
@@ -248,11 +248,15 @@ def _starts(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) ->
     return array
 
 
-def _setting(options: MatchOptions, reference: ImageData) -> tuple[Any, ...]:
-    known_variance = reference.noise_variance
+def _setting(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...]:
+    """Options and what is known of the noise: the images' variances, or all one where any is unknown."""
+    given = [image.noise_variance for image in images]
+    variances = [v for v in given if v is not None and v > 0.0]
+    known = len(variances) == len(images)
     return (
         options.subset_px, SPLINE_ORDER[options.interpolation], options.max_iterations, options.tolerance_px,
-        options.max_sigma_px, options.max_step_px, 0.0 if known_variance is None else float(known_variance),
+        options.max_sigma_px, options.max_step_px, (images[0].slope_noise, images[0].slope_share),
+        tuple(variances) if known else (1.0,) * len(images), known,
     )  # fmt: skip
 
 

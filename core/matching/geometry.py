@@ -67,7 +67,7 @@ def shape_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> ShapeGeo
     xy_px
         (N, 2) points in camera 1.
     w
-        (N, 3) inverse depth, 1/mm, and its slopes.
+        (N, 3) inverse depth, 1/mm, and its slopes; of (N, 6) the first three.
     """
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
     plane = _plane(ray, np.asarray(w, dtype=np.float64))
@@ -85,6 +85,38 @@ def shape_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> ShapeGeo
         phi_rad=np.arccos(upward[..., 1]),
         zp_mm=zp,
     )
+
+
+def principal_curvatures(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> Float:
+    """Principal curvatures (N, 2) of the surface in 1/mm, the larger first; positive where it bulges towards camera 1.
+
+    Parameters
+    ----------
+    pair, xy_px
+        As in :func:`shape_geometry`.
+    w
+        (N, 6) inverse depth as a second-order polynomial: ``w0 + w1 X + w2 Y + w3 X^2 + w4 X Y + w5 Y^2``.
+
+    Notes
+    -----
+    The surface is P = (Xc + X, Yc + Y, 1) / w(X, Y). With w P linear in X and Y, the second fundamental form is
+    -w_ij (n . P) / w, with n . P > 0 for the normal that points away from camera 1.
+    """
+    w = np.asarray(w, dtype=np.float64)
+    ray = pair.cam1.rays_cam(xy_px).xyz_mm
+    plane = _plane(ray, w)
+    basis = np.zeros((*w.shape[:-1], 3, 2))
+    basis[..., 0, 0] = basis[..., 1, 1] = 1.0
+    tangents = (basis - ray[..., None] * (w[..., None, 1:3] / w[..., :1, None])) / w[..., :1, None]
+    first = np.swapaxes(tangents, -1, -2) @ tangents
+    # n . P is one over the length of the plane's vector
+    scale = -1.0 / (w[..., 0] * np.linalg.norm(plane, axis=-1))
+    second = np.stack([2.0 * w[..., 3], w[..., 4], w[..., 4], 2.0 * w[..., 5]], axis=-1)
+    operator = _inverse2(first) @ (second * scale[..., None]).reshape(*w.shape[:-1], 2, 2)
+    mean = 0.5 * (operator[..., 0, 0] + operator[..., 1, 1])
+    det = operator[..., 0, 0] * operator[..., 1, 1] - operator[..., 0, 1] * operator[..., 1, 0]
+    apart = np.sqrt(np.maximum(mean**2 - det, 0.0))
+    return np.stack([mean + apart, mean - apart], axis=-1)
 
 
 def plane_from_angles(
@@ -106,9 +138,10 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
     pair, xy_px, w
         As in :func:`shape_geometry`.
     G
-        (N, 3, 3), see :class:`core.matching.MotionFit`.
+        (N, 3, 3) or (N, 3, 6), see :class:`core.matching.MotionFit`. Second-order terms do not show in the middle of
+        the patch, where all of this is told.
     """
-    w, G = np.asarray(w, dtype=np.float64), np.asarray(G, dtype=np.float64)
+    w, G = np.asarray(w, dtype=np.float64)[..., :3], np.asarray(G, dtype=np.float64)[..., :3]
     R = pair.cam1.cam_from_sys.rotation
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
     uvw = ((G[..., :, 0] - ray) / w[..., :1]) @ R

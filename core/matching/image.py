@@ -1,26 +1,30 @@
-"""Images prepared for matching: spline coefficients and gradients.
+"""Images prepared for matching: spline coefficients, gradients, and what is known of the noise.
 
-B-spline coefficients are found exactly (recursive prefilter, mirror boundary: the image continues symmetrically about
-its outermost pixel centres), so the spline passes through every pixel.
+B-spline coefficients are exact to float32 (mirror boundary: the image continues symmetrically about its outermost
+pixel centres), so the spline passes through every pixel.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from core.errors import ImageError, InputError
+from core.matching.filters import correlate, derivative, prefilter
 from core.matching.options import SPLINE_ORDER, Interpolation
+from core.matching.slopes import SlopeFilter, slope_filter
 
 PAD = 4
 """Mirrored coefficients kept around the image, so that no tap needs a test (quintic: 2 left, 3 right, and rounding)."""
 
 Float32 = NDArray[np.float32]
+_ONE = np.ones(1)
+WIENER = True
+"""Whether gradients are those of :mod:`core.matching.slopes`, or the spline's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,18 +36,18 @@ class ImageData:
     coefficients
         (rows + 2 PAD, cols + 2 PAD) float32 B-spline coefficients. float32 rounds them by 6e-8 of their size, some
         1e-5 grey levels of an 8-bit image: a shift of 1e-6 px.
-    pixels
-        (rows, cols) float32 grey levels.
+    raw
+        (rows, cols) grey levels as they were given.
     order
         3 or 5.
     weights
-        (rows, cols) float32 relative inverse noise variance of the pixels, mean about 1; None: all alike.
+        (rows, cols) float32 inverse noise variance of the pixels over its mean, or None where all count alike.
     noise_variance
-        Variance of the noise of a pixel of weight 1, grey levels squared; None: to be estimated from residuals.
+        Variance of the noise of a pixel of weight 1, grey levels squared, or None where it is not known.
     """
 
     coefficients: Float32
-    pixels: Float32
+    raw: NDArray[Any]
     order: int
     weights: Float32 | None = None
     noise_variance: float | None = None
@@ -51,24 +55,38 @@ class ImageData:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the image."""
-        return int(self.pixels.shape[0]), int(self.pixels.shape[1])
+        return int(self.raw.shape[0]), int(self.raw.shape[1])
+
+    @cached_property
+    def pixels(self) -> Float32:
+        """(rows, cols) grey levels, float32. Made on the first call: only a reference image needs them."""
+        return np.ascontiguousarray(self.raw, dtype=np.float32)
+
+    @cached_property
+    def slopes(self) -> SlopeFilter | None:
+        """The derivative that is best under this image's noise; None where the image shows nothing."""
+        return slope_filter(self.raw, self.noise_variance)
+
+    @property
+    def slope_noise(self) -> float:
+        """Variance of ``gradients`` per variance of white noise in the pixels, mean of both directions."""
+        return self.slopes.gain if WIENER and self.slopes else float((derivative(self.order) ** 2).sum())
+
+    @property
+    def slope_share(self) -> float:
+        """Share of noise in the squares of ``gradients``, over the image's texture, that is allowed for in them."""
+        return self.slopes.share if WIENER and self.slopes else 0.0
 
     @cached_property
     def gradients(self) -> tuple[Float32, Float32]:
-        """The spline's derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
-        if self.order == 3:
-            smooth, slope = np.array([1.0, 4.0, 1.0]) / 6.0, np.array([-1.0, 0.0, 1.0]) / 2.0
-        else:
-            smooth, slope = (
-                np.array([1.0, 26.0, 66.0, 26.0, 1.0]) / 120.0,
-                np.array([-1.0, -10.0, 0.0, 10.0, 1.0]) / 24.0,
-            )
-        inner = slice(PAD, -PAD)
-        along_y = ndimage.correlate1d(self.coefficients, smooth, axis=0)[inner]
-        gx = ndimage.correlate1d(along_y, slope, axis=1)[:, inner]
-        along_x = ndimage.correlate1d(self.coefficients, smooth, axis=1)[:, inner]
-        gy = ndimage.correlate1d(along_x, slope, axis=0)[inner]
-        return np.ascontiguousarray(gx, dtype=np.float32), np.ascontiguousarray(gy, dtype=np.float32)
+        """Derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
+        if WIENER and self.slopes:
+            return self.slopes.apply(self.raw)
+        slope = derivative(self.order)
+        gx, gy = np.empty(self.shape, np.float32), np.empty(self.shape, np.float32)
+        correlate(self.raw, _ONE, slope, gx)
+        correlate(self.raw, slope, _ONE, gy)
+        return gx, gy
 
 
 def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quintic") -> ImageData:
@@ -108,6 +126,17 @@ def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quinti
         raise ImageError(f"an image of type {pixels.dtype} has no grey levels.")
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         raise ImageError("the image holds NaN or infinite grey levels.")
-    coefficients = ndimage.spline_filter(pixels.astype(np.float64), order=order, output=np.float64, mode="mirror")
-    padded = np.pad(coefficients.astype(np.float32), PAD, mode="reflect")
-    return ImageData(padded, np.array(pixels, dtype=np.float32, order="C"), order)
+    return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order)
+
+
+def _coefficients(pixels: NDArray[Any], order: int) -> Float32:
+    rows, cols = pixels.shape
+    padded = np.empty((rows + 2 * PAD, cols + 2 * PAD), np.float32)
+    inner = padded[PAD:-PAD, PAD:-PAD]
+    taps = prefilter(order)
+    correlate(pixels, taps, taps, inner)
+    padded[PAD:-PAD, :PAD] = inner[:, PAD:0:-1]
+    padded[PAD:-PAD, -PAD:] = inner[:, -2 : -PAD - 2 : -1]
+    padded[:PAD] = padded[2 * PAD : PAD : -1]
+    padded[-PAD:] = padded[-PAD - 2 : -2 * PAD - 2 : -1]
+    return padded

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from core.errors import InputError
 
 Interpolation = Literal["cubic", "quintic"]
 Patch = Literal["rigid", "stretch", "curved"]
+PatchSetting = Literal["rigid", "stretch", "curved", "auto"]
+PATCHES: tuple[Patch, ...] = get_args(Patch)
+PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
 
 SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
 
@@ -22,7 +25,8 @@ class MatchOptions:
     subset_px
         Width and height of the square subset in camera 1, px.
     patch
-        ``stretch`` (12 unknowns, the default) or ``rigid`` (the paper's 9). Shape does not use it.
+        ``stretch`` (12 unknowns, the default) or ``rigid`` (the paper's 9): a plane that moves; shape is a plane with
+        both. ``curved``: a second-order surface (6 unknowns) with a second-order displacement (18 more).
     interpolation
         Spline that the images were prepared with; ``cubic`` is faster, and biased on sharp speckle.
     max_iterations
@@ -48,7 +52,7 @@ class MatchOptions:
     def __post_init__(self) -> None:
         if not 5 <= self.subset_px <= 401:
             raise InputError(f"subset_px is {self.subset_px}, it must lie in 5 to 401.", code="option_out_of_range")
-        if self.patch not in ("rigid", "stretch", "curved"):
+        if self.patch not in PATCHES:
             raise InputError(
                 f"patch is {self.patch!r}, it must be 'rigid', 'stretch' or 'curved'.", code="option_out_of_range"
             )

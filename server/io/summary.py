@@ -36,8 +36,9 @@ def summarise(result: Field) -> dict[str, Any]:
         off), ``epipolar_offset_rms_px`` and ``epipolar_offset_sd_px`` (about the mean); ``epipolar_residual_rms_px``
         (the error left in each image when both cameras share the misfit equally: half of
         ``epipolar_offset_rms_px``), ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
-        ``sigma_median_mm``, for displacements also ``displacement_mm`` (mean, min, max of u, v, w). What cannot be
-        told is None.
+        ``sigma_median_mm``, ``patch`` (what the field was measured with, why, and the numbers of the choice; see
+        :class:`core.field.patch.PatchChoice`), for displacements also ``displacement_mm`` (mean, min, max of u, v, w).
+        What cannot be told is None.
     """
     status = result.status
     valid = result.valid
@@ -65,6 +66,7 @@ def summarise(result: Field) -> dict[str, Any]:
             for k, name in enumerate(names)
         },
     }
+    summary["patch"] = None if result.patch is None else result.patch.document()
     if result.uvw_mm is not None:
         uvw = result.uvw_mm[valid]
         summary["displacement_mm"] = {

@@ -30,8 +30,9 @@ from core.matching.kernels.point import (
     epipolar_shift,
     joint_weights,
     make_point,
-    noise_variance,
+    noise_from_residuals,
     settled,
+    share_correction,
     texture_status,
 )
 from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain, rigid_columns, rotate
@@ -46,7 +47,7 @@ def n_motion_out(terms: int) -> int:
 def make_motion(degree: int) -> Any:
     """Compile the fit for plane (degree 1, stretch or rigid) or curved (2) patches."""
     (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
-     roughness, few) = make_point(degree, 3)  # fmt: skip
+     texture, few) = make_point(degree, 3)  # fmt: skip
     unknowns = 4 * few + 1
 
     @njit(nogil=True, error_model="numpy")
@@ -62,10 +63,10 @@ def make_motion(degree: int) -> Any:
         return OK
 
     @njit(nogil=True, error_model="numpy")
-    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations, chain, rigid):
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid):
         """Set up and factor the normal equations; status."""
         weights, block, columns, half, _, normal = equations
-        joint_weights(levels, 3, weights)
+        joint_weights(levels, variances, 3, weights)
         if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
         n = unknowns
@@ -87,7 +88,7 @@ def make_motion(degree: int) -> Any:
     @njit(nogil=True, error_model="numpy")
     def motion_point(reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
-        subset, order, max_iterations, tolerance, max_sigma, max_step, known_variance, rigid = setting
+        subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise, rigid = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain,
          work) = space  # fmt: skip
         gram, columns, normal = of_reference[7], equations[2], equations[5]
@@ -96,7 +97,8 @@ def make_motion(degree: int) -> Any:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
-        if not 1e-6 < roughness(gram, f2) < WHITE_ROUGHNESS:
+        gradients, weakest = texture(gram)
+        if not 1e-6 < gradients / f2 < WHITE_ROUGHNESS:
             return LOW_TEXTURE, 0
         w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
@@ -137,7 +139,7 @@ def make_motion(degree: int) -> Any:
                 if few == 3 and rigid:
                     rigid_chain(xc, yc, w, rotation, G, chain)
                 result = freeze(
-                    R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations, chain, rigid
+                    R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid
                 )
                 if result != OK:
                     return result, iterations
@@ -189,17 +191,19 @@ def make_motion(degree: int) -> Any:
         for k in range(3):
             out[at + 1 + k] = levels[k, ZNCC]
             worst = min(worst, levels[k, ZNCC])
-        variance = noise_variance(levels, 3, float(subset * subset), p, float(n), order)
+        variance = noise_from_residuals(levels, 3, float(subset * subset), float(n))
         out[at + 4] = math.sqrt(variance)
-        if known_variance > 0.0:
-            variance = known_variance
+        if known_noise:
+            variance = variances[0]
         covariance = out[at + 5 : at + 30]
         covariance_of_last(normal, n, 5, work, covariance)
+        factor_on = share_correction(gradients, variance, p, slope[0], slope[1]) * (1.0 if known_noise else variance)
         for i in range(25):
-            covariance[i] *= variance
+            covariance[i] *= factor_on
         # px: along and across camera 2's epipolar line, and both ways in camera 1 at t
         sigma = max(math.sqrt(covariance[0]) * along, math.sqrt(covariance[24]))
         sigma = max(sigma, math.sqrt(max(covariance[6], covariance[12])) * lens1[1] / G[2, 0])
-        return texture_status(status, sigma, max_sigma, worst), iterations
+        share = slope[0] * variance * p / weakest
+        return texture_status(status, share, sigma, max_sigma, worst), iterations
 
     return motion_point, work_space, few

@@ -38,11 +38,16 @@ LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are set up anew
 PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted, not compared anew
 FIRST_RATE = 0.1  # convergence rate assumed before two steps have shown it
-# white noise of variance 1 behind a spline: variance of the value, mean over all sub-pixel places
-VALUE_NOISE = (0.764, 0.843)  # cubic, quintic
+# White noise of variance 1 behind a spline, at fraction t between pixels, along one axis: a + b cos(2 pi t), the first
+# two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
+VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
+ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
+MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
 WHITE_ROUGHNESS = 1.2  # mean squared gradient over variance that only white noise has
 
-GAIN, SHIFT, ZNCC, CONTRAST, MISFIT = range(5)  # of an image's levels; the misfit is the residuals' sum of squares
+# an image's levels; the misfit is the residuals' sum of squares, the last the noise of its interpolated grey levels
+# over that of its pixels
+GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED = range(6)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -73,41 +78,92 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
 
 
 @njit(nogil=True, error_model="numpy")
-def joint_weights(levels, images, weights):
-    """Inverse covariance of the comparisons' residuals, in units of 1 / sigma^2.
+def joint_weights(levels, variances, images, weights):
+    """Inverse covariance of the comparisons' residuals.
 
     Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
-    sigma^2 (diag(1 / contrast^2) + 1 1^T).
+    diag(v_k / contrast_k^2) + v_ref 1 1^T, with the reference's variance first in ``variances``.
     """
-    total = 1.0
+    total = 1.0 / variances[0]
     for k in range(images):
-        s = min(max(levels[k, CONTRAST], 0.05), 20.0)
-        total += s * s
+        total += _certainty(levels, variances, k)
     for k in range(images):
-        a = min(max(levels[k, CONTRAST], 0.05), 20.0) ** 2
+        a = _certainty(levels, variances, k)
         for o in range(images):
-            b = min(max(levels[o, CONTRAST], 0.05), 20.0) ** 2
-            weights[k, o] = (a if k == o else 0.0) - a * b / total
+            weights[k, o] = (a if k == o else 0.0) - a * _certainty(levels, variances, o) / total
 
 
 @njit(nogil=True, error_model="numpy")
-def noise_variance(levels, images, n, p, unknowns, order):
+def _certainty(levels, variances, k):
+    s = min(max(levels[k, CONTRAST], 0.05), 20.0)
+    return s * s / variances[1 + k]
+
+
+@njit(nogil=True, error_model="numpy")
+def _mean_cosine(place, along_x, along_y):
+    """Mean of cos(2 pi t) over a subset whose places run from ``place`` by up to these px each way."""
+    mean = math.cos(2.0 * math.pi * place)
+    for reach in (along_x, along_y):
+        a = abs(2.0 * math.pi * reach)
+        if a > 8.0:
+            return 0.0
+        if a > 1e-3:
+            mean *= math.sin(a) / a
+    return mean
+
+
+@njit(nogil=True, error_model="numpy")
+def interpolated_noise(warp, half, order):
+    """Variance of interpolated grey levels per variance of white noise in the pixels, mean over the subset."""
+    a, b = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
+    return (a + b * _mean_cosine(warp[0], warp[1] - half, warp[2])) * (
+        a + b * _mean_cosine(warp[10], warp[11], warp[12] - half)
+    )
+
+
+@njit(nogil=True, error_model="numpy")
+def noise_from_residuals(levels, images, n, unknowns):
     """Variance of one image's noise at weight one, in reference grey levels squared, from the residuals.
 
-    Of three comparisons the quietest counts: what raises the others' residuals are small differences of the views,
+    Of three comparisons the quietest count: what raises the others' residuals are small differences of the views,
     which do not pull the solution as noise does.
+    """
+    freedom = max(n - 2.0 - unknowns / images, 1.0)
+    smallest = np.inf
+    for k in range(images):
+        smallest = min(smallest, _one_variance(levels, k))
+    limit = smallest * (1.0 + ALIKE_SD * math.sqrt(2.0 / freedom))
+    total, count = 0.0, 0
+    for k in range(images):
+        one = _one_variance(levels, k)
+        if one <= limit:
+            total += one
+            count += 1
+    return max(total, 0.0) / max(count, 1) / freedom
+
+
+@njit(nogil=True, error_model="numpy")
+def _one_variance(levels, k):
+    s = min(max(levels[k, CONTRAST], 0.05), 20.0)
+    return levels[k, MISFIT] / (1.0 + levels[k, SMOOTHED] / (s * s))
+
+
+@njit(nogil=True, error_model="numpy")
+def share_correction(texture, variance, p, slope_noise, expected_share):
+    """Factor on the covariance where the subset's gradients hold another share of noise than the image's mean.
 
     Parameters
     ----------
-    n, p
-        Number of pixels, and the sum of their weights.
+    texture
+        Sum of the squared gradients, mean of both directions.
+    variance, p
+        Of the noise, and the sum of the weights.
+    slope_noise, expected_share
+        ``ImageData.slope_noise`` and ``slope_share``.
     """
-    value_noise = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
-    smallest = np.inf
-    for k in range(images):
-        s = min(max(levels[k, CONTRAST], 0.05), 20.0)
-        smallest = min(smallest, levels[k, MISFIT] / (1.0 + value_noise / (s * s)))
-    return max(smallest, 0.0) / max(n - 2.0 - unknowns / images, 1.0)
+    share = min(slope_noise * variance * p / texture, MAX_NOISE_SHARE)
+    ratio = (1.0 - min(expected_share, MAX_NOISE_SHARE)) / (1.0 - share)
+    return ratio * ratio
 
 
 @njit(nogil=True, error_model="numpy")
@@ -120,10 +176,12 @@ def settled(motion, previous, tolerance):
 
 
 @njit(nogil=True, error_model="numpy")
-def texture_status(status, sigma_px, max_sigma_px, zncc):
+def texture_status(status, share, sigma_px, max_sigma_px, zncc):
     """Final status: a point that settled, or did not, on noise taken for texture or on a match that scatters."""
-    if status == OK and sigma_px < max_sigma_px:
+    if status == OK and share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:
         return OK
+    if zncc > 0.5 and not share < MAX_NOISE_SHARE:
+        return LOW_TEXTURE
     if status == OK:
         return LOW_TEXTURE if zncc > 0.5 else LOW_CORRELATION
     return status
@@ -170,7 +228,7 @@ def make_point(degree: int, images: int) -> Any:
             reference,
             (np.zeros(N_WARP, np.float32), np.empty(26), np.empty(3 + n_columns)),  # warp, places, sums
             np.empty((images, n_columns)),  # rhs
-            np.empty((images, 5)),  # levels
+            np.empty((images, 6)),  # levels
             np.empty((images, 3, few)),  # M
             equations,
             np.empty((images, n_columns)),  # moves
@@ -218,6 +276,7 @@ def make_point(degree: int, images: int) -> Any:
         levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
         levels[CONTRAST] = c / gain
         levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
+        levels[SMOOTHED] = interpolated_noise(warp, of_reference[4][2], order)
         return True
 
     @njit(nogil=True, error_model="numpy")
@@ -359,9 +418,11 @@ def make_point(degree: int, images: int) -> Any:
             levels[k, ZNCC] = 1.0 - 0.5 * levels[k, MISFIT] / f2
 
     @njit(nogil=True, error_model="numpy")
-    def roughness(gram, f2):
-        """Squared gradient (per px) over the grey levels' variance, mean over directions."""
-        return 0.5 * (gram[0, 0] + gram[few, few]) / f2
+    def texture(gram):
+        """Squared gradients (per px): mean over directions, and in the weakest direction."""
+        xx, xy, yy = gram[0, 0], gram[0, few], gram[few, few]
+        mean = 0.5 * (xx + yy)
+        return mean, mean - math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
 
     return (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of,
-            predict, roughness, few)  # fmt: skip
+            predict, texture, few)  # fmt: skip

@@ -27,8 +27,9 @@ from core.matching.kernels.point import (
     epipolar_shift,
     joint_weights,
     make_point,
-    noise_variance,
+    noise_from_residuals,
     settled,
+    share_correction,
     texture_status,
 )
 from core.matching.kernels.warp import lens_jacobian
@@ -42,14 +43,14 @@ def n_shape_out(terms: int) -> int:
 def make_shape(degree: int) -> Any:
     """Compile the fit for plane (degree 1) or curved (2) patches."""
     (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
-     roughness, few) = make_point(degree, 1)  # fmt: skip
+     texture, few) = make_point(degree, 1)  # fmt: skip
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @njit(nogil=True, error_model="numpy")
-    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations):
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations):
         """Set up and factor the normal equations; status."""
         weights, block, columns, _, _, normal = equations
-        joint_weights(levels, 1, weights)
+        joint_weights(levels, variances, 1, weights)
         if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
         assemble(equations, of_reference[7])
@@ -58,7 +59,7 @@ def make_shape(degree: int) -> Any:
     @njit(nogil=True, error_model="numpy")
     def shape_point(reference, image2, lens1, lens2, R, t, xy, start, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
-        subset, order, max_iterations, tolerance, max_sigma, max_step, known_variance = setting
+        subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
         gram, columns, normal = of_reference[7], equations[2], equations[5]
         inside, xc, yc, p, offset, f2 = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
@@ -66,7 +67,8 @@ def make_shape(degree: int) -> Any:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
-        if not 1e-6 < roughness(gram, f2) < WHITE_ROUGHNESS:
+        gradients, weakest = texture(gram)
+        if not 1e-6 < gradients / f2 < WHITE_ROUGHNESS:
             return LOW_TEXTURE, 0
         w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
@@ -94,7 +96,7 @@ def make_shape(degree: int) -> Any:
             if levels[0, CONTRAST] == 0.0:
                 return LOW_TEXTURE, iterations
             if moved > REFREEZE_PX:
-                result = freeze(R, t, e, nu_x, nu_y, M, slopes, levels, of_reference, inverse, equations)
+                result = freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations)
                 if result != OK:
                     return result, iterations
                 moved = 0.0
@@ -123,13 +125,15 @@ def make_shape(degree: int) -> Any:
         for j in range(few):
             out[j] = w[j]
         out[few], out[few + 1] = e, levels[0, ZNCC]
-        variance = noise_variance(levels, 1, float(subset * subset), p, float(n), order)
+        variance = noise_from_residuals(levels, 1, float(subset * subset), float(n))
         out[few + 2] = math.sqrt(variance)
+        if known_noise:
+            variance = variances[0]
         covariance_of_last(normal, n, 2, work, small)
-        if known_variance > 0.0:
-            variance = known_variance
-        out[few + 3], out[few + 4], out[few + 5] = variance * small[0], variance * small[1], variance * small[3]
+        factor_on = share_correction(gradients, variance, p, slope[0], slope[1]) * (1.0 if known_noise else variance)
+        out[few + 3], out[few + 4], out[few + 5] = factor_on * small[0], factor_on * small[1], factor_on * small[3]
         sigma = max(math.sqrt(out[few + 3]) * along, math.sqrt(out[few + 5]))
-        return texture_status(status, sigma, max_sigma, levels[0, ZNCC]), iterations
+        share = slope[0] * variance * p / weakest
+        return texture_status(status, share, sigma, max_sigma, levels[0, ZNCC]), iterations
 
     return shape_point, work_space, few
