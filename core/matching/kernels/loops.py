@@ -232,7 +232,7 @@ def _reference_sums(degree: int) -> Any:
         mean
             float32.
         out
-            float64 out. With p the weight: sums of p, p f, p f^2; of p f gx and p f gy times each monomial up to
+            float64 out. With p the weight: sums of p, p f, p f^2, p (f - its right neighbour)^2; of p f gx and p f gy times each monomial up to
             ``degree``; of p gx and p gy times the same; of p gx^2, p gx gy and p gy^2 times each monomial up to twice
             the degree.
         """
@@ -251,10 +251,11 @@ def _reference_sums(degree: int) -> Any:
 
             def with_grey(offset: Any) -> list[Vec]:
                 x, y, f, p, gx, gy = get(offset, *range(N_ROWS))
+                difference = load(builder, at(builder, rows[F], builder.add(offset, LONG(1)))) - f
                 f = f - mean
                 store(f, at(builder, rows[F], offset))
                 pf = p * f
-                return [p, pf, pf * f, *times([pf * gx, pf * gy], _powers(x, y, degree))]
+                return [p, pf, pf * f, p * difference * difference, *times([pf * gx, pf * gy], _powers(x, y, degree))]
 
             def columns_alone(offset: Any) -> list[Vec]:
                 x, y, p, gx, gy = get(offset, X, Y, WEIGHT, GX, GY)
@@ -271,7 +272,7 @@ def _reference_sums(degree: int) -> Any:
             few, many = len(monomials(degree)), len(monomials(2 * degree))
             place = 0
             for terms, n in (
-                (with_grey, 3 + 2 * few), (columns_alone, 2 * few), (products(GX, GX), many), (products(GX, GY), many),
+                (with_grey, 4 + 2 * few), (columns_alone, 2 * few), (products(GX, GX), many), (products(GX, GY), many),
                 (products(GY, GY), many),
             ):  # fmt: skip
                 _sum_up(builder, args[1], n, terms, out, place)

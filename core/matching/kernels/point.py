@@ -42,8 +42,9 @@ FIRST_RATE = 0.1  # convergence rate assumed before two steps have shown it
 # two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
 VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
 ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
+FLAT = 1e-6  # squared contrast below which an image shows nothing
 MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
-WHITE_ROUGHNESS = 1.2  # mean squared gradient over variance that only white noise has
+WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
 
 # an image's levels; the misfit is the residuals' sum of squares, the last the noise of its interpolated grey levels
 # over that of its pixels
@@ -100,16 +101,19 @@ def _certainty(levels, variances, k):
 
 
 @njit(nogil=True, error_model="numpy")
+def _spread_over(reach):
+    """Mean of cos(2 pi t) for t from -reach to reach."""
+    a = abs(2.0 * math.pi * reach)
+    if a > 8.0:
+        return 0.0
+    return math.sin(a) / a if a > 1e-3 else 1.0
+
+
+@njit(nogil=True, error_model="numpy")
 def _mean_cosine(place, along_x, along_y):
     """Mean of cos(2 pi t) over a subset whose places run from ``place`` by up to these px each way."""
-    mean = math.cos(2.0 * math.pi * place)
-    for reach in (along_x, along_y):
-        a = abs(2.0 * math.pi * reach)
-        if a > 8.0:
-            return 0.0
-        if a > 1e-3:
-            mean *= math.sin(a) / a
-    return mean
+    spread = _spread_over(along_x) * _spread_over(along_y)
+    return spread * math.cos(2.0 * math.pi * place) if spread != 0.0 else 0.0
 
 
 @njit(nogil=True, error_model="numpy")
@@ -264,7 +268,7 @@ def make_point(degree: int, images: int) -> Any:
         mean = sums[0] / p
         fd = sums[1] - offset * sums[0]
         y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
-        if not y2 > 1e-12 * f2:
+        if not y2 > FLAT * gain * gain * f2:
             levels[ZNCC] = 0.0
             levels[CONTRAST] = 0.0
             return True

@@ -91,7 +91,7 @@ def make_reference(degree: int) -> Any:
     few, many = len(monomials(degree)), len(monomials(2 * degree))
     n_columns = 2 * few
     product = _product_table(degree)
-    first_fg, first_g, first_gg = 3, 3 + n_columns, 3 + 2 * n_columns
+    first_fg, first_g, first_gg = 4, 4 + n_columns, 4 + 2 * n_columns
     sum_all = sum_reference[degree]
 
     @njit(nogil=True, error_model="numpy")
@@ -115,12 +115,12 @@ def make_reference(degree: int) -> Any:
         Returns
         -------
         tuple
-            ``inside`` (bool), the point's ray ``xc, yc``, the weights' sum, the mean of f that is left, and the sum of
-            squares of f about it.
+            ``inside`` (bool), the point's ray ``xc, yc``, the weights' sum, the mean of f that is left, the sum of
+            squares of f about it, and the differences of neighbours against it: 1 for white noise.
         """
         pixels, grad_x, grad_y, weights = reference
         raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
-        nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0)
+        nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
         left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
@@ -167,7 +167,7 @@ def make_reference(degree: int) -> Any:
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])
-        return True, xc, yc, p, offset, f2
+        return True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2
 
     return set_up_reference, n_columns, first_gg + 3 * many
 

@@ -22,7 +22,7 @@ from core.matching.kernels.point import (
     REFREEZE_PX,
     SHIFT,
     SINGULAR,
-    WHITE_ROUGHNESS,
+    WHITE,
     ZNCC,
     epipolar_shift,
     joint_weights,
@@ -62,13 +62,13 @@ def make_shape(degree: int) -> Any:
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
         gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2 = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
+        inside, xc, yc, p, offset, f2, white = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
         if not inside:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
         gradients, weakest = texture(gram)
-        if not 1e-6 < gradients / f2 < WHITE_ROUGHNESS:
+        if not (white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
         w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
