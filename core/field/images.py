@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from core.errors import ImageError
-from core.field.features import Features, detect
+from core.field.features import Box, Features, Picture, detect_all
 from core.lens import Float
 from core.matching.image import ImageData, prepare
 from core.matching.options import Interpolation
@@ -40,7 +41,7 @@ class MeasureImage:
     def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
         self.name = name
         self._prepared: dict[Interpolation, ImageData] = {}
-        self._features: list[tuple[NDArray[np.bool_] | None, bool, Features]] = []
+        self._features: dict[tuple[Box, int], Features] = {}
         self._variance: dict[int, Float] = {}
         if isinstance(image, MeasureImage):
             self.pixels: NDArray[Any] = image.pixels
@@ -61,16 +62,6 @@ class MeasureImage:
         if interpolation not in self._prepared:
             self._prepared[interpolation] = prepare(self.pixels, interpolation)
         return self._prepared[interpolation]
-
-    def features(self, mask: NDArray[np.bool_] | None = None, *, halve: bool = False) -> Features:
-        """Return keypoints where ``mask`` allows them, found on the first call for that mask and size."""
-        for known, size, features in self._features:
-            same = known is mask or (known is not None and mask is not None and np.array_equal(known, mask))
-            if same and size == halve:
-                return features
-        features = detect(self.pixels, mask=mask, halve=halve)
-        self._features.append((mask, halve, features))
-        return features
 
     def subset_variance(self, subset_px: int) -> Float:
         """Return the grey-level variance (rows, cols) in the square of ``subset_px`` about each pixel."""
@@ -101,6 +92,16 @@ class MeasureImage:
                 code="image_blank",
                 remedy=remedy,
             )
+
+
+def features_of(wanted: Sequence[tuple[MeasureImage, Box]], scale: int) -> list[Features]:
+    """Return the keypoints of images within boxes (x0, y0, x1, y1), found on the first call for that box and scale."""
+    new = [(image, box) for image, box in wanted if (box, scale) not in image._features]
+    for (image, box), found in zip(
+        new, detect_all([Picture(image.pixels, box) for image, box in new], scale=scale), strict=True
+    ):
+        image._features[box, scale] = found
+    return [image._features[box, scale] for image, box in wanted]
 
 
 def largest_structure(pixels: NDArray[Any]) -> float:
