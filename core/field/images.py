@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -10,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from core.errors import ImageError
-from core.field.features import Features, detect
+from core.field.features import Box, Features, Picture, detect_all
 from core.lens import Float
 from core.matching.image import ImageData, prepare
 from core.matching.options import Interpolation
+from core.noise import NoiseModel
 
 _TILE = 48
 _LEAST_STRUCTURE = 0.2
@@ -39,15 +41,17 @@ class MeasureImage:
 
     def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
         self.name = name
-        self._prepared: dict[Interpolation, ImageData] = {}
-        self._features: list[tuple[NDArray[np.bool_] | None, bool, Features]] = []
+        self._prepared: dict[tuple[Interpolation, NoiseModel | None], ImageData] = {}
+        self._features: dict[tuple[Box, int], Features] = {}
         self._variance: dict[int, Float] = {}
         if isinstance(image, MeasureImage):
             self.pixels: NDArray[Any] = image.pixels
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
         elif isinstance(image, ImageData):
             self.pixels = image.pixels
-            self._prepared["cubic" if image.order == 3 else "quintic"] = image
+            kind: Interpolation = "cubic" if image.order == 3 else "quintic"
+            # prepared with a model by hand, it keeps it where none is asked for
+            self._prepared[kind, image.noise] = self._prepared[kind, None] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
 
@@ -56,21 +60,12 @@ class MeasureImage:
         """Rows and columns."""
         return int(self.pixels.shape[0]), int(self.pixels.shape[1])
 
-    def prepared(self, interpolation: Interpolation) -> ImageData:
-        """Return the spline coefficients, computed on the first call."""
-        if interpolation not in self._prepared:
-            self._prepared[interpolation] = prepare(self.pixels, interpolation)
-        return self._prepared[interpolation]
-
-    def features(self, mask: NDArray[np.bool_] | None = None, *, halve: bool = False) -> Features:
-        """Return keypoints where ``mask`` allows them, found on the first call for that mask and size."""
-        for known, size, features in self._features:
-            same = known is mask or (known is not None and mask is not None and np.array_equal(known, mask))
-            if same and size == halve:
-                return features
-        features = detect(self.pixels, mask=mask, halve=halve)
-        self._features.append((mask, halve, features))
-        return features
+    def prepared(self, interpolation: Interpolation, noise: NoiseModel | None = None) -> ImageData:
+        """Return the image with its spline coefficients and the camera's noise, computed on the first call."""
+        key = interpolation, noise
+        if key not in self._prepared:
+            self._prepared[key] = prepare(self.pixels, interpolation, noise)
+        return self._prepared[key]
 
     def subset_variance(self, subset_px: int) -> Float:
         """Return the grey-level variance (rows, cols) in the square of ``subset_px`` about each pixel."""
@@ -101,6 +96,16 @@ class MeasureImage:
                 code="image_blank",
                 remedy=remedy,
             )
+
+
+def features_of(wanted: Sequence[tuple[MeasureImage, Box]], scale: int) -> list[Features]:
+    """Return the keypoints of images within boxes (x0, y0, x1, y1), found on the first call for that box and scale."""
+    new = [(image, box) for image, box in wanted if (box, scale) not in image._features]
+    for (image, box), found in zip(
+        new, detect_all([Picture(image.pixels, box) for image, box in new], scale=scale), strict=True
+    ):
+        image._features[box, scale] = found
+    return [image._features[box, scale] for image, box in wanted]
 
 
 def largest_structure(pixels: NDArray[Any]) -> float:

@@ -18,7 +18,8 @@ from core.stereo import StereoPair
 
 _TILTS_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
 _SAMPLES = 17  # per side: enough to tell matches apart, a quarter of the work of all pixels
-_DEPTH_SPAN = 8.0
+DEPTH_SPAN = 8.0
+"""Depths from an eighth of the nominal one to eight times it are searched."""
 _BLOCK = 512
 
 
@@ -27,8 +28,8 @@ def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int]
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     if not np.isfinite(ray).all():
         return np.zeros(0)
-    nominal = _nominal_depth(pair)
-    w = np.geomspace(1.0 / (nominal * _DEPTH_SPAN), _DEPTH_SPAN / nominal, 4000)
+    nominal = nominal_depth(pair)
+    w = np.geomspace(1.0 / (nominal * DEPTH_SPAN), DEPTH_SPAN / nominal, 4000)
     xy2 = pair.image2_at_depth(np.broadcast_to(xy_px, (len(w), 2)), 1.0 / w)
     rows, cols = image2_shape
     with np.errstate(invalid="ignore"):
@@ -151,7 +152,7 @@ def _tilted(pair: StereoPair, ray: Float, depths: Float) -> list[Float]:
     return out
 
 
-def _nominal_depth(pair: StereoPair) -> float:
+def nominal_depth(pair: StereoPair) -> float:
     """Depth in camera 1 where the two optical axes come closest, or ten baselines if they run apart."""
     back = pair.cam2_from_cam1.inverse()
     c, a = back.translation_mm, back.rotation[:, 2]

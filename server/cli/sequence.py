@@ -25,6 +25,7 @@ from server.io.calibration_any import LoadedCalibration
 from server.io.files import make_folder, sha256_of, write_bytes
 from server.io.images import read_image
 from server.io.netcdf import Provenance, write_field
+from server.io.noise_json import LoadedNoise
 from server.io.summary import summarise, to_json
 from server.overlap import ReadAhead, WriteBehind
 from server.version import software_version
@@ -55,6 +56,7 @@ class MeasureJob:
     interpolation: Literal["cubic", "quintic"]
     mask_file: Path | None
     out: Path
+    noise: LoadedNoise | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return what the result depends on besides its inputs."""
@@ -64,6 +66,7 @@ class MeasureJob:
             "patch": self.patch, "interpolation": self.interpolation,
             "seeds": None if seeds is None else seeds.tolist(),
             "mask": None if self.mask_file is None else str(self.mask_file),
+            "noise": None if self.noise is None else self.noise.record(),
         }  # fmt: skip
 
 
@@ -136,7 +139,10 @@ class _Runner:
         if not _kernels_are_compiled():
             progress.note("compiling kernels, once per machine ...")
         self._options = measure.MeasureOptions(
-            subset_px=job.subset_px, patch=job.patch, interpolation=job.interpolation
+            subset_px=job.subset_px,
+            patch=job.patch,
+            interpolation=job.interpolation,
+            noise=(None, None) if job.noise is None else job.noise.models,
         )
         self._reference = measure.ReferencePair(job.calibration.pair, *self.read(job.pairs[0]))
         self._n = 0
@@ -147,8 +153,8 @@ class _Runner:
     def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
         """Read both images of a step and prepare them for matching."""
         one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.files.cam1, pair.files.cam2))
-        for image in (one, two):
-            image.prepared(self._options.interpolation)
+        for image, noise in zip((one, two), self._options.noise, strict=True):
+            image.prepared(self._options.interpolation, noise)
         return one, two
 
     def measure(self, images: tuple[MeasureImage, MeasureImage] | None) -> None:
@@ -211,6 +217,8 @@ class _Runner:
                   "reference_cam2": first.sha256[1], "cam1": now.sha256[0], "cam2": now.sha256[1]}  # fmt: skip
         if job.mask_file is not None:
             inputs["mask"] = sha256_of(job.mask_file)
+        if job.noise is not None:
+            inputs["noise"] = job.noise.sha256
         return Provenance(
             settings=job.settings(), inputs=inputs, software_version=software_version(), step=n,
             frame="target" if job.calibration.source == "calibration_json" else "camera1",
