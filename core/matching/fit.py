@@ -112,7 +112,8 @@ def fit_shape(
     xy_px
         (N, 2) points in camera 1.
     start
-        (N, 3), or for curved patches (N, 6), start values of ``w``; a point with a start that is not finite comes back as NOT_SEEDED.
+        (N, 3), or for curved patches (N, 6), start values of ``w``; a point with a start that is not finite comes back
+        as NOT_SEEDED.
     options
         Defaults to ``MatchOptions()``.
 

@@ -31,7 +31,7 @@ def _stamp() -> int:
 
 @cache
 def shape_points(degree: int) -> Any:
-    """Return the compiled fit of shape for plane (1) or curved (2) patches, for rows ``first`` to ``last`` of ``xy``."""
+    """Return the compiled fit of shape for plane (1) or curved (2) patches, for rows ``first`` to ``last``."""
     stamp = _stamp() + degree
     shape_point, work_space, _ = make_shape(degree)
 

@@ -23,8 +23,6 @@ def padded(n):
     return (n + QUAD - 1) // QUAD * QUAD
 
 
-
-
 @njit(nogil=True, error_model="numpy")
 def invert3(m, out):
     """Inverse of the leading 3 x 3 of a matrix; False if it has none."""
@@ -166,7 +164,7 @@ def solve(u, b, n):
 
 @njit(nogil=True, error_model="numpy")
 def covariance_of_last(u, n, m, work, out):
-    """Inverse's trailing (m, m) block from :func:`make_factor`, row by row into ``out``: the others drop out by themselves."""
+    """Inverse's trailing (m, m) block from :func:`make_factor`'s factor, row by row into ``out``."""
     first = n - m
     for j in range(m):  # columns of the trailing block's inverse, upper triangular
         for i in range(m):

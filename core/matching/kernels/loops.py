@@ -68,7 +68,8 @@ def _four_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec
             total = term if total is None else total + term
         assert total is not None
         sums.append(total)
-    return transpose4(*sums)
+    a, b, c, d = sums
+    return transpose4(a, b, c, d)
 
 
 def _two_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec, Vec]:
@@ -85,7 +86,9 @@ def _two_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec,
             total = term if total is None else total + term
         assert total is not None
         sums.append(total)
-    return join(*sums, [0, 2, 8, 10, 4, 6, 12, 14]), join(*sums, [1, 3, 9, 11, 5, 7, 13, 15])
+    first_two, last_two = sums
+    even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
+    return join(first_two, last_two, even), join(first_two, last_two, odd)
 
 
 def _spline(order: int, rows: list[Any], first: list[Any], tx: Vec, ty: Vec) -> Vec:
@@ -132,6 +135,7 @@ def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[V
 
 
 def data(context: Any, builder: Any, sig: Any, args: Any, i: int) -> Any:
+    """Pointer to the first element of the array that is argument ``i``."""
     return context.make_array(sig.args[i])(context, builder, args[i]).data
 
 
@@ -142,7 +146,9 @@ def _reference_rows(context: Any, builder: Any, sig: Any, args: Any, i: int) -> 
 
 
 def _comparison(order: int, degree: int) -> Any:
-    def compare_pixels(_typingctx: Any, c: Any, base: Any, stride: Any, warp: Any, ref: Any, blocks: Any, out: Any) -> Any:  # fmt: skip
+    def compare_pixels(
+        _typingctx: Any, c: Any, base: Any, stride: Any, warp: Any, ref: Any, blocks: Any, out: Any
+    ) -> Any:
         """Compare one image with the reference subset.
 
         Parameters
@@ -196,7 +202,13 @@ def _comparison(order: int, degree: int) -> Any:
                 a = weight * d
                 bx, by = a * gx, a * gy
                 columns = _powers(x, y, degree)
-                return [a, a * f, a * d, *(bx * m if m else bx for m in columns), *(by * m if m else by for m in columns)]
+                return [
+                    a,
+                    a * f,
+                    a * d,
+                    *(bx * m if m else bx for m in columns),
+                    *(by * m if m else by for m in columns),
+                ]
 
             find_place(LONG(0))
             _sum_up(builder, args[5], 3 + 2 * len(monomials(degree)), terms, data(context, builder, sig, args, 6), 0)
@@ -232,9 +244,9 @@ def _reference_sums(degree: int) -> Any:
         mean
             float32.
         out
-            float64 out. With p the weight: sums of p, p f, p f^2, p (f - its right neighbour)^2; of p f gx and p f gy times each monomial up to
-            ``degree``; of p gx and p gy times the same; of p gx^2, p gx gy and p gy^2 times each monomial up to twice
-            the degree.
+            float64 out. With p the weight: sums of p, p f, p f^2, p (f - its right neighbour)^2; of p f gx and p f gy
+            times each monomial up to ``degree``; of p gx and p gy times the same; of p gx^2, p gx gy and p gy^2 times
+            each monomial up to twice the degree.
         """
         sig = types.void(ref, blocks, mean, out)
 

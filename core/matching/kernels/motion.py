@@ -12,10 +12,16 @@ import numpy as np
 from numba import njit
 
 from core.matching.kernels.linear import covariance_of_last, solve
-from core.matching.kernels.loops import LANES
-from core.matching.kernels.point import (
+from core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
+    SHIFT,
+    ZNCC,
+    joint_weights,
+    noise_from_residuals,
+    share_correction,
+)
+from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -23,19 +29,15 @@ from core.matching.kernels.point import (
     OUTSIDE_IMAGE,
     PREDICTED_PX,
     REFREEZE_PX,
-    SHIFT,
     SINGULAR,
     WHITE,
-    ZNCC,
     epipolar_shift,
-    joint_weights,
     make_point,
-    noise_from_residuals,
     settled,
-    share_correction,
     texture_status,
 )
 from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain, rigid_columns, rotate
+from core.matching.kernels.vectors import LANES
 from core.matching.kernels.warp import lens_jacobian
 
 
@@ -86,13 +88,17 @@ def make_motion(degree: int) -> Any:
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @njit(nogil=True, error_model="numpy")
-    def motion_point(reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out):
+    def motion_point(
+        reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out
+    ):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise, rigid = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain,
          work) = space  # fmt: skip
         gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2, white = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
+        inside, xc, yc, p, offset, f2, white = set_up_reference(
+            reference, lens1, xy[0], xy[1], subset, ref, of_reference
+        )
         if not inside:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
@@ -144,7 +150,7 @@ def make_motion(degree: int) -> Any:
                 if result != OK:
                     return result, iterations
                 moved = 0.0
-            gradient(equations, rhs, n, small)
+            gradient(equations, rhs, small)
             solve(normal, small, n)
             motion = moves_of(columns, small, moves)
             cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0

@@ -9,8 +9,9 @@ With C = [c, ex, ey, 0, ...], c = (Xc, Yc, 1), camera images see the patch throu
 S(e) shifts camera 2's normalised image by e times one pixel across the epipolar line of the point.
 
 Unknowns, in this order inside: (w_j, G_0j, G_1j, G_2j) for j = 1, 2, ..., then for j = 0, then e. So what belongs to
-the point itself comes last, where its covariance can be read off the factor. A step changes image k's matrix by dM_k; what
-the patch does in its own coordinates then is ``M_k^-1 dM_k m``, from which ``dX = d_1 - X d_0``, ``dY = d_2 - Y d_0``.
+the point itself comes last, where its covariance can be read off the factor. A step changes image k's matrix by dM_k;
+what the patch does in its own coordinates then is ``d = M_k^-1 dM_k m``, from which ``dX = d_1 - X d_0`` and
+``dY = d_2 - Y d_0``.
 """
 
 from __future__ import annotations
@@ -23,6 +24,17 @@ from numba import njit
 
 from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
 from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
+from core.matching.kernels.noise import (
+    CONTRAST,
+    GAIN,
+    MAX_NOISE_SHARE,
+    MISFIT,
+    N_LEVELS,
+    SHIFT,
+    SMOOTHED,
+    ZNCC,
+    interpolated_noise,
+)
 from core.matching.kernels.reference import make_reference, set_up_tables, width
 from core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
 from core.status import PointStatus
@@ -38,17 +50,8 @@ LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are set up anew
 PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted, not compared anew
 FIRST_RATE = 0.1  # convergence rate assumed before two steps have shown it
-# White noise of variance 1 behind a spline, at fraction t between pixels, along one axis: a + b cos(2 pi t), the first
-# two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
-VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
-ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
 FLAT = 1e-6  # squared contrast below which an image shows nothing
-MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
 WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
-
-# an image's levels; the misfit is the residuals' sum of squares, the last the noise of its interpolated grey levels
-# over that of its pixels
-GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED = range(6)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -76,98 +79,6 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
     du, dv = (t[0] - u * t[2]) / z, (t[1] - v * t[2]) / z
     along = math.sqrt((j11 * du + j12 * dv) ** 2 + (j21 * du + j22 * dv) ** 2)
     return i11 * gx + i12 * gy, i21 * gx + i22 * gy, along
-
-
-@njit(nogil=True, error_model="numpy")
-def joint_weights(levels, variances, images, weights):
-    """Inverse covariance of the comparisons' residuals.
-
-    Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
-    diag(v_k / contrast_k^2) + v_ref 1 1^T, with the reference's variance first in ``variances``.
-    """
-    total = 1.0 / variances[0]
-    for k in range(images):
-        total += _certainty(levels, variances, k)
-    for k in range(images):
-        a = _certainty(levels, variances, k)
-        for o in range(images):
-            weights[k, o] = (a if k == o else 0.0) - a * _certainty(levels, variances, o) / total
-
-
-@njit(nogil=True, error_model="numpy")
-def _certainty(levels, variances, k):
-    s = min(max(levels[k, CONTRAST], 0.05), 20.0)
-    return s * s / variances[1 + k]
-
-
-@njit(nogil=True, error_model="numpy")
-def _spread_over(reach):
-    """Mean of cos(2 pi t) for t from -reach to reach."""
-    a = abs(2.0 * math.pi * reach)
-    if a > 8.0:
-        return 0.0
-    return math.sin(a) / a if a > 1e-3 else 1.0
-
-
-@njit(nogil=True, error_model="numpy")
-def _mean_cosine(place, along_x, along_y):
-    """Mean of cos(2 pi t) over a subset whose places run from ``place`` by up to these px each way."""
-    spread = _spread_over(along_x) * _spread_over(along_y)
-    return spread * math.cos(2.0 * math.pi * place) if spread != 0.0 else 0.0
-
-
-@njit(nogil=True, error_model="numpy")
-def interpolated_noise(warp, half, order):
-    """Variance of interpolated grey levels per variance of white noise in the pixels, mean over the subset."""
-    a, b = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
-    return (a + b * _mean_cosine(warp[0], warp[1] - half, warp[2])) * (
-        a + b * _mean_cosine(warp[10], warp[11], warp[12] - half)
-    )
-
-
-@njit(nogil=True, error_model="numpy")
-def noise_from_residuals(levels, images, n, unknowns):
-    """Variance of one image's noise at weight one, in reference grey levels squared, from the residuals.
-
-    Of three comparisons the quietest count: what raises the others' residuals are small differences of the views,
-    which do not pull the solution as noise does.
-    """
-    freedom = max(n - 2.0 - unknowns / images, 1.0)
-    smallest = np.inf
-    for k in range(images):
-        smallest = min(smallest, _one_variance(levels, k))
-    limit = smallest * (1.0 + ALIKE_SD * math.sqrt(2.0 / freedom))
-    total, count = 0.0, 0
-    for k in range(images):
-        one = _one_variance(levels, k)
-        if one <= limit:
-            total += one
-            count += 1
-    return max(total, 0.0) / max(count, 1) / freedom
-
-
-@njit(nogil=True, error_model="numpy")
-def _one_variance(levels, k):
-    s = min(max(levels[k, CONTRAST], 0.05), 20.0)
-    return levels[k, MISFIT] / (1.0 + levels[k, SMOOTHED] / (s * s))
-
-
-@njit(nogil=True, error_model="numpy")
-def share_correction(texture, variance, p, slope_noise, expected_share):
-    """Factor on the covariance where the subset's gradients hold another share of noise than the image's mean.
-
-    Parameters
-    ----------
-    texture
-        Sum of the squared gradients, mean of both directions.
-    variance, p
-        Of the noise, and the sum of the weights.
-    slope_noise, expected_share
-        ``ImageData.slope_noise`` and ``slope_share``.
-    """
-    share = min(slope_noise * variance * p / texture, MAX_NOISE_SHARE)
-    ratio = (1.0 - min(expected_share, MAX_NOISE_SHARE)) / (1.0 - share)
-    return ratio * ratio
 
 
 @njit(nogil=True, error_model="numpy")
@@ -232,7 +143,7 @@ def make_point(degree: int, images: int) -> Any:
             reference,
             (np.zeros(N_WARP, np.float32), np.empty(26), np.empty(3 + n_columns)),  # warp, places, sums
             np.empty((images, n_columns)),  # rhs
-            np.empty((images, 6)),  # levels
+            np.empty((images, N_LEVELS)),  # levels
             np.empty((images, 3, few)),  # M
             equations,
             np.empty((images, n_columns)),  # moves
@@ -375,7 +286,7 @@ def make_point(degree: int, images: int) -> Any:
         product(columns[0], row, weighted[0], row, normal, row, images * n_columns, unknowns)
 
     @njit(nogil=True, error_model="numpy")
-    def gradient(equations, rhs, n, out):
+    def gradient(equations, rhs, out):
         """Right-hand side in the unknowns from each image's sums ``rhs``, with the sign of a step downhill."""
         weights, columns = equations[0], equations[2]
         for c in range(row):

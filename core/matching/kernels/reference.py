@@ -20,7 +20,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.matching.kernels.loops import F, GX, GY, WEIGHT, X, Y, data, monomials, sum_reference
+from core.matching.kernels.loops import GX, GY, WEIGHT, F, X, Y, monomials, sum_reference
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 

@@ -9,10 +9,16 @@ import numpy as np
 from numba import njit
 
 from core.matching.kernels.linear import covariance_of_last, solve
-from core.matching.kernels.loops import LANES
-from core.matching.kernels.point import (
+from core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
+    SHIFT,
+    ZNCC,
+    joint_weights,
+    noise_from_residuals,
+    share_correction,
+)
+from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -20,18 +26,14 @@ from core.matching.kernels.point import (
     OUTSIDE_IMAGE,
     PREDICTED_PX,
     REFREEZE_PX,
-    SHIFT,
     SINGULAR,
     WHITE,
-    ZNCC,
     epipolar_shift,
-    joint_weights,
     make_point,
-    noise_from_residuals,
     settled,
-    share_correction,
     texture_status,
 )
+from core.matching.kernels.vectors import LANES
 from core.matching.kernels.warp import lens_jacobian
 
 
@@ -62,7 +64,9 @@ def make_shape(degree: int) -> Any:
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
         gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2, white = set_up_reference(reference, lens1, xy[0], xy[1], subset, ref, of_reference)
+        inside, xc, yc, p, offset, f2, white = set_up_reference(
+            reference, lens1, xy[0], xy[1], subset, ref, of_reference
+        )
         if not inside:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
@@ -100,7 +104,7 @@ def make_shape(degree: int) -> Any:
                 if result != OK:
                     return result, iterations
                 moved = 0.0
-            gradient(equations, rhs, n, step)
+            gradient(equations, rhs, step)
             solve(normal, step, n)
             motion = moves_of(columns, step, moves)
             cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0

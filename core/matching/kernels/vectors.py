@@ -85,7 +85,9 @@ class Vec:
         kind = self.value.type
         bits = 32 if kind.element == FLOAT else 64
         function = cgutils.get_or_insert_function(
-            self.builder.module, ir.FunctionType(kind.element, [kind]), f"llvm.vector.reduce.{name}.v{kind.count}f{bits}"
+            self.builder.module,
+            ir.FunctionType(kind.element, [kind]),
+            f"llvm.vector.reduce.{name}.v{kind.count}f{bits}",
         )
         return self.builder.call(function, [self.value])
 

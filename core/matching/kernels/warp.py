@@ -98,6 +98,7 @@ def undistort(lens, x, y):
         return u, v
     return np.nan, np.nan
 
+
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
     place = np.array([-1.0, -0.4, 0.4, 1.0])
     x, y = (a.ravel() for a in np.meshgrid(place, place))
@@ -222,7 +223,8 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
     powers
         (M, 16) the monomials of the nodes' rays.
     out
-        (26,) out: ten coefficients of x, two zeros, ten of y, two zeros; smallest depth of a node; largest squared radius.
+        (26,) out: ten coefficients of x, two zeros, ten of y, two zeros; a node's smallest depth and largest squared
+        radius.
     """
     sig = types.void(lens, m, powers, out)
 
