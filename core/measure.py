@@ -298,8 +298,7 @@ class _Run:
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
         self.checked = False  # whether every point that stands went through the gates
-        rows, cols = np.clip(np.rint(self.xy_px[:, ::-1]).astype(int), 0, np.array(self.ref1.shape) - 1).T
-        self.texture = self.ref1.subset_variance(self.options.subset_px)[rows, cols]
+        self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px)
 
     # seeds
 

@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from core.lens import Float
 from core.stereo import StereoPair
@@ -81,7 +80,9 @@ def sweep(
     inside = (pixels.min() >= 0) and pixels[:, 0].max() <= cols - 1 and pixels[:, 1].max() <= rows - 1
     if len(depths) == 0 or not inside:
         return np.zeros((0, 3)), np.zeros(0)
-    smooth1, smooth2 = (ndimage.gaussian_filter(i.astype(np.float32), 1.0) for i in (image1, image2))
+    smooth1, smooth2 = (
+        np.asarray(cv2.GaussianBlur(i.astype(np.float32), (0, 0), 1.0), np.float32) for i in (image1, image2)
+    )
     ref = _normalise(_sample(smooth1, pixels[None]))[0]
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     rays = pair.cam1.rays_cam(pixels).xyz_mm
