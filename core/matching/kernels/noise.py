@@ -11,7 +11,7 @@ from numba import njit
 # two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
 VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
 ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
-MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
+MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
 
 # an image's levels; the misfit is the residuals' sum of squares, the last the noise of its interpolated grey levels
 # over that of its pixels
