@@ -1,7 +1,7 @@
 """Measure speed on this machine, beside a peer and beside the machine's own limits: ``make bench``.
 
 Writes ``docs/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` is the one-minute form:
-the small rig only, no long sequences. ``--only`` runs some parts (ceilings, code, kernel, peer) and prints; the page is then not written.
+the small rig only, no long sequences. ``--only`` runs some parts (ceilings, code, kernel, peer, whole) and prints; the page is then not written.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from docs.scripts.bench_ceilings import measure_ceilings
 from docs.scripts.bench_page import Report, targets, thousands, write_page
 from docs.scripts.bench_pairs import MODERN, PAPER, BenchScene, make_scene
 from docs.scripts.bench_peer import Outcome, Run, peer_python, run_ours, run_peer
+from docs.scripts.bench_sequence_page import measure_all
 
-PARTS = ("ceilings", "code", "kernel", "peer")
+PARTS = ("ceilings", "code", "kernel", "peer", "whole")
 PEER_SETTINGS: dict[str, dict[str, object]] = {
     "tuned": {"max_displacement": 16},
     "default": {},
@@ -117,6 +118,13 @@ def _runs(scene: str, threads: int, quick: bool) -> tuple[list[Run], list[Run]]:
     return [*warm, *own], [Run(WARM, 21, 1, PEER_SETTINGS["tuned"]), *other]
 
 
+def whole(report: Report, folder: Path) -> None:
+    """Whole measurements: sequences, fresh processes, seeds, many points, memory."""
+    figures = measure_all(folder, quick=report.quick)
+    report.more += figures.sections()
+    report.rows += figures.rows()
+
+
 def _told(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
     kept = [o for o in outcomes if not o.run.name.startswith(WARM)]
     for o in kept:
@@ -136,7 +144,7 @@ def main() -> int:
     args = parser.parse_args()
     wanted = [name for name in args.only.split(",") if name] or list(PARTS)
     report = Report(quick=args.quick)
-    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer}
+    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer, "whole": whole}
     with tempfile.TemporaryDirectory(prefix="stereorig_bench_") as folder:
         for name in wanted:
             start = time.perf_counter()
