@@ -38,7 +38,7 @@ def test_stages_of_a_sequence_are_told_apart(tmp_path: Path, small: None) -> Non
     found = bench.child_sequence(job)
     assert len(found["files_s"]) == 4
     assert np.all(np.diff(found["files_s"]) > 0)
-    assert found["valid"] > 0.95
+    assert found["valid"] > 0.7  # camera 2 does not see the rest of so small a sensor
     assert set(found["stages"]) == {stage for stage, _, _ in bench.STAGES}
     assert found["stages"]["fit"][0] > 0
     assert found["stages"]["write"][0] > 0
