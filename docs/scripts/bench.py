@@ -22,8 +22,9 @@ from docs.scripts.bench_ceilings import measure_ceilings
 from docs.scripts.bench_page import Report, targets, thousands, write_page
 from docs.scripts.bench_pairs import MODERN, PAPER, BenchScene, make_scene
 from docs.scripts.bench_peer import Outcome, Run, peer_python, run_ours, run_peer
+from docs.scripts.bench_sequence_page import measure_all
 
-PARTS = ("ceilings", "code", "kernel", "peer", "sequence")
+PARTS = ("ceilings", "code", "kernel", "peer", "whole")
 PEER_SETTINGS: dict[str, dict[str, object]] = {
     "tuned": {"max_displacement": 16},
     "default": {},
@@ -120,6 +121,13 @@ def _runs(scene: str, threads: int, quick: bool) -> tuple[list[Run], list[Run]]:
     return [*warm, *own], [Run(WARM, 21, 1, PEER_SETTINGS["tuned"]), *other]
 
 
+def whole(report: Report, folder: Path) -> None:
+    """Whole measurements: sequences, fresh processes, seeds, many points, memory."""
+    figures = measure_all(folder, quick=report.quick)
+    report.more += figures.sections()
+    report.rows += figures.rows()
+
+
 def _told(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
     kept = [o for o in outcomes if not o.run.name.startswith(WARM)]
     for o in kept:
@@ -131,15 +139,6 @@ def _told(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
     return kept
 
 
-def sequence(report: Report, folder: Path) -> None:
-    """Whole measurements: sequences, a fresh process, seeds, cost against points, memory."""
-    from docs.scripts.bench_sequence_page import measure_all
-
-    found = measure_all(folder / "sequence", quick=report.quick)
-    report.rows += found.rows()
-    report.more += found.sections()
-
-
 def main() -> int:
     """Run the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -148,7 +147,7 @@ def main() -> int:
     args = parser.parse_args()
     wanted = [name for name in args.only.split(",") if name] or list(PARTS[:-1] if args.quick else PARTS)
     report = Report(quick=args.quick)
-    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer, "sequence": sequence}
+    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer, "whole": whole}
     with tempfile.TemporaryDirectory(prefix="stereorig_bench_") as folder:
         for name in wanted:
             start = time.perf_counter()
