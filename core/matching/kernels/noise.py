@@ -25,7 +25,8 @@ def joint_weights(levels, variances, images, weights):
     """Inverse covariance of the comparisons' residuals.
 
     Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
-    diag(v_k / contrast_k^2) + v_ref 1 1^T, with the reference's variance first in ``variances``.
+    diag(v_k / (contrast_k^2 density_k)) + v_ref 1 1^T, with the reference's variance first in ``variances``. The noise of
+    an image that shows the subset on more pixels averages out the more.
     """
     total = 1.0 / variances[0]
     for k in range(images):
@@ -39,7 +40,7 @@ def joint_weights(levels, variances, images, weights):
 @njit(nogil=True, error_model="numpy")
 def _certainty(levels, variances, k):
     s = min(max(levels[k, CONTRAST], 0.05), 20.0)
-    return s * s / variances[1 + k]
+    return s * s * levels[k, DENSITY] / variances[1 + k]
 
 
 @njit(nogil=True, error_model="numpy")

@@ -17,6 +17,7 @@ what the patch does in its own coordinates then is ``d = M_k^-1 dM_k m``, from w
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from core.matching.kernels.linear import QUAD, invert3, make_factor, make_produc
 from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
 from core.matching.kernels.noise import (
     CONTRAST,
+    DENSITY,
     GAIN,
     MAX_NOISE_SHARE,
     MISFIT,
@@ -102,6 +104,56 @@ def texture_status(status, share, sigma_px, max_sigma_px, zncc):
     return status
 
 
+@cache
+def make_compare(degree: int) -> Any:
+    """Compile the comparison of one image with the reference; shape and motion use the same."""
+    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    n_columns = 2 * len(monomials(degree))
+
+    @njit(nogil=True, error_model="numpy")
+    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
+        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
+
+        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
+        """
+        coefficients, rows, cols, stride = image
+        blocks, p, offset, f2 = known
+        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
+        warp, places, sums = space
+        base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
+        if base < 0:
+            return False
+        warp[20] = levels[GAIN]
+        warp[21] = levels[SHIFT]
+        if order == 3:
+            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        else:
+            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
+        gain, shift = float(warp[20]), float(warp[21])
+        mean = sums[0] / p
+        fd = sums[1] - offset * sums[0]
+        y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
+        if not y2 > FLAT * gain * gain * f2:
+            levels[ZNCC] = 0.0
+            levels[CONTRAST] = 0.0
+            return True
+        c = math.sqrt(y2 / f2)
+        for i in range(n_columns):
+            rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
+        levels[GAIN] = gain / c
+        levels[SHIFT] = (shift + mean + offset) / c - offset
+        levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
+        levels[CONTRAST] = c / gain
+        levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
+        half = of_reference[4][2]
+        levels[SMOOTHED] = interpolated_noise(warp, half, order)
+        levels[DENSITY] = min(max(abs(warp[1] * warp[12] - warp[2] * warp[11]) / (half * half), 0.01), 100.0)
+        return True
+
+    return compare
+
+
 def make_point(degree: int, images: int) -> Any:
     """Compile what the fits share, for patches of this degree (1 plane, 2 curved) and one or three comparisons."""
     few = len(monomials(degree))
@@ -109,7 +161,7 @@ def make_point(degree: int, images: int) -> Any:
     unknowns = each * few + 1
     row = (unknowns + QUAD - 1) // QUAD * QUAD
     set_up_reference, n_columns, n_raw = make_reference(degree)
-    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    compare = make_compare(degree)
     product, factor = make_product(row), make_factor(row)
 
     @njit(nogil=True, error_model="numpy")
@@ -154,45 +206,6 @@ def make_point(degree: int, images: int) -> Any:
             np.zeros((unknowns, unknowns)),  # chain
             np.empty((5, 5)),  # work
         )
-
-    @njit(nogil=True, error_model="numpy")
-    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
-        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
-
-        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
-        """
-        coefficients, rows, cols, stride = image
-        blocks, p, offset, f2 = known
-        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
-        warp, places, sums = space
-        base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
-        if base < 0:
-            return False
-        warp[20] = levels[GAIN]
-        warp[21] = levels[SHIFT]
-        if order == 3:
-            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
-        else:
-            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
-        # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
-        gain, shift = float(warp[20]), float(warp[21])
-        mean = sums[0] / p
-        fd = sums[1] - offset * sums[0]
-        y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
-        if not y2 > FLAT * gain * gain * f2:
-            levels[ZNCC] = 0.0
-            levels[CONTRAST] = 0.0
-            return True
-        c = math.sqrt(y2 / f2)
-        for i in range(n_columns):
-            rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
-        levels[GAIN] = gain / c
-        levels[SHIFT] = (shift + mean + offset) / c - offset
-        levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
-        levels[CONTRAST] = c / gain
-        levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
-        levels[SMOOTHED] = interpolated_noise(warp, of_reference[4][2], order)
-        return True
 
     @njit(nogil=True, error_model="numpy")
     def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M):

@@ -13,6 +13,7 @@ also the sensitivity of their sums to a displacement.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,7 @@ def _product_table(degree: int) -> np.ndarray:
     return np.array([[many.index((a[0] + b[0], a[1] + b[1])) for b in few] for a in few])
 
 
+@cache
 def make_reference(degree: int) -> Any:
     """Compile the set-up of the reference subset for patches of this degree (1 plane, 2 curved)."""
     few, many = len(monomials(degree)), len(monomials(2 * degree))
