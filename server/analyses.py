@@ -18,6 +18,7 @@ from server.compute import run_task
 from server.io.files import sha256_of
 from server.io.images import decode_mask, read_image
 from server.jobs import Job
+from server.noise_sequence import averages_of
 from server.problem import problem_of
 from server.regions import make_grid
 from server.service import Service
@@ -132,6 +133,9 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
         **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
     }
+    noise = document["settings"].get("noise")
+    if noise:
+        checksums["noise.json"] = noise["sha256"]
     return StepTask(
         folder=str(service.tests.analysis_path(test_id, document["id"])),
         calibration=str(service.tests.calibration_file(test_id)),
@@ -142,6 +146,8 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         previous=previous,
         settings=document["settings"],
         inputs=checksums,
+        noise=str(service.tests.analysis_path(test_id, document["id"]) / "noise.json") if noise else None,
+        averages={"ref": averages_of(ref.document), "cur": averages_of(now.document)},
         label=now.document["label"],
         load_n=now.document["load_n"],
     )

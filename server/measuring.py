@@ -20,7 +20,7 @@ import numpy as np
 
 from core.camera import Camera
 from core.errors import FileFormatError
-from core.field.images import check_calibrated_size
+from core.field.images import MeasureImage, check_calibrated_size
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.seeds import Seed
@@ -30,6 +30,7 @@ from core.threads import set_threads
 from server.io.calibration_any import load_calibration
 from server.io.images import GrayImage, read_image, read_mask
 from server.io.netcdf import Provenance, read_field, write_field
+from server.io.noise_json import load_noise
 from server.io.summary import summarise
 from server.regions import make_grid
 from server.tasks import StepTask
@@ -77,7 +78,7 @@ def measure_step(task: StepTask) -> dict[str, Any]:
         shape = _field(task, context, task.reference)
         previous = None if task.previous in (None, task.reference) else _field(task, context, task.previous)
         result = context.reference.motion(
-            _image(task, "cur1"), _image(task, "cur2"), context.grid, context.options,
+            _seen(task, "cur1"), _seen(task, "cur2"), context.grid, context.options,
             shape=shape, previous=previous, **more,
         )  # fmt: skip
     computed = time.perf_counter()
@@ -115,13 +116,24 @@ def _make_context(task: StepTask) -> _Context:
     options = MeasureOptions(
         subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"]
     )
-    return _Context(ReferencePair(calibration.pair, one, two), _grid(task, one), options)
+    reference = ReferencePair(calibration.pair, _seen(task, "ref1", one), _seen(task, "ref2", two))
+    return _Context(reference, _grid(task, one), options)
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:
     mask_path = Path(task.folder) / "mask.png"
     mask = read_mask(mask_path) if mask_path.exists() else None
     return make_grid(task.settings, mask, (image.shape[0], image.shape[1]))
+
+
+def _seen(task: StepTask, which: str, image: GrayImage | None = None) -> MeasureImage:
+    """An image with its camera's noise, which a mean of frames has less of."""
+    model = None
+    if task.noise is not None:
+        model = load_noise(task.noise).models[0 if which.endswith("1") else 1]
+    if model is not None:
+        model = model.averaged(*task.averages[which[:3]])
+    return MeasureImage(_image(task, which) if image is None else image, which, noise=model)
 
 
 def _image(task: StepTask, which: str) -> GrayImage:
