@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
 
         started = time.monotonic()
         try:
-            task = _task(service, document, n, previous)
+            task = _task(service, document, n, previous, steps[index + 1] if index + 1 < len(steps) else None)
             summary = run_task(service.worker, job, measure_step, task, progress=progress)
         except (Cancelled, StorageError, WorkerDiedError):
             raise  # not the step's own doing
@@ -124,7 +125,7 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
     return job.result
 
 
-def _task(service: Service, document: dict[str, Any], n: int, previous: int | None) -> StepTask:
+def _task(service: Service, document: dict[str, Any], n: int, previous: int | None, following: int | None) -> StepTask:
     test_id, displacement = document["test_id"], document["kind"] == "displacement"
     reference = document["steps"][0] if displacement else n
     ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
@@ -136,6 +137,10 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
     noise = document["settings"].get("noise")
     if noise:
         checksums["noise.json"] = noise["sha256"]
+    after = None
+    if following is not None and displacement:
+        with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
+            after = service.tests.step(test_id, following)
     return StepTask(
         folder=str(service.tests.analysis_path(test_id, document["id"])),
         calibration=str(service.tests.calibration_file(test_id)),
@@ -147,9 +152,15 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         settings=document["settings"],
         inputs=checksums,
         noise=str(service.tests.analysis_path(test_id, document["id"]) / "noise.json") if noise else None,
-        averages={"ref": averages_of(ref.document), "cur": averages_of(now.document)},
+        averages={
+            str(path): averages_of(step.document)
+            for step in (ref, now, after)
+            if step is not None
+            for path in (step.cam1, step.cam2)
+        },
         label=now.document["label"],
         load_n=now.document["load_n"],
+        following=None if after is None else (str(after.cam1), str(after.cam2)),
     )
 
 

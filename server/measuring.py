@@ -1,8 +1,8 @@
 """One step of an analysis, in the worker: images by path, the result as a file in the analysis' folder.
 
 What the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of points, the
-last two fields) is kept between tasks; a fresh worker makes it again from the files, so a step measured anywhere
-gives the same result.
+last two fields) is kept between tasks, and the next step's images are read while a step is fitted; a fresh worker makes
+all of it again from the files, so a step measured anywhere gives the same result.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import time
 from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
+from core.noise import NoiseModel
 from core.stereo import StereoPair
 from core.threads import set_threads
 from server.io.calibration_any import load_calibration
@@ -38,6 +40,7 @@ from server.version import software_version
 from server.worker_process import current_task
 
 _KEPT = 2
+_Pair = tuple[MeasureImage, MeasureImage]
 
 
 @dataclass(eq=False)
@@ -48,9 +51,11 @@ class _Context:
     grid: PointGrid
     options: MeasureOptions
     fields: dict[int, Field] = field(default_factory=dict)
+    ahead: tuple[tuple[str, str], Future[_Pair]] | None = None
 
 
 _contexts: OrderedDict[str, _Context] = OrderedDict()
+_reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 
 
 def measure_step(task: StepTask) -> dict[str, Any]:
@@ -73,14 +78,16 @@ def measure_step(task: StepTask) -> dict[str, Any]:
     if seeds is not None:
         more["seeds"] = np.asarray(seeds, dtype=np.float64)
     if task.kind == "shape":
+        _read_ahead(task, context)
         result = context.reference.shape(context.grid, context.options, **more)
     else:
         shape = _field(task, context, task.reference)
         previous = None if task.previous in (None, task.reference) else _field(task, context, task.previous)
+        images = _images_now(task, context)
+        _read_ahead(task, context)
         result = context.reference.motion(
-            _seen(task, "cur1"), _seen(task, "cur2"), context.grid, context.options,
-            shape=shape, previous=previous, **more,
-        )  # fmt: skip
+            *images, context.grid, context.options, shape=shape, previous=previous, **more
+        )
     computed = time.perf_counter()
     extra = {"label": task.label, "test_step": str(task.n), "reference_step": str(task.reference)}
     if task.load_n is not None:
@@ -93,6 +100,39 @@ def measure_step(task: StepTask) -> dict[str, Any]:
     context.fields = {n: f for n, f in context.fields.items() if n == task.reference} | {task.n: result}
     summary = summarise(result)
     return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
+
+
+def _images_now(task: StepTask, context: _Context) -> _Pair:
+    """Return the step's images: those read while the step before was fitted, if they are these."""
+    paths = task.images["cur1"], task.images["cur2"]
+    ahead, context.ahead = context.ahead, None
+    if ahead is not None and ahead[0] == paths:
+        return ahead[1].result()
+    return _read_pair(paths, task, context.options)
+
+
+def _read_ahead(task: StepTask, context: _Context) -> None:
+    """Begin to read the images of the step that will come next."""
+    context.ahead = None
+    if task.following is not None:
+        context.ahead = task.following, _reader.submit(_read_pair, task.following, task, context.options)
+
+
+def _read_pair(paths: tuple[str, str], task: StepTask, options: MeasureOptions) -> _Pair:
+    models = _noise(task)
+    one, two = (_seen(read_image(path), path, task, model) for path, model in zip(paths, models, strict=True))
+    for image in (one, two):
+        image.prepared(options.interpolation)
+    return one, two
+
+
+def _noise(task: StepTask) -> tuple[NoiseModel | None, NoiseModel | None]:
+    return (None, None) if task.noise is None else load_noise(task.noise).models
+
+
+def _seen(image: GrayImage, path: str, task: StepTask, model: NoiseModel | None) -> MeasureImage:
+    """An image with its camera's noise, which a mean of frames has less of."""
+    return MeasureImage(image, path, noise=None if model is None else model.averaged(*task.averages[path]))
 
 
 def _context_of(task: StepTask) -> _Context:
@@ -116,24 +156,18 @@ def _make_context(task: StepTask) -> _Context:
     options = MeasureOptions(
         subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"]
     )
-    reference = ReferencePair(calibration.pair, _seen(task, "ref1", one), _seen(task, "ref2", two))
-    return _Context(reference, _grid(task, one), options)
+    models = _noise(task)
+    seen1, seen2 = (
+        _seen(image, task.images[which], task, model)
+        for image, which, model in zip((one, two), ("ref1", "ref2"), models, strict=True)
+    )
+    return _Context(ReferencePair(calibration.pair, seen1, seen2), _grid(task, one), options)
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:
     mask_path = Path(task.folder) / "mask.png"
     mask = read_mask(mask_path) if mask_path.exists() else None
     return make_grid(task.settings, mask, (image.shape[0], image.shape[1]))
-
-
-def _seen(task: StepTask, which: str, image: GrayImage | None = None) -> MeasureImage:
-    """An image with its camera's noise, which a mean of frames has less of."""
-    model = None
-    if task.noise is not None:
-        model = load_noise(task.noise).models[0 if which.endswith("1") else 1]
-    if model is not None:
-        model = model.averaged(*task.averages[which[:3]])
-    return MeasureImage(_image(task, which) if image is None else image, which, noise=model)
 
 
 def _image(task: StepTask, which: str) -> GrayImage:

@@ -34,10 +34,12 @@ class StepTask:
         Region, subset and models, as in ``analysis.json``.
     inputs
         Name and SHA-256 of each input file.
+    following
+        Paths of the images of the step that will probably be asked for next, to be read meanwhile.
     noise
         Path of the noise models, or None.
     averages
-        For ``ref`` and ``cur``: how many frames the images are means of, and what their grey levels were multiplied by.
+        By an image's path: how many frames it is the mean of, and what its grey levels were multiplied by.
     """
 
     folder: str
@@ -51,6 +53,7 @@ class StepTask:
     inputs: dict[str, str]
     label: str
     load_n: float | None
+    following: tuple[str, str] | None = None
     noise: str | None = None
     averages: dict[str, tuple[int, float]] = field(default_factory=dict)
 
