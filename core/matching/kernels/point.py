@@ -25,6 +25,7 @@ from numba import njit
 
 from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
 from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
     CONTRAST,
     DENSITY,
@@ -109,8 +110,9 @@ def make_compare(degree: int) -> Any:
     """Compile the comparison of one image with the reference; shape and motion use the same."""
     cubic, quintic = compare_cubic[degree], compare_quintic[degree]
     n_columns = 2 * len(monomials(degree))
+    made_for = f"{degree}"
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
         """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
 
@@ -163,8 +165,9 @@ def make_point(degree: int, images: int) -> Any:
     set_up_reference, n_columns, n_raw = make_reference(degree)
     compare = make_compare(degree)
     product, factor = make_product(row), make_factor(row)
+    made_for = f"{degree}_{images}"
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def work_space(subset):
         """Everything one thread needs, so that no point allocates."""
         ref = np.empty((N_ROWS, width(subset)), np.float32)
@@ -207,7 +210,7 @@ def make_point(degree: int, images: int) -> Any:
             np.empty((5, 5)),  # work
         )
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M):
         """The matrices through which the images see the patch."""
         for i in range(3):
@@ -225,7 +228,7 @@ def make_point(degree: int, images: int) -> Any:
                 M[k, 0, j] += e * nu_x * M[k, 2, j]
                 M[k, 1, j] += e * nu_y * M[k, 2, j]
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
         """What each unknown does to the patch, px in the reference, as coefficients of ``columns``; False if singular.
 
@@ -282,7 +285,7 @@ def make_point(degree: int, images: int) -> Any:
                             out[few + by_y, c] -= d * place[2]
         return True
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def assemble(equations, gram):
         """Normal equations: sum over comparisons k, o of ``weights_ko columns_k^T gram columns_o``."""
         weights, _, columns, half, weighted, normal = equations
@@ -298,7 +301,7 @@ def make_point(degree: int, images: int) -> Any:
                 product(weights, 4, half[0, r:], wide, weighted[0, r:], wide, images, images)
         product(columns[0], row, weighted[0], row, normal, row, images * n_columns, unknowns)
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def gradient(equations, rhs, out):
         """Right-hand side in the unknowns from each image's sums ``rhs``, with the sign of a step downhill."""
         weights, columns = equations[0], equations[2]
@@ -312,7 +315,7 @@ def make_point(degree: int, images: int) -> Any:
                 for c in range(row):
                     out[c] += columns[k, r, c] * s
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def moves_of(columns, step, moves):
         """Each image's motion of the patch (coefficients) for a step; returns the largest corner motion, camera 1 px.
 
@@ -332,7 +335,7 @@ def make_point(degree: int, images: int) -> Any:
             largest = max(largest, x * x + y * y)
         return math.sqrt(largest)
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def predict(moves, rhs, gram, f2, levels):
         """Correlations after a small last step, from the quadratic form that the step was found with."""
         for k in range(images):
@@ -345,7 +348,7 @@ def make_point(degree: int, images: int) -> Any:
             levels[k, MISFIT] = max(levels[k, MISFIT] + change, 0.0)
             levels[k, ZNCC] = 1.0 - 0.5 * levels[k, MISFIT] / f2
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def texture(gram):
         """Squared gradients (per px): mean over directions, and in the weakest direction."""
         xx, xy, yy = gram[0, 0], gram[0, few], gram[few, few]

@@ -22,6 +22,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from core.matching.kernels.loops import GX, GY, WEIGHT, F, X, Y, monomials, sum_reference
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 
@@ -96,7 +97,7 @@ def make_reference(degree: int) -> Any:
     first_fg, first_g, first_gg = 4, 4 + n_columns, 4 + 2 * n_columns
     sum_all = sum_reference[degree]
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(f"{degree}")
     def set_up_reference(reference, lens, x_px, y_px, subset, ref, space):
         """Copy the subset nearest to (x_px, y_px) and sum it.
 
