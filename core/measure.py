@@ -20,7 +20,7 @@ from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
 from core.field.grow import fit_in_batches, grow
 from core.field.images import MeasureImage, different, same_size
-from core.field.patch import UsedPatch, asked_for
+from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting, UsedPatch, asked_for
 from core.field.patch_choice import choose_patch
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
@@ -41,7 +41,7 @@ from core.field.unreached import mark_outside
 from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
-from core.matching.options import PATCH_SETTINGS, Interpolation, MatchOptions, Patch, PatchSetting
+from core.matching.options import Interpolation, MatchOptions, Patch
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.status import PointStatus
 from core.stereo import StereoPair
@@ -77,7 +77,7 @@ class MeasureOptions:
     """
 
     subset_px: int = 33
-    patch: PatchSetting = "stretch"
+    patch: PatchSetting = DEFAULT_PATCH
     interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)

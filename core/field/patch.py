@@ -6,11 +6,12 @@ Apart from the choice itself, so that files can be read and written without load
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, get_args
 
-if TYPE_CHECKING:
-    from core.matching.options import PatchSetting
-
+PatchSetting = Literal["stretch", "rigid", "curved", "auto"]
+"""What can be asked for."""
+PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
+DEFAULT_PATCH: PatchSetting = "stretch"
 UsedPatch = Literal["plane", "rigid", "stretch", "curved"]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import MeasurementError
+from core.field.patch import PatchSetting
 from core.field.result import Field
 from server.cli.image_lists import ImagePair
 from server.cli.region import RegionRequest
@@ -46,7 +47,7 @@ class MeasureJob:
     region: RegionRequest
     subset_px: int
     step_px: int
-    patch: Literal["stretch", "rigid"]
+    patch: PatchSetting
     interpolation: Literal["cubic", "quintic"]
     mask_file: Path | None
     out: Path
@@ -132,6 +133,7 @@ class _Runner:
         self._reference = measure.ReferencePair(job.calibration.pair, read_image(first.cam1), read_image(first.cam2))
         self._shape: Field | None = None
         self._last: Field | None = None
+        self._chosen: str | None = None
         self._done = 0.0
 
     def step(self, n: int) -> dict[str, Any]:
@@ -160,7 +162,17 @@ class _Runner:
             f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
             f"{residual}{duration(summary['seconds'])}"
         )
+        self._say_choice(n, result)
         return summary
+
+    def _say_choice(self, n: int, result: Field) -> None:
+        """Say what the patch was chosen for, of the shape, of the first step, and where it changes."""
+        choice = result.patch
+        if choice is None or self._job.patch != "auto":
+            return
+        if n <= 1 or choice.patch != self._chosen:
+            self._progress.note(f"{'shape' if n == 0 else f'step {n}'}: {choice.reason}")
+        self._chosen = choice.patch
 
     def _shape_of_reference(self) -> Field:
         region = self._job.region
