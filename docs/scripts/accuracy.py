@@ -16,7 +16,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from docs.scripts import accuracy_calibration, accuracy_experiments, accuracy_matching
+from docs.scripts import accuracy_calibration, accuracy_curved, accuracy_experiments, accuracy_matching
 from docs.scripts.table import Row, Section
 
 FIGURES = Path(__file__).resolve().parents[1] / "figures"
@@ -30,6 +30,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "strain": accuracy_matching.strain,
     "rotation": accuracy_matching.rotation,
     "epipolar": accuracy_matching.epipolar,
+    **accuracy_curved.SECTIONS,
     "plate": accuracy_experiments.plate,
     "steel": accuracy_experiments.steel,
     "panel": accuracy_experiments.panel,

@@ -296,9 +296,9 @@ class AnalysisRequest(Request):
     step_px: Annotated[Whole, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
     patch: PatchSetting = Field(
         DEFAULT_PATCH,
-        description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about twice "
-        "the noise; auto takes stretch or curved, whichever errs less on the field in all, shape and motion apart; each "
-        "step's summary has the choice and its reason under patch.",
+        description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about "
+        "twice the noise; auto takes stretch or curved, whichever errs less on the field in all, shape and motion "
+        "apart; each step's summary has the choice and its reason under patch.",
     )
     interpolation: Literal["cubic", "quintic"] = Field("quintic", description="B-spline order.")
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] | None = Field(

@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
     add("--step", default="10", metavar="PX", help="distance of the points (10)")
     add("--patch", choices=PATCH_SETTINGS, default=DEFAULT_PATCH,
-        help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: stretch "
-        f"or curved, whichever errs less on the field in all, with the reason said ({DEFAULT_PATCH})")  # fmt: skip
+        help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: "
+        f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})")  # fmt: skip
     add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
     add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
