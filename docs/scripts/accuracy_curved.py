@@ -195,7 +195,7 @@ def noise_cost(figures: Path) -> Section:
             ]
         rows.append(Row(f"mean u, v, w, {subset} px, curved, worst of the fields", float(np.max(means)), "um", 0.06))
     fig, ax = plt.subplots(figsize=(6, 3.2), layout="constrained")
-    for k, (subset, values) in enumerate(bars.items()):
+    for k, values in enumerate(bars.values()):
         x = np.arange(4) + 5 * k
         for j, label in enumerate(("plane", "curved")):
             ax.bar(x + 0.4 * j - 0.2, [v[j] for v in values.values()], 0.4, color=f"C{j}", label=None if k else label)
