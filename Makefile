@@ -6,6 +6,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PEER := .venv-bench
+PEER_STAMP := $(PEER)/.installed
 ARGS ?=
 
 .PHONY: help demo test serve check bench format accuracy clean
@@ -15,7 +17,7 @@ help:
 	@echo "make test    run every test"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls"
-	@echo "make bench   time the matching on this machine"
+	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a minute)"
 	@echo "make accuracy   measure every figure of docs/accuracy.md again (about ten minutes)"
 
 $(STAMP): pyproject.toml
@@ -43,7 +45,16 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP)
+# The peer has its own environment, since its pins clash with ours. Without it the rest is measured all the same.
+$(PEER_STAMP): pyproject.toml | $(STAMP)
+	@rm -rf $(PEER)
+	@echo "Setting up $(PEER) (once) ..."
+	@$(PYTHON) -m venv $(PEER)
+	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' > $(PEER)/requirements.txt
+	@$(PEER)/bin/python -m pip install --quiet --disable-pip-version-check -r $(PEER)/requirements.txt && touch $@ \
+		|| { echo "pip could not install the peer; its message is above. The bench goes on without it."; rm -rf $(PEER); }
+
+bench: $(STAMP) $(PEER_STAMP)
 	$(BIN)/python -m docs.scripts.bench $(ARGS)
 
 accuracy: $(STAMP)
@@ -54,5 +65,5 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(PEER) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

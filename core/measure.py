@@ -42,6 +42,7 @@ from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
 from core.matching.options import Interpolation, MatchOptions, Patch
+from core.noise import NoiseModel
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.status import PointStatus
 from core.stereo import StereoPair
@@ -74,6 +75,9 @@ class MeasureOptions:
         Correlation below which no comparison is a match. The field's own scatter decides above it.
     gates
         Limits of the checks that every point must pass.
+    noise
+        Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and say how far
+        points scatter. None: from what a match leaves, all pixels alike.
     """
 
     subset_px: int = 33
@@ -81,6 +85,7 @@ class MeasureOptions:
     interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
+    noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)
@@ -275,13 +280,13 @@ class _Run:
         self.xy_px = grid.xy_px.reshape(-1, 2)
         self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
         self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
-        kind = self.options.interpolation
+        kind, (noise1, noise2) = self.options.interpolation, self.options.noise
         self.fitter = Fitter(
             pair=pair,
-            ref1=self.ref1.prepared(kind),
-            ref2=self.ref2.prepared(kind),
-            cur1=None if self.cur1 is None else self.cur1.prepared(kind),
-            cur2=None if self.cur2 is None else self.cur2.prepared(kind),
+            ref1=self.ref1.prepared(kind, noise1),
+            ref2=self.ref2.prepared(kind, noise2),
+            cur1=None if self.cur1 is None else self.cur1.prepared(kind, noise1),
+            cur2=None if self.cur2 is None else self.cur2.prepared(kind, noise2),
             options=self.options.match_options(),
             least_zncc=self.options.least_zncc,
         )
@@ -327,7 +332,9 @@ class _Run:
             if self._sample_holds(w, G):
                 if self.patch.patch == "curved":
                     self._refit_curved()
-                index = np.flatnonzero(self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2)))
+                # the sample stands already, fitted from these very starts
+                known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+                index = np.flatnonzero(self.usable & known & ~self.points.ok)
                 self.progress("previous", 0, len(index))
                 fit_in_batches(
                     self.fitter, self.points, index, self.xy_px, w[index], G[index], far_px=_SAMPLE_FAR_PX,

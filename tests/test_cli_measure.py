@@ -311,3 +311,20 @@ def test_the_specimen(specimen_dir: Path, tmp_path: Path) -> None:
             ok = np.isin(data["status"], (0, 10))
             off = data["epipolar_px"].values[ok] - np.median(data["epipolar_px"].values[ok])
             assert np.abs(off).max() <= 5 * 0.08
+
+
+def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path) -> None:
+    from core.noise import NoiseModel
+    from server.io.noise_json import load_noise, noise_content, write_noise
+
+    file = tmp_path / "noise.json"
+    model = NoiseModel(coefficients=(1.96, 0.0128, 0.0), frames=8)
+    write_noise(file, noise_content({"cam1": model, "cam2": model}))
+    out = tmp_path / "out"
+    assert main(command(folder, out, noise=str(file), roi="90,80,130,110", cam1=[str(folder / "cam1_0.tif")],
+                        cam2=[str(folder / "cam2_0.tif")])) == 0  # fmt: skip
+    with xr.open_dataset(out / "step_0000.nc") as data:
+        assert (data["status"].values == 0).all()
+        settings, inputs = (json.loads(data.attrs[name]) for name in ("settings", "inputs_sha256"))
+    assert inputs["noise"] == load_noise(file).sha256
+    assert settings["noise"]["cam1"] == {"coefficients": [1.96, 0.0128, 0.0], "frames": 8}

@@ -8,6 +8,7 @@ from scipy.ndimage import correlate1d, gaussian_filter, map_coordinates, spline_
 
 from core.matching import prepare
 from core.matching.image import PAD
+from core.noise import NoiseModel
 from core.threads import available_threads, set_threads, threads
 
 ORDER = {"cubic": 3, "quintic": 5}
@@ -74,3 +75,19 @@ def test_a_prepared_image_does_not_follow_a_reused_buffer():
     image[:] = 0
     np.testing.assert_array_equal(kept.pixels, expected)
     assert np.corrcoef(kept.gradients[0].ravel(), slope.ravel())[0, 1] > 0.9
+
+
+def test_a_noise_model_weighs_pixels_by_their_level():
+    model = NoiseModel(coefficients=(1.0, 0.2, 0.0), range_grey=(0.0, 255.0))
+    grey = 20.0 + 200.0 * (np.indices((60, 80))[1] > 39)
+    noisy = grey + np.sqrt(model.variance(grey)) * np.random.default_rng(0).normal(size=grey.shape)
+    image = prepare(noisy, noise=model)
+    sides = [np.s_[4:-4, 4:34], np.s_[4:-4, 44:76]]
+    variances = [image.noise_variance / image.weights[side].mean() for side in sides]
+    np.testing.assert_allclose(variances, model.variance([20.0, 220.0]), rtol=0.03)
+    assert image.weights.mean() == pytest.approx(1.0, rel=0.05)
+    # the pixel's own noise hardly weighs it
+    part = sides[0]
+    assert abs(np.corrcoef(image.weights[part].ravel(), noisy[part].ravel())[0, 1]) < 0.6
+    assert prepare(noisy).weights is None
+    assert prepare(noisy).noise_variance is None

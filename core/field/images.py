@@ -14,6 +14,7 @@ from core.field.features import Features, detect
 from core.lens import Float
 from core.matching.image import ImageData, prepare
 from core.matching.options import Interpolation
+from core.noise import NoiseModel
 
 _TILE = 48
 _LEAST_STRUCTURE = 0.2
@@ -39,7 +40,7 @@ class MeasureImage:
 
     def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
         self.name = name
-        self._prepared: dict[Interpolation, ImageData] = {}
+        self._prepared: dict[tuple[Interpolation, NoiseModel | None], ImageData] = {}
         self._features: list[tuple[NDArray[np.bool_] | None, bool, Features]] = []
         self._variance: dict[int, Float] = {}
         if isinstance(image, MeasureImage):
@@ -47,7 +48,9 @@ class MeasureImage:
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
         elif isinstance(image, ImageData):
             self.pixels = image.pixels
-            self._prepared["cubic" if image.order == 3 else "quintic"] = image
+            kind: Interpolation = "cubic" if image.order == 3 else "quintic"
+            # prepared with a model by hand, it keeps it where none is asked for
+            self._prepared[kind, image.noise] = self._prepared[kind, None] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
 
@@ -56,11 +59,12 @@ class MeasureImage:
         """Rows and columns."""
         return int(self.pixels.shape[0]), int(self.pixels.shape[1])
 
-    def prepared(self, interpolation: Interpolation) -> ImageData:
-        """Return the spline coefficients, computed on the first call."""
-        if interpolation not in self._prepared:
-            self._prepared[interpolation] = prepare(self.pixels, interpolation)
-        return self._prepared[interpolation]
+    def prepared(self, interpolation: Interpolation, noise: NoiseModel | None = None) -> ImageData:
+        """Return the image with its spline coefficients and the camera's noise, computed on the first call."""
+        key = interpolation, noise
+        if key not in self._prepared:
+            self._prepared[key] = prepare(self.pixels, interpolation, noise)
+        return self._prepared[key]
 
     def features(self, mask: NDArray[np.bool_] | None = None, *, halve: bool = False) -> Features:
         """Return keypoints where ``mask`` allows them, found on the first call for that mask and size."""

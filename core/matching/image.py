@@ -10,18 +10,25 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import ImageError, InputError
-from core.matching.filters import correlate, derivative, prefilter
+from core.matching.filters import correlate, derivative, in_bands, prefilter
 from core.matching.options import SPLINE_ORDER, Interpolation
+from core.matching.slopes import SlopeFilter, slope_filter
+from core.noise import NoiseModel
 
 PAD = 4
 """Mirrored coefficients kept around the image, so that no tap needs a test (quintic: 2 left, 3 right, and rounding)."""
 
 Float32 = NDArray[np.float32]
 _ONE = np.ones(1)
+_SAMPLE = 4  # every fourth pixel is enough for a mean variance
+_LEVEL_PX = 1.0  # reach (sd) of the surroundings whose grey level weighs a pixel
+WIENER = False
+"""Whether gradients are those of :mod:`core.matching.slopes`, or the spline's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +44,14 @@ class ImageData:
         (rows, cols) grey levels as they were given.
     order
         3 or 5.
-    weights
-        (rows, cols) float32 inverse noise variance of the pixels over its mean, or None where all count alike.
-    noise_variance
-        Variance of the noise of a pixel of weight 1, grey levels squared, or None where it is not known.
+    noise
+        The camera's noise model, or None where it is not known.
     """
 
     coefficients: Float32
     raw: NDArray[Any]
     order: int
-    weights: Float32 | None = None
-    noise_variance: float | None = None
+    noise: NoiseModel | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -60,8 +64,50 @@ class ImageData:
         return np.ascontiguousarray(self.raw, dtype=np.float32)
 
     @cached_property
+    def noise_variance(self) -> float | None:
+        """Variance of the noise of a pixel of weight 1, grey levels squared, or None where it is not known."""
+        if self.noise is None:
+            return None
+        return float(1.0 / np.mean(1.0 / self.noise.variance(self.raw[::_SAMPLE, ::_SAMPLE])))
+
+    @cached_property
+    def weights(self) -> Float32 | None:
+        """(rows, cols) float32 inverse variance of the pixels' noise, about 1 in the mean; None where all count alike.
+
+        A pixel's own noise must not weigh it, or bright noise would count less than dark: its surroundings' level does.
+        """
+        if self.noise is None or self.noise_variance is None:
+            return None
+        out = np.empty(self.shape, np.float32)
+        model, one = self.noise, self.noise_variance
+
+        def weigh(source: NDArray[Any]) -> Any:
+            level = cv2.GaussianBlur(source.astype(np.float32), (5, 5), _LEVEL_PX, borderType=cv2.BORDER_REFLECT_101)
+            return one / model.variance(level)
+
+        in_bands(self.raw, 2, weigh, out)
+        return out
+
+    @cached_property
+    def slopes(self) -> SlopeFilter | None:
+        """The derivative that is best under this image's noise; None where the image shows nothing."""
+        return slope_filter(self.raw, self.noise_variance)
+
+    @property
+    def slope_noise(self) -> float:
+        """Variance of ``gradients`` per variance of white noise in the pixels, mean of both directions."""
+        return self.slopes.gain if WIENER and self.slopes else float((derivative(self.order) ** 2).sum())
+
+    @property
+    def slope_share(self) -> float:
+        """Share of noise in the squares of ``gradients``, over the image's texture, that is allowed for in them."""
+        return self.slopes.share if WIENER and self.slopes else 0.0
+
+    @cached_property
     def gradients(self) -> tuple[Float32, Float32]:
-        """The spline's derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
+        """Derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
+        if WIENER and self.slopes:
+            return self.slopes.apply(self.raw)
         slope = derivative(self.order)
         gx, gy = np.empty(self.shape, np.float32), np.empty(self.shape, np.float32)
         correlate(self.raw, _ONE, slope, gx)
@@ -69,7 +115,9 @@ class ImageData:
         return gx, gy
 
 
-def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quintic") -> ImageData:
+def prepare(
+    image: ArrayLike | ImageData, interpolation: Interpolation = "quintic", noise: NoiseModel | None = None
+) -> ImageData:
     """Find the spline coefficients of an image.
 
     Parameters
@@ -78,6 +126,8 @@ def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quinti
         (rows, cols) grey levels, any real type; or an image already prepared, which comes back unchanged.
     interpolation
         ``cubic`` or ``quintic``.
+    noise
+        The camera's noise model; pixels then count by their noise, and it says how far a match scatters.
 
     Raises
     ------
@@ -106,7 +156,7 @@ def prepare(image: ArrayLike | ImageData, interpolation: Interpolation = "quinti
         raise ImageError(f"an image of type {pixels.dtype} has no grey levels.")
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         raise ImageError("the image holds NaN or infinite grey levels.")
-    return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order)
+    return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order, noise)
 
 
 def _coefficients(pixels: NDArray[Any], order: int) -> Float32:

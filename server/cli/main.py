@@ -18,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "serve": ("server.cli.serve", "start the service"),
     "demo": ("server.cli.demo", "run one of the paper's experiments on the simulated rig, over HTTP"),
     "calibrate": ("server.cli.calibrate", "calibrate a pair of cameras from grid images"),
+    "noise": ("server.cli.noise", "measure the cameras' noise from repeated frames"),
     "measure": ("server.cli.measure", "measure shape and displacement from image files"),
 }
 

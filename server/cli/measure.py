@@ -15,6 +15,7 @@ from server.cli.sequence import CheckedPair, MeasureJob, measure_sequence
 from server.cli.terminal import ProgressLine
 from server.io.calibration_any import LoadedCalibration, load_calibration
 from server.io.images import decode_image, read_file
+from server.io.noise_json import load_noise
 
 SUBSET_RANGE_PX = (7, 301)
 STEP_RANGE_PX = (1, 1000)
@@ -36,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})")  # fmt: skip
     add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
     add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
+    add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
@@ -87,12 +89,14 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         margin = float(subset // 2 + 2)
         rectangle = (margin, margin, cols - 1 - margin, rows - 1 - margin)
     mask_file = None if args.mask is None else Path(args.mask)
+    noise = None if args.noise is None else load_noise(args.noise)
     region = check_region(rectangle, image_shape=shapes[0], subset_px=subset, step_px=step,
                           mask_path=mask_file, seeds=args.seed)  # fmt: skip
     pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     return MeasureJob(
         calibration=calibration, calibration_file=calibration_file, pairs=pairs, region=region, subset_px=subset,
         step_px=step, patch=args.patch, interpolation=args.interpolation, mask_file=mask_file, out=out,
+        noise=noise,
     )  # fmt: skip
 
 

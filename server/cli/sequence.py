@@ -1,4 +1,7 @@
-"""The measurement of a sequence of pairs: one step in memory at a time, one file a step, a summary at the end."""
+"""The measurement of a sequence of pairs: one file a step, a summary at the end.
+
+While a step is measured, the next pair is read and the last result is written; no more than these are in memory.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import MeasurementError
+from core.field.images import MeasureImage
 from core.field.patch import PatchSetting
 from core.field.result import Field
 from server.cli.image_lists import ImagePair
@@ -22,7 +26,9 @@ from server.io.calibration_any import LoadedCalibration
 from server.io.files import make_folder, sha256_of, write_bytes
 from server.io.images import read_image
 from server.io.netcdf import Provenance, write_field
+from server.io.noise_json import LoadedNoise
 from server.io.summary import summarise, to_json
+from server.overlap import ReadAhead, WriteBehind
 from server.version import software_version
 
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
@@ -51,6 +57,7 @@ class MeasureJob:
     interpolation: Literal["cubic", "quintic"]
     mask_file: Path | None
     out: Path
+    noise: LoadedNoise | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return what the result depends on besides its inputs."""
@@ -60,6 +67,7 @@ class MeasureJob:
             "patch": self.patch, "interpolation": self.interpolation,
             "seeds": None if seeds is None else seeds.tolist(),
             "mask": None if self.mask_file is None else str(self.mask_file),
+            "noise": None if self.noise is None else self.noise.record(),
         }  # fmt: skip
 
 
@@ -72,9 +80,13 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
         As the measurement raises them. Results of steps that were finished before stay; no summary is written.
     """
     started = time.monotonic()
-    with _output_folder(job.out):
-        runner = _Runner(job, progress)
-        steps = [runner.step(n) for n in range(len(job.pairs))]
+    with _output_folder(job.out), WriteBehind[dict[str, Any]]() as written:
+        runner = _Runner(job, progress, written)
+        with ReadAhead(runner.read, job.pairs[1:]) as pairs:
+            runner.measure(None)
+            for images in pairs:
+                runner.measure(images)
+        steps = written.finish()
     seconds = round(time.monotonic() - started, 3)
     summary = {
         "software_version": software_version(),
@@ -118,37 +130,63 @@ def _kernels_are_compiled() -> bool:
 class _Runner:
     """Measures the steps in order; keeps the reference, its shape and the last field, whatever the number of steps."""
 
-    def __init__(self, job: MeasureJob, progress: ProgressLine) -> None:
+    def __init__(self, job: MeasureJob, progress: ProgressLine, written: WriteBehind[dict[str, Any]]) -> None:
         # the kernels' modules take seconds to load: after the input was checked is early enough
         from core import measure
 
         self._job = job
         self._progress = progress
+        self._written = written
         if not _kernels_are_compiled():
             progress.note("compiling kernels, once per machine ...")
         self._options = measure.MeasureOptions(
-            subset_px=job.subset_px, patch=job.patch, interpolation=job.interpolation
+            subset_px=job.subset_px,
+            patch=job.patch,
+            interpolation=job.interpolation,
+            noise=(None, None) if job.noise is None else job.noise.models,
         )
-        first = job.pairs[0].files
-        self._reference = measure.ReferencePair(job.calibration.pair, read_image(first.cam1), read_image(first.cam2))
+        self._reference = measure.ReferencePair(job.calibration.pair, *self.read(job.pairs[0]))
+        self._n = 0
         self._shape: Field | None = None
         self._last: Field | None = None
         self._chosen: str | None = None
         self._done = 0.0
 
-    def step(self, n: int) -> dict[str, Any]:
-        """Measure one step, write its file, return its summary."""
+    def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
+        """Read both images of a step and prepare them for matching."""
+        one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.files.cam1, pair.files.cam2))
+        for image, noise in zip((one, two), self._options.noise, strict=True):
+            image.prepared(self._options.interpolation, noise)
+        return one, two
+
+    def measure(self, images: tuple[MeasureImage, MeasureImage] | None) -> None:
+        """Measure the next step, the reference's shape first (no images), and have its file written."""
         started = time.monotonic()
-        pair = self._job.pairs[n]
-        result = self._shape_of_reference() if n == 0 else self._motion(n)
+        n, region = self._n, self._job.region
+        if images is None:
+            result = self._shape = self._reference.shape(
+                region.grid, self._options, seeds=region.seeds_px, progress=self._shower(n)
+            )
+        else:
+            result = self._last = self._reference.motion(
+                *images, region.grid, self._options,
+                shape=self._shape, previous=self._last, seeds=region.seeds_px, progress=self._shower(n),
+            )  # fmt: skip
         if not result.valid.any():
+            files = self._job.pairs[n].files
             raise MeasurementError(
-                f"No point of step {n} ({pair.files.cam1.name}, {pair.files.cam2.name}) could be measured.",
+                f"No point of step {n} ({files.cam1.name}, {files.cam2.name}) could be measured.",
                 code="nothing_measured",
                 remedy="Check that both cameras see the same textured surface, in this order, and the region.",
             )
         if n == 0:
             self._remove_older()
+        self._written.put(self._write, n, result, started)
+        self._n += 1
+
+    def _write(self, n: int, result: Field, started: float) -> dict[str, Any]:
+        """Write the file of a step, say so, return its summary."""
+        pair = self._job.pairs[n]
         name = f"step_{n:04d}.nc"
         write_field(self._job.out / name, result, self._provenance(n))
         summary = {
@@ -174,19 +212,6 @@ class _Runner:
             self._progress.note(f"{'shape' if n == 0 else f'step {n}'}: {choice.reason}")
         self._chosen = choice.patch
 
-    def _shape_of_reference(self) -> Field:
-        region = self._job.region
-        self._shape = self._reference.shape(region.grid, self._options, seeds=region.seeds_px, progress=self._shower(0))
-        return self._shape
-
-    def _motion(self, n: int) -> Field:
-        files, region = self._job.pairs[n].files, self._job.region
-        self._last = self._reference.motion(
-            read_image(files.cam1), read_image(files.cam2), region.grid, self._options,
-            shape=self._shape, previous=self._last, seeds=region.seeds_px, progress=self._shower(n),
-        )  # fmt: skip
-        return self._last
-
     def _shower(self, n: int) -> Any:
         count = len(self._job.pairs)
 
@@ -204,6 +229,8 @@ class _Runner:
                   "reference_cam2": first.sha256[1], "cam1": now.sha256[0], "cam2": now.sha256[1]}  # fmt: skip
         if job.mask_file is not None:
             inputs["mask"] = sha256_of(job.mask_file)
+        if job.noise is not None:
+            inputs["noise"] = job.noise.sha256
         return Provenance(
             settings=job.settings(), inputs=inputs, software_version=software_version(), step=n,
             frame="target" if job.calibration.source == "calibration_json" else "camera1",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from typing import TextIO
 
@@ -24,7 +25,7 @@ def duration(seconds: float) -> str:
 
 
 class ProgressLine:
-    """Shows how far the work is and an estimate of the time left, on stderr.
+    """Shows how far the work is and an estimate of the time left, on stderr; any thread may tell it.
 
     Parameters
     ----------
@@ -38,12 +39,14 @@ class ProgressLine:
         self._last = time.monotonic()
         self._start: tuple[float, float] | None = None
         self._width = 0
+        self._lock = threading.RLock()
 
     def note(self, text: str) -> None:
         """Write a line that stays."""
-        self._clear()
-        self._stream.write(f"{text}\n")
-        self._stream.flush()
+        with self._lock:
+            self._clear()
+            self._stream.write(f"{text}\n")
+            self._stream.flush()
 
     def show(self, text: str, fraction: float) -> None:
         """Say where the work is; ``fraction`` of all of it is done."""
@@ -71,13 +74,15 @@ class ProgressLine:
         if not self._live:
             self.note(line)
             return
-        self._stream.write("\r" + line.ljust(self._width))
-        self._stream.flush()
-        self._width = len(line)
+        with self._lock:
+            self._stream.write("\r" + line.ljust(self._width))
+            self._stream.flush()
+            self._width = len(line)
 
     def close(self) -> None:
         """Leave the terminal clean."""
-        self._clear()
+        with self._lock:
+            self._clear()
 
     def _clear(self) -> None:
         if self._live and self._width:

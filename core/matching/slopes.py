@@ -1,0 +1,153 @@
+"""Reference gradients that are best under noise: a Wiener derivative made for the image's own texture.
+
+The matcher takes the derivatives of all comparisons from the reference's gradients, and their noise costs random
+error: a tenth and more in coarse texture. Of all linear filters the one that comes closest to the true derivative,
+``i k S / (S + N)`` for a texture of spectrum S under white noise N, loses least. Its error is uncorrelated with its
+output, so the sum of its squares is at once the sensitivity of the sums to a shift: no noise has to be taken out.
+It is odd, so its noise does not correlate with a pixel's own noise, and no bias follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from core.matching.filters import derivative, in_bands
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+REACH = 3
+"""The filter is 7 x 7; 9 x 9 gains less than 0.05 % of the information."""
+
+_TILE = 128
+_MOST_TILES = 48
+_LEAST_POWER = 0.1  # of a strong tile's grey-level variance: tiles below it show no texture
+_RINGS = (0.6, 0.8)  # of the Nyquist frequency, both ways: beyond the second, lenses leave little but noise
+_FALL = 2.0  # by which the sharpest texture's spectrum falls from one ring to the next
+_LEVEL = 1.05  # rings that differ by less show noise alone
+_MOST_NOISE = 0.5  # of the grey levels' variance
+_BLANK = 1e-20  # of the squared grey levels: rounding
+_LEAST_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeFilter:
+    """Two odd filters, to be correlated with an image.
+
+    Attributes
+    ----------
+    along_x, along_y
+        (7, 7) taps.
+    gain
+        Variance of the filtered gradient per variance of white noise, mean of both directions.
+    share
+        Share of noise in the filtered gradient's squares over the image's texture.
+    noise_variance
+        Of a pixel, grey levels squared, as the filter was made for.
+    """
+
+    along_x: Float
+    along_y: Float
+    gain: float
+    share: float
+    noise_variance: float
+
+    def apply(self, image: NDArray[Any]) -> tuple[Float32, Float32]:
+        """Gradients along x and y (rows, cols), grey levels per px; the image continues as its mirror."""
+        out = np.empty((2, *image.shape), np.float32)
+        for taps, into in zip((self.along_x, self.along_y), out, strict=True):
+            _correlate(image, taps.astype(np.float32), into)
+        return out[0], out[1]
+
+
+def _correlate(image: NDArray[Any], taps: Float32, out: Float32) -> None:
+    in_bands(
+        image, REACH, lambda source: cv2.filter2D(source, cv2.CV_32F, taps, borderType=cv2.BORDER_REFLECT_101), out
+    )
+
+
+def slope_filter(image: NDArray[Any], noise_variance: float | None = None) -> SlopeFilter | None:
+    """Make the filter for an image; None if it shows nothing.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels; tiles of it without texture are left out.
+    noise_variance
+        Of a pixel, grey levels squared; from the spectrum's floor when left out. Texture that is sharp enough to reach
+        the floor raises it: the gradients then lose a little, and the covariance stays on the safe side.
+
+    Notes
+    -----
+    The taps h solve the normal equations ``sum_j R(i - j) h(j) = (d S)(i)``: R the image's autocorrelation, S the
+    texture's, d the derivative. That is the quintic spline's: the exact one would make too much of what is aliased.
+    """
+    spectra, window = _spectra(image)
+    if spectra is None:
+        return None
+    noise = _floor(spectra) if noise_variance is None else noise_variance
+    side = 2 * REACH + 1
+    W = _lags(np.abs(fft.rfft2(window)) ** 2 / (window**2).sum())
+    S = _lags(spectra.mean(axis=0)) / np.maximum(W, 0.01)  # index 0 is lag 0, negative lags come from the end
+    if not S[0, 0] > 0.0:
+        return None
+    noise = min(noise, _MOST_NOISE * float(S[0, 0]))
+    S[0, 0] -= noise
+    lag = np.arange(-REACH, REACH + 1)
+    y, x = (v.ravel() for v in np.meshgrid(lag, lag, indexing="ij"))
+    normal = S[y[:, None] - y, x[:, None] - x]
+    normal[np.diag_indices(side**2)] += noise + _LEAST_NOISE * S[0, 0]
+    slope = derivative(5)
+    far = min(len(slope) // 2, len(S) // 2 - 1 - REACH)
+    tap = np.arange(-far, far + 1)
+    slope = slope[len(slope) // 2 - far : len(slope) // 2 + far + 1]
+    wanted = np.stack([S[-y[:, None], tap - x[:, None]] @ slope, S[tap - y[:, None], -x[:, None]] @ slope], axis=-1)
+    taps = np.linalg.solve(normal, wanted)
+    taps = 0.5 * (taps - taps[::-1])  # odd, but for rounding
+    gain = float((taps**2).sum()) / 2.0
+    power = float(np.einsum("ik,ij,jk->", taps, normal, taps)) / 2.0
+    if not power > 0.0:
+        return None
+    along_x, along_y = taps.T.reshape(2, side, side)
+    return SlopeFilter(along_x, along_y, gain, gain * noise / power, noise)
+
+
+def _spectra(image: NDArray[Any]) -> tuple[Float | None, Float]:
+    """Periodograms (tiles, side, side // 2 + 1) of tiles that show texture, white noise at its variance; the window."""
+    rows, cols = image.shape
+    side = min(_TILE, rows // 2 * 2, cols // 2 * 2)
+    places = [(y, x) for y in range(0, rows - side + 1, side) for x in range(0, cols - side + 1, side)]
+    places = places[:: -(-len(places) // _MOST_TILES)]
+    tiles = np.stack([image[y : y + side, x : x + side] for y, x in places]).astype(np.float64)
+    hann = np.hanning(side + 2)[1:-1]
+    window = np.outer(hann, hann)
+    tiles = (tiles - np.tensordot(tiles, window / window.sum())[:, None, None]) * window
+    power = (tiles**2).mean(axis=(1, 2))
+    if not power.max() > _BLANK * float(np.abs(image[::8, ::8]).max()) ** 2:
+        return None, window
+    tiles = tiles[power >= _LEAST_POWER * np.quantile(power, 0.9)]
+    return np.abs(fft.rfft2(tiles)) ** 2 / (window**2).sum(), window
+
+
+def _floor(spectra: Float) -> float:
+    """Noise variance from the spectrum where both frequencies are highest, median over the tiles.
+
+    White noise is level there, texture still falls: what falls between two rings is taken for texture and carried on.
+    """
+    side = spectra.shape[1]
+    frequency = np.minimum.outer(np.abs(np.fft.fftfreq(side)), np.fft.rfftfreq(side)) * 2.0
+    inner = np.median(spectra[:, (frequency > _RINGS[0]) & (frequency <= _RINGS[1])].mean(axis=1))
+    outer = np.median(spectra[:, frequency > _RINGS[1]].mean(axis=1))
+    return float(max(outer - max(inner - _LEVEL * outer, 0.0) / (_FALL - 1.0), 0.0))
+
+
+def _lags(spectrum: Float) -> Float:
+    """Autocorrelation (side, side) of a spectrum over lags, cyclic."""
+    side = spectrum.shape[0]
+    return np.asarray(fft.irfft2(spectrum, s=(side, side)))

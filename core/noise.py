@@ -1,0 +1,336 @@
+"""A camera's noise, measured from repeated frames of one scene: variance against grey level.
+
+A sensor's noise is the reading's, the same everywhere, and the light's own, whose variance grows with the light:
+``variance = c0 + c1 g`` in grey levels squared, with a small ``c2 g^2`` where the camera bends its output. The model
+weighs a subset's pixels and says how far a match scatters, without a guess from residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import ImageError, InputError
+
+Float = NDArray[np.float64]
+
+LARGEST_SHIFT_PX = 0.1
+"""Frames that moved further from one to the next are no still scene: the first-order correction would not hold."""
+LARGEST_EXCESS = 0.25
+"""Share by which variance at steep places may exceed that at flat ones of the same grey level."""
+
+_BINS = 48
+_FEWEST_PIXELS = 400  # of a bin
+_MOST_PIXELS = 1_500_000  # looked at in one frame; more tell nothing new
+_OUTLIER = 6.0  # sd of a difference
+_CLIPPED_SD = 3.0  # distance from black and white, in sd, below which a level's noise is cut off
+_CLEAR = 0.25  # of the variance at the lowest level seen
+_SURE = 4.0  # sd of a coefficient that is believed
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseModel:
+    """Variance of a pixel's noise against its grey level.
+
+    Attributes
+    ----------
+    coefficients
+        c0, c1, c2 of ``c0 + c1 g + c2 g^2``: grey levels squared, grey levels, 1.
+    coefficients_sd
+        Their standard deviations; 0 for a coefficient that was left out.
+    range_grey
+        Where the polynomial holds: the levels seen without clipping, and for a line all the converter's. Beyond it the
+        nearest end's variance is taken.
+    frames
+        Number of frames it was measured from.
+    levels, variances, variances_sd
+        (k,) what was measured: mean grey level, variance and its standard deviation, bin by bin.
+    misfit
+        Root mean square of (measured - model) / sd over the bins; 1 is pure chance.
+    drift
+        Largest relative change of brightness between consecutive frames; taken out.
+    shift_px
+        Largest motion of the image between consecutive frames; taken out to first order.
+    excess
+        Share by which steep places vary more than flat ones of the same grey level: 0 in a still scene.
+    """
+
+    coefficients: tuple[float, float, float]
+    coefficients_sd: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    range_grey: tuple[float, float] = (-np.inf, np.inf)
+    frames: int = 0
+    levels: tuple[float, ...] = ()
+    variances: tuple[float, ...] = ()
+    variances_sd: tuple[float, ...] = ()
+    misfit: float = 0.0
+    drift: float = 0.0
+    shift_px: float = 0.0
+    excess: float = 0.0
+
+    def __post_init__(self) -> None:
+        low, high = self.range_grey
+        if not (low < high and np.isfinite(self.coefficients).all()):
+            raise InputError(
+                f"a noise model over grey levels {low:g} to {high:g} with coefficients {self.coefficients} is none.",
+                code="noise_model_invalid",
+            )
+        ends = self.variance([v for v in (low, high) if np.isfinite(v)] or [0.0])
+        if not (ends > 0.0).all():
+            raise InputError(
+                f"the noise model gives a variance of {float(ends.min()):g} inside its range; it must be positive.",
+                code="noise_model_invalid",
+            )
+
+    def variance(self, grey: ArrayLike) -> Float:
+        """Variance (...) in grey levels squared at grey levels (...)."""
+        g = np.clip(np.asarray(grey, dtype=np.float64), *self.range_grey)
+        c0, c1, c2 = self.coefficients
+        return np.asarray(c0 + g * (c1 + g * c2))
+
+    def averaged(self, frames: int, scale: float = 1.0) -> NoiseModel:
+        """Return the model of means over ``frames`` frames whose grey levels were multiplied by ``scale``."""
+        if frames < 1 or not scale > 0.0:
+            raise InputError(f"{frames} frames, scale {scale:g}: no mean.", code="option_out_of_range")
+        factors = tuple(scale**power / frames for power in (2, 1, 0))
+        low, high = self.range_grey
+        c, s = self.coefficients, self.coefficients_sd
+        return NoiseModel(
+            coefficients=(c[0] * factors[0], c[1] * factors[1], c[2] * factors[2]),
+            coefficients_sd=(s[0] * factors[0], s[1] * factors[1], s[2] * factors[2]),
+            range_grey=(low * scale, high * scale), frames=self.frames, levels=tuple(v * scale for v in self.levels),
+            variances=tuple(v * factors[0] for v in self.variances),
+            variances_sd=tuple(v * factors[0] for v in self.variances_sd),
+            misfit=self.misfit, drift=self.drift, shift_px=self.shift_px, excess=self.excess,
+        )  # fmt: skip
+
+
+def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = None) -> NoiseModel:
+    """Measure a camera's noise from frames of a scene that stands still.
+
+    Parameters
+    ----------
+    frames
+        Two or more images (rows, cols) of one camera with one setting, in the order in which they were taken. The more
+        grey levels the scene shows, the better; a speckled specimen will do.
+    full_scale
+        Grey level at which the converter ends; from the type of integer images, or the largest value that more than a
+        thousandth of the pixels share, when left out.
+
+    Returns
+    -------
+    NoiseModel
+        In the frames' grey levels. Rounding to whole grey levels is part of it.
+
+    Raises
+    ------
+    InputError
+        ``too_few_frames``.
+    ImageError
+        ``image_size_mismatch``, ``image_type``; ``frames_identical`` if nothing differs, ``frames_not_static`` if the
+        scene moved or changed, ``image_saturated`` if hardly a pixel is free of clipping.
+
+    Notes
+    -----
+    Consecutive frames are subtracted, so that slow drift cancels. What a change of brightness and a shift of the whole
+    image make of each difference is taken out by least squares. Half the mean square of the rest, in bins of grey
+    level, is the variance; the polynomial is fitted with the bins' own uncertainties.
+    """
+    images = _checked(frames)
+    mean: Float = np.asarray(np.mean(images, axis=0, dtype=np.float64))
+    gy, gx = np.gradient(mean)
+    if full_scale is None:
+        full_scale = _full_scale(frames, images)
+    free = _unclipped(images, full_scale)
+    steep = np.asarray(np.hypot(gx, gy))
+    basis = np.stack([np.ones_like(mean), mean, gx, gy], axis=-1)
+    differences, drift, shift = [], 0.0, 0.0
+    for a, b in pairwise(images):
+        rest, gain, moved = _still(b.astype(np.float64) - a, basis, free)
+        drift, shift = max(drift, gain), max(shift, moved)
+        differences.append(rest)
+    if shift > LARGEST_SHIFT_PX:
+        raise _not_static(f"they move by {shift:.2f} px from one frame to the next")
+    square: Float = 0.5 * np.stack(differences) ** 2
+    levels, variances, sds, excess, excess_sd = _binned(mean, square, free, steep)
+    if excess > LARGEST_EXCESS and excess > _SURE * excess_sd:
+        raise _not_static(f"steep places vary by {100 * excess:.0f} % more than flat ones of the same grey level")
+    c, sd, misfit = _fit(levels, variances, sds)
+    low, high = float(levels[0]), float(levels[-1])
+    if c[2] == 0.0:  # a line holds beyond what was seen, as far as it stays clear of zero
+        low = 0.0 if low > 0.0 and c[0] > _CLEAR * (c[0] + c[1] * low) else low
+        high = full_scale if high < full_scale < np.inf and c[1] >= 0.0 else high
+    return NoiseModel(
+        coefficients=c, coefficients_sd=sd, range_grey=(low, high), frames=len(images),
+        levels=tuple(map(float, levels)), variances=tuple(map(float, variances)), variances_sd=tuple(map(float, sds)),
+        misfit=misfit, drift=drift, shift_px=shift, excess=float(excess),
+    )  # fmt: skip
+
+
+def _not_static(what: str) -> ImageError:
+    return ImageError(
+        f"the frames do not show a still scene: {what}.",
+        code="frames_not_static",
+        remedy="Take the frames in one go, with nothing loaded or touched, and a steady light.",
+    )
+
+
+def _checked(frames: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+    images = [np.asarray(frame) for frame in frames]
+    if len(images) < 2:
+        raise InputError(
+            f"{len(images)} frame given, noise shows in two or more.",
+            code="too_few_frames",
+            remedy="Capture the same scene several times.",
+        )
+    first = images[0].shape
+    for k, image in enumerate(images):
+        if image.ndim != 2 or image.dtype.kind not in "uif" or min(image.shape) < 16:
+            raise ImageError(
+                f"frame {k} has the shape {image.shape} and type {image.dtype}; it must be gray, 16 px or more.",
+                code="image_type",
+            )
+        if image.shape != first:
+            raise ImageError(
+                f"frame {k} is {image.shape[1]} x {image.shape[0]} px, the first {first[1]} x {first[0]} px.",
+                code="image_size_mismatch",
+                remedy="Give frames of one camera.",
+            )
+        if image.dtype.kind == "f" and not np.isfinite(image).all():
+            raise ImageError(f"frame {k} holds NaN or infinite grey levels.", code="image_not_finite")
+    for k in range(1, len(images)):
+        if np.array_equal(images[k - 1], images[k]):
+            raise ImageError(
+                f"frames {k - 1} and {k} are the same, grey level by grey level.",
+                code="frames_identical",
+                remedy="Give different frames, not copies of one; a camera without noise needs no model.",
+            )
+    rows = -(-first[0] * first[1] // _MOST_PIXELS)
+    if rows > 1:  # a band from the middle, whole rows: neighbours are needed for slopes
+        height = first[0] // rows
+        top = (first[0] - height) // 2
+        images = [image[top : top + height] for image in images]
+    return images
+
+
+def _full_scale(frames: Sequence[ArrayLike], images: list[NDArray[Any]]) -> float:
+    top = max(float(image.max()) for image in images)
+    if all(np.asarray(frame).dtype == np.uint8 for frame in frames):
+        return 255.0
+    # 10 and 12 bits come in 16: where many pixels share the largest value, it is the converter's end
+    share = np.mean([np.mean(image == top) for image in images])
+    if share > 1e-3:
+        return top
+    return 65535.0 if images[0].dtype == np.uint16 else np.inf
+
+
+def _unclipped(images: list[NDArray[Any]], full_scale: float) -> NDArray[np.bool_]:
+    low, high = np.minimum.reduce(images), np.maximum.reduce(images)
+    bottom = 0.0 if images[0].dtype.kind == "u" else -np.inf
+    free = (low > bottom) & (high < full_scale)
+    if free.mean() < 0.01:
+        raise ImageError(
+            f"{100 * (1 - free.mean()):.1f} % of the pixels are black or saturated; their noise is cut off.",
+            code="image_saturated",
+            remedy="Change exposure or light.",
+        )
+    return np.asarray(free)
+
+
+def _still(difference: Float, basis: Float, free: NDArray[np.bool_]) -> tuple[Float, float, float]:
+    """A difference of two frames without change of brightness and shift; the relative change, and the shift in px."""
+    A, d = basis[free], difference[free]
+    x = np.zeros(basis.shape[-1])
+    keep = np.ones(len(d), bool)
+    for _ in range(3):
+        a = A[keep]
+        scale = np.sqrt((a * a).mean(axis=0)) + 1e-30
+        a = a / scale
+        x = np.linalg.lstsq(a.T @ a, a.T @ d[keep], rcond=1e-10)[0] / scale
+        rest = d - A @ x
+        keep = np.abs(rest) <= _OUTLIER * max(float(np.sqrt(np.mean(rest[keep] ** 2))), 1e-30)
+    middle = float(A[:, 1].mean())
+    gain = abs(x[0] + x[1] * middle) / max(middle, 1e-30)
+    return difference - basis @ x, float(gain), float(np.hypot(x[2], x[3]))
+
+
+def _binned(
+    mean: Float, square: Float, free: NDArray[np.bool_], steep: Float
+) -> tuple[Float, Float, Float, float, float]:
+    """Mean grey levels, variances and their sd by bins; excess of the steep places and its sd."""
+    g, v, s = mean[free], square[:, free], steep[free]
+    order = np.argsort(g, kind="stable")
+    count = int(np.clip(len(g) // _FEWEST_PIXELS, 1, _BINS))
+    # half the differences share a frame with their neighbour: 1.5 times the variance of independent ones
+    repeat = 1.0 if len(v) == 1 else 1.5
+    levels, variances, sds, ratio, weight = [], [], [], 0.0, 0.0
+    near = np.quantile(g, [0.0, 1.0])
+    for part in np.array_split(order, count):
+        values = v[:, part]
+        limit = _OUTLIER**2 * max(float(values.mean()), 1e-30)
+        while True:  # what sticks out (a fly, a flash) until nothing does
+            kept = values <= limit
+            new = _OUTLIER**2 * max(float(values[kept].mean()), 1e-30)
+            if new >= 0.99 * limit:
+                break
+            limit = new
+        variance, n = float(values[kept].mean()), int(kept.sum())
+        flat = s[part] <= np.median(s[part])
+        a, b = values[:, flat], values[:, ~flat]
+        a, b = a[a <= limit], b[b <= limit]
+        if variance > 0.0 and a.size and b.size and a.mean() > 0.0:
+            ratio += part.size * (b.mean() / a.mean() - 1.0)
+            weight += part.size
+        levels.append(float(g[part].mean()))
+        variances.append(variance)
+        sds.append(max(variance, 1e-12) * np.sqrt(2.0 * repeat / max(n, 1)))
+    g_bin, v_bin, sd_bin = np.array(levels), np.array(variances), np.array(sds)
+    sd = np.sqrt(v_bin)
+    inside = (g_bin > near[0] + _CLIPPED_SD * sd) & (g_bin < near[1] - _CLIPPED_SD * sd)
+    if free.all():
+        inside[:] = True  # nothing was cut off
+    if inside.sum() < 2:
+        inside = v_bin > 0.0
+    excess_sd = np.sqrt(8.0 * repeat / max(v.size, 1))
+    g_bin, v_bin, sd_bin = g_bin[inside], v_bin[inside], sd_bin[inside]
+    return g_bin, v_bin, sd_bin, ratio / max(weight, 1.0), float(excess_sd)
+
+
+def _fit(g: Float, v: Float, sd: Float) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
+    """Polynomial over the bins: of the lowest degree up to 2 whose next coefficient is not sure, positive in range."""
+    middle, half = 0.5 * (g[0] + g[-1]), max(0.5 * (g[-1] - g[0]), 1e-9)
+    u = (g - middle) / half
+    chosen: tuple[Float, Float, float] | None = None
+    for degree in range(min(3, len(g))):
+        A = u[:, None] ** np.arange(degree + 1)
+        weight = 1.0 / sd**2
+        for _ in range(10):
+            C = np.linalg.inv((A * weight[:, None]).T @ A)
+            x = C @ (A * weight[:, None]).T @ v
+            model = np.maximum(A @ x, 1e-3 * v.mean())
+            error = sd / np.maximum(v, 1e-12) * model  # the model's own scatter, so that low bins do not pull
+            t = np.abs(v - model) / error
+            weight = np.where(t < 3.0, 1.0, 3.0 / np.maximum(t, 1e-12)) / error**2
+        misfit = float(np.sqrt(np.mean(np.minimum(t, 1e6) ** 2)))
+        C = C * max(misfit, 1.0) ** 2
+        positive = (np.polynomial.polynomial.polyval(np.linspace(-1, 1, 33), x) > 0.0).all()
+        sure = degree == 0 or abs(x[degree]) > _SURE * np.sqrt(C[degree, degree])
+        if chosen is None or (sure and positive):
+            chosen = x, C, misfit
+    assert chosen is not None
+    x, C, misfit = chosen
+    # from u = (g - middle) / half to g
+    T = np.zeros((3, 3))
+    a, b = 1.0 / half, -middle / half
+    T[0] = [1.0, b, b * b]
+    T[1] = [0.0, a, 2.0 * a * b]
+    T[2] = [0.0, 0.0, a * a]
+    n = len(x)
+    c = T[:, :n] @ x
+    cov = T[:, :n] @ C @ T[:, :n].T
+    s = np.sqrt(np.diag(cov))
+    return (float(c[0]), float(c[1]), float(c[2])), (float(s[0]), float(s[1]), float(s[2])), misfit
