@@ -15,16 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import InputError, SeedError
 from core.field.assemble import assemble
-from core.field.features import LARGE_PIXELS
+from core.field.features import Box
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
 from core.field.grow import fit_in_batches, grow
-from core.field.images import MeasureImage, different, same_size
+from core.field.images import MeasureImage, different, features_of, same_size
 from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting, UsedPatch, asked_for
 from core.field.patch_choice import choose_patch
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
-from core.field.scatter import scattered_motion, scattered_shape
+from core.field.scatter import ScatteredShape, scattered_motion, scattered_shape
 from core.field.seeds import (
     Seed,
     as_seeds,
@@ -38,6 +38,7 @@ from core.field.seeds import (
 )
 from core.field.starts import Starts
 from core.field.unreached import mark_outside
+from core.field.where import box_around, scales, seen_by_camera2
 from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
@@ -297,8 +298,7 @@ class _Run:
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
         self.checked = False  # whether every point that stands went through the gates
-        rows, cols = np.clip(np.rint(self.xy_px[:, ::-1]).astype(int), 0, np.array(self.ref1.shape) - 1).T
-        self.texture = self.ref1.subset_variance(self.options.subset_px)[rows, cols]
+        self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px)
 
     # seeds
 
@@ -365,41 +365,36 @@ class _Run:
         return True
 
     def _match_seeds(self) -> int:
-        """Seeds from feature matches; how many stand. Large images are tried at half their size first."""
-        large = max(self.ref1.pixels.size, self.ref2.pixels.size) > LARGE_PIXELS
-        return (self._match_seeds_at(halve=True) if large else 0) or self._match_seeds_at(halve=False)
+        """Seeds from feature matches; how many stand. Large images are reduced, less and less until seeds are found."""
+        reach = self.options.subset_px + self.grid.step_px
+        box1 = box_around(self.xy_px[self.usable], reach, self.ref1.shape)
+        box2 = seen_by_camera2(self.pair, box1, self.ref2.shape)
+        for scale in scales((box1, box2), (self.ref1.shape, self.ref2.shape)):
+            found = self._match_seeds_at(scale, box1, box2)
+            if found > 0:
+                return found
+        return 0
 
-    def _match_seeds_at(self, *, halve: bool) -> int:
+    def _match_seeds_at(self, scale: int, box1: Box, box2: Box) -> int:
         raise_if_cancelled(self.cancel)
-        mask = self._feature_mask()
-        f1 = self.ref1.features(mask, halve=halve)
-        raise_if_cancelled(self.cancel)
-        f2 = self.ref2.features(halve=halve)
-        raise_if_cancelled(self.cancel)
-        shape = scattered_shape(self.pair, f1, f2)
-        motion = shape_now = None
+        wanted = [(self.ref1, box1)]
+        if self.known_w is None:
+            wanted.append((self.ref2, box2))
         if self.cur1 is not None and self.cur2 is not None:
-            n1 = self.cur1.features(halve=halve)
+            wanted += [(image, (0, 0, *image.shape[::-1])) for image in (self.cur1, self.cur2)]
+        features = features_of(wanted, scale)
+        raise_if_cancelled(self.cancel)
+        shape = ScatteredShape.empty() if self.known_w is not None else scattered_shape(self.pair, *features[:2])
+        motion = shape_now = None
+        if self.cur1 is not None:
+            motion = scattered_motion(features[0], features[-2])
             raise_if_cancelled(self.cancel)
-            n2 = self.cur2.features(halve=halve)
-            raise_if_cancelled(self.cancel)
-            motion = scattered_motion(f1, n1)
-            shape_now = scattered_shape(self.pair, n1, n2)
+            shape_now = scattered_shape(self.pair, *features[-2:])
         elif len(shape.xy_px) < _FEWEST_MATCHES:
             return 0
         return seeds_from_matches(
             self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
         )
-
-    def _feature_mask(self) -> NDArray[np.bool_]:
-        """Where features of camera 1's reference help: within a subset and a step of the points."""
-        reach = self.options.subset_px + self.grid.step_px
-        mask = np.zeros(self.ref1.shape, bool)
-        xy = self.xy_px[self.usable]
-        x0, y0 = np.maximum(np.floor(xy.min(axis=0) - reach).astype(int), 0)
-        x1, y1 = np.ceil(xy.max(axis=0) + reach).astype(int)
-        mask[y0 : y1 + 1, x0 : x1 + 1] = True
-        return mask
 
     def _swept_shape(self) -> None:
         for i in swept_places(self.xy_px, self.usable):

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
+from core.compiling import COMPILING
 from core.errors import Cancelled, MeasurementError
 from server.worker_process import serve
 
@@ -86,6 +87,7 @@ class ComputeWorker(Executor):
         self._restart_at = 0.0
         self.starts = 0
         self.ready = threading.Event()
+        self.compiling = threading.Event()  # since the process began; until it is ready
         self._thread = threading.Thread(target=self._run, name="compute-worker", daemon=True)
         self._thread.start()
 
@@ -154,10 +156,14 @@ class ComputeWorker(Executor):
     def _note(self, message: tuple[Any, ...]) -> None:
         if message[0] == "ready":
             self.ready.set()
+        elif message[0] == "compiling":
+            self.compiling.set()
+            _log.warning("%s", COMPILING)  # a warning reaches the service's terminal
 
     def _start(self) -> None:
         self._end_process()
         self.ready.clear()
+        self.compiling.clear()
         ours, theirs = self._context.Pipe()
         self._cancel = self._context.Event()
         process = self._context.Process(
@@ -232,7 +238,11 @@ class ComputeWorker(Executor):
 
     def _wait_ready(self, task: _Task, connection: Connection, process: multiprocessing.process.BaseProcess) -> bool:
         # a task that is cancelled while the kernels warm up must not cost a restart
+        told = False
         while not self.ready.is_set():
+            if self.compiling.is_set() and not told and task.future.on_progress is not None:
+                told = True
+                task.future.on_progress(COMPILING, 0, 1)
             if task.future.stop_requested.is_set() or self._closing.is_set():
                 raise Cancelled("The computation was cancelled.")
             try:

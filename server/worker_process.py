@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from typing import Any
 
+from core.compiling import COMPILING, told_when_compiling
 from core.errors import Cancelled
 
 _log = logging.getLogger("stereorig.worker")
@@ -75,7 +76,8 @@ def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | No
     if warm_up is not None:
         module, name = warm_up.split(":")
         try:
-            getattr(importlib.import_module(module), name)(threads)
+            with told_when_compiling(lambda: send(("compiling",))):
+                getattr(importlib.import_module(module), name)(threads)
         except Exception:  # noqa: BLE001 - the first task will say what is wrong to somebody who asked
             _log.exception("warming up failed")
     send(("ready",))
@@ -84,9 +86,10 @@ def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | No
             task_id, function, args, kwargs = connection.recv()
         except (EOFError, OSError):
             return  # the service is gone
-        _current = TaskChannel(send, task_id, cancel)
+        _current = channel = TaskChannel(send, task_id, cancel)
         try:
-            result = function(*args, **kwargs)
+            with told_when_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
+                result = function(*args, **kwargs)
         except BaseException as error:  # noqa: BLE001 - carried back to the caller
             _reply_error(send, task_id, error)
         else:

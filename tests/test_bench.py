@@ -8,10 +8,13 @@ import llvmlite.binding as llvm
 import numpy as np
 import pytest
 
-from docs.scripts import bench_worker
-from docs.scripts.bench_ceilings import CompiledLoop, fma_ir, gather_ir, load_ir, rows_ir, vector_width
-from docs.scripts.bench_pairs import BenchScene, Request, judge, make_scene
-from docs.scripts.bench_peer import Run, peer_python, run_peer
+from docs.scripts import bench_page, bench_worker
+from docs.scripts.bench_assembly import HERE, count_loop, innermost_loops
+from docs.scripts.bench_ceilings import Ceilings, CompiledLoop, fma_ir, gather_ir, load_ir, rows_ir, vector_width
+from docs.scripts.bench_kernel import KINDS, Costs, Rate
+from docs.scripts.bench_page import Report
+from docs.scripts.bench_pairs import BenchScene, Errors, Request, judge, make_scene
+from docs.scripts.bench_peer import Outcome, Run, peer_python, run_peer
 
 TINY = Request("tiny", "sim_paper", (150, 140), (46, 46, 106, 96), 10, 1)
 
@@ -81,3 +84,82 @@ def test_ceiling_loops_compute_what_they_say() -> None:
     assert CompiledLoop("rows", rows_ir()).call(n, 1023, *where) == pytest.approx(8 * 4 + 16 * 0.25 * n)
     if llvm.get_host_cpu_features().get("avx2"):
         assert CompiledLoop("gather", gather_ir()).call(n, 1023, *where) == pytest.approx(8 * 8 + 16 * 0.5 * n)
+
+
+ASSEMBLY = """
+before:
+	vmovups	(%rdi), %ymm0
+.outer:
+	xorl	%eax, %eax
+.inner:
+	vmovups	(%rdi,%rax,4), %xmm1
+	vinsertf128	$1, (%rsi,%rax,4), %ymm1, %ymm1
+	vmovups	-32(%rsp), %ymm3
+	vfmadd231ps	16(%rsp), %ymm1, %ymm2   # 32-byte Folded Reload
+	vpermilps	$27, %ymm1, %ymm4
+	vmovups	%xmm4, (%rdx)
+	vgatherdps	%ymm5, (%rdi,%ymm6,4), %ymm7
+	vdivps	%ymm1, %ymm2, %ymm3
+	addq	$8, %rax
+	jne	.inner
+	decq	%rcx
+	jne	.outer
+	vfmadd231ps	%zmm1, %zmm1, %zmm2
+	ret
+"""
+
+
+def test_assembly_is_counted_in_the_innermost_loop() -> None:
+    (body,) = innermost_loops(ASSEMBLY)
+    assert len(body) == 10
+    found = count_loop("here", "loop", ASSEMBLY)
+    assert found.width_bits == 256
+    assert found.instructions == 10
+    assert found.stack == 2
+    assert found.counts == {
+        "gathers": 1, "multiply-adds": 1, "divides": 1, "row loads": 2, "multiplies, adds": 0, "rounds, converts": 0,
+        "shuffles": 1,
+    }  # fmt: skip
+
+
+def test_costs_split_a_point_s_time() -> None:
+    cost = Costs("cubic", 2.0, 1.0, 1.0, 3.0, 0.01, np.array([81.0]), np.array([2.0]), np.array([5.0]))
+    parts = cost.parts_us(33, 2.0)
+    assert parts["pixel loop"] == pytest.approx(3 * 1089 * 3e-3 * 2)
+    assert cost.overhead_us(2.0) == pytest.approx(4.0)
+    assert sum(parts.values()) == pytest.approx(4.0 + 1.089 + 19.602)
+
+
+def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_page, "DOCS", tmp_path)
+    report = Report(quick=False, peer_version="1.2.3")
+    for threads in (1, 2):
+        levels = {"L1": 200.0, "L2": 80.0, "L3": 60.0}
+        report.ceilings.append(Ceilings(threads, 8, 100.0 * threads, levels, 13.0, 18.0, 9.9, 0.97))
+        for fit in ("shape", "motion"):
+            for kind in KINDS:
+                report.rates += [Rate(fit, kind, subset, threads, 65432.1, 2.0) for subset in (21, 33)]
+    for kind in KINDS:
+        for subset in (21, 33):
+            report.iterations[f"motion, {kind}, {subset} px"] = np.array([2, 2, 3], dtype=np.int32)
+        n, spent = np.array([81.0, 81.0, 441.0, 441.0]), np.array([2.0, 3.0, 2.0, 3.0])
+        report.costs.append(Costs(kind, 2.0, 0.5, 1.0, 2.5, 0.03, n, spent, 2.0 + 0.01 * n * spent))
+        report.loops.append(count_loop(HERE, kind, ASSEMBLY))
+    errors = Errors(0, np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.1, 0.1, 0.3, 0.2]))
+    worse = Errors(2, errors.mean_um, 2.0 * errors.sd_um)
+    for scene in ("modern", "paper"):
+        for what in ("single", "sequence"):
+            run, other = Run(f"cubic {what}, 33 px", 33, 5), Run(f"tuned {what}, 33 px", 33, 5)
+            report.ours.setdefault(scene, []).extend(Outcome(run, t, 9900, 2.0 / t, 2.0, errors) for t in (1, 2))
+            report.peer.setdefault(scene, []).extend(Outcome(other, t, 9900, 24.0 / t, 24.0, worse) for t in (1, 2))
+    page = bench_page.write_page(report).read_text()
+    assert "| speed over the peer's: cubic sequence, 33 px, 2 threads | 12 | >= 10 |  | yes |" in page
+    assert (
+        "| random error over the peer's, worst of u, v, w: cubic sequence, 33 px, 2 threads | 0.5 | 1 |  | yes |"
+        in page
+    )
+    assert "| motion, cubic, 33 px, 2 threads | 6.543e+04 | >= 60000 | points/s | yes |" in page
+    assert "| pyvale | tuned sequence, 33 px | 2 | 12.00 | 4,120 | 2 |" in page
+    for name in ("bench_peer_speed", "bench_peer_accuracy", "bench_costs", "bench_iterations"):
+        assert f"figures/{name}.png" in page
+        assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 5000

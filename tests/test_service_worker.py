@@ -5,10 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor
+from pathlib import Path
 
 import pytest
 import worker_functions as work
+from numba import njit
 
+from core.compiling import COMPILING, told_when_compiling
 from core.errors import Cancelled, RegionError
 from server.worker import ComputeWorker, WorkerDiedError
 
@@ -43,6 +46,24 @@ def test_progress_comes_while_it_works(worker: ComputeWorker) -> None:
     assert future.result(timeout=30) == 5
     assert seen[-1] == ("counting", 5, 5)
     assert [done for _, done, _ in seen] == sorted(done for _, done, _ in seen)
+
+
+def test_a_task_that_compiles_kernels_says_so(worker: ComputeWorker) -> None:
+    seen: list[tuple[str, int, int]] = []
+    future = worker.submit(work.compile_something)
+    future.on_progress = lambda *report: seen.append(report)
+    assert future.result(timeout=60) == 42
+    assert seen == [(COMPILING, 0, 1)]
+
+
+def test_a_task_that_waits_for_kernels_to_be_compiled_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # nothing is on disk there
+    seen: list[tuple[str, int, int]] = []
+    with ComputeWorker(threads=1, warm_up="worker_functions:warm_up") as made:
+        future = made.submit(work.add, 1, 2)
+        future.on_progress = lambda *report: seen.append(report)
+        assert future.result(timeout=60) == 3
+    assert seen == [(COMPILING, 0, 1)]
 
 
 @pytest.mark.fault(43)
@@ -92,3 +113,18 @@ def test_after_shutdown_nothing_is_taken() -> None:
     worker.shutdown()
     with pytest.raises(RuntimeError, match="shut down"):
         worker.submit(work.add, 1, 1)
+
+
+def test_compiling_is_told_once_and_loading_never() -> None:
+    @njit
+    def once(x: int) -> int:
+        return x + 1
+
+    told: list[int] = []
+    with told_when_compiling(lambda: told.append(1)):
+        assert once(1) == 2
+        assert once(1.5) == 2.5  # another signature, compiled too
+    assert told == [1]
+    with told_when_compiling(lambda: told.append(2)):
+        assert once(2) == 3
+    assert told == [1]

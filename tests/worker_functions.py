@@ -42,3 +42,19 @@ def deaf(seconds: float) -> None:
 
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def compile_something() -> int:
+    from numba import njit
+
+    @njit
+    def twice(x: int) -> int:
+        return 2 * x
+
+    return int(twice(21))
+
+
+def warm_up(threads: int) -> None:
+    time.sleep(0.5)  # so that a task is waiting
+    compile_something()
+    time.sleep(0.5)

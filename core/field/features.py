@@ -2,91 +2,160 @@
 
 SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012), matched by the ratio test in both
 directions. Nothing here knows the cameras; the geometry filters come after.
+
+Images are reduced to what seeds need, and worked on in tiles: all tiles of all images share the threads, and what is
+in memory at a time does not grow with the images.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from core.lens import Float
+from core.threads import run_ranges
 
-MAX_KEYPOINTS = 8000
-"""Brute-force matching grows with the square; 8,000 find all the seeds that a field needs."""
+MAX_KEYPOINTS = 4000
+"""Matching grows with the square; so many find all the seeds that a field needs."""
 _RATIO = 0.85
-_CHUNK = 1024
-LARGE_PIXELS = 1_000_000
+_CHUNK = 256
 _LEAST_CONTRAST = 0.01
+_TILE_PX = 832
+_RIM_PX = 24
+_SHARE_MORE = 1.5  # a tile may keep so much more than its share of the keypoints: texture is seldom even
+
+Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Keypoints of one image: ``xy_px`` (n, 2), unit ``descriptors`` (n, 128) float32."""
+    """Keypoints of one image: ``xy_px`` (n, 2), unit ``descriptors`` (n, 128) float32.
+
+    ``scale`` says how many times smaller the image was when they were found: they are good to a third of that, in px.
+    """
 
     xy_px: Float
     descriptors: NDArray[np.float32]
+    scale: int = 1
 
 
-def eight_bit(image: NDArray[Any], region: tuple[int, int, int, int] | None = None) -> NDArray[np.uint8]:
-    """Stretch grey levels of any depth between the 0.5 and 99.5 percentile of a region (x0, y0, x1, y1) to 8 bit."""
-    part = image if region is None else image[region[1] : region[3] + 1, region[0] : region[2] + 1]
-    low, high = np.percentile(part[:: max(1, part.shape[0] // 512), :: max(1, part.shape[1] // 512)], (0.5, 99.5))
+class Picture(NamedTuple):
+    """Where to look for features: an image (rows, cols) and a box (x0, y0, x1, y1) of it, half open."""
+
+    image: NDArray[Any]
+    box: Box
+
+
+def stretch_to_eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Stretch grey levels of any depth between their 0.5 and 99.5 percentile to 8 bit."""
+    some = image[:: max(1, image.shape[0] // 512), :: max(1, image.shape[1] // 512)]
+    low, high = np.percentile(some, (0.5, 99.5))
     span = max(float(high - low), 1e-9)
     stretched = (image.astype(np.float32) - np.float32(low)) * np.float32(255.0 / span)
     return np.asarray(np.clip(stretched, 0.0, 255.0).astype(np.uint8))
 
 
+def reduced(image: NDArray[Any], scale: int) -> NDArray[Any]:
+    """Return the means of squares of ``scale`` x ``scale`` pixels, with their fractions; what is left over is cut."""
+    if scale == 1:
+        return image
+    rows, cols = image.shape[0] // scale * scale, image.shape[1] // scale * scale
+    size = (cols // scale, rows // scale)
+    part = image[:rows, :cols]
+    # a few rows at a time: as float32 a large image would take four times its memory
+    out = np.empty((size[1], size[0]), np.float32)
+    step = max(1, 4_000_000 // (cols * scale)) * scale
+    for y in range(0, rows, step):
+        band = part[y : y + step].astype(np.float32)
+        out[y // scale : (y + len(band)) // scale] = cv2.resize(
+            band, (size[0], len(band) // scale), interpolation=cv2.INTER_AREA
+        )
+    return out
+
+
 def detect(
-    image: NDArray[Any],
-    *,
-    mask: NDArray[np.bool_] | None = None,
-    halve: bool = False,
-    max_keypoints: int | None = None,
+    image: NDArray[Any], *, box: Box | None = None, scale: int = 1, max_keypoints: int = MAX_KEYPOINTS
 ) -> Features:
-    """Find keypoints and describe them.
+    """Find keypoints of one image and describe them, see :func:`detect_all`."""
+    whole = (0, 0, image.shape[1], image.shape[0])
+    return detect_all([Picture(image, whole if box is None else box)], scale=scale, max_keypoints=max_keypoints)[0]
+
+
+def detect_all(pictures: Sequence[Picture], *, scale: int = 1, max_keypoints: int = MAX_KEYPOINTS) -> list[Features]:
+    """Find keypoints of several images and describe them.
 
     Parameters
     ----------
-    image
-        (rows, cols) grey levels of any depth.
-    mask
-        Where keypoints may lie; everywhere when left out.
-    halve
-        Work on the image at half its size: a quarter of the time, good to half a pixel.
+    pictures
+        Images (rows, cols), grey levels of any depth, and the box of each in which keypoints may lie.
+    scale
+        Work on the images at a ``scale``-th of their size.
     max_keypoints
-        The strongest ones are kept; :data:`MAX_KEYPOINTS`, or five eighths of it at half size, when left out.
+        The strongest ones of each image are kept.
     """
-    if max_keypoints is None:
-        max_keypoints = MAX_KEYPOINTS * 5 // 8 if halve else MAX_KEYPOINTS
-    if mask is not None and mask.any():
-        # work on the mask's bounding box only, with a rim for the filters
-        rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        y0, y1 = max(int(rows[0]) - 24, 0), min(int(rows[-1]) + 25, image.shape[0])
-        x0, x1 = max(int(cols[0]) - 24, 0), min(int(cols[-1]) + 25, image.shape[1])
-    else:
-        x0, y0, y1, x1 = 0, 0, image.shape[0], image.shape[1]
-    picture = eight_bit(np.ascontiguousarray(image[y0:y1, x0:x1]))
-    allowed = None if mask is None else np.ascontiguousarray(mask[y0:y1, x0:x1]).astype(np.uint8) * np.uint8(255)
-    scale = 1.0
-    if halve and min(picture.shape) >= 64:
-        scale = 2.0
-        picture = np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-        if allowed is not None:
-            size = (picture.shape[1], picture.shape[0])
-            allowed = np.asarray(cv2.resize(allowed, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-    sift = cv2.SIFT_create(nfeatures=max_keypoints, contrastThreshold=_LEAST_CONTRAST)  # type: ignore[attr-defined]
-    keypoints, descriptors = sift.detectAndCompute(picture, allowed)
+    small: list[NDArray[np.uint8]] = [np.zeros((0, 0), np.uint8)] * len(pictures)
+
+    def shrink(first: int, last: int) -> None:
+        for k in range(first, last):
+            x0, y0, x1, y1 = _with_rim(pictures[k], scale)
+            small[k] = stretch_to_eight_bit(reduced(pictures[k].image[y0:y1, x0:x1], scale))
+
+    run_ranges(shrink, len(pictures), 1)
+    tiles = [(k, core) for k, picture in enumerate(small) for core in _tiles((picture.shape[0], picture.shape[1]))]
+    found: list[tuple[Float, NDArray[np.float32], Float]] = [(np.zeros((0, 2)),) * 3] * len(tiles)  # type: ignore[list-item]
+
+    def search(first: int, last: int) -> None:
+        for i in range(first, last):
+            k, core = tiles[i]
+            share = (core[2] - core[0]) * (core[3] - core[1]) / small[k].size
+            found[i] = _search(small[k], core, int(max_keypoints * min(1.0, _SHARE_MORE * share)) + 1)
+
+    run_ranges(search, len(tiles), 1)
+    out = []
+    for k, picture in enumerate(pictures):
+        parts = [found[i] for i, (owner, _) in enumerate(tiles) if owner == k]
+        xy, descriptors, response = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        corner = np.array(_with_rim(picture, scale)[:2])
+        xy = (xy + 0.5) * scale - 0.5 + corner
+        x0, y0, x1, y1 = picture.box
+        inside = (xy[:, 0] >= x0) & (xy[:, 1] >= y0) & (xy[:, 0] <= x1 - 1) & (xy[:, 1] <= y1 - 1)
+        order = np.flatnonzero(inside)[np.argsort(-response[inside], kind="stable")][:max_keypoints]
+        out.append(Features(xy[order], np.ascontiguousarray(descriptors[order]), scale))
+    return out
+
+
+def _with_rim(picture: Picture, scale: int) -> Box:
+    """The box with a rim for the filters."""
+    rows, cols = picture.image.shape[:2]
+    x0, y0, x1, y1 = picture.box
+    rim = _RIM_PX * scale
+    return max(x0 - rim, 0), max(y0 - rim, 0), min(x1 + rim, cols), min(y1 + rim, rows)
+
+
+def _tiles(shape: tuple[int, int]) -> list[Box]:
+    """Cut an image into equal parts of at most 832 px."""
+    ys, xs = (np.linspace(0, n, -(-n // _TILE_PX) + 1).astype(int).tolist() for n in shape)
+    return [(x0, y0, x1, y1) for y0, y1 in pairwise(ys) for x0, x1 in pairwise(xs)]
+
+
+def _search(picture: NDArray[np.uint8], core: Box, most: int) -> tuple[Float, NDArray[np.float32], Float]:
+    """Keypoints (n, 2) inside ``core``, their descriptors and strengths; what is around it helps the filters."""
+    x0, y0, x1, y1 = _with_rim(Picture(picture, core), 1)
+    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=_LEAST_CONTRAST)  # type: ignore[attr-defined]
+    allowed = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    allowed[core[1] - y0 : core[3] - y0, core[0] - x0 : core[2] - x0] = 255
+    keypoints, descriptors = sift.detectAndCompute(np.ascontiguousarray(picture[y0:y1, x0:x1]), allowed)
     if descriptors is None or len(keypoints) == 0:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    xy = np.array([k.pt for k in keypoints], dtype=np.float64)
-    xy = (xy + 0.5) * scale - 0.5 + (x0, y0)
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0)
+    xy = np.array([k.pt for k in keypoints], dtype=np.float64) + np.array([x0, y0])
     d = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)).astype(np.float32)
-    order = np.argsort([-k.response for k in keypoints], kind="stable")[:max_keypoints]
-    return Features(xy[order], np.ascontiguousarray(d[order]))
+    return xy, d, np.array([k.response for k in keypoints])
 
 
 def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int64]:
@@ -95,24 +164,23 @@ def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int6
     if n_a == 0 or n_b < 2:
         return np.zeros((0, 2), np.int64)
     best = np.empty(n_a, np.int64)
-    distinct = np.empty(n_a, bool)
-    column_score = np.full(n_b, -np.inf, np.float32)
-    column_best = np.zeros(n_b, np.int64)
-    for start in range(0, n_a, _CHUNK):
-        rows = slice(start, min(start + _CHUNK, n_a))
-        score = a.descriptors[rows] @ b.descriptors.T
+    top = np.empty(n_a, np.float32)
+    second = np.empty(n_a, np.float32)
+    most = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # of each column over a chunk of rows
+    transposed = np.ascontiguousarray(b.descriptors.T)
+
+    def compare(first: int, last: int) -> None:
+        score = a.descriptors[first:last] @ transposed
         j = np.argmax(score, axis=1)
         index = np.arange(len(j))
-        top = score[index, j]
-        i = np.argmax(score, axis=0)
-        column = score[i, np.arange(n_b)]
-        better = column > column_score
-        column_score[better], column_best[better] = column[better], i[better] + start
+        best[first:last], top[first:last] = j, score[index, j]
+        most[first // _CHUNK] = score.max(axis=0)
         score[index, j] = -np.inf
-        second = score.max(axis=1)
-        best[rows] = j
-        # |d1 - d2|^2 = 2 - 2 d1.d2 for unit vectors
-        distinct[rows] = (1.0 - top) < ratio**2 * (1.0 - second)
-    mutual = column_best[best] == np.arange(n_a)
+        second[first:last] = score.max(axis=1)
+
+    run_ranges(compare, n_a, _CHUNK)
+    mutual = top >= most.max(axis=0)[best]
+    # |d1 - d2|^2 = 2 - 2 d1.d2 for unit vectors
+    distinct = (1.0 - top) < ratio**2 * (1.0 - second)
     keep = np.flatnonzero(distinct & mutual)
     return np.stack([keep, best[keep]], axis=1)

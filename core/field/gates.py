@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from core.field.fitter import PointFits
 from core.field.kernels import N_QUANTITIES, compare_with_neighbours, sorting_network
@@ -197,10 +197,10 @@ def _gate_neighbours(
 
 
 def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions) -> None:
-    labels, n = ndimage.label(points.ok.reshape(shape), structure=np.ones((3, 3)))
-    if n == 0:
+    n, labels, facts, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
+    if n < 2:
         return
-    size = np.bincount(labels.ravel())
+    size = facts[:, cv2.CC_STAT_AREA].copy()
     size[0] = options.least_cluster
     points.refuse((size[labels] < options.least_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
 

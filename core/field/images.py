@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from core.errors import ImageError
-from core.field.features import Features, detect
+from core.field.features import Box, Features, Picture, detect_all
 from core.lens import Float
 from core.matching.image import ImageData, prepare
 from core.matching.options import Interpolation
@@ -20,6 +20,7 @@ _TILE = 48
 _LEAST_STRUCTURE = 0.2
 _BAND_PX = 6.0
 _SMALLEST = 32
+_BAND_PIXELS = 1_000_000
 
 
 class MeasureImage:
@@ -41,8 +42,8 @@ class MeasureImage:
     def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
         self.name = name
         self._prepared: dict[tuple[Interpolation, NoiseModel | None], ImageData] = {}
-        self._features: list[tuple[NDArray[np.bool_] | None, bool, Features]] = []
-        self._variance: dict[int, Float] = {}
+        self._features: dict[tuple[Box, int], Features] = {}
+        self._variance: list[tuple[int, Float, Float]] = []  # of one set of points at most
         if isinstance(image, MeasureImage):
             self.pixels: NDArray[Any] = image.pixels
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
@@ -66,25 +67,33 @@ class MeasureImage:
             self._prepared[key] = prepare(self.pixels, interpolation, noise)
         return self._prepared[key]
 
-    def features(self, mask: NDArray[np.bool_] | None = None, *, halve: bool = False) -> Features:
-        """Return keypoints where ``mask`` allows them, found on the first call for that mask and size."""
-        for known, size, features in self._features:
-            same = known is mask or (known is not None and mask is not None and np.array_equal(known, mask))
-            if same and size == halve:
-                return features
-        features = detect(self.pixels, mask=mask, halve=halve)
-        self._features.append((mask, halve, features))
-        return features
+    def subset_variance(self, xy_px: Float, subset_px: int) -> Float:
+        """Return the grey-level variance (n,) in the square of ``subset_px`` about the pixels nearest to points (n, 2).
 
-    def subset_variance(self, subset_px: int) -> Float:
-        """Return the grey-level variance (rows, cols) in the square of ``subset_px`` about each pixel."""
-        if subset_px not in self._variance:
-            pixels = self.pixels.astype(np.float64)
-            pixels -= pixels.mean()
-            mean = cv2.boxFilter(pixels, -1, (subset_px, subset_px))
-            square = cv2.boxFilter(pixels * pixels, -1, (subset_px, subset_px))
-            self._variance[subset_px] = np.maximum(np.asarray(square) - np.asarray(mean) ** 2, 0.0)
-        return self._variance[subset_px]
+        Kept for the last points that were asked for: those of a sequence are the same in every step.
+        """
+        for known_px, known_xy, known in self._variance:
+            if known_px == subset_px and np.array_equal(known_xy, xy_px):
+                return known
+        rows, cols = self.shape
+        mean = float(self.pixels.mean())
+        at = np.clip(np.rint(xy_px[:, ::-1]).astype(int), 0, np.array(self.shape) - 1)
+        out = np.empty(len(at))
+        half, size = subset_px // 2, (subset_px, subset_px)
+        band = max(_BAND_PIXELS // cols, 1)
+        for first in range(0, rows, band):  # in bands: as float64 a large image would take gigabytes
+            here = np.flatnonzero((at[:, 0] >= first) & (at[:, 0] < first + band))
+            if len(here) == 0:
+                continue
+            top = max(first - half, 0)
+            pixels = self.pixels[top : first + band + half].astype(np.float64)
+            pixels -= mean
+            about = cv2.boxFilter(pixels, -1, size)
+            square = cv2.boxFilter(pixels * pixels, -1, size)
+            r, c = at[here, 0] - top, at[here, 1]
+            out[here] = np.maximum(np.asarray(square)[r, c] - np.asarray(about)[r, c] ** 2, 0.0)
+        self._variance[:] = [(subset_px, np.array(xy_px), out)]
+        return out
 
     def refuse_blank(self, box: tuple[float, float, float, float] | None = None) -> None:
         """Raise ``image_blank`` if nothing but noise is seen in (x0, y0, x1, y1), or anywhere when left out."""
@@ -107,6 +116,16 @@ class MeasureImage:
             )
 
 
+def features_of(wanted: Sequence[tuple[MeasureImage, Box]], scale: int) -> list[Features]:
+    """Return the keypoints of images within boxes (x0, y0, x1, y1), found on the first call for that box and scale."""
+    new = [(image, box) for image, box in wanted if (box, scale) not in image._features]
+    for (image, box), found in zip(
+        new, detect_all([Picture(image.pixels, box) for image, box in new], scale=scale), strict=True
+    ):
+        image._features[box, scale] = found
+    return [image._features[box, scale] for image, box in wanted]
+
+
 def largest_structure(pixels: NDArray[Any]) -> float:
     """Return the largest correlation between neighbouring pixels over tiles of 48 px, slow shading taken out.
 
@@ -122,7 +141,7 @@ def largest_structure(pixels: NDArray[Any]) -> float:
     best = 0.0
     for y, x in places:
         t = pixels[y : y + tile, x : x + tile].astype(np.float32)
-        t = t - ndimage.gaussian_filter(t, _BAND_PX, mode="nearest")
+        t = t - cv2.GaussianBlur(t, (0, 0), _BAND_PX, borderType=cv2.BORDER_REPLICATE)
         variance = float(np.mean(t * t))
         if variance > 1e-4:
             lag = 0.5 * float(np.mean(t[:, 1:] * t[:, :-1]) + np.mean(t[1:] * t[:-1]))

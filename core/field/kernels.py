@@ -144,3 +144,55 @@ def compare_with_neighbours(first, last, network, ok, rays, w, G, motion, differ
                         spread[r, c, q] = deviation[c - start]
             for c in range(start, stop):
                 count[r, c] = n[c - start]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def least_median(first, last, x, v, triplets, flat_below, residual, least):
+    """Find the linear map through three of a place's samples that has the least median residual over all of them.
+
+    Parameters
+    ----------
+    first, last
+        Places to do.
+    x, v
+        (m, k, 2) where the samples lie, and (m, k, d) their values.
+    triplets
+        (s, 3) which three samples to try.
+    flat_below
+        Triplets that span a triangle of less than half this area say nothing about slopes.
+    residual
+        (m, k) out: of the best map; not finite where there is none.
+    least
+        (m,) out: its median, inf where there is none.
+    """
+    samples, dimensions = v.shape[1], v.shape[2]
+    r, ordered = np.empty(samples), np.empty(samples)
+    half = samples // 2
+    for m in range(first, last):
+        least[m] = np.inf
+        residual[m, :] = np.inf
+        for s in range(triplets.shape[0]):
+            i, j, k = triplets[s, 0], triplets[s, 1], triplets[s, 2]
+            xi, yi = x[m, i, 0], x[m, i, 1]
+            xj, yj = x[m, j, 0] - xi, x[m, j, 1] - yi
+            xk, yk = x[m, k, 0] - xi, x[m, k, 1] - yi
+            det = xj * yk - xk * yj
+            if abs(det) < flat_below:
+                continue
+            for n in range(samples):
+                dx, dy = x[m, n, 0] - xi, x[m, n, 1] - yi
+                a, b = (dx * yk - xk * dy) / det, (xj * dy - dx * yj) / det
+                total = 0.0
+                for q in range(dimensions):
+                    there = v[m, i, q] + a * (v[m, j, q] - v[m, i, q]) + b * (v[m, k, q] - v[m, i, q])
+                    total += (there - v[m, n, q]) ** 2
+                r[n] = np.sqrt(total)
+                value, place = r[n], n
+                while place > 0 and ordered[place - 1] > value:
+                    ordered[place] = ordered[place - 1]
+                    place -= 1
+                ordered[place] = value
+            middle = ordered[half] if samples % 2 == 1 else 0.5 * (ordered[half - 1] + ordered[half])
+            if middle < least[m]:
+                least[m] = middle
+                residual[m, :] = r

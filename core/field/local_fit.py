@@ -7,9 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from core.field.kernels import least_median
 from core.lens import Float
+from core.threads import run_ranges
 
 _TRIPLETS = 48
+_FLAT = 1e-2
+_AT_ONCE = 256
 
 
 class LocalFits(NamedTuple):
@@ -68,18 +72,13 @@ def robust_local_fits(
 
     rng = np.random.default_rng(seed)
     triplets = np.argsort(rng.random((_TRIPLETS, k)), axis=1)[:, :3]
-    corner, target = A[:, triplets], v[:, triplets]  # (M, S, 3, 3), (M, S, 3, d)
-    flat = np.abs(np.linalg.det(corner)) < 1e-2  # nearly collinear triplets say nothing about slopes
-    corner = np.where(flat[..., None, None], np.eye(3), corner)
-    candidate = np.linalg.solve(corner, target)  # (M, S, 3, d)
-    residual = np.linalg.norm(np.einsum("mki,msid->mskd", A, candidate) - v[:, None], axis=3)
-    median = np.where(flat, np.inf, np.median(residual, axis=2))
-    best = np.argmin(median, axis=1)
-    r = residual[np.arange(m), best]
+    r, median = np.empty((m, k)), np.empty(m)
+    arrays = (np.ascontiguousarray(A[:, :, 1:]), np.ascontiguousarray(v), triplets, _FLAT, r, median)
+    run_ranges(lambda first, last: least_median(first, last, *arrays), m, _AT_ONCE)
     for _ in range(2):
         weight = (r < tolerance).astype(float)
         normal = np.einsum("mki,mk,mkj->mij", A, weight, A)
-        enough = (weight.sum(axis=1) >= 4) & (np.abs(np.linalg.det(normal)) > 1e-3) & np.isfinite(median.min(axis=1))
+        enough = (weight.sum(axis=1) >= 4) & (np.abs(np.linalg.det(normal)) > 1e-3) & np.isfinite(median)
         normal = np.where(enough[:, None, None], normal, np.eye(3))
         solution = np.linalg.solve(normal, np.einsum("mki,mk,mkd->mid", A, weight, v))
         r = np.linalg.norm(np.einsum("mki,mid->mkd", A, solution) - v, axis=2)

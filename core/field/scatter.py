@@ -14,7 +14,7 @@ from core.lens import Bool, Float
 from core.stereo import StereoPair
 
 EPIPOLAR_PX = 1.5
-"""Distance from the epipolar line up to which a feature match can be right."""
+"""Distance from the epipolar line up to which a feature match can be right, on images of up to half their size."""
 _DEPTH_TOLERANCE_PX = 1.5
 _MOTION_TOLERANCE_PX = 2.0
 _FEWEST = 12
@@ -31,10 +31,18 @@ class ScatteredShape:
         (n, 2) in camera 1.
     w0
         (n,) inverse depth, 1/mm.
+    scale
+        How many times smaller the images were when the features were found.
     """
 
     xy_px: Float
     w0: Float
+    scale: int = 1
+
+    @staticmethod
+    def empty() -> ScatteredShape:
+        """Return no matches."""
+        return ScatteredShape(np.zeros((0, 2)), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +51,7 @@ class ScatteredMotion:
 
     xy_px: Float
     xy_now_px: Float
+    scale: int = 1
 
 
 def scattered_shape(pair: StereoPair, features1: Features, features2: Features) -> ScatteredShape:
@@ -55,11 +64,13 @@ def scattered_shape(pair: StereoPair, features1: Features, features2: Features) 
     """
     pairs = match(features1, features2)
     xy1, xy2 = features1.xy_px[pairs[:, 0]], features2.xy_px[pairs[:, 1]]
-    near = _on_line(pair, xy1, xy2)
-    refuse_swapped(pair, xy1, xy2, near)
+    scale = max(features1.scale, features2.scale)
+    limit = EPIPOLAR_PX * _looser(scale)
+    near = _on_line(pair, xy1, xy2, limit)
+    refuse_swapped(pair, xy1, xy2, near, limit_px=limit)
     xy1, xy2 = xy1[near], xy2[near]
     if len(xy1) == 0:
-        return ScatteredShape(np.zeros((0, 2)), np.zeros(0))
+        return ScatteredShape.empty()
     points = pair.triangulate(xy1, xy2)
     depth = pair.cam1.cam_from_sys.apply(points.xyz_mm)[:, 2]
     depth2 = pair.cam2.cam_from_sys.apply(points.xyz_mm)[:, 2]
@@ -68,9 +79,9 @@ def scattered_shape(pair: StereoPair, features1: Features, features2: Features) 
     xy1, w0 = xy1[front], 1.0 / depth[front]
     if len(xy1) < _FEWEST:
         return ScatteredShape(xy1[:0], w0[:0])
-    tolerance = _DEPTH_TOLERANCE_PX * float(np.median(depth_per_px(pair, pair.cam1.rays_cam(xy1).xyz_mm, w0)))
+    tolerance = _depth_tolerance(pair, xy1, w0, scale)
     right = consistent(xy1, w0[:, None], tolerance=2.0 * tolerance)
-    return ScatteredShape(xy1[right], w0[right])
+    return ScatteredShape(xy1[right], w0[right], scale)
 
 
 def scattered_motion(features_ref: Features, features_now: Features) -> ScatteredMotion:
@@ -79,8 +90,19 @@ def scattered_motion(features_ref: Features, features_now: Features) -> Scattere
     xy, now = features_ref.xy_px[pairs[:, 0]], features_now.xy_px[pairs[:, 1]]
     if len(xy) < _FEWEST:
         return ScatteredMotion(xy[:0], now[:0])
-    right = consistent(xy, now, tolerance=2.0 * _MOTION_TOLERANCE_PX)
-    return ScatteredMotion(xy[right], now[right])
+    scale = max(features_ref.scale, features_now.scale)
+    right = consistent(xy, now, tolerance=2.0 * _MOTION_TOLERANCE_PX * _looser(scale))
+    return ScatteredMotion(xy[right], now[right], scale)
+
+
+def _looser(scale: int) -> float:
+    """By how much more features scatter that were found on a ``scale`` times smaller image."""
+    return max(1.0, scale / 2.0)
+
+
+def _depth_tolerance(pair: StereoPair, xy1: Float, w0: Float, scale: int) -> float:
+    per_px = float(np.median(depth_per_px(pair, pair.cam1.rays_cam(xy1).xyz_mm, w0)))
+    return _DEPTH_TOLERANCE_PX * _looser(scale) * per_px
 
 
 def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float) -> Starts:
@@ -88,8 +110,7 @@ def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float) -> Start
     w = np.full((len(xy_px), 3), np.nan)
     if len(shape.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w)
-    rays = pair.cam1.rays_cam(shape.xy_px).xyz_mm
-    tolerance = _DEPTH_TOLERANCE_PX * float(np.median(depth_per_px(pair, rays, shape.w0)))
+    tolerance = _depth_tolerance(pair, shape.xy_px, shape.w0, shape.scale)
     fits = robust_local_fits(xy_px, shape.xy_px, shape.w0[:, None], tolerance=tolerance)
     centre = pair.cam1.rays_cam(xy_px).xyz_mm
     per_norm = pair.cam1.lens.image_jacobian(centre[:, :2])
@@ -105,7 +126,8 @@ def motion_starts(
     G = np.full((len(xy_px), 3, 3), np.nan)
     if len(motion.xy_px) < 4 or len(shape_now.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w, G)
-    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=_MOTION_TOLERANCE_PX)
+    tolerance = _MOTION_TOLERANCE_PX * _looser(motion.scale)
+    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=tolerance)
     known = np.isfinite(fits.value).all(axis=1)
     if known.any():
         w_now = shape_starts(pair, shape_now, fits.value[known]).w
@@ -146,12 +168,12 @@ def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_p
     return G
 
 
-def refuse_swapped(pair: StereoPair, xy1: Float, xy2: Float, near: Bool) -> None:
+def refuse_swapped(pair: StereoPair, xy1: Float, xy2: Float, near: Bool, *, limit_px: float = EPIPOLAR_PX) -> None:
     """Raise ``cameras_swapped`` if matches (n, 2) fit the cameras clearly better with exchanged roles."""
     n = len(xy1)
     if n < _SWAP_FEWEST or near.mean() > 0.6:
         return
-    swapped = _on_line(pair, xy2, xy1)
+    swapped = _on_line(pair, xy2, xy1, limit_px)
     if swapped.mean() > 0.7 and swapped.sum() > 1.5 * near.sum():
         raise ImageError(
             f"of {n} matches between the two images {near.sum()} fit the calibration as given, "
@@ -164,7 +186,7 @@ def refuse_swapped(pair: StereoPair, xy1: Float, xy2: Float, near: Bool) -> None
         )
 
 
-def _on_line(pair: StereoPair, xy1: Float, xy2: Float) -> Bool:
+def _on_line(pair: StereoPair, xy1: Float, xy2: Float, limit_px: float) -> Bool:
     if len(xy1) == 0:
         return np.zeros(0, bool)
     ray1, ray2 = pair.cam1.rays_cam(xy1), pair.cam2.rays_cam(xy2)
@@ -172,5 +194,5 @@ def _on_line(pair: StereoPair, xy1: Float, xy2: Float) -> Bool:
     near = np.zeros(len(xy1), bool)
     if both.any():
         with np.errstate(invalid="ignore"):
-            near[both] = np.abs(pair.epipolar_residual_px(xy1[both], xy2[both])) < EPIPOLAR_PX
+            near[both] = np.abs(pair.epipolar_residual_px(xy1[both], xy2[both])) < limit_px
     return near

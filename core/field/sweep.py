@@ -11,14 +11,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from core.lens import Float
 from core.stereo import StereoPair
 
 _TILTS_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
 _SAMPLES = 17  # per side: enough to tell matches apart, a quarter of the work of all pixels
-_DEPTH_SPAN = 8.0
+DEPTH_SPAN = 8.0
+"""Depths from an eighth of the nominal one to eight times it are searched."""
 _BLOCK = 512
 
 
@@ -27,8 +27,8 @@ def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int]
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     if not np.isfinite(ray).all():
         return np.zeros(0)
-    nominal = _nominal_depth(pair)
-    w = np.geomspace(1.0 / (nominal * _DEPTH_SPAN), _DEPTH_SPAN / nominal, 4000)
+    nominal = nominal_depth(pair)
+    w = np.geomspace(1.0 / (nominal * DEPTH_SPAN), DEPTH_SPAN / nominal, 4000)
     xy2 = pair.image2_at_depth(np.broadcast_to(xy_px, (len(w), 2)), 1.0 / w)
     rows, cols = image2_shape
     with np.errstate(invalid="ignore"):
@@ -80,7 +80,9 @@ def sweep(
     inside = (pixels.min() >= 0) and pixels[:, 0].max() <= cols - 1 and pixels[:, 1].max() <= rows - 1
     if len(depths) == 0 or not inside:
         return np.zeros((0, 3)), np.zeros(0)
-    smooth1, smooth2 = (ndimage.gaussian_filter(i.astype(np.float32), 1.0) for i in (image1, image2))
+    smooth1, smooth2 = (
+        np.asarray(cv2.GaussianBlur(i.astype(np.float32), (0, 0), 1.0), np.float32) for i in (image1, image2)
+    )
     ref = _normalise(_sample(smooth1, pixels[None]))[0]
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     rays = pair.cam1.rays_cam(pixels).xyz_mm
@@ -151,7 +153,7 @@ def _tilted(pair: StereoPair, ray: Float, depths: Float) -> list[Float]:
     return out
 
 
-def _nominal_depth(pair: StereoPair) -> float:
+def nominal_depth(pair: StereoPair) -> float:
     """Depth in camera 1 where the two optical axes come closest, or ten baselines if they run apart."""
     back = pair.cam2_from_cam1.inverse()
     c, a = back.translation_mm, back.rotation[:, 2]

@@ -91,7 +91,7 @@ class ImageData:
     @cached_property
     def slopes(self) -> SlopeFilter | None:
         """The derivative that is best under this image's noise; None where the image shows nothing."""
-        return slope_filter(self.raw, self.noise_variance)
+        return slope_filter(self.raw, self.order, self.noise_variance)
 
     @property
     def slope_noise(self) -> float:

@@ -16,7 +16,13 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from docs.scripts import accuracy_calibration, accuracy_curved, accuracy_experiments, accuracy_matching
+from docs.scripts import (
+    accuracy_calibration,
+    accuracy_curved,
+    accuracy_experiments,
+    accuracy_matching,
+    accuracy_noise,
+)
 from docs.scripts.table import Row, Section
 
 FIGURES = Path(__file__).resolve().parents[1] / "figures"
@@ -31,6 +37,9 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "rotation": accuracy_matching.rotation,
     "epipolar": accuracy_matching.epipolar,
     **accuracy_curved.SECTIONS,
+    "noise-random": accuracy_noise.random_error,
+    "noise-mean": accuracy_noise.mean_error,
+    "noise-model": accuracy_noise.camera_noise,
     "plate": accuracy_experiments.plate,
     "steel": accuracy_experiments.steel,
     "panel": accuracy_experiments.panel,

@@ -1,98 +1,153 @@
-"""Time the matching on this machine: ``make bench``. Nothing here passes or fails.
+"""Measure speed on this machine, beside a peer and beside the machine's own limits: ``make bench``.
 
-Points per second of the point-level matcher (start values within a tenth of a pixel, images prepared) and of a whole
-field (seeds, growth, checks), at one and at two threads, cubic and quintic, best and median of several runs. Ratios between rows
-of one run are worth more than the figures themselves: machines and their neighbours differ.
+Writes ``docs/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` is the one-minute form:
+the small rig only, no long sequences. ``--only`` runs some parts (ceilings, code, kernel, peer) and prints; the page is then not written.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
+import os
+import tempfile
 import time
-from collections.abc import Callable
-from functools import partial
+from pathlib import Path
 
-import numpy as np
+import matplotlib as mpl
 
-from core.camera import RigidTransform
-from core.field.region import PointGrid
-from core.matching.fit import fit_motion, fit_shape
-from core.matching.image import prepare
-from core.matching.options import Interpolation, MatchOptions
-from core.measure import MeasureOptions, ReferencePair
+mpl.use("Agg")
+
 from core.threads import available_threads, set_threads
-from docs.scripts.paper_rig import load_rig, plane_scene
+from docs.scripts import bench_assembly, bench_kernel
+from docs.scripts.bench_ceilings import measure_ceilings
+from docs.scripts.bench_page import Report, targets, thousands, write_page
+from docs.scripts.bench_pairs import MODERN, PAPER, BenchScene, make_scene
+from docs.scripts.bench_peer import Outcome, Run, peer_python, run_ours, run_peer
+
+PARTS = ("ceilings", "code", "kernel", "peer")
+PEER_SETTINGS: dict[str, dict[str, object]] = {
+    "tuned": {"max_displacement": 16},
+    "default": {},
+    "loose": {"max_displacement": 16, "precision": 0.01},
+    "unfiltered": {"max_displacement": 16, "image_filter_kernel": 1},
+}
+WARM = "warm-up"
 
 
-def _rate(points: int, work: Callable[[], object], runs: int) -> tuple[float, float]:
-    """Best and median points per second."""
-    work()
-    times = []
-    for _ in range(runs):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return points / min(times), points / statistics.median(times)
+def counts() -> list[int]:
+    """Numbers of threads to measure at."""
+    return sorted({1, min(2, available_threads())})
+
+
+def ceilings(report: Report, folder: Path) -> None:
+    """What the machine can do."""
+    del folder
+    for threads in counts():
+        report.ceilings.append(measure_ceilings(threads))
+        print(f"  {report.ceilings[-1]}")
+
+
+def code(report: Report, folder: Path) -> None:
+    """What the compiler makes of the loops."""
+    del folder
+    names = [bench_assembly.HERE] if report.quick else [bench_assembly.HERE, *bench_assembly.TARGETS]
+    for name in names:
+        found = bench_assembly.inspect_target(name)
+        report.loops += found
+        for loop in found:
+            print(f"  {loop.target:16s}{loop.loop:22s}{loop.width_bits:4d} bit  {loop.counts}  stack {loop.stack}")
+
+
+def kernel(report: Report, folder: Path) -> None:
+    """The matcher at a point."""
+    del folder
+    runs = 3 if report.quick else 7
+    scene = bench_kernel.make_kernel_scene(8 if report.quick else 4)
+    for threads in counts():
+        rates, report.iterations = bench_kernel.measure_rates(scene, threads, runs)
+        report.rates += rates
+        for r in rates:
+            print(
+                f"  {r.fit:8s}{r.interpolation:9s}{r.subset_px:3d} px {r.threads:2d} thread(s){thousands(r.per_second):>10s} / s"
+            )
+    for kind in bench_kernel.KINDS:
+        report.costs.append(bench_kernel.measure_costs(scene, kind, runs, 500 if report.quick else 1500))
+        c = report.costs[-1]
+        print(f"  {kind}: {c.loop_ns:.2f} ns a pixel, image and iteration; {c.overhead_us(2.0):.2f} us a point besides")
+    set_threads(available_threads())
+
+
+def peer(report: Report, folder: Path) -> None:
+    """Ours and the peer on the same files."""
+    python = peer_python()
+    if python is None:
+        print("  pyvale is not installed: `make bench` installs it into .venv-bench")
+    for request in (PAPER,) if report.quick else (MODERN, PAPER):
+        scene = make_scene(request, folder / request.name)
+        name = request.name
+        report.ours[name], report.peer[name] = [], []
+        for threads in counts():
+            own, other = _runs(name, threads, report.quick)
+            _, found = run_ours(scene, own, threads, folder)
+            report.ours[name] += _told(scene, found)
+            if python is not None:
+                report.peer_version, found = run_peer(python, scene, other, threads, folder)
+                report.peer[name] += _told(scene, found)
+        if python is None:
+            del report.peer[name]
+
+
+def _runs(scene: str, threads: int, quick: bool) -> tuple[list[Run], list[Run]]:
+    """What both programs measure; the first run of each only warms the process up."""
+    large, most = scene == "modern", threads == counts()[-1]
+    steps = 2 if quick else 3 if large and not most else 6
+    own, other = [], []
+    for subset in (33, 21) if most else (33,):
+        for kind in ("cubic", "quintic"):
+            options = {"interpolation": kind}
+            own.append(Run(f"{kind} single, {subset} px", subset, 1, options, repeats=2))
+            own.append(Run(f"{kind} sequence, {subset} px", subset, steps, options, repeats=2))
+        settings = ["tuned"] if large or not most or subset == 21 or quick else ["tuned", "loose", "unfiltered"]
+        for setting in settings:
+            if setting == "tuned":
+                other.append(Run(f"tuned single, {subset} px", subset, 1, PEER_SETTINGS["tuned"]))
+            other.append(Run(f"{setting} sequence, {subset} px", subset, steps, PEER_SETTINGS[setting]))
+    if large and most:
+        other.append(Run("default single, 33 px", 33, 1, PEER_SETTINGS["default"]))
+    warm = [Run(f"{WARM} {kind}", 33, 1, {"interpolation": kind}) for kind in ("cubic", "quintic")]
+    return [*warm, *own], [Run(WARM, 21, 1, PEER_SETTINGS["tuned"]), *other]
+
+
+def _told(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
+    kept = [o for o in outcomes if not o.run.name.startswith(WARM)]
+    for o in kept:
+        sd = ", ".join(f"{v:.3f}" for v in o.errors.sd_um)
+        print(
+            f"  {scene.request.name:8s}{o.run.name:28s}{o.threads:2d} thread(s){o.wall_s:8.2f} s{thousands(o.rate):>10s} / s"
+            f"   lost {o.errors.lost}   sd of u, v, w, Z {sd} um", flush=True,
+        )  # fmt: skip
+    return kept
 
 
 def main() -> int:
-    """Print the table."""
+    """Run the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="a minute: the small rig only")
+    parser.add_argument("--only", default="", help=f"some of {', '.join(PARTS)}; the page is not written")
     args = parser.parse_args()
-    rig = load_rig()
-    before = plane_scene(rig.texture(1))
-    after = plane_scene(rig.texture(1), motion=RigidTransform(np.eye(3), np.array([0.013, -0.007, 0.021])))
-    ref, cur = rig.shoot(before, seed=1), rig.shoot(after, seed=2)
-    grid = PointGrid.rectangle(60, 60, 450, 420, step_px=4)
-    xy = grid.xy_px.reshape(-1, 2)
-    depth = rig.pair.cam1.cam_from_sys.apply(rig.pair.cam1.back_project_to_plane(xy).xyz_mm)
-    print(f"{len(xy)} points, 512 x 480 px, noise 2 of 255, {available_threads()} thread(s) available")
-    print(f"{'':34s}{'threads':>8s}{'best / s':>12s}{'median / s':>12s}{'us a point':>12s}")
-    for kind in ("cubic", "quintic"):
-        interpolation: Interpolation = kind  # type: ignore[assignment]
-        images = [prepare(image, interpolation) for image in (*ref, *cur)]
-        for subset in (21, 33):
-            options = MatchOptions(subset_px=subset, interpolation=interpolation)
-            # start values: the plane's inverse depth, an eighth of a pixel away
-            w = np.zeros((len(xy), 3))
-            w[:, 0] = 1.0 / depth[:, 2]
-            first = fit_shape(rig.pair, images[0], images[1], xy, w, options)
-            usable = first.status == 0
-            here, w = xy[usable], first.w[usable]
-            moved = fit_motion(rig.pair, *images, here, w, None, options)
-            ok = moved.status == 0
-            here, w, G = here[ok], w[ok], moved.G[ok]
-            w[:, 0] *= 1.0 + 1e-5
-            G = G * (1.0 + 5e-6)
-            for threads in range(1, available_threads() + 1):
-                set_threads(threads)
-                shape = _rate(
-                    len(here), partial(fit_shape, rig.pair, images[0], images[1], here, w, options), args.runs
-                )
-                motion = _rate(len(here), partial(fit_motion, rig.pair, *images, here, w, G, options), args.runs)
-                for name, (best, median) in (("shape", shape), ("motion, 3 comparisons", motion)):
-                    label = f"{name}, {kind}, {subset} px"
-                    print(f"{label:34s}{threads:8d}{best:12.0f}{median:12.0f}{1e6 * threads / best:12.1f}")
-        options33 = MeasureOptions(subset_px=33, interpolation=interpolation)
-        field_grid = PointGrid.rectangle(60, 60, 450, 420, step_px=5)
-        n = field_grid.x_px.size
-        reference = ReferencePair(rig.pair, *ref)
-        shape_field = reference.shape(field_grid, options33)
-        for threads in range(1, available_threads() + 1):
-            set_threads(threads)
-            previous = reference.motion(*cur, field_grid, options33, shape=shape_field)
-            first_step = _rate(n, partial(reference.motion, *cur, field_grid, options33, shape=shape_field), args.runs)
-            later = _rate(
-                n,
-                partial(reference.motion, *cur, field_grid, options33, shape=shape_field, previous=previous),
-                args.runs,
-            )
-            for name, (best, median) in (("field, first step", first_step), ("field, later step", later)):
-                print(
-                    f"{name + ', ' + kind + ', 33 px':34s}{threads:8d}{best:12.0f}{median:12.0f}{1e6 * threads / best:12.1f}"
-                )
+    wanted = [name for name in args.only.split(",") if name] or list(PARTS)
+    report = Report(quick=args.quick)
+    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer}
+    with tempfile.TemporaryDirectory(prefix="stereorig_bench_") as folder:
+        for name in wanted:
+            start = time.perf_counter()
+            print(name, flush=True)
+            jobs[name](report, Path(folder))
+            print(f"  ({time.perf_counter() - start:.0f} s)", flush=True)
+    print("\n" + "\n".join(row.text() for row in targets(report)))
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    print(f"\nload of the machine at the end: {load:.1f}")
+    if not args.only:
+        print(f"wrote {write_page(report)}")
     return 0
 
 

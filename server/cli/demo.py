@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     log = out / "service.log"
     log.unlink(missing_ok=True)
     with _terminated_like_interrupted(), contextlib.closing(progress):
-        say("starting the service (the first start on a machine compiles the kernels, a minute or so) ...")
+        say("starting the service (the first start on a machine compiles kernels, half a minute or so) ...")
         with running_service(config, out / "data", log) as url:
             say(f"service: {url}, log: {log}")
             with ServiceClient(url, on_progress=say.progress) as client:

@@ -6,7 +6,6 @@ While a step is measured, the next pair is read and the last result is written; 
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import time
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from core.compiling import COMPILING, told_when_compiling
 from core.errors import MeasurementError
 from core.field.images import MeasureImage
 from core.field.patch import PatchSetting
@@ -80,7 +80,11 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
         As the measurement raises them. Results of steps that were finished before stay; no summary is written.
     """
     started = time.monotonic()
-    with _output_folder(job.out), WriteBehind[dict[str, Any]]() as written:
+    with (
+        _output_folder(job.out),
+        told_when_compiling(lambda: progress.note(f"{COMPILING} ...")),
+        WriteBehind[dict[str, Any]]() as written,
+    ):
         runner = _Runner(job, progress, written)
         with ReadAhead(runner.read, job.pairs[1:]) as pairs:
             runner.measure(None)
@@ -117,16 +121,6 @@ def _output_folder(out: Path) -> Iterator[None]:
         raise
 
 
-def _kernels_are_compiled() -> bool:
-    """Whether numba finds compiled matching kernels beside the code or in its cache folder."""
-    from core.matching import kernels
-
-    places = [Path(path) for path in kernels.__path__]
-    if "NUMBA_CACHE_DIR" in os.environ:
-        places.append(Path(os.environ["NUMBA_CACHE_DIR"]))
-    return any(next(place.rglob("*.nbi"), None) is not None for place in places)
-
-
 class _Runner:
     """Measures the steps in order; keeps the reference, its shape and the last field, whatever the number of steps."""
 
@@ -137,8 +131,6 @@ class _Runner:
         self._job = job
         self._progress = progress
         self._written = written
-        if not _kernels_are_compiled():
-            progress.note("compiling kernels, once per machine ...")
         self._options = measure.MeasureOptions(
             subset_px=job.subset_px,
             patch=job.patch,

@@ -1,0 +1,446 @@
+"""Writes ``docs/performance.md`` and its plots from what the bench measured."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+import llvmlite.binding as llvm
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from docs.scripts.bench_assembly import HERE, LoopCount
+from docs.scripts.bench_ceilings import Ceilings
+from docs.scripts.bench_kernel import Costs, Rate
+from docs.scripts.bench_peer import Outcome
+from docs.scripts.table import Row
+
+DOCS = Path(__file__).resolve().parents[1]
+
+
+@dataclass
+class Report:
+    """Everything measured; what was left out is empty.
+
+    Attributes
+    ----------
+    quick
+        Whether this is the short form.
+    ceilings, rates, costs, loops
+        See the modules of these names.
+    iterations
+        Iterations of each point by the fit's name.
+    ours, peer
+        Outcomes by scene.
+    peer_version
+        None where the peer is not installed.
+    more
+        Sections that other scripts measured: title, text.
+    rows
+        Targets of those.
+    """
+
+    quick: bool
+    ceilings: list[Ceilings] = field(default_factory=list)
+    rates: list[Rate] = field(default_factory=list)
+    iterations: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    costs: list[Costs] = field(default_factory=list)
+    loops: list[LoopCount] = field(default_factory=list)
+    ours: dict[str, list[Outcome]] = field(default_factory=dict)
+    peer: dict[str, list[Outcome]] = field(default_factory=dict)
+    peer_version: str | None = None
+    more: list[tuple[str, str]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+
+
+def machine() -> list[str]:
+    """What it ran on, one fact an entry."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        named = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = named[0] if named else model
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "llvmlite"))
+    return [
+        f"{model} (LLVM calls it {llvm.get_host_cpu_name()}), {cores} cores for this process",
+        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {packages}, "
+        f"LLVM {'.'.join(map(str, llvm.llvm_version_info))}",
+        datetime.now(UTC).strftime("%Y-%m-%d"),
+    ]  # fmt: skip
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def thousands(value: float) -> str:
+    """Three digits that count, with commas."""
+    if not np.isfinite(value):
+        return "-"
+    digits = max(0, int(np.floor(np.log10(abs(value)))) - 2) if value else 0
+    return f"{round(value / 10**digits) * 10**digits:,.0f}"
+
+
+def save(figure: plt.Figure, name: str, caption: str) -> str:
+    """Write a plot and return its line in the page."""
+    (DOCS / "figures").mkdir(exist_ok=True)
+    figure.savefig(DOCS / "figures" / name, dpi=110)
+    plt.close(figure)
+    return f"![{caption}](figures/{name})"
+
+
+# targets
+
+
+def pick_rate(report: Report, fit: str, interpolation: str, subset: int, threads: int) -> float:
+    """Points a second of one kind of fit, NaN if it was not measured."""
+    found = [
+        r.per_second
+        for r in report.rates
+        if (r.fit, r.interpolation, r.subset_px, r.threads) == (fit, interpolation, subset, threads)
+    ]
+    return found[0] if found else float("nan")
+
+
+def targets(report: Report) -> list[Row]:
+    """What the project asks of itself."""
+    rows: list[Row] = []
+    if report.rates:
+        most = max(r.threads for r in report.rates)
+        for fit, subset, least in (("motion", 33, 6e4), ("motion", 21, 1.2e5), ("shape", 33, 2e5)):
+            rate = pick_rate(report, fit, "cubic", subset, most)
+            rows.append(Row(f"{fit}, cubic, {subset} px, {most} threads", rate, "points/s", least, at_least=True))
+        slower = pick_rate(report, "motion", "cubic", 33, 1) / pick_rate(report, "motion", "quintic", 33, 1)
+        rows.append(Row("quintic over cubic, motion, 33 px, time", slower, "", 1.8))
+    for cost in report.costs:
+        limit = cost.interpolation == "cubic"
+        spent = float(np.mean(report.iterations.get(f"motion, {cost.interpolation}, 33 px", np.array([2.0]))))
+        rows.append(
+            Row(
+                f"pixel loop, {cost.interpolation}",
+                cost.loop_ns,
+                "ns a pixel, image, iteration",
+                3.0 if limit else None,
+            )
+        )
+        rows.append(
+            Row(f"time of a motion without pixels, {cost.interpolation}", cost.overhead_us(spent), "us a point", 3.0 if limit else None)
+        )  # fmt: skip
+    return [*rows, *peer_rows(report), *report.rows]
+
+
+# the peer
+
+
+def find(outcomes: list[Outcome], name: str, threads: int) -> Outcome | None:
+    """The outcome of a run by its name."""
+    return next((o for o in outcomes if o.run.name == name and o.threads == threads), None)
+
+
+def peer_rows(report: Report) -> list[Row]:
+    """Ratios to the peer and errors beside its."""
+    rows = []
+    for scene, outcomes in report.ours.items():
+        for ours in outcomes:
+            if ours.run.subset_px != 33 or "tuned" not in [o.run.name.split()[0] for o in report.peer.get(scene, [])]:
+                continue
+            what = ours.run.name.split(" ", 1)[1]
+            peer = find(report.peer[scene], f"tuned {what}", ours.threads)
+            if peer is None or scene != "modern":
+                continue
+            least = 10.0 if "sequence" in what else 3.0
+            label = f"{ours.run.name}, {ours.threads} thread{'s' if ours.threads > 1 else ''}"
+            rows.append(Row(f"speed over the peer's: {label}", ours.rate / peer.rate, "", least, at_least=True))
+            if "sequence" in what and ours.threads == max(o.threads for o in outcomes):
+                worst = float(np.max(ours.errors.sd_um[:3] / peer.errors.sd_um[:3]))
+                rows.append(Row(f"random error over the peer's, worst of u, v, w: {label}", worst, "", 1.0))
+                rows.append(Row(f"points lost: {label}", ours.errors.lost, "", 0))
+    return rows
+
+
+def _outcome_row(program: str, o: Outcome) -> list[str]:
+    e = o.errors
+    sd, mean = [f"{v:.3f}" for v in e.sd_um], [f"{v:+.3f}" for v in e.mean_um]
+    return [
+        program, o.run.name, str(o.threads), f"{o.wall_s:.2f}", thousands(o.rate), str(e.lost), " / ".join(sd), " / ".join(mean)
+    ]  # fmt: skip
+
+
+def peer_text(report: Report) -> list[str]:
+    """The section about the peer."""
+    head = [
+        "program",
+        "run",
+        "threads",
+        "s",
+        "points/s",
+        "lost",
+        "sd of u / v / w / Z, um",
+        "mean of u / v / w / Z, um",
+    ]
+    text = [PEER_HOW.format(version=report.peer_version or "not installed here")]
+    for scene, ours in report.ours.items():
+        rows = [_outcome_row("stereorig", o) for o in ours]
+        rows += [_outcome_row("pyvale", o) for o in report.peer.get(scene, [])]
+        text += [f"### {SCENES[scene]}", table(head, rows)]
+    if report.peer:
+        text += [_speed_plot(report), _accuracy_plot(report)]
+    return text
+
+
+def _speed_plot(report: Report) -> str:
+    scene = "modern" if "modern" in report.peer else next(iter(report.peer))
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained", sharey=True)
+    for ax, threads in zip(axes, sorted({o.threads for o in report.ours[scene]}), strict=False):
+        bars = [("stereorig", o) for o in report.ours[scene]] + [("pyvale", o) for o in report.peer[scene]]
+        bars = [(program, o) for program, o in bars if o.threads == threads and o.run.subset_px == 33]
+        names = [o.run.name.removesuffix(", 33 px") for _, o in bars]
+        drawn = ax.barh(names, [o.rate for _, o in bars], color=["C0" if p == "stereorig" else "C1" for p, _ in bars])
+        ax.bar_label(drawn, [thousands(o.rate) for _, o in bars], padding=3, fontsize=8)
+        ax.set(xscale="log", xlabel="points / s", title=f"{threads} thread{'s' if threads > 1 else ''}")
+        ax.margins(x=0.25)
+    axes[0].invert_yaxis()
+    figure.suptitle("Disk to disk, 33 px: stereorig (blue), pyvale (orange)")
+    return save(figure, "bench_peer_speed.png", "Points a second, ours and the peer's")
+
+
+def _accuracy_plot(report: Report) -> str:
+    scenes = list(report.peer)
+    figure, axes = plt.subplots(1, len(scenes), figsize=(4.6 * len(scenes), 3.6), layout="constrained", squeeze=False)
+    for ax, scene in zip(axes[0], scenes, strict=True):
+        most = max(o.threads for o in report.ours[scene])
+        for colour, outcomes in (("C0", report.ours[scene]), ("C1", report.peer[scene])):
+            for o in outcomes:
+                if o.threads != most or "single" in o.run.name:
+                    continue
+                ax.plot(o.rate, o.errors.sd3_um, "o" if o.run.subset_px == 33 else "s", color=colour)
+                ax.annotate(o.run.name.replace(" sequence", ""), (o.rate, o.errors.sd3_um), fontsize=7,
+                            xytext=(4, 4), textcoords="offset points")  # fmt: skip
+        ax.set(xscale="log", xlabel="points / s", ylabel="random error of the displacement / um", title=SCENES[scene])
+        ax.title.set_fontsize(9)
+        ax.margins(x=0.25, y=0.15)
+        ax.set_ylim(bottom=0.0)
+    return save(figure, "bench_peer_accuracy.png", "Random error against speed")
+
+
+SCENES = {
+    "modern": "25 degrees, 1200 x 1100 px, 39 um a pixel, 9,900 points",
+    "paper": "60 degrees, 512 x 480 px, 33 um a pixel, 1,330 points",
+}
+PEER_HOW = """pyvale {version} (`dic.calculate_3d`) and `stereorig measure`, each called in one warm process of its own, on as many cores as
+threads: image files on disk to result files on disk, the same TIFF files (8 bit, noise 2 of 255), the same points (step 10
+px), the same cameras to the last digit (OpenCV's lens with distortion, in both). "single" is the reference and one step, "sequence" the
+reference and several; points a second count the points of the displacement fields, and the time is the whole call's, the reference's own
+work and, for us, the search for seeds included. pyvale is given its seed. Its subsets move by an affine function, ours as planes in space;
+both weigh all pixels alike. Its settings:
+
+- `tuned`: 16 px as the largest displacement to look for, which makes its first search fast; everything else its default (cubic B-spline,
+  Gaussian filter of 5 px with sd 1, precision 0.001). This is what the ratios compare with.
+- `default`: all its defaults (128 px to look for).
+- `loose`: precision 0.01. `unfiltered`: without its Gaussian filter.
+
+Means and scatters are over points against the simulation's truth, in the system of the specimen (w and Z across its plane); the scatter is pooled over
+steps, the mean is the worst step's."""
+
+
+# the kernel
+
+
+def kernel_text(report: Report) -> list[str]:
+    """The section about the point-level matcher."""
+    rows = [
+        [r.fit, r.interpolation, str(r.subset_px), str(r.threads), thousands(r.per_second),
+         f"{1e6 * r.threads / r.per_second:.1f}", f"{r.iterations:.2f}"]
+        for r in report.rates
+    ]  # fmt: skip
+    text = [
+        KERNEL_HOW,
+        table(["fit", "spline", "subset, px", "threads", "points/s", "us a point and thread", "iterations"], rows),
+    ]
+    if report.iterations:
+        text.append(_iterations_plot(report))
+    if report.costs:
+        text += _costs_text(report)
+    return text
+
+
+def _iterations_plot(report: Report) -> str:
+    figure, ax = plt.subplots(figsize=(6, 2.8), layout="constrained")
+    names = [name for name in report.iterations if "33" in name]
+    top = max(int(report.iterations[name].max()) for name in names)
+    for k, name in enumerate(names):
+        share = np.bincount(report.iterations[name], minlength=top + 1)[1:] / report.iterations[name].size
+        ax.bar(np.arange(1, top + 1) + 0.2 * (k - (len(names) - 1) / 2), 100 * share, 0.2, label=name)
+    ax.set(xlabel="iterations", ylabel="points / %", xticks=range(1, top + 1), title="Starts within a tenth of a pixel")
+    ax.legend(fontsize=8)
+    return save(figure, "bench_iterations.png", "Iterations spent")
+
+
+def _costs_text(report: Report) -> list[str]:
+    head = [
+        "spline",
+        "once a point, us",
+        "an iteration, us",
+        "once a pixel, ns",
+        "pixel loop, ns a pixel, image and iteration",
+        "misfit",
+    ]
+    rows = [
+        [c.interpolation, f"{c.point_us:.2f}", f"{c.iteration_us:.2f}", f"{c.reference_ns:.2f}", f"{c.loop_ns:.2f}",
+         f"{100 * c.misfit:.0f} %"]
+        for c in report.costs
+    ]  # fmt: skip
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6), layout="constrained")
+    for k, c in enumerate(report.costs):
+        far = c.iterations > np.median(c.iterations)
+        for subset, filled, label in ((~far, True, "near"), (far, False, "far")):
+            left.plot(c.pixels[subset], c.measured_us[subset], "o", color=f"C{k}", fillstyle="full" if filled else "none",
+                      label=f"{c.interpolation}, {label} start")  # fmt: skip
+            fit = [
+                sum(c.parts_us(round(n**0.5), i).values())
+                for n, i in zip(c.pixels[subset], c.iterations[subset], strict=True)
+            ]
+            left.plot(c.pixels[subset], fit, color=f"C{k}", lw=0.8)
+    left.set(
+        xlabel="pixels in the subset", ylabel="us a point", title="Motion, one thread; lines: the model", xlim=0, ylim=0
+    )
+    left.legend(fontsize=8)
+    names = []
+    bottoms: dict[str, float] = {}
+    for c in report.costs:
+        for subset in (21, 33):
+            name = f"{c.interpolation}\n{subset} px"
+            names.append(name)
+            spent = float(report.iterations[f"motion, {c.interpolation}, {subset} px"].mean())
+            for k, (part, us) in enumerate(c.parts_us(subset, spent).items()):
+                right.bar(
+                    name, us, bottom=bottoms.get(name, 0.0), color=f"C{k + 2}", label=part if len(names) == 1 else None
+                )
+                bottoms[name] = bottoms.get(name, 0.0) + us
+    right.set(ylabel="us a point", title="Where a motion's time goes")
+    right.legend(fontsize=8)
+    plot = save(figure, "bench_costs.png", "Time against pixels, and its parts")
+    return [COSTS_HOW, table(head, rows), plot]
+
+
+KERNEL_HOW = """`fit_shape` and `fit_motion` alone (stretch patch, three comparisons), 512 x 480 px, 60 degrees, noise 2 of 255, images prepared, starts within
+a tenth of a pixel, as in a sequence. Best of several runs."""
+COSTS_HOW = """Nine subset sizes from 9 to 41 px and two distances of the start values, one thread, fitted by
+`time = a + b iterations + pixels (c + 3 d iterations)`: once a point (places, factors, covariance), each iteration (warps, sums' algebra, solve), once a
+pixel (the reference's rows and the sums of its normal equations), and the pixel loop."""
+
+
+# the machine
+
+
+def machine_text(report: Report) -> list[str]:
+    """The section about the machine's limits and how near the loop comes to them."""
+    head = [
+        "threads",
+        "multiply-adds, GFlop/s",
+        "L1 / L2 / L3 loads, GB/s",
+        "copy / triad, GB/s",
+        "16 taps by gathers, ns",
+        "16 taps by rows of four, ns",
+    ]
+    rows = [
+        [str(c.threads), f"{c.fma_gflops:.0f}", " / ".join(f"{v:.0f}" for v in c.load_gb_s.values()),
+         f"{c.copy_gb_s:.1f} / {c.triad_gb_s:.1f}", f"{c.gather_ns:.2f}", f"{c.rows_ns:.2f}"]
+        for c in report.ceilings
+    ]  # fmt: skip
+    text = [CEILINGS_HOW, table(head, rows)]
+    here = {loop.loop: loop for loop in report.loops if loop.target == HERE}
+    one = next((c for c in report.ceilings if c.threads == 1), None)
+    if one and here and report.costs:
+        lines = []
+        for c in report.costs:
+            loop = here[c.interpolation]
+            arithmetic, loads = loop_limits_ns(loop, one)
+            lines.append(
+                [c.interpolation, f"{c.loop_ns:.2f}", f"{arithmetic:.2f} ({100 * arithmetic / c.loop_ns:.0f} %)",
+                 f"{loads:.2f} ({100 * loads / c.loop_ns:.0f} %)"]
+            )  # fmt: skip
+        text += [
+            SHARE_HOW,
+            table(
+                ["spline", "measured, ns a pixel, image and iteration", "its arithmetic alone", "its row loads alone"],
+                lines,
+            ),
+        ]
+    return text
+
+
+def loop_limits_ns(loop: LoopCount, one: Ceilings) -> tuple[float, float]:
+    """ns a pixel that the loop's vector arithmetic and its row loads would take alone, one thread at its measured best."""
+    instructions = sum(loop.counts[name] for name in ("multiply-adds", "multiplies, adds", "rounds, converts"))
+    lanes = min(loop.width_bits // 32, one.vector)
+    a_second = one.fma_gflops * 1e9 / (2 * one.vector)  # vector instructions
+    arithmetic = 1e9 * instructions * (8 / lanes) / (8 * a_second)
+    # the ceiling's pixel is four row loads; the loop's turn is eight pixels
+    return arithmetic, one.rows_ns * loop.counts["row loads"] / 32
+
+
+CEILINGS_HOW = """Small loops in LLVM IR, compiled by the LLVM behind numba for this processor, all threads at once; taps come from a picture that fits the first
+cache. A gather is one instruction a tap for eight pixels; rows are four loads of four values a pixel, each with a multiply-add."""
+SHARE_HOW = """The pixel loop beside these limits, one thread. "Arithmetic": its vector multiplies, adds and conversions at the rate of multiply-adds. "Row loads": as many as
+it has, at the measured rate. What is left is shuffles between the two, stack accesses and latency."""
+
+
+# generated code
+
+
+def assembly_text(report: Report) -> list[str]:
+    """The section about the generated code."""
+    if not report.loops:
+        return []
+    classes = list(report.loops[0].counts)
+    head = ["processor", "loop", "vector, bit", "instructions", *classes, "touch the stack"]
+    rows = [
+        [x.target, x.loop, str(x.width_bits), str(x.instructions), *(str(x.counts[c]) for c in classes), str(x.stack)]
+        for x in report.loops
+    ]  # fmt: skip
+    return [ASSEMBLY_HOW, table(head, rows)]
+
+
+ASSEMBLY_HOW = """Instructions of one turn of the innermost loop (eight pixels of one image), compiled for four processors and for this one, counted in the assembly; nothing of
+it was run elsewhere. `haswell` and `znver3` have AVX2, the other two AVX-512. No gathers are left: taps come as rows of four (`vmovups` and `vinsertf128`; a quintic's
+fifth and sixth taps as pairs). An instruction counts in one class; those with a place on the stack are counted besides."""
+
+HEAD = """# Performance, measured
+
+Everything on this page was measured by `make bench{quick}` in one run, which writes the page anew; nothing is typed in. Timings are those of this machine at that hour;
+ratios within the page travel better than figures.
+"""
+
+
+def write_page(report: Report) -> Path:
+    """Write the page and its plots; returns its path."""
+    rows = targets(report)
+    header = Row.header().replace("at most", "limit")
+    sections: list[tuple[str, list[str]]] = [
+        ("Machine", [*(f"- {fact}" for fact in machine())]),
+        ("What was asked, and what it is", ["\n".join([header, *(row.markdown() for row in rows)])]),
+        ("Beside pyvale", peer_text(report) if report.ours else []),
+        ("One point", kernel_text(report) if report.rates else []),
+        ("The machine's limits", machine_text(report) if report.ceilings else []),
+        ("Generated code", assembly_text(report)),
+        *((title, [text]) for title, text in report.more),
+    ]
+    page = [HEAD.format(quick=" ARGS=--quick" if report.quick else "")]
+    for title, parts in sections:
+        if parts:
+            glue = "\n" if title == "Machine" else "\n\n"
+            page += [f"## {title}\n", glue.join(parts) + "\n"]
+    path = DOCS / "performance.md"
+    path.write_text("\n".join(page).rstrip() + "\n")
+    return path
