@@ -21,7 +21,8 @@ from core.field.gates import GateOptions, apply_gates
 from core.field.grow import fit_in_batches, grow
 from core.field.images import MeasureImage, different, features_of, same_size
 from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting, UsedPatch, asked_for
-from core.field.patch_choice import choose_patch
+from core.field.patch_choice import advise, choose_patch
+from core.field.plane_error import plane_error
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
 from core.field.scatter import ScatteredShape, scattered_motion, scattered_shape
@@ -459,8 +460,21 @@ class _Run:
         if self.patch.patch == "curved" and self.fitter.terms == 3:
             self._refit_curved()
         self._fill()
-        if self.options.patch == "auto" and not self.patch.kept:
-            self.patch = choose_patch(self.fitter, self.points, self.xy_px)
+        told = (
+            None
+            if self.fitter.terms == 6
+            else plane_error(
+                self.points,
+                shape=self.grid.shape,
+                rays=self.rays,
+                step_px=self.grid.step_px,
+                subset_px=self.options.subset_px,
+            )
+        )
+        if self.options.patch != "auto":
+            self.patch = advise(self.patch, told)
+        elif not self.patch.kept:
+            self.patch = choose_patch(self.fitter, self.points, self.xy_px, told)
             if self.patch.patch == "curved":
                 self._refit_curved()
                 self._fill()

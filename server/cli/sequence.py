@@ -141,7 +141,7 @@ class _Runner:
         self._n = 0
         self._shape: Field | None = None
         self._last: Field | None = None
-        self._chosen: str | None = None
+        self._chosen: tuple[str, bool] | None = None
         self._done = 0.0
 
     def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
@@ -196,13 +196,15 @@ class _Runner:
         return summary
 
     def _say_choice(self, n: int, result: Field) -> None:
-        """Say what the patch was chosen for, of the shape, of the first step, and where it changes."""
+        """Say what the patch was chosen for: of the shape, of the first step, and where it changes."""
         choice = result.patch
-        if choice is None or self._job.patch != "auto":
+        if choice is None:
             return
-        if n <= 1 or choice.patch != self._chosen:
+        new = (choice.patch, choice.curved_advised)
+        if (choice.asked == "auto" and n <= 1) or (new != self._chosen and (choice.asked == "auto" or new[1])):
             self._progress.note(f"{'shape' if n == 0 else f'step {n}'}: {choice.reason}")
-        self._chosen = choice.patch
+        if n > 0:
+            self._chosen = new
 
     def _shower(self, n: int) -> Any:
         count = len(self._job.pairs)
