@@ -460,24 +460,7 @@ class _Run:
         if self.patch.patch == "curved" and self.fitter.terms == 3:
             self._refit_curved()
         self._fill()
-        told = (
-            None
-            if self.fitter.terms == 6
-            else plane_error(
-                self.points,
-                shape=self.grid.shape,
-                rays=self.rays,
-                step_px=self.grid.step_px,
-                subset_px=self.options.subset_px,
-            )
-        )
-        if self.options.patch != "auto":
-            self.patch = advise(self.patch, told)
-        elif not self.patch.kept:
-            self.patch = choose_patch(self.fitter, self.points, self.xy_px, told)
-            if self.patch.patch == "curved":
-                self._refit_curved()
-                self._fill()
+        self._settle_patch()
         mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
             self._grow()
@@ -487,6 +470,22 @@ class _Run:
         return assemble(
             self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape, patch=self.patch
         )
+
+    def _settle_patch(self) -> None:
+        """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
+        told = None
+        if self.fitter.terms == 3:
+            told = plane_error(
+                self.points, shape=self.grid.shape, rays=self.rays, step_px=self.grid.step_px,
+                subset_px=self.options.subset_px,
+            )  # fmt: skip
+        if self.options.patch != "auto":
+            self.patch = advise(self.patch, told)
+        elif not self.patch.kept:
+            self.patch = choose_patch(self.fitter, self.points, self.xy_px, told)
+            if self.patch.patch == "curved":
+                self._refit_curved()
+                self._fill()
 
     def _fill(self) -> None:
         """Grow, check, and grow into what the checks emptied."""
