@@ -18,7 +18,7 @@ from core.field.assemble import assemble
 from core.field.features import Box
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
-from core.field.grow import fit_in_batches, grow
+from core.field.grow import Attempts, fit_in_batches, grow
 from core.field.images import MeasureImage, different, features_of, same_size
 from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting, UsedPatch, asked_for
 from core.field.patch_choice import advise, choose_patch
@@ -299,6 +299,7 @@ class _Run:
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
         self.checked = False  # whether every point that stands went through the gates
+        self.attempts = Attempts.on(grid.shape)
         self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px)
 
     # seeds
@@ -327,6 +328,7 @@ class _Run:
             self.hoped_for = self.usable & previous.valid.ravel()
         else:
             self.hoped_for = self.usable
+        self._forget_attempts()
         if previous is not None and previous.starts is not None and previous.starts.G is not None:
             n = len(self.xy_px)
             w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
@@ -463,6 +465,7 @@ class _Run:
         self._settle_patch()
         mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
+            self._forget_attempts()
             self._grow()
             self._gate()
         mark_outside(self.fitter, self.points, self.xy_px, self.usable)
@@ -507,6 +510,7 @@ class _Run:
         self.fitter = self.fitter.curved()
         self.points = self.fitter.empty(len(flat.status))
         self.points.status[:] = flat.status
+        self._forget_attempts()
         G = None if self.fitter.comparisons == 1 else flat.G[index]
         fit_in_batches(
             self.fitter, self.points, index, self.xy_px, flat.w[index], G, far_px=_SAMPLE_FAR_PX, cancel=self.cancel
@@ -518,9 +522,14 @@ class _Run:
         untouched = self.hoped_for & (self.points.status == PointStatus.NOT_SEEDED)
         return float(untouched.sum()) / max(int(self.usable.sum()), 1)
 
+    def _forget_attempts(self) -> None:
+        """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
+        self.attempts = Attempts.on(self.grid.shape)
+        self.attempts.left[self.usable & ~self.hoped_for] = 1
+
     def _grow(self) -> int:
         added = grow(
-            self.fitter, self.points, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
+            self.fitter, self.points, attempts=self.attempts, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
             progress=self.progress, cancel=self.cancel,
         )  # fmt: skip
         self.checked = self.checked and added == 0

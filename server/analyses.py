@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
@@ -98,7 +99,7 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
 
         started = time.monotonic()
         try:
-            task = _task(service, document, n, previous)
+            task = _task(service, document, n, previous, steps[index + 1] if index + 1 < len(steps) else None)
             summary = run_task(service.worker, job, measure_step, task, progress=progress)
         except (Cancelled, StorageError, WorkerDiedError):
             raise  # not the step's own doing
@@ -123,7 +124,7 @@ def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> 
     return job.result
 
 
-def _task(service: Service, document: dict[str, Any], n: int, previous: int | None) -> StepTask:
+def _task(service: Service, document: dict[str, Any], n: int, previous: int | None, following: int | None) -> StepTask:
     test_id, displacement = document["test_id"], document["kind"] == "displacement"
     reference = document["steps"][0] if displacement else n
     ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
@@ -132,6 +133,10 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
         **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
     }
+    after = None
+    if following is not None and displacement:
+        with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
+            after = service.tests.step(test_id, following)
     return StepTask(
         folder=str(service.tests.analysis_path(test_id, document["id"])),
         calibration=str(service.tests.calibration_file(test_id)),
@@ -144,6 +149,7 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         inputs=checksums,
         label=now.document["label"],
         load_n=now.document["load_n"],
+        following=None if after is None else (str(after.cam1), str(after.cam2)),
     )
 
 

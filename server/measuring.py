@@ -1,8 +1,8 @@
 """One step of an analysis, in the worker: images by path, the result as a file in the analysis' folder.
 
 What the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of points, the
-last two fields) is kept between tasks; a fresh worker makes it again from the files, so a step measured anywhere
-gives the same result.
+last two fields) is kept between tasks, and the next step's images are read while a step is fitted; a fresh worker makes
+all of it again from the files, so a step measured anywhere gives the same result.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import time
 from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 
 from core.camera import Camera
 from core.errors import FileFormatError
-from core.field.images import check_calibrated_size
+from core.field.images import MeasureImage, check_calibrated_size
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.seeds import Seed
@@ -37,6 +38,7 @@ from server.version import software_version
 from server.worker_process import current_task
 
 _KEPT = 2
+_Pair = tuple[MeasureImage, MeasureImage]
 
 
 @dataclass(eq=False)
@@ -47,9 +49,11 @@ class _Context:
     grid: PointGrid
     options: MeasureOptions
     fields: dict[int, Field] = field(default_factory=dict)
+    ahead: tuple[tuple[str, str], Future[_Pair]] | None = None
 
 
 _contexts: OrderedDict[str, _Context] = OrderedDict()
+_reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 
 
 def measure_step(task: StepTask) -> dict[str, Any]:
@@ -72,14 +76,16 @@ def measure_step(task: StepTask) -> dict[str, Any]:
     if seeds is not None:
         more["seeds"] = np.asarray(seeds, dtype=np.float64)
     if task.kind == "shape":
+        _read_ahead(task, context)
         result = context.reference.shape(context.grid, context.options, **more)
     else:
         shape = _field(task, context, task.reference)
         previous = None if task.previous in (None, task.reference) else _field(task, context, task.previous)
+        images = _images_now(task, context)
+        _read_ahead(task, context)
         result = context.reference.motion(
-            _image(task, "cur1"), _image(task, "cur2"), context.grid, context.options,
-            shape=shape, previous=previous, **more,
-        )  # fmt: skip
+            *images, context.grid, context.options, shape=shape, previous=previous, **more
+        )
     computed = time.perf_counter()
     extra = {"label": task.label, "test_step": str(task.n), "reference_step": str(task.reference)}
     if task.load_n is not None:
@@ -92,6 +98,29 @@ def measure_step(task: StepTask) -> dict[str, Any]:
     context.fields = {n: f for n, f in context.fields.items() if n == task.reference} | {task.n: result}
     summary = summarise(result)
     return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
+
+
+def _images_now(task: StepTask, context: _Context) -> _Pair:
+    """Return the step's images: those read while the step before was fitted, if they are these."""
+    paths = task.images["cur1"], task.images["cur2"]
+    ahead, context.ahead = context.ahead, None
+    if ahead is not None and ahead[0] == paths:
+        return ahead[1].result()
+    return _read_pair(paths, context.options)
+
+
+def _read_ahead(task: StepTask, context: _Context) -> None:
+    """Begin to read the images of the step that will come next."""
+    context.ahead = None
+    if task.following is not None:
+        context.ahead = task.following, _reader.submit(_read_pair, task.following, context.options)
+
+
+def _read_pair(paths: tuple[str, str], options: MeasureOptions) -> _Pair:
+    one, two = (MeasureImage(read_image(path), path) for path in paths)
+    for image, noise in zip((one, two), options.noise, strict=True):
+        image.prepared(options.interpolation, noise)
+    return one, two
 
 
 def _context_of(task: StepTask) -> _Context:

@@ -34,6 +34,8 @@ class StepTask:
         Region, subset and models, as in ``analysis.json``.
     inputs
         Name and SHA-256 of each input file.
+    following
+        Paths of the images of the step that will probably be asked for next, to be read meanwhile.
     """
 
     folder: str
@@ -47,6 +49,7 @@ class StepTask:
     inputs: dict[str, str]
     label: str
     load_n: float | None
+    following: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
+from core.matching import prepare
 from core.stereo import StereoPair
 
 _W_STEPS = [1e-7, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
@@ -43,9 +44,10 @@ class Twin:
         self.XY = pair.cam1.rays_cam(self.pixels).xyz_mm[:, :2] - self.centre[:2]
         self.f = self._grey(0, self.pixels)
         self.f -= self.f.mean()
-        h = 1e-3
-        grey = [self._grey(0, self.pixels + d) for d in ((h, 0), (-h, 0), (0, h), (0, -h))]
-        gradient = np.stack([grey[0] - grey[1], grey[2] - grey[3]], -1) / (2 * h)
+        # the derivatives that the matching takes are its own choice (tests/test_slopes.py); their use is tested here
+        kind = "cubic" if order == 3 else "quintic"
+        columns, rows = self.pixels.astype(int).T
+        gradient = np.stack([g[rows, columns] for g in prepare(images[0], kind).gradients], -1).astype(float)
         # over normalised offsets: pixel per normalised unit by differences of the back-projection
         h = 1e-2
         ray = [pair.cam1.rays_cam(xy + np.array(d)).xyz_mm[:2] for d in ((h, 0), (-h, 0), (0, h), (0, -h))]

@@ -6,6 +6,8 @@ neighbours. Nothing is ever filled in: what does not match stays empty.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,11 +17,13 @@ from core.lens import Bool, Float
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.status import PointStatus
 
-_OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])
+_OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
 _ALL_AT_ONCE = 512
 _MOST_A_BATCH = 4096  # a cancel is heard within a second even on a slow machine
 _FAR_PX = 3.0
-_ATTEMPTS = 4
+_COUNT_AGAIN = 1.05
+ATTEMPTS = 4
+"""How often a point is started, each time from another neighbour."""
 
 
 def fit_in_batches(
@@ -50,11 +54,40 @@ def fit_in_batches(
     return good
 
 
+@dataclass(eq=False)
+class Attempts:
+    """What growth has tried on a grid of n points, so that nothing is tried twice.
+
+    Attributes
+    ----------
+    neighbours
+        (n, 8) index of each point's neighbours, -1 outside the grid.
+    tried
+        (n, 8) from which of them the point was started before.
+    left
+        (n,) how often it may still be started.
+    """
+
+    neighbours: NDArray[np.int32]
+    tried: Bool
+    left: NDArray[np.int8]
+
+    @staticmethod
+    def on(shape: tuple[int, int]) -> Attempts:
+        """Return the attempts of a grid of (rows, cols) on which nothing was tried."""
+        n = shape[0] * shape[1]
+        places = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
+        places[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
+        rows, cols = slice(1, -1), slice(1, -1)
+        neighbours = np.stack([np.roll(places, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1)
+        return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
+
+
 def grow(
     fitter: Fitter,
     points: PointFits,
     *,
-    shape: tuple[int, int],
+    attempts: Attempts,
     xy_px: Float,
     rays: Float,
     usable: Bool,
@@ -69,61 +102,71 @@ def grow(
     fitter
         The matcher.
     points
-        n = rows x columns points; changed in place.
-    shape
-        Rows and columns of the grid.
+        n points of a grid; changed in place.
+    attempts
+        What was tried before; changed in place.
     xy_px, rays
         (n, 2) px, (n, 3) normalised.
     usable
         (n,) which points may be measured.
     stage, progress, cancel
         Reports and stop.
-    """
-    rows, cols = shape
-    total = int(usable.sum())
-    tried = np.zeros((rows * cols, len(_OFFSETS)), bool)
-    attempts = np.zeros(rows * cols, np.int8)
-    added = 0
-    r, c = np.divmod(np.arange(rows * cols), cols)
-    neighbours = np.full((rows * cols, len(_OFFSETS)), -1, np.intp)
-    for k, (dr, dc) in enumerate(_OFFSETS):
-        inside = (r + dr >= 0) & (r + dr < rows) & (c + dc >= 0) & (c + dc < cols)
-        neighbours[inside, k] = ((r + dr) * cols + c + dc)[inside]
 
-    while True:
+    Notes
+    -----
+    A wave looks at the front only: points that are open and may have a standing neighbour. So the work grows with the
+    number of points, not with points times waves.
+    """
+    total = int(usable.sum())
+    quality = points.quality
+    standing, counted, added = int((quality > 0.0).sum()), 0, 0
+    least, front = 0.0, np.zeros(len(quality), bool)
+    while standing > 0:
         raise_if_cancelled(cancel)
-        quality = points.quality
-        progress(stage, int((quality > 0).sum()), total)
-        todo = np.flatnonzero(usable & (quality <= 0.0) & (attempts < _ATTEMPTS))
-        if len(todo) == 0:
-            break
-        parent_quality = np.where(_may_be_parent(quality), quality, -1.0)
-        near = neighbours[todo]
-        score = np.where((near >= 0) & ~tried[todo], parent_quality[near], -1.0)
+        progress(stage, standing, total)
+        if standing > _COUNT_AGAIN * counted:  # what is normal for the field changes with its size
+            least, counted = _least_parent(quality), standing
+            front = usable & (quality <= 0.0) & (attempts.left > 0)
+        todo = np.flatnonzero(front)
+        near = attempts.neighbours[todo]
+        score = np.where((near >= 0) & ~attempts.tried[todo], quality[near], -1.0)
+        score[score < least] = -1.0
         choice = np.argmax(score, axis=1)
-        best = score[np.arange(len(todo)), choice]
+        best = np.take_along_axis(score, choice[:, None], axis=1)[:, 0]
         reachable = best > 0.0
+        front[todo[~reachable]] = False  # until a neighbour comes to stand
         if not reachable.any():
-            break
+            if standing == counted:
+                break
+            counted = 0
+            continue
         todo, choice, best = todo[reachable], choice[reachable], best[reachable]
         if len(todo) > _ALL_AT_ONCE:
             leading = best >= np.quantile(best, 0.5)
             todo, choice = todo[leading], choice[leading]
-        parent = neighbours[todo, choice]
-        tried[todo, choice] = True
-        attempts[todo] += 1
+        parent = attempts.neighbours[todo, choice]
+        attempts.tried[todo, choice] = True
+        attempts.left[todo] -= 1
         offset = rays[todo, :2] - rays[parent, :2]
         w = move_w(points.w[parent], offset)
         G = move_matrix(points.G[parent], offset) if fitter.comparisons == 3 else None
-        added += int(fit_in_batches(fitter, points, todo, xy_px, w, G, far_px=_FAR_PX, cancel=cancel).sum())
+        good = fit_in_batches(fitter, points, todo, xy_px, w, G, far_px=_FAR_PX, cancel=cancel)
+        front[todo[good | (attempts.left[todo] <= 0)]] = False
+        new = todo[good]
+        quality[new] = points.zncc[new].min(axis=1)
+        beside, side = attempts.neighbours[new], np.arange(len(_OFFSETS)) ^ 2  # as the neighbour sees the new point
+        inside = beside >= 0
+        beside, side = beside[inside], np.broadcast_to(side, inside.shape)[inside]
+        attempts.tried[beside, side] = False  # a point that stood there before, and fell, had other values
+        front[beside[usable[beside] & (quality[beside] <= 0.0) & (attempts.left[beside] > 0)]] = True
+        added += len(new)
+        standing += len(new)
     return added
 
 
-def _may_be_parent(quality: Float) -> Bool:
-    """Points far below the field's own correlation do not hand their values on."""
+def _least_parent(quality: Float) -> float:
+    """Correlation of a point that may hand its values on: not far below the field's own."""
     standing = quality[quality > 0.0]
-    if len(standing) == 0:
-        return np.zeros(len(quality), bool)
     middle = float(np.median(standing))
     scatter = 1.4826 * float(np.median(np.abs(standing - middle)))
-    return np.asarray(quality >= middle - max(0.15, 8.0 * scatter))
+    return middle - max(0.15, 8.0 * scatter)

@@ -13,8 +13,8 @@ from core.errors import ImageError, InputError
 from core.lens import Float
 from core.matching.image import PAD, ImageData, prepare
 from core.matching.kernels.drivers import motion_points, shape_points
-from core.matching.kernels.motion import N_MOTION_OUT
-from core.matching.kernels.shape import N_SHAPE_OUT
+from core.matching.kernels.motion import n_motion_out
+from core.matching.kernels.shape import n_shape_out
 from core.matching.options import SPLINE_ORDER, MatchOptions
 from core.stereo import StereoPair
 from core.threads import run_ranges
@@ -32,7 +32,8 @@ class ShapeFit:
     Attributes
     ----------
     w
-        (N, 3) inverse depth in camera 1, 1/mm, at the point and its slopes over normalised x and y.
+        (N, 3) inverse depth in camera 1, 1/mm, at the point and its slopes over normalised x and y; for curved patches
+        (N, 6), with the coefficients of x^2, x y and y^2 (offsets from the point) besides.
     epipolar_px, epipolar_sigma_px
         (N,) offset of camera 2's image across the epipolar line, sign as ``StereoPair.epipolar_residual_px``.
     zncc
@@ -64,7 +65,8 @@ class MotionFit:
     w, epipolar_px, epipolar_sigma_px, noise, iterations, status
         As in :class:`ShapeFit`.
     G
-        (N, 3, 3): camera 1 at t sees the patch at ``G (1, X, Y)`` (scale fixed by ``w``).
+        (N, 3, 3): camera 1 at t sees the patch at ``G (1, X, Y)`` (scale fixed by ``w``); for curved patches (N, 3, 6),
+        at ``G (1, X, Y, X^2, X Y, Y^2)``.
     zncc
         (N, 3) correlation with camera 2 at t0, camera 1 at t, camera 2 at t.
     covariance
@@ -110,7 +112,8 @@ def fit_shape(
     xy_px
         (N, 2) points in camera 1.
     start
-        (N, 3) start values of ``w``; a point with a start that is not finite comes back as NOT_SEEDED.
+        (N, 3), or for curved patches (N, 6), start values of ``w``; a point with a start that is not finite comes back
+        as NOT_SEEDED.
     options
         Defaults to ``MatchOptions()``.
 
@@ -127,22 +130,26 @@ def fit_shape(
     options = options or MatchOptions()
     images = [prepare(image, options.interpolation) for image in (ref1, ref2)]
     xy, n = _points(xy_px)
-    w = _starts("start", start, (n, 3))
-    out = np.full((n, N_SHAPE_OUT), np.nan)
+    degree, terms = _patch(options)
+    w = _starts("start", start, (n,), terms)
+    out = np.full((n, n_shape_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     pose = pair.cam2_from_cam1
-    setting = _setting(options)
+    setting = _setting(options, images)
     fixed = (
-        images[0].pixels, images[0].gradients, _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2),
-        _own(pose.rotation), _own(pose.translation_mm), xy, w, setting, out, status, iterations,
+        _reference(images[0]), _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation),
+        _own(pose.translation_mm), xy, w, setting, out, status, iterations,
     )  # fmt: skip
-    run_ranges(lambda first, last: shape_points(first, last, *fixed), n, POINTS_AT_ONCE)
-    out[status != 0, :4] = np.nan
-    out[status != 0, 6:] = np.nan
-    covariance = out[:, [6, 7, 7, 8]].reshape(n, 2, 2)
+    kernel = shape_points(degree)
+    run_ranges(lambda first, last: kernel(first, last, *fixed), n, POINTS_AT_ONCE)
+    failed = status != 0
+    out[failed, : terms + 1] = np.nan
+    out[failed, terms + 3 :] = np.nan
+    covariance = out[:, [terms + 3, terms + 4, terms + 4, terms + 5]].reshape(n, 2, 2)
     return ShapeFit(
-        w=out[:, :3], epipolar_px=out[:, 3], epipolar_sigma_px=np.sqrt(out[:, 8]), zncc=out[:, 4:5], noise=out[:, 5],
-        covariance=covariance, iterations=iterations, status=status,
+        w=out[:, :terms], epipolar_px=out[:, terms], epipolar_sigma_px=np.sqrt(out[:, terms + 5]),
+        zncc=out[:, terms + 1 : terms + 2], noise=out[:, terms + 2], covariance=covariance, iterations=iterations,
+        status=status,
     )  # fmt: skip
 
 
@@ -168,9 +175,9 @@ def fit_motion(
     xy_px
         (N, 2) points in camera 1 at t0.
     start_w
-        (N, 3) start values of ``w``.
+        (N, 3), or for curved patches (N, 6), start values of ``w``.
     start_G
-        (N, 3, 3) start values of ``G``; no motion when left out.
+        (N, 3, 3), or for curved patches (N, 3, 6), start values of ``G``; no motion when left out.
     options
         Defaults to ``MatchOptions()``.
 
@@ -195,25 +202,27 @@ def fit_motion(
                 remedy="Give images of one size per camera.",
             )
     xy, n = _points(xy_px)
-    w = _starts("start_w", start_w, (n, 3))
-    G = _starts("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3, 3))
-    out = np.full((n, N_MOTION_OUT), np.nan)
+    degree, terms = _patch(options)
+    w = _starts("start_w", start_w, (n,), terms)
+    G = _starts("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
+    out = np.full((n, n_motion_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     pose = pair.cam2_from_cam1
-    setting = (*_setting(options), options.patch == "rigid")
+    setting = (*_setting(options, images), options.patch == "rigid")
     fixed = (
-        images[0].pixels, images[0].gradients, _flat(images[1]), _flat(images[2]), _flat(images[3]),
-        _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out,
-        status, iterations,
+        _reference(images[0]), _flat(images[1]), _flat(images[2]), _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2),
+        _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out, status, iterations,
     )  # fmt: skip
-    run_ranges(lambda first, last: motion_points(first, last, *fixed), n, POINTS_AT_ONCE)
-    out[status != 0, :13] = np.nan
-    out[status != 0, 17:] = np.nan
-    covariance = out[:, 17:].reshape(n, 5, 5)
+    kernel = motion_points(degree)
+    run_ranges(lambda first, last: kernel(first, last, *fixed), n, POINTS_AT_ONCE)
+    failed, at = status != 0, 4 * terms
+    out[failed, : at + 1] = np.nan
+    out[failed, at + 5 :] = np.nan
+    covariance = out[:, at + 5 :].reshape(n, 5, 5)
     return MotionFit(
-        w=out[:, :3], G=out[:, 3:12].reshape(n, 3, 3), epipolar_px=out[:, 12],
-        epipolar_sigma_px=np.sqrt(covariance[:, 4, 4]), zncc=out[:, 13:16], noise=out[:, 16], covariance=covariance,
-        iterations=iterations, status=status,
+        w=out[:, :terms], G=out[:, terms:at].reshape(n, 3, terms), epipolar_px=out[:, at],
+        epipolar_sigma_px=np.sqrt(covariance[:, 4, 4]), zncc=out[:, at + 1 : at + 4], noise=out[:, at + 4],
+        covariance=covariance, iterations=iterations, status=status,
     )  # fmt: skip
 
 
@@ -224,18 +233,37 @@ def _points(xy_px: ArrayLike) -> tuple[Float, int]:
     return xy, xy.shape[0]
 
 
-def _starts(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float:
-    array = np.array(values, dtype=np.float64, order="C")
-    if array.shape != shape:
-        raise InputError(f"{name} has shape {array.shape}, it must be {shape}.", code="shape_mismatch")
+def _patch(options: MatchOptions) -> tuple[int, int]:
+    """Degree of the patch and number of its monomials."""
+    return (2, 6) if options.patch == "curved" else (1, 3)
+
+
+def _starts(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) -> Float:
+    """Start values with ``terms`` columns; a plane's serve a curved patch, the rest is zero."""
+    given = np.asarray(values, dtype=np.float64)
+    columns = given.shape[-1] if given.ndim else 0
+    if given.shape[:-1] != shape or columns not in (3, terms):
+        raise InputError(f"{name} has shape {given.shape}, it must be {(*shape, terms)}.", code="shape_mismatch")
+    array = np.zeros((*shape, terms))
+    array[..., :columns] = given
     return array
 
 
-def _setting(options: MatchOptions) -> tuple[Any, ...]:
+def _setting(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...]:
+    """Options and what is known of the noise: the images' variances, or all one where any is unknown."""
+    given = [image.noise_variance for image in images]
+    variances = [v for v in given if v is not None and v > 0.0]
+    known = len(variances) == len(images)
     return (
         options.subset_px, SPLINE_ORDER[options.interpolation], options.max_iterations, options.tolerance_px,
-        options.max_sigma_px, options.max_step_px,
+        options.max_sigma_px, options.max_step_px, (images[0].slope_noise, images[0].slope_share),
+        tuple(variances) if known else (1.0,) * len(images), known,
     )  # fmt: skip
+
+
+def _reference(image: ImageData) -> tuple[Any, ...]:
+    weights = np.empty((0, 0), np.float32) if image.weights is None else image.weights
+    return (image.pixels, *image.gradients, weights)
 
 
 def _flat(image: ImageData) -> tuple[Any, ...]:

@@ -27,7 +27,7 @@ Float32 = NDArray[np.float32]
 _ONE = np.ones(1)
 _SAMPLE = 4  # every fourth pixel is enough for a mean variance
 _LEVEL_PX = 1.0  # reach (sd) of the surroundings whose grey level weighs a pixel
-WIENER = False
+WIENER = True
 """Whether gradients are those of :mod:`core.matching.slopes`, or the spline's own."""
 
 

@@ -109,7 +109,7 @@ def sequence_files(folder: Path, *, steps: int = 5, pictures: int = 5, suffix: s
                 Image.fromarray(picture).save(name)
     run = folder / f"{size_px[0]}x{size_px[1]}_{steps}_{suffix}"
     run.mkdir(exist_ok=True)
-    round_trip = [*range(1, pictures + 1), *range(pictures - 1, 0, -1)]
+    round_trip = [*range(1, pictures + 1), *range(pictures - 1, 1, -1)]
     for n in range(steps + 1):
         source = 0 if n == 0 else round_trip[(n - 1) % len(round_trip)]
         for cam in CAMERAS:

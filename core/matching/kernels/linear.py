@@ -1,55 +1,31 @@
-"""Small dense algebra for one point: Cholesky, 3 x 3 inverse, normal equations from the nine-column form."""
+"""Small dense algebra for one point: 3 x 3 inverse, weighted normal equations, Cholesky, covariance of the last few."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from core.matching.kernels.loops import data
+from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
+
+QUAD = 4
 
 
 @njit(nogil=True, error_model="numpy")
-def factor(a, n):
-    """Cholesky factor of the leading (n, n) of ``a`` in place (lower); False if not positive definite.
-
-    The test is relative to each diagonal entry, so it does not depend on the unknowns' units.
-    """
-    for j in range(n):
-        diagonal = a[j, j]
-        s = diagonal
-        for k in range(j):
-            s -= a[j, k] * a[j, k]
-        if not s > 1e-11 * diagonal:
-            return False
-        root = math.sqrt(s)
-        a[j, j] = root
-        inverse = 1.0 / root
-        for i in range(j + 1, n):
-            s = a[i, j]
-            for k in range(j):
-                s -= a[i, k] * a[j, k]
-            a[i, j] = s * inverse
-    return True
-
-
-@njit(nogil=True, error_model="numpy")
-def solve(a, b, n):
-    """Solve in place with the factor from :func:`factor`."""
-    for i in range(n):
-        s = b[i]
-        for k in range(i):
-            s -= a[i, k] * b[k]
-        b[i] = s / a[i, i]
-    for i in range(n - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, n):
-            s -= a[k, i] * b[k]
-        b[i] = s / a[i, i]
+def padded(n):
+    """Row length for ``n`` unknowns: whole vectors of doubles."""
+    return (n + QUAD - 1) // QUAD * QUAD
 
 
 @njit(nogil=True, error_model="numpy")
 def invert3(m, out):
-    """Inverse of a 3 x 3 matrix; False if it has none."""
+    """Inverse of the leading 3 x 3 of a matrix; False if it has none."""
     c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
     c01 = m[1, 2] * m[2, 0] - m[1, 0] * m[2, 2]
     c02 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
@@ -69,78 +45,140 @@ def invert3(m, out):
     return True
 
 
-@njit(nogil=True, error_model="numpy")
-def assemble(weights, blocks, offsets, hessian, images, normal, half):
-    """Normal equations in (theta_0, theta_1, theta_2, e) from the nine-column Gram matrix.
+def _vectors(builder: Any, pointer: Any, parts: int) -> list[Vec]:
+    return [load(builder, at(builder, pointer, LONG(QUAD * c)), QUAD, DOUBLE) for c in range(parts)]
 
-    Image k's matrix M_k changes by ``M_k^-1 dM_k = blocks_k [theta_0 theta_1 theta_2] + e offsets_k``, where theta_j
-    holds column j's unknowns (w_j, G_0j, G_1j, G_2j).
 
-    Parameters
-    ----------
-    weights
-        (images, images) joint weights of the comparisons.
-    blocks
-        (images, 3, 4).
-    offsets
-        (images, 9), row by row.
-    hessian
-        (9, 9) from ``reference_sums``.
-    normal
-        (13, 13) out.
-    half
-        (images, 9, 13) work space: weighted ``hessian`` times Jacobian of each image.
+def make_product(row: int) -> Any:
+    """Compile ``c[i, :] = sum over r of a[r, i] b[r, :]`` for rows of ``row`` doubles, a multiple of four.
+
+    Two i at a time: with an odd number, one more row is read and written. Arguments: a, its row length; b, its row
+    length; c, its row length; number of r, number of i.
     """
-    for k in range(images):
-        for r in range(9):
-            for j in range(3):
-                for i in range(4):
-                    half[k, r, 4 * j + i] = (
-                        hessian[r, j] * blocks[k, 0, i]
-                        + hessian[r, 3 + j] * blocks[k, 1, i]
-                        + hessian[r, 6 + j] * blocks[k, 2, i]
-                    )
-            s = 0.0
-            for c in range(9):
-                s += hessian[r, c] * offsets[k, c]
-            half[k, r, 12] = s
-    for r in range(9):
-        for c in range(13):
-            if images == 3:
-                a, b, d = half[0, r, c], half[1, r, c], half[2, r, c]
-                for k in range(3):
-                    half[k, r, c] = weights[k, 0] * a + weights[k, 1] * b + weights[k, 2] * d
-            else:
-                half[0, r, c] *= weights[0, 0]
-    for r in range(13):
-        for c in range(13):
-            normal[r, c] = 0.0
-    for k in range(images):
-        for j in range(3):
-            for i in range(4):
-                row = normal[4 * j + i]
-                a, b, d = blocks[k, 0, i], blocks[k, 1, i], blocks[k, 2, i]
-                for c in range(13):
-                    row[c] += a * half[k, j, c] + b * half[k, 3 + j, c] + d * half[k, 6 + j, c]
-        for c in range(13):
-            s = 0.0
-            for r in range(9):
-                s += offsets[k, r] * half[k, r, c]
-            normal[12, c] += s
+    parts = row // QUAD
+
+    @intrinsic
+    def product(_typingctx: Any, a: Any, a_row: Any, b: Any, b_row: Any, c: Any, c_row: Any, n_r: Any, n_i: Any) -> Any:
+        sig = types.void(a, a_row, b, b_row, c, c_row, n_r, n_i)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            a, b, c = (data(context, builder, sig, args, i) for i in (0, 2, 4))
+            vector = ir.VectorType(DOUBLE, QUAD)
+            sums = [[cgutils.alloca_once(builder, vector) for _ in range(parts)] for _ in range(2)]
+            pairs = builder.sdiv(builder.add(args[7], LONG(1)), LONG(2))
+            with cgutils.for_range(builder, pairs) as outer:
+                i = builder.mul(outer.index, LONG(2))
+                for one in (*sums[0], *sums[1]):
+                    builder.store(ir.Constant(vector, [0.0] * QUAD), one)
+                with cgutils.for_range(builder, args[6]) as inner:
+                    row_b = _vectors(builder, at(builder, b, builder.mul(inner.index, args[3])), parts)
+                    factors = at(builder, a, builder.add(builder.mul(inner.index, args[1]), i))
+                    for which in range(2):
+                        f = spread(builder, builder.load(at(builder, factors, LONG(which))), QUAD)
+                        for one, value in zip(sums[which], row_b, strict=True):
+                            builder.store((Vec(builder, builder.load(one)) + f * value).value, one)
+                for which in range(2):
+                    target = at(builder, c, builder.mul(builder.add(i, LONG(which)), args[5]))
+                    for part, one in enumerate(sums[which]):
+                        store(Vec(builder, builder.load(one)), at(builder, target, LONG(QUAD * part)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    return product
+
+
+def make_factor(row: int) -> Any:
+    """Compile the Cholesky factor for matrices with rows of ``row`` doubles."""
+    parts = row // QUAD
+
+    @intrinsic
+    def eliminate(_typingctx: Any, a: Any, i: Any) -> Any:
+        """Row i less what the rows above explain: ``a[i, :] -= a[j, i] a[j, :]`` for all j < i."""
+        sig = types.void(a, i)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            a = data(context, builder, sig, args, 0)
+            own = at(builder, a, builder.mul(args[1], LONG(row)))
+            sums = [cgutils.alloca_once(builder, ir.VectorType(DOUBLE, QUAD)) for _ in range(parts)]
+            for one, value in zip(sums, _vectors(builder, own, parts), strict=True):
+                builder.store(value.value, one)
+            with cgutils.for_range(builder, args[1]) as above:
+                other = at(builder, a, builder.mul(above.index, LONG(row)))
+                f = spread(builder, builder.load(at(builder, other, args[1])), QUAD)
+                for one, value in zip(sums, _vectors(builder, other, parts), strict=True):
+                    builder.store((Vec(builder, builder.load(one)) - f * value).value, one)
+            for part, one in enumerate(sums):
+                store(Vec(builder, builder.load(one)), at(builder, own, LONG(QUAD * part)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    @intrinsic
+    def scale_row(_typingctx: Any, a: Any, i: Any, factor: Any) -> Any:
+        sig = types.void(a, i, factor)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            own = at(builder, data(context, builder, sig, args, 0), builder.mul(args[1], LONG(row)))
+            f = spread(builder, args[2], QUAD)
+            for part, value in enumerate(_vectors(builder, own, parts)):
+                store(value * f, at(builder, own, LONG(QUAD * part)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    @njit(nogil=True, error_model="numpy")
+    def factor(a, n):
+        """Cholesky factor U, ``a = U^T U``, of the leading (n, n) in place; reads and fills the upper triangle.
+
+        The diagonal gets its inverse. False if not positive definite; the test is relative to each diagonal entry, so
+        it does not depend on the unknowns' units. Entries below the diagonal are left with rubbish.
+        """
+        for i in range(n):
+            original = a[i, i]
+            eliminate(a, np.int64(i))
+            if not a[i, i] > 1e-11 * original:
+                return False
+            inverse = 1.0 / math.sqrt(a[i, i])
+            scale_row(a, np.int64(i), inverse)
+            a[i, i] = inverse
+        return True
+
+    return factor
 
 
 @njit(nogil=True, error_model="numpy")
-def gradient(weights, blocks, offsets, rhs, images, out):
-    """Right-hand side (13,) in (theta_0, theta_1, theta_2, e) from each image's nine sums ``rhs`` (images, 9)."""
-    for r in range(13):
-        out[r] = 0.0
-    for k in range(images):
-        for r in range(9):
+def solve(u, b, n):
+    """Solve ``U^T U x = b`` in place with the factor from :func:`make_factor`."""
+    for i in range(n):
+        s = b[i] * u[i, i]
+        b[i] = s
+        for c in range(i + 1, n):
+            b[c] -= u[i, c] * s
+    for i in range(n - 1, -1, -1):
+        s = b[i]
+        for c in range(i + 1, n):
+            s -= u[i, c] * b[c]
+        b[i] = s * u[i, i]
+
+
+@njit(nogil=True, error_model="numpy")
+def covariance_of_last(u, n, m, work, out):
+    """Inverse's trailing (m, m) block from :func:`make_factor`'s factor, row by row into ``out``."""
+    first = n - m
+    for j in range(m):  # columns of the trailing block's inverse, upper triangular
+        for i in range(m):
+            work[i, j] = 0.0
+        work[j, j] = u[first + j, first + j]
+        for i in range(j - 1, -1, -1):
             s = 0.0
-            for o in range(images):
-                s += weights[k, o] * rhs[o, r]
-            a = r // 3
-            j = r - 3 * a
-            for i in range(4):
-                out[4 * j + i] += blocks[k, a, i] * s
-            out[12] += offsets[k, r] * s
+            for k in range(i + 1, j + 1):
+                s -= u[first + i, first + k] * work[k, j]
+            work[i, j] = s * u[first + i, first + i]
+    for i in range(m):
+        for j in range(i, m):
+            s = 0.0
+            for k in range(j, m):
+                s += work[i, k] * work[j, k]
+            out[m * i + j] = s
+            out[m * j + i] = s

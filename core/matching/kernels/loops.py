@@ -1,290 +1,302 @@
 """The loops over a subset's pixels: where the time goes.
 
-Everything per pixel, image and iteration happens in one loop that stores nothing: warp, interpolation and eleven sums.
-Without stores the compiler needs no aliasing promise and vectorises, with gathers for the taps. The warp is relative
-to the image of the subset's centre, which is set up in double precision outside, so single precision is exact to about
-2e-6 px. No bounds are tested here: :func:`core.matching.kernels.warp.set_up_warp` proves beforehand that every tap lies
-inside the padded image.
+Written in vectors of eight pixels (:mod:`core.matching.kernels.vectors`), because row loads of four taps are two to
+four times faster than the gathers that a compiler makes of the same loop. One image's comparison is one loop that
+stores nothing: place of the pixel (a cubic polynomial in the offsets within the subset), spline value, residual, and
+its sums with the columns of the Jacobian. The places of the next eight pixels are found while the taps of these eight
+are loaded, so that no load waits for an address. No bounds are tested here:
+:func:`core.matching.kernels.warp.set_up_warp` proves beforehand that every tap lies inside the padded image.
+
+The reference subset is a (6, width) float32 array with the rows X and Y (offsets from the subset's centre over its half
+width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's place
+along x and y. ``width`` is the number of pixels rounded up to eight, and eight more; the surplus is zero.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: NaN must stay visible
+from core.matching.kernels.vectors import FLOAT, INT, LANES, LONG, Vec, at, join, load, spread, store, transpose4
 
-N_SUMS = 11
-# order of the sums: d, d f, d^2, then d times fx, fx X, fx Y, fy, fy X, fy Y, q X, q Y with q = fx X + fy Y
-
-
-@intrinsic
-def load(_typingctx: Any, array: Any, index: Any) -> Any:
-    """Element of a 1-D contiguous array at an int32 index that is known to be inside.
-
-    Plain indexing of a signed index costs a select per tap (Python's negative indices), and 64-bit indices halve the
-    width of a gather.
-    """
-    if not isinstance(array, types.Array) or array.ndim != 1:
-        return None
-    signature = array.dtype(array, index)
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        pointer = builder.gep(data, [builder.sext(args[1], ir.IntType(64))], inbounds=True)
-        return context.unpack_value(builder, sig.args[0].dtype, pointer)
-
-    return signature, codegen
+X, Y, F, WEIGHT, GX, GY = range(6)
+N_ROWS = 6
+N_WARP = 22
+"""Ten coefficients of the place along x, ten along y, gain and shift of the grey levels."""
 
 
-@intrinsic
-def floor_to_int(_typingctx: Any, x: Any) -> Any:
-    """Largest int32 not above a float32."""
-    if x != types.float32:
-        return None
-
-    def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.FloatType(), [ir.FloatType()]), "llvm.floor.f32"
-        )
-        return builder.fptosi(builder.call(function, [args[0]]), ir.IntType(32))
-
-    return types.int32(x), codegen
+def monomials(degree: int) -> list[tuple[int, int]]:
+    """Exponents of x and y in the order used everywhere: 1, x, y, x^2, x y, y^2, x^3, ..."""
+    return [(d - j, j) for d in range(degree + 1) for j in range(d + 1)]
 
 
-def _int32_operation(name: str) -> Any:
-    # numba widens int32 arithmetic to 64 bits, which would double the gathers
-    def typed(_typingctx: Any, a: Any, b: Any) -> Any:
-        if a != types.int32 or b != types.int32:
-            return None
-
-        def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-            return getattr(builder, name)(*args, flags=("nsw",))
-
-        return types.int32(a, b), codegen
-
-    typed.__name__ = f"int32_{name}"
-    typed.__doc__ = f"int32 {name} of two int32 that is known not to overflow."
-    return intrinsic(typed)
-
-
-add = _int32_operation("add")
-mul = _int32_operation("mul")
-
-
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def _image_point(p, x, y):
-    """Where the image shows the patch at offset (x, y), relative to the base tap; ``p`` as ``set_up_warp`` fills it."""
-    one, three = np.float32(1.0), np.float32(3.0)
-    # patch -> normalised image plane, relative to the centre's image
-    inv = one / (one + (p[0] * x + p[1] * y))
-    u = (p[2] * x + p[3] * y) * inv
-    v = (p[4] * x + p[5] * y) * inv
-    # lens, relative to the centre: radial factor in rho = r^2 - r0^2, then tangential terms
-    uu = u * u
-    vv = v * v
-    uv = u * v
-    rho = (p[6] * u + p[7] * v) + (uu + vv)
-    dl = rho * (p[8] + rho * (p[9] + rho * p[10]))
-    xd = (u + p[11]) * dl + (p[13] * u + p[14] * v) + ((p[16] + p[16]) * uv + p[17] * (three * uu + vv))
-    yd = (v + p[12]) * dl + (p[14] * u + p[15] * v) + ((p[17] + p[17]) * uv + p[16] * (uu + three * vv))
-    return p[21] + (p[18] * xd + p[19] * yd), p[22] + p[20] * yd
-
-
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def _cubic_weights(t):
+def _cubic_weights(t: Vec) -> list[Vec]:
     """Six times the cubic B-spline's weights at fraction ``t``."""
-    four, three, six, one = np.float32(4.0), np.float32(3.0), np.float32(6.0), np.float32(1.0)
-    s = one - t
+    s = 1.0 - t
     tt = t * t
-    w0 = s * s * s
-    w3 = tt * t
-    w1 = four + tt * (three * t - six)
-    return w0, w1, six - (w0 + w1 + w3), w3
+    w0, w3 = s * s * s, tt * t
+    w1 = 4.0 + tt * (3.0 * t - 6.0)
+    return [w0, w1, 6.0 - (w0 + w1 + w3), w3]
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def _quintic_weights(t):
+def _quintic_weights(t: Vec) -> list[Vec]:
     """120 times the quintic B-spline's weights at fraction ``t``."""
-    s = np.float32(1.0) - t
-    tt = t * t
-    ss = s * s
-    w0 = ss * ss * s
-    w5 = tt * tt * t
-    w2 = np.float32(66.0) + tt * (np.float32(-60.0) + tt * (np.float32(30.0) - np.float32(10.0) * t))
-    w3 = np.float32(66.0) + ss * (np.float32(-60.0) + ss * (np.float32(30.0) - np.float32(10.0) * s))
-    # w1(t) = 1 + 5 s + 10 s^2 + 10 s^3 + 5 s^4 - 5 s^5
-    five, ten, one = np.float32(5.0), np.float32(10.0), np.float32(1.0)
-    w1 = one + s * (five + s * (ten + s * (ten + s * (five - five * s))))
-    return w0, w1, w2, w3, np.float32(120.0) - (w0 + w1 + (w2 + w3) + w5), w5
+    s = 1.0 - t
+    tt, ss = t * t, s * s
+    w0, w5 = ss * ss * s, tt * tt * t
+    w2 = 66.0 + tt * (-60.0 + tt * (30.0 - 10.0 * t))
+    w3 = 66.0 + ss * (-60.0 + ss * (30.0 - 10.0 * s))
+    w1 = 1.0 + s * (5.0 + s * (10.0 + s * (10.0 + s * (5.0 - 5.0 * s))))
+    return [w0, w1, w2, w3, 120.0 - (w0 + w1 + (w2 + w3) + w5), w5]
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def _row4(c, k, w0, w1, w2, w3):
-    i1, i2, i3 = np.int32(1), np.int32(2), np.int32(3)
-    return (w0 * load(c, k) + w1 * load(c, add(k, i1))) + (w2 * load(c, add(k, i2)) + w3 * load(c, add(k, i3)))
+def _four_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec, Vec, Vec, Vec]:
+    """Weighted sums over the rows of four neighbouring columns of taps, each for eight pixels."""
+    sums: list[Vec] = []
+    for j in range(4):  # pixels j and j + 4 share a vector
+        total = None
+        for row, weight in zip(rows, wy, strict=True):
+            builder = weight.builder
+            taps = join(load(builder, at(builder, row, first[j]), 4), load(builder, at(builder, row, first[j + 4]), 4),
+                        range(8))  # fmt: skip
+            term = weight.pick([j] * 4 + [j + 4] * 4) * taps
+            total = term if total is None else total + term
+        assert total is not None
+        sums.append(total)
+    a, b, c, d = sums
+    return transpose4(a, b, c, d)
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def _row6(c, k, w0, w1, w2, w3, w4, w5):
-    i4, i5 = np.int32(4), np.int32(5)
-    return _row4(c, k, w0, w1, w2, w3) + (w4 * load(c, add(k, i4)) + w5 * load(c, add(k, i5)))
+def _two_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec, Vec]:
+    """As ``_four_columns`` for the fifth and sixth tap."""
+    sums: list[Vec] = []
+    for j in (0, 2):
+        at_once = (j, j + 1, j + 4, j + 5)
+        total = None
+        for row, weight in zip(rows, wy, strict=True):
+            builder = weight.builder
+            a, b, c, d = (load(builder, at(builder, at(builder, row, first[m]), LONG(4)), 2) for m in at_once)
+            taps = join(join(a, b, range(4)), join(c, d, range(4)), range(8))
+            term = weight.pick([m for m in at_once for _ in range(2)]) * taps
+            total = term if total is None else total + term
+        assert total is not None
+        sums.append(total)
+    first_two, last_two = sums
+    even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
+    return join(first_two, last_two, even), join(first_two, last_two, odd)
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def value_cubic(c, base, stride, p, x, y):
-    """36 times the image's grey level at the patch's offset (x, y)."""
-    xt, yt = _image_point(p, x, y)
-    ix, iy = floor_to_int(xt), floor_to_int(yt)
-    k = add(add(base, mul(iy, stride)), ix)
-    w0, w1, w2, w3 = _cubic_weights(xt - np.float32(ix))
-    y0, y1, y2, y3 = _cubic_weights(yt - np.float32(iy))
-    r0 = _row4(c, k, w0, w1, w2, w3)
-    k1 = add(k, stride)
-    r1 = _row4(c, k1, w0, w1, w2, w3)
-    k2 = add(k1, stride)
-    r2 = _row4(c, k2, w0, w1, w2, w3)
-    r3 = _row4(c, add(k2, stride), w0, w1, w2, w3)
-    return (y0 * r0 + y1 * r1) + (y2 * r2 + y3 * r3)
+def _spline(order: int, rows: list[Any], first: list[Any], tx: Vec, ty: Vec) -> Vec:
+    """36 (cubic) or 14400 (quintic) times the spline's value."""
+    weights = _cubic_weights if order == 3 else _quintic_weights
+    wx, wy = weights(tx), weights(ty)
+    a, b, c, d = _four_columns(rows, first, wy)
+    value = (wx[0] * a + wx[1] * b) + (wx[2] * c + wx[3] * d)
+    if order == 5:
+        e, f = _two_columns(rows, first, wy)
+        value = value + (wx[4] * e + wx[5] * f)
+    return value
 
 
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def value_quintic(c, base, stride, p, x, y):
-    """14400 times the image's grey level at the patch's offset (x, y)."""
-    xt, yt = _image_point(p, x, y)
-    ix, iy = floor_to_int(xt), floor_to_int(yt)
-    k = add(add(base, mul(iy, stride)), ix)
-    w0, w1, w2, w3, w4, w5 = _quintic_weights(xt - np.float32(ix))
-    y0, y1, y2, y3, y4, y5 = _quintic_weights(yt - np.float32(iy))
-    value = y0 * _row6(c, k, w0, w1, w2, w3, w4, w5)
-    k = add(k, stride)
-    value += y1 * _row6(c, k, w0, w1, w2, w3, w4, w5)
-    k = add(k, stride)
-    value += y2 * _row6(c, k, w0, w1, w2, w3, w4, w5)
-    k = add(k, stride)
-    value += y3 * _row6(c, k, w0, w1, w2, w3, w4, w5)
-    k = add(k, stride)
-    value += y4 * _row6(c, k, w0, w1, w2, w3, w4, w5)
-    k = add(k, stride)
-    return value + y5 * _row6(c, k, w0, w1, w2, w3, w4, w5)
+def _place(c: list[Vec], x: Vec, y: Vec) -> Vec:
+    """Cubic polynomial with coefficients in the order of :func:`monomials`."""
+    along_x = c[0] + x * (c[1] + x * (c[3] + x * c[6]))
+    return along_x + y * ((c[2] + x * (c[4] + x * c[7])) + y * ((c[5] + x * c[8]) + y * c[9]))
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
-def sums_cubic(c, base, stride, p, ref, n, sums):
-    """Compare one image with the reference: the eleven sums over the subset's pixels, cubic spline.
-
-    Parameters
-    ----------
-    c
-        Padded coefficients, flat float32.
-    base
-        int32 flat index of the first tap for the offset (0, 0) of the warp.
-    stride
-        int32 row length of ``c``.
-    p
-        (25,) float32 warp of :func:`core.matching.kernels.warp.set_up_warp`; the last two scale and shift grey levels.
-    ref
-        (5, n_max) float32: X, Y, reference grey level (mean taken out), its derivatives with respect to X and Y.
-    n
-        Number of pixels.
-    sums
-        (11,) float64 out.
-    """
-    rx, ry, rf, rgx, rgy = ref[0], ref[1], ref[2], ref[3], ref[4]
-    gain = p[23] * np.float32(1.0 / 36.0)
-    shift = p[24]
-    zero = np.float32(0.0)
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = zero
-    for i in range(n):
-        x = rx[i]
-        y = ry[i]
-        f = rf[i]
-        d = value_cubic(c, base, stride, p, x, y) * gain - (shift + f)
-        s0 += d
-        s1 += d * f
-        s2 += d * d
-        gx = d * rgx[i]
-        gy = d * rgy[i]
-        q = gx * x + gy * y
-        s3 += gx
-        s4 += gx * x
-        s5 += gx * y
-        s6 += gy
-        s7 += gy * x
-        s8 += gy * y
-        s9 += q * x
-        s10 += q * y
-    sums[0] = s0
-    sums[1] = s1
-    sums[2] = s2
-    sums[3] = s3
-    sums[4] = s4
-    sums[5] = s5
-    sums[6] = s6
-    sums[7] = s7
-    sums[8] = s8
-    sums[9] = s9
-    sums[10] = s10
+def _lanes(builder: Any, indices: Any) -> list[Any]:
+    """Eight int32 lanes as 64-bit scalars, two at a time."""
+    pairs = builder.bitcast(indices, ir.VectorType(LONG, LANES // 2))
+    scalars = []
+    for j in range(LANES // 2):
+        pair = builder.extract_element(pairs, INT(j))
+        scalars += [builder.sext(builder.trunc(pair, INT), LONG), builder.ashr(pair, LONG(32))]
+    return scalars
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
-def sums_quintic(c, base, stride, p, ref, n, sums):
-    """Compare one image with the reference: the eleven sums over the subset's pixels, quintic spline.
+def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[Vec]], out: Any, place: int) -> None:
+    """Loop over ``count`` blocks; ``terms(offset)`` gives the block's summands; totals go to ``out`` as float64."""
+    zero = ir.Constant(ir.VectorType(FLOAT, LANES), [0.0] * LANES)
+    sums = [cgutils.alloca_once(builder, zero.type) for _ in range(n_sums)]  # LLVM keeps them in registers
+    for one in sums:
+        builder.store(zero, one)
+    with cgutils.for_range(builder, count) as loop:
+        offset = builder.mul(builder.sext(loop.index, LONG), LONG(LANES))
+        for one, term in zip(sums, terms(offset), strict=True):
+            builder.store((Vec(builder, builder.load(one)) + term).value, one)
+    for i, one in enumerate(sums):
+        total = builder.fpext(Vec(builder, builder.load(one)).sum(), ir.DoubleType())
+        builder.store(total, at(builder, out, LONG(place + i)))
 
-    Parameters
-    ----------
-    c
-        Padded coefficients, flat float32.
-    base
-        int32 flat index of the first tap for the offset (0, 0) of the warp.
-    stride
-        int32 row length of ``c``.
-    p
-        (25,) float32 warp of :func:`core.matching.kernels.warp.set_up_warp`; the last two scale and shift grey levels.
-    ref
-        (5, n_max) float32: X, Y, reference grey level (mean taken out), its derivatives with respect to X and Y.
-    n
-        Number of pixels.
-    sums
-        (11,) float64 out.
-    """
-    rx, ry, rf, rgx, rgy = ref[0], ref[1], ref[2], ref[3], ref[4]
-    gain = p[23] * np.float32(1.0 / 14400.0)
-    shift = p[24]
-    zero = np.float32(0.0)
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = zero
-    for i in range(n):
-        x = rx[i]
-        y = ry[i]
-        f = rf[i]
-        d = value_quintic(c, base, stride, p, x, y) * gain - (shift + f)
-        s0 += d
-        s1 += d * f
-        s2 += d * d
-        gx = d * rgx[i]
-        gy = d * rgy[i]
-        q = gx * x + gy * y
-        s3 += gx
-        s4 += gx * x
-        s5 += gx * y
-        s6 += gy
-        s7 += gy * x
-        s8 += gy * y
-        s9 += q * x
-        s10 += q * y
-    sums[0] = s0
-    sums[1] = s1
-    sums[2] = s2
-    sums[3] = s3
-    sums[4] = s4
-    sums[5] = s5
-    sums[6] = s6
-    sums[7] = s7
-    sums[8] = s8
-    sums[9] = s9
-    sums[10] = s10
+
+def data(context: Any, builder: Any, sig: Any, args: Any, i: int) -> Any:
+    """Pointer to the first element of the array that is argument ``i``."""
+    return context.make_array(sig.args[i])(context, builder, args[i]).data
+
+
+def _reference_rows(context: Any, builder: Any, sig: Any, args: Any, i: int) -> list[Any]:
+    array = context.make_array(sig.args[i])(context, builder, args[i])
+    width = builder.extract_value(array.shape, 1)
+    return [at(builder, array.data, builder.mul(width, LONG(r))) for r in range(N_ROWS)]
+
+
+def _comparison(order: int, degree: int) -> Any:
+    def compare_pixels(
+        _typingctx: Any, c: Any, base: Any, stride: Any, warp: Any, ref: Any, blocks: Any, out: Any
+    ) -> Any:
+        """Compare one image with the reference subset.
+
+        Parameters
+        ----------
+        c
+            Padded coefficients, flat float32.
+        base
+            int64 flat index of the first tap for place (0, 0).
+        stride
+            int64 row length of ``c``.
+        warp
+            (22,) float32, see :func:`core.matching.kernels.warp.set_up_warp`.
+        ref
+            The reference subset.
+        blocks
+            int64 number of its pixels over eight, rounded up.
+        out
+            float64 out: sums of a, a f, a d with d the residual and a its product with the weight, then of a gx and of
+            a gy times each monomial up to ``degree``.
+        """
+        sig = types.void(c, base, stride, warp, ref, blocks, out)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            p = data(context, builder, sig, args, 3)
+            warp = [spread(builder, builder.load(at(builder, p, LONG(i)))) for i in range(N_WARP)]
+            gain = warp[20] * (1.0 / 36.0 if order == 3 else 1.0 / 14400.0)
+            stride = spread(builder, builder.trunc(args[2], INT)).value
+            rows = [at(builder, data(context, builder, sig, args, 0), args[1])]
+            for _ in range(order):
+                rows.append(at(builder, rows[-1], args[2]))
+            ref = _reference_rows(context, builder, sig, args, 4)
+            vector = ir.VectorType(FLOAT, LANES)
+            k_next = cgutils.alloca_once(builder, ir.VectorType(INT, LANES))
+            tx_next, ty_next = (cgutils.alloca_once(builder, vector) for _ in range(2))
+
+            def find_place(offset: Any) -> None:
+                x, y = (load(builder, at(builder, ref[r], offset)) for r in (X, Y))
+                xt, yt = _place(warp[:10], x, y), _place(warp[10:20], x, y)
+                xf, yf = xt.floor(), yt.floor()
+                k = builder.add(builder.mul(yf.to_int(), stride, flags=("nsw",)), xf.to_int(), flags=("nsw",))
+                builder.store(k, k_next)
+                builder.store((xt - xf).value, tx_next)
+                builder.store((yt - yf).value, ty_next)
+
+            def terms(offset: Any) -> list[Vec]:
+                first = _lanes(builder, builder.load(k_next))
+                tx, ty = Vec(builder, builder.load(tx_next)), Vec(builder, builder.load(ty_next))
+                find_place(builder.add(offset, LONG(LANES)))
+                x, y, f, weight, gx, gy = (load(builder, at(builder, row, offset)) for row in ref)
+                d = _spline(order, rows, first, tx, ty) * gain - (warp[21] + f)
+                a = weight * d
+                bx, by = a * gx, a * gy
+                columns = _powers(x, y, degree)
+                return [
+                    a,
+                    a * f,
+                    a * d,
+                    *(bx * m if m else bx for m in columns),
+                    *(by * m if m else by for m in columns),
+                ]
+
+            find_place(LONG(0))
+            _sum_up(builder, args[5], 3 + 2 * len(monomials(degree)), terms, data(context, builder, sig, args, 6), 0)
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    compare_pixels.__name__ = f"compare_{'cubic' if order == 3 else 'quintic'}_{degree}"
+    return intrinsic(compare_pixels)
+
+
+def _powers(x: Vec, y: Vec, degree: int) -> list[Vec | None]:
+    """Monomials up to the degree; None for the constant."""
+    known: dict[tuple[int, int], Vec | None] = {(0, 0): None, (1, 0): x, (0, 1): y}
+    for i, j in monomials(degree):
+        if (i, j) not in known:
+            lower = known[(i - 1, j)] if i else known[(0, j - 1)]
+            assert lower is not None
+            known[(i, j)] = lower * (x if i else y)
+    return [known[m] for m in monomials(degree)]
+
+
+def _reference_sums(degree: int) -> Any:
+    def sum_reference(_typingctx: Any, ref: Any, blocks: Any, mean: Any, out: Any) -> Any:
+        """Take ``mean`` out of the reference's grey levels and sum what the normal equations need.
+
+        Parameters
+        ----------
+        ref
+            The reference subset; its row f is changed in place.
+        blocks
+            int64 number of pixels over eight, rounded up.
+        mean
+            float32.
+        out
+            float64 out. With p the weight: sums of p, p f, p f^2, p (f - its right neighbour)^2; of p f gx and p f gy
+            times each monomial up to ``degree``; of p gx and p gy times the same; of p gx^2, p gx gy and p gy^2 times
+            each monomial up to twice the degree.
+        """
+        sig = types.void(ref, blocks, mean, out)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            rows = _reference_rows(context, builder, sig, args, 0)
+            mean = spread(builder, args[2])
+            out = data(context, builder, sig, args, 3)
+
+            def get(offset: Any, *which: int) -> list[Vec]:
+                return [load(builder, at(builder, rows[r], offset)) for r in which]
+
+            def times(factors: list[Vec], columns: list[Vec | None]) -> list[Vec]:
+                return [factor if m is None else factor * m for factor in factors for m in columns]
+
+            def with_grey(offset: Any) -> list[Vec]:
+                x, y, f, p, gx, gy = get(offset, *range(N_ROWS))
+                difference = load(builder, at(builder, rows[F], builder.add(offset, LONG(1)))) - f
+                f = f - mean
+                store(f, at(builder, rows[F], offset))
+                pf = p * f
+                return [p, pf, pf * f, p * difference * difference, *times([pf * gx, pf * gy], _powers(x, y, degree))]
+
+            def columns_alone(offset: Any) -> list[Vec]:
+                x, y, p, gx, gy = get(offset, X, Y, WEIGHT, GX, GY)
+                return times([p * gx, p * gy], _powers(x, y, degree))
+
+            def products(a: int, b: int) -> Callable[[Any], list[Vec]]:
+                def terms(offset: Any) -> list[Vec]:
+                    x, y, p = get(offset, X, Y, WEIGHT)
+                    g, h = get(offset, a, b)
+                    return times([p * g * h], _powers(x, y, 2 * degree))
+
+                return terms
+
+            few, many = len(monomials(degree)), len(monomials(2 * degree))
+            place = 0
+            for terms, n in (
+                (with_grey, 4 + 2 * few), (columns_alone, 2 * few), (products(GX, GX), many), (products(GX, GY), many),
+                (products(GY, GY), many),
+            ):  # fmt: skip
+                _sum_up(builder, args[1], n, terms, out, place)
+                place += n
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    sum_reference.__name__ = f"sum_reference_{degree}"
+    return intrinsic(sum_reference)
+
+
+compare_cubic = {degree: _comparison(3, degree) for degree in (1, 2)}
+compare_quintic = {degree: _comparison(5, degree) for degree in (1, 2)}
+sum_reference = {degree: _reference_sums(degree) for degree in (1, 2)}

@@ -1,26 +1,42 @@
-"""What the fits of shape and of motion share at one point.
+"""What the fits of shape and of motion share at one point, for plane and for curved patches.
 
-Unknowns, in this order inside: (w0, G00, G10, G20), (w1, G01, ...), (w2, G02, ...), e. Camera images see the patch
-through
+With C = [c, ex, ey, 0, ...], c = (Xc, Yc, 1), camera images see the patch through matrices that act on its monomials m:
 
-    cam2 at t0   M_0 = S(e) (R21 C + t21 w^T),   C = [c, ex, ey], c = (Xc, Yc, 1)
+    cam2 at t0   M_0 = S(e) (R21 C + t21 w^T)
     cam1 at t    M_1 = G
     cam2 at t    M_2 = S(e) (R21 G + t21 w^T)
 
 S(e) shifts camera 2's normalised image by e times one pixel across the epipolar line of the point.
+
+Unknowns, in this order inside: (w_j, G_0j, G_1j, G_2j) for j = 1, 2, ..., then for j = 0, then e. So what belongs to
+the point itself comes last, where its covariance can be read off the factor. A step changes image k's matrix by dM_k;
+what the patch does in its own coordinates then is ``d = M_k^-1 dM_k m``, from which ``dX = d_1 - X d_0`` and
+``dY = d_2 - Y d_0``.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
-from core.matching.kernels.linear import invert3, solve
-from core.matching.kernels.loops import N_SUMS, sums_cubic, sums_quintic
-from core.matching.kernels.reference import N_REFERENCE, nine_from_eight
-from core.matching.kernels.warp import N_WARP, lens_jacobian, set_up_warp
+from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
+from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
+from core.matching.kernels.noise import (
+    CONTRAST,
+    GAIN,
+    MAX_NOISE_SHARE,
+    MISFIT,
+    N_LEVELS,
+    SHIFT,
+    SMOOTHED,
+    ZNCC,
+    interpolated_noise,
+)
+from core.matching.kernels.reference import make_reference, set_up_tables, width
+from core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
 from core.status import PointStatus
 
 OK = int(PointStatus.OK)
@@ -31,85 +47,11 @@ SINGULAR = int(PointStatus.SINGULAR)
 NOT_SEEDED = int(PointStatus.NOT_SEEDED)
 LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 
-REFREEZE_PX = 0.5  # corner motion after which the frozen Hessian is set up anew
-CREEPING = 8  # iterations after which the noise is taken out of the Hessian that makes the steps
-FIRST_RATE = 0.3  # convergence rate assumed before two steps have shown it
-MAX_NOISE_SHARE = 0.7  # of the squared gradients; above it the texture is noise
-# white noise of variance 1 behind a spline: variance of the value, mean over all sub-pixel places, and of the
-# derivative at pixel centres (integrals of the cardinal splines' squares); cubic, quintic
-VALUE_NOISE = (0.764, 0.843)
-SLOPE_NOISE = (1.392, 1.894)
-WHITE_ROUGHNESS = 1.2  # mean squared gradient over variance that only white noise has
-
-
-@njit(nogil=True, error_model="numpy")
-def work_space(subset, images):
-    """Everything one thread needs, so that no point allocates."""
-    return (
-        np.empty((N_REFERENCE, subset * subset), np.float32),  # 0 ref
-        np.zeros(N_WARP, np.float32),  # 1 p
-        np.empty(N_SUMS),  # 2 sums
-        np.empty(4),  # 3 box
-        np.empty((2, 10)),  # 4 poly
-        np.empty((10, 9)),  # 5 work
-        np.empty((2, 9)),  # 6 sum_j, sum_fj
-        np.empty((9, 9)),  # 7 hessian
-        np.empty((images, 9)),  # 8 rhs
-        np.empty((images, 4)),  # 9 gain, shift, zncc, contrast
-        np.empty((images, images)),  # 10 weights
-        np.empty((images, 3, 3)),  # 11 M
-        np.empty((images, 3, 4)),  # 12 blocks
-        np.empty((images, 9)),  # 13 offsets
-        np.empty((13, 13)),  # 14 normal
-        np.empty((images, 9, 13)),  # 15 half
-        np.empty((4, 13)),  # 16 vectors
-        np.empty((13, 13)),  # 17 reduced
-        np.zeros((13, 13)),  # 18 chain
-        np.empty((3, 3)),  # 19 inverse
-        np.empty((3, 3)),  # 20 G
-        np.empty((3, 3)),  # 21 rotation
-        np.empty((9, 9)),  # 22 denoised
-        np.empty((13, 13)),  # 23 noisy
-        np.empty((5, 13)),  # 24 columns
-    )
-
-
-@njit(nogil=True, error_model="numpy")
-def compare(image, lens, m, order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels, rhs):
-    """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
-
-    Fills ``rhs`` (9,), the sums of the zero-mean normalised residual times the nine columns, and updates ``levels``:
-    gain and shift that normalise this image's grey levels, zncc, contrast.
-    """
-    coefficients, rows, cols, stride = image
-    base = set_up_warp(lens, m, box, rows, cols, stride, 1 if order == 3 else 2, p)
-    if base < 0:
-        return False
-    p[23] = levels[0]
-    p[24] = levels[1]
-    if order == 3:
-        sums_cubic(coefficients, np.int32(base), np.int32(stride), p, ref, n, sums)
-    else:
-        sums_quintic(coefficients, np.int32(base), np.int32(stride), p, ref, n, sums)
-    # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
-    gain, shift = float(p[23]), float(p[24])
-    mean = sums[0] / n
-    y2 = sums[2] + 2.0 * sums[1] + f2 - sums[0] * mean
-    if not y2 > 1e-12 * f2:
-        levels[2] = 0.0
-        levels[3] = 0.0
-        for i in range(9):
-            rhs[i] = 0.0
-        return True
-    c = math.sqrt(y2 / f2)
-    nine_from_eight(sums[3:], rhs)
-    for i in range(9):
-        rhs[i] = (rhs[i] - mean * sum_j[i] + sum_fj[i]) / c - sum_fj[i]
-    levels[0] = gain / c
-    levels[1] = (shift + mean) / c
-    levels[2] = (sums[1] + f2) / math.sqrt(f2 * y2)
-    levels[3] = c / gain
-    return True
+REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are set up anew
+PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted, not compared anew
+FIRST_RATE = 0.1  # convergence rate assumed before two steps have shown it
+FLAT = 1e-6  # squared contrast below which an image shows nothing
+WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
 
 
 @njit(nogil=True, error_model="numpy")
@@ -140,194 +82,9 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
 
 
 @njit(nogil=True, error_model="numpy")
-def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, images, M):
-    """The matrices through which the images see the patch."""
-    for i in range(3):
-        M[0, i, 0] = R[i, 0] * xc + R[i, 1] * yc + R[i, 2] + t[i] * w[0]
-        M[0, i, 1] = R[i, 0] + t[i] * w[1]
-        M[0, i, 2] = R[i, 1] + t[i] * w[2]
-        if images == 3:
-            for j in range(3):
-                M[1, i, j] = G[i, j]
-                M[2, i, j] = R[i, 0] * G[0, j] + R[i, 1] * G[1, j] + R[i, 2] * G[2, j] + t[i] * w[j]
-    for k in range(0, images, 2):
-        for j in range(3):
-            M[k, 0, j] += e * nu_x * M[k, 2, j]
-            M[k, 1, j] += e * nu_y * M[k, 2, j]
-
-
-@njit(nogil=True, error_model="numpy")
-def jacobian_blocks(R, t, e, nu_x, nu_y, images, M, inverse, blocks, offsets):
-    """``M^-1 dM`` per unknown, see :func:`core.matching.kernels.linear.assemble`; False if an M is singular."""
-    for k in range(images):
-        if not invert3(M[k], inverse):
-            return False
-        for a in range(3):
-            if k == 1:
-                blocks[k, a, 0] = 0.0
-                for i in range(3):
-                    blocks[k, a, 1 + i] = inverse[a, i]
-                for j in range(3):
-                    offsets[k, 3 * a + j] = 0.0
-                continue
-            s0, s1 = inverse[a, 0], inverse[a, 1]
-            s2 = inverse[a, 2] + e * (nu_x * s0 + nu_y * s1)  # row a of M^-1 S(e)
-            blocks[k, a, 0] = s0 * t[0] + s1 * t[1] + s2 * t[2]
-            for i in range(3):
-                blocks[k, a, 1 + i] = (s0 * R[0, i] + s1 * R[1, i] + s2 * R[2, i]) if k == 2 else 0.0
-            shift = nu_x * s0 + nu_y * s1
-            for j in range(3):
-                offsets[k, 3 * a + j] = shift * M[k, 2, j]
-    return True
-
-
-@njit(nogil=True, error_model="numpy")
-def joint_weights(levels, images, weights):
-    """Inverse covariance of the comparisons' residuals, in units of 1 / sigma^2.
-
-    Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
-    sigma^2 (diag(1 / contrast^2) + 1 1^T).
-    """
-    total = 1.0
-    for k in range(images):
-        s = min(max(levels[k, 3], 0.05), 20.0)
-        total += s * s
-    for k in range(images):
-        a = min(max(levels[k, 3], 0.05), 20.0) ** 2
-        for o in range(images):
-            b = min(max(levels[o, 3], 0.05), 20.0) ** 2
-            weights[k, o] = (a if k == o else 0.0) - a * b / total
-
-
-@njit(nogil=True, error_model="numpy")
-def corner_motion(blocks, offsets, step, images, box, scale_x, scale_y):
-    """Largest motion of a corner of the subset over the images for a step (13,), in camera 1 px."""
-    largest = 0.0
-    for k in range(images):
-        for ix in range(2):
-            for iy in range(2, 4):
-                x, y = box[ix], box[iy]
-                d0 = d1 = d2 = 0.0
-                for j in range(3):
-                    m = 1.0 if j == 0 else (x if j == 1 else y)
-                    for a in range(3):
-                        s = offsets[k, 3 * a + j] * step[12]
-                        for i in range(4):
-                            s += blocks[k, a, i] * step[4 * j + i]
-                        if a == 0:
-                            d0 += s * m
-                        elif a == 1:
-                            d1 += s * m
-                        else:
-                            d2 += s * m
-                largest = max(largest, math.hypot((d1 - x * d0) * scale_x, (d2 - y * d0) * scale_y))
-    return largest
-
-
-@njit(nogil=True, error_model="numpy")
-def residual_variance(levels, images, n, f2, unknowns, order):
-    """Variance of one image's noise, in reference grey levels squared, from the residuals.
-
-    Of three comparisons the quietest counts: what raises the others' residuals are small differences of the views,
-    which do not pull the solution as noise does.
-    """
-    value_noise = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
-    smallest = np.inf
-    for k in range(images):
-        s = min(max(levels[k, 3], 0.05), 20.0)
-        smallest = min(smallest, 2.0 * f2 * (1.0 - levels[k, 2]) / (1.0 + value_noise / (s * s)))
-    return max(smallest, 0.0) / max(n - 2.0 - unknowns / images, 1.0)
-
-
-@njit(nogil=True, error_model="numpy")
-def noise_share(variance, roughness, f2, n, order):
-    """Share of noise in the reference's squared gradients of this roughness, hence in the Hessian.
-
-    The Hessian H is larger than the sensitivity H (1 - share) that turns a shift into its right-hand side, so the
-    covariance is sigma^2 H^-1 / (1 - share)^2: the sandwich.
-    """
-    slope_noise = SLOPE_NOISE[0] if order == 3 else SLOPE_NOISE[1]
-    return slope_noise * variance * n / (roughness * f2)
-
-
-@njit(nogil=True, error_model="numpy")
-def take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised):
-    """The Gram matrix less the share that white noise of this variance in the reference has in it.
-
-    What is left is how far a shift really pulls the right-hand side. The noise's share is largest in the patch's
-    least certain deformations, where Gauss-Newton with the noisy matrix creeps and its inverse is too small.
-
-    Parameters
-    ----------
-    hessian, denoised
-        (9, 9) from ``reference_sums``, and the result.
-    box
-        Range of X and of Y, for the moments of the subset's pixels.
-    variance
-        Of the noise, grey levels squared.
-    """
-    j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
-    n = subset * subset
-    noise = (SLOPE_NOISE[0] if order == 3 else SLOPE_NOISE[1]) * variance * n
-    vx, vy = noise * (j11 * j11 + j21 * j21), noise * (j12 * j12 + j22 * j22)
-    s2 = float(n)
-    dx2, dy2 = ((box[1] - box[0]) / (subset - 1)) ** 2, ((box[3] - box[2]) / (subset - 1)) ** 2
-    m2, m4 = (s2 - 1.0) / 12.0, (s2 - 1.0) * (3.0 * s2 - 7.0) / 240.0
-    x2, y2, x4, y4 = m2 * dx2, m2 * dy2, m4 * dx2 * dx2, m4 * dy2 * dy2
-    for i in range(9):
-        for j in range(9):
-            denoised[i, j] = hessian[i, j]
-    denoised[0, 0] -= vx * x2 + vy * y2
-    denoised[1, 1] -= vx * x4 + vy * x2 * y2
-    denoised[2, 2] -= vx * x2 * y2 + vy * y4
-    for j in range(3):
-        moment = 1.0 if j == 0 else (x2 if j == 1 else y2)
-        denoised[3 + j, 3 + j] -= vx * moment
-        denoised[6 + j, 6 + j] -= vy * moment
-    for i, j, v in ((0, 4, vx * x2), (1, 3, vx * x2), (0, 8, vy * y2), (2, 6, vy * y2)):
-        denoised[i, j] += v
-        denoised[j, i] += v
-
-
-@njit(nogil=True, error_model="numpy")
-def sandwich(factor_s, noisy, wanted, free, columns, out):
-    """``S^-1 H S^-1`` for some unknowns, from the Cholesky factor of S and H itself.
-
-    ``wanted`` (m,) are their indices, ``columns`` (m, free) work space, ``out`` (m * m,) the result.
-    """
-    m = len(wanted)
-    for a in range(m):
-        for b in range(free):
-            columns[a, b] = 0.0
-        columns[a, wanted[a]] = 1.0
-        solve(factor_s, columns[a], free)
-    for a in range(m):
-        for b in range(a, m):
-            s = 0.0
-            for i in range(free):
-                t = 0.0
-                for j in range(free):
-                    t += noisy[i, j] * columns[b, j]
-                s += columns[a, i] * t
-            out[m * a + b] = s
-            out[m * b + a] = s
-
-
-@njit(nogil=True, error_model="numpy")
-def texture_roughness(hessian, lens1, xc, yc, f2):
-    """Squared gradient (per px) over the grey levels' variance: mean over directions, and in the weakest direction."""
-    j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
-    xx, yy = j11 * j11 + j21 * j21, j12 * j12 + j22 * j22
-    gxx, gyy = hessian[3, 3] / xx, hessian[6, 6] / yy
-    gxy = hessian[3, 6] / math.sqrt(xx * yy)
-    mean = 0.5 * (gxx + gyy)
-    return mean / f2, (mean - math.sqrt(0.25 * (gxx - gyy) ** 2 + gxy * gxy)) / f2
-
-
-@njit(nogil=True, error_model="numpy")
 def settled(motion, previous, tolerance):
     """Whether the steps still to come, as a geometric series, move no corner further than the tolerance."""
-    if motion < 0.1 * tolerance:
+    if motion < tolerance:
         return True
     rate = FIRST_RATE if previous == 0.0 else motion / previous
     return rate < 0.9 and motion * rate / (1.0 - rate) < tolerance
@@ -343,3 +100,244 @@ def texture_status(status, share, sigma_px, max_sigma_px, zncc):
     if status == OK:
         return LOW_TEXTURE if zncc > 0.5 else LOW_CORRELATION
     return status
+
+
+def make_point(degree: int, images: int) -> Any:
+    """Compile what the fits share, for patches of this degree (1 plane, 2 curved) and one or three comparisons."""
+    few = len(monomials(degree))
+    each = 4 if images == 3 else 1  # unknowns a monomial: w_j, and G_0j, G_1j, G_2j
+    unknowns = each * few + 1
+    row = (unknowns + QUAD - 1) // QUAD * QUAD
+    set_up_reference, n_columns, n_raw = make_reference(degree)
+    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    product, factor = make_product(row), make_factor(row)
+
+    @njit(nogil=True, error_model="numpy")
+    def work_space(subset):
+        """Everything one thread needs, so that no point allocates."""
+        ref = np.empty((N_ROWS, width(subset)), np.float32)
+        set_up_tables(subset, ref)
+        basis = np.zeros((few, few))
+        basis[0, 0] = 1.0
+        reference = (
+            np.empty(n_raw),
+            np.empty(22),
+            np.empty((few, N_NODES)),
+            basis,
+            np.empty(3),
+            np.empty(n_columns),
+            np.empty(n_columns),
+            np.empty((n_columns, n_columns)),
+        )
+        # four of what there is one of for each image: the products work on pairs
+        equations = (
+            np.zeros((4, 4)),  # weights
+            np.zeros((3, 5)),  # what an image's matrix makes of a unit of each unknown
+            np.zeros((4, n_columns, row)),  # columns
+            np.zeros((4, n_columns, row)),  # Gram matrix times columns
+            np.zeros((4, n_columns, row)),  # the same, weighted
+            np.zeros((row, row)),  # normal equations, then their factor
+        )
+        return (
+            ref,
+            reference,
+            (np.zeros(N_WARP, np.float32), np.empty(26), np.empty(3 + n_columns)),  # warp, places, sums
+            np.empty((images, n_columns)),  # rhs
+            np.empty((images, N_LEVELS)),  # levels
+            np.empty((images, 3, few)),  # M
+            equations,
+            np.empty((images, n_columns)),  # moves
+            np.zeros((4, row)),  # vectors
+            np.empty((3, 3)),  # inverse
+            np.empty((3, few)),  # G
+            np.empty((3, 3)),  # rotation
+            np.zeros((unknowns, unknowns)),  # chain
+            np.empty((5, 5)),  # work
+        )
+
+    @njit(nogil=True, error_model="numpy")
+    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
+        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
+
+        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
+        """
+        coefficients, rows, cols, stride = image
+        blocks, p, offset, f2 = known
+        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
+        warp, places, sums = space
+        base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
+        if base < 0:
+            return False
+        warp[20] = levels[GAIN]
+        warp[21] = levels[SHIFT]
+        if order == 3:
+            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        else:
+            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
+        gain, shift = float(warp[20]), float(warp[21])
+        mean = sums[0] / p
+        fd = sums[1] - offset * sums[0]
+        y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
+        if not y2 > FLAT * gain * gain * f2:
+            levels[ZNCC] = 0.0
+            levels[CONTRAST] = 0.0
+            return True
+        c = math.sqrt(y2 / f2)
+        for i in range(n_columns):
+            rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
+        levels[GAIN] = gain / c
+        levels[SHIFT] = (shift + mean + offset) / c - offset
+        levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
+        levels[CONTRAST] = c / gain
+        levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
+        levels[SMOOTHED] = interpolated_noise(warp, of_reference[4][2], order)
+        return True
+
+    @njit(nogil=True, error_model="numpy")
+    def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M):
+        """The matrices through which the images see the patch."""
+        for i in range(3):
+            for j in range(few):
+                M[0, i, j] = t[i] * w[j]
+            M[0, i, 0] += R[i, 0] * xc + R[i, 1] * yc + R[i, 2]
+            M[0, i, 1] += R[i, 0]
+            M[0, i, 2] += R[i, 1]
+            if images == 3:
+                for j in range(few):
+                    M[1, i, j] = G[i, j]
+                    M[2, i, j] = R[i, 0] * G[0, j] + R[i, 1] * G[1, j] + R[i, 2] * G[2, j] + t[i] * w[j]
+        for k in range(0, images, 2):
+            for j in range(few):
+                M[k, 0, j] += e * nu_x * M[k, 2, j]
+                M[k, 1, j] += e * nu_y * M[k, 2, j]
+
+    @njit(nogil=True, error_model="numpy")
+    def jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
+        """What each unknown does to the patch, px in the reference, as coefficients of ``columns``; False if singular.
+
+        ``slopes`` are d(px) / d(ray) of camera 1 at the point.
+        """
+        _, _, _, basis, place, _, _, _ = of_reference
+        last = each * few
+        j11, j12, j21, j22 = slopes
+        for k in range(images):
+            if not invert3(M[k], inverse):
+                return False
+            for a in range(3):
+                if k == 1:
+                    for i in range(3):
+                        block[a, 1 + i] = inverse[a, i]
+                    block[a, 0], block[a, 4] = 0.0, 0.0
+                    continue
+                s0, s1 = inverse[a, 0], inverse[a, 1]
+                s2 = inverse[a, 2] + e * (nu_x * s0 + nu_y * s1)  # row a of M^-1 S(e)
+                block[a, 0] = s0 * t[0] + s1 * t[1] + s2 * t[2]
+                for i in range(3):
+                    block[a, 1 + i] = (s0 * R[0, i] + s1 * R[1, i] + s2 * R[2, i]) if k == 2 else 0.0
+                block[a, 4] = nu_x * s0 + nu_y * s1
+            for i in range(5):
+                x, y = block[1, i], block[2, i]
+                block[1, i], block[2, i] = j11 * x + j12 * y, j21 * x + j22 * y
+            out = columns[k]
+            for r in range(n_columns):
+                for c in range(row):
+                    out[r, c] = 0.0
+            for j in range(few):
+                at = each * (j - 1) if j > 0 else last - each
+                degree_of_m = 1 if j == 0 else (3 if j < 3 else 6)  # coefficients of monomial j of the ray
+                for m in range(degree_of_m):
+                    b, from_e = basis[j, m], basis[j, m] * M[k, 2, j]  # dM of e is the shift times M's last row
+                    for i in range(each):
+                        out[m, at + i] += block[1, i] * b
+                        out[few + m, at + i] += block[2, i] * b
+                    out[m, last] += block[1, 4] * from_e
+                    out[few + m, last] += block[2, 4] * from_e
+                # - X d_0 and - Y d_0 have one degree more; X and Y in px are the pixel's place
+                if j == 0 or (few == 6 and j < 3):
+                    for m in range(degree_of_m):
+                        b = basis[j, m]
+                        if b == 0.0:
+                            continue
+                        by_x, by_y = (1, 2) if m == 0 else ((3, 4) if m == 1 else (4, 5))
+                        for i in range(each + 1):
+                            c = at + i if i < each else last
+                            d = block[0, i] * b if i < each else block[0, 4] * b * M[k, 2, j]
+                            out[m, c] -= d * place[0]
+                            out[by_x, c] -= d * place[2]
+                            out[few + m, c] -= d * place[1]
+                            out[few + by_y, c] -= d * place[2]
+        return True
+
+    @njit(nogil=True, error_model="numpy")
+    def assemble(equations, gram):
+        """Normal equations: sum over comparisons k, o of ``weights_ko columns_k^T gram columns_o``."""
+        weights, _, columns, half, weighted, normal = equations
+        wide = n_columns * row
+        for k in range(images):
+            product(gram, n_columns, columns[k], row, half[k], row, n_columns, n_columns)
+        if images == 1:
+            for r in range(n_columns):
+                for c in range(row):
+                    weighted[0, r, c] = weights[0, 0] * half[0, r, c]
+        else:
+            for r in range(n_columns):
+                product(weights, 4, half[0, r:], wide, weighted[0, r:], wide, images, images)
+        product(columns[0], row, weighted[0], row, normal, row, images * n_columns, unknowns)
+
+    @njit(nogil=True, error_model="numpy")
+    def gradient(equations, rhs, out):
+        """Right-hand side in the unknowns from each image's sums ``rhs``, with the sign of a step downhill."""
+        weights, columns = equations[0], equations[2]
+        for c in range(row):
+            out[c] = 0.0
+        for k in range(images):
+            for r in range(n_columns):
+                s = 0.0
+                for o in range(images):
+                    s -= weights[k, o] * rhs[o, r]
+                for c in range(row):
+                    out[c] += columns[k, r, c] * s
+
+    @njit(nogil=True, error_model="numpy")
+    def moves_of(columns, step, moves):
+        """Each image's motion of the patch (coefficients) for a step; returns the largest corner motion, camera 1 px.
+
+        The sum of the coefficients' sizes bounds it.
+        """
+        largest = 0.0
+        for k in range(images):
+            x, y = 0.0, 0.0
+            for j in range(few):
+                a, b = 0.0, 0.0
+                for c in range(unknowns):
+                    a += columns[k, j, c] * step[c]
+                    b += columns[k, few + j, c] * step[c]
+                moves[k, j], moves[k, few + j] = a, b
+                x += abs(a)
+                y += abs(b)
+            largest = max(largest, x * x + y * y)
+        return math.sqrt(largest)
+
+    @njit(nogil=True, error_model="numpy")
+    def predict(moves, rhs, gram, f2, levels):
+        """Correlations after a small last step, from the quadratic form that the step was found with."""
+        for k in range(images):
+            change = 0.0
+            for r in range(n_columns):
+                s = 2.0 * rhs[k, r]
+                for c in range(n_columns):
+                    s += gram[r, c] * moves[k, c]
+                change += s * moves[k, r]
+            levels[k, MISFIT] = max(levels[k, MISFIT] + change, 0.0)
+            levels[k, ZNCC] = 1.0 - 0.5 * levels[k, MISFIT] / f2
+
+    @njit(nogil=True, error_model="numpy")
+    def texture(gram):
+        """Squared gradients (per px): mean over directions, and in the weakest direction."""
+        xx, xy, yy = gram[0, 0], gram[0, few], gram[few, few]
+        mean = 0.5 * (xx + yy)
+        return mean, mean - math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+
+    return (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of,
+            predict, texture, few)  # fmt: skip

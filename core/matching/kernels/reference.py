@@ -1,190 +1,183 @@
-"""The reference subset: rays of its pixels, grey levels, gradients, and the sums that the Hessian is made of.
+"""The reference subset: grey levels, gradients, and the sums that the normal equations are made of.
 
-The derivative of an image's grey levels with respect to the matrix M through which it sees the patch is, at pixel
-(X, Y), contrast times ``g M^-1 dM (1, X, Y)^T`` with ``g = (-X fX - Y fY, fX, fY)`` and (fX, fY) the *reference's*
-gradient. So nine columns ``g_a m_j`` that know nothing of any image make every Jacobian; one of them depends on two
-others, because scaling M changes nothing.
+A step of the unknowns displaces the patch, as any image sees it, by ``dx = a . m, dy = b . m`` px in the reference
+image (``m`` the monomials 1, x, y, or those up to second order, of a pixel's place in the subset), and an image's grey
+levels by contrast times ``gx dx + gy dy`` with the *reference's* gradient (gx, gy). So the columns ``gx m_j, gy m_j``,
+which know nothing of any image, make every Jacobian. Terms of higher degree, that perspective adds, are left out of the
+Jacobian (not of the warp): they are some thousandths of the others, and change where Gauss-Newton goes, not where it
+ends.
+
+The gradients are expected to be the best estimate of the noise-free texture's: then the Gram matrix of the columns is
+also the sensitivity of their sums to a displacement.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-from core.matching.kernels.loops import FAST
-from core.matching.kernels.warp import lens_jacobian, undistort
-
-N_REFERENCE = 11
-# rows of the reference: X, Y, f, fX, fY, fX X, fX Y, fY X, fY Y, q X, q Y
-
-
-def _polynomial_fit() -> tuple[np.ndarray, np.ndarray]:
-    node = np.array([-1.0, -0.4, 0.4, 1.0])
-    xi, eta = (a.ravel() for a in np.meshgrid(node, node))
-    columns = [np.ones(16), xi, xi**2, xi**3, eta, eta * xi, eta * xi**2, eta**2, eta**2 * xi, eta**3]
-    return np.linalg.pinv(np.stack(columns, axis=1)), np.stack([xi, eta])
-
-
-_FIT, _NODES = _polynomial_fit()
-
-
-@njit(fastmath=FAST, error_model="numpy", forceinline=True)
-def _dot(a, b, n):
-    total = np.float32(0.0)
-    for i in range(n):
-        total += a[i] * b[i]
-    return float(total)
+from core.matching.kernels.loops import GX, GY, WEIGHT, F, X, Y, monomials, sum_reference
+from core.matching.kernels.vectors import LANES, LONG, at, load, store
+from core.matching.kernels.warp import set_up_nodes, undistort
 
 
 @njit(nogil=True, error_model="numpy")
-def set_up_reference(pixels, grad_x, grad_y, lens, x_px, y_px, subset, ref, box, poly):
-    """Fill the reference subset about (x_px, y_px).
+def width(subset):
+    """Row length of the reference subset's array."""
+    return (subset * subset + LANES - 1) // LANES * LANES + LANES
 
-    The pixels are the ``subset`` x ``subset`` nearest ones, at their own places; their rays are relative to the exact
-    ray of (x_px, y_px). Undistortion is exact at 16 nodes and a cubic polynomial between them (1e-9 px on the paper's
-    lens, tested below 1e-5 px).
 
-    Parameters
-    ----------
-    pixels, grad_x, grad_y
-        (rows, cols) float32 of camera 1 at t0.
-    lens
-        Camera 1's.
-    ref
-        (11, subset^2) float32 out, rows as listed above.
-    box
-        (4,) out: range of X, then of Y.
-    poly
-        (2, 10) work space.
+@intrinsic
+def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, ref: Any, row: Any) -> Any:
+    """Copy a square of an image, 8 px or more wide, into one row of the reference subset's array."""
+    sig = types.void(image, top, left, subset, ref, row)
 
-    Returns
-    -------
-    tuple
-        ``inside`` (bool), the centre's ray ``xc, yc``, and the grey levels' sum of squares about their mean.
-    """
-    rows, cols = pixels.shape
-    left = int(np.floor(x_px - 0.5 * (subset - 1) + 0.5))
-    top = int(np.floor(y_px - 0.5 * (subset - 1) + 0.5))
-    if left < 0 or top < 0 or left + subset > cols or top + subset > rows:
-        return False, 0.0, 0.0, 0.0
-    xc, yc = undistort(lens, x_px, y_px)
-    half = 0.5 * (subset - 1)
-    for j in range(10):
-        poly[0, j] = 0.0
-        poly[1, j] = 0.0
-    for i in range(16):
-        u, v = undistort(lens, left + half + half * _NODES[0, i], top + half + half * _NODES[1, i])
-        for j in range(10):
-            poly[0, j] += _FIT[j, i] * (u - xc)
-            poly[1, j] += _FIT[j, i] * (v - yc)
-    if not np.isfinite(poly[0, 0] + poly[1, 0]):
-        return False, 0.0, 0.0, 0.0
-    j11, j12, j21, j22 = lens_jacobian(lens, xc, yc)
-    h11, h12, h21, h22 = np.float32(j11), np.float32(j12), np.float32(j21), np.float32(j22)
-    total = 0.0
-    scale = 1.0 / half
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        array = context.make_array(sig.args[0])(context, builder, args[0])
+        cols = builder.extract_value(array.shape, 1)
+        out = context.make_array(sig.args[4])(context, builder, args[4])
+        to = at(builder, out.data, builder.mul(args[5], builder.extract_value(out.shape, 1)))
+        start = at(builder, array.data, builder.add(builder.mul(args[1], cols), args[2]))
+        subset = args[3]
+        last = builder.sub(subset, LONG(LANES))
+        whole = builder.sdiv(subset, LONG(LANES))
+        with cgutils.for_range(builder, subset) as line:
+            source = at(builder, start, builder.mul(line.index, cols))
+            target = at(builder, to, builder.mul(line.index, subset))
+            with cgutils.for_range(builder, whole) as part:
+                offset = builder.mul(part.index, LONG(LANES))
+                store(load(builder, at(builder, source, offset)), at(builder, target, offset))
+            # the rest, overlapping what is there
+            store(load(builder, at(builder, source, last)), at(builder, target, last))
+        return context.get_dummy_value()
+
+    return sig, codegen
+
+
+@njit(nogil=True, error_model="numpy")
+def _copy(image, top, left, subset, ref, row):
+    if subset >= LANES:
+        _copy_square(image, np.int64(top), np.int64(left), np.int64(subset), ref, np.int64(row))
+        return
     for r in range(subset):
-        eta = r * scale - 1.0
         for c in range(subset):
-            total += pixels[top + r, left + c]
-        x0 = poly[0, 0] + eta * (poly[0, 4] + eta * (poly[0, 7] + eta * poly[0, 9]))
-        x1 = poly[0, 1] + eta * (poly[0, 5] + eta * poly[0, 8])
-        x2 = poly[0, 2] + eta * poly[0, 6]
-        x3 = poly[0, 3]
-        y0 = poly[1, 0] + eta * (poly[1, 4] + eta * (poly[1, 7] + eta * poly[1, 9]))
-        y1 = poly[1, 1] + eta * (poly[1, 5] + eta * poly[1, 8])
-        y2 = poly[1, 2] + eta * poly[1, 6]
-        y3 = poly[1, 3]
+            ref[row, r * subset + c] = image[top + r, left + c]
+
+
+@njit(nogil=True, error_model="numpy")
+def set_up_tables(subset, ref):
+    """Fill the rows that all points share: places of the pixels and weights of one; the surplus is zero."""
+    half = 0.5 * (subset - 1)
+    ref[:] = np.float32(0.0)
+    for r in range(subset):
         for c in range(subset):
-            xi = c * scale - 1.0
             i = r * subset + c
-            ref[0, i] = x0 + xi * (x1 + xi * (x2 + xi * x3))
-            ref[1, i] = y0 + xi * (y1 + xi * (y2 + xi * y3))
-            ref[2, i] = pixels[top + r, left + c]
-            ref[3, i] = grad_x[top + r, left + c]
-            ref[4, i] = grad_y[top + r, left + c]
-    n = subset * subset
-    mean = np.float32(total / n)
-    x, y, f, gx, gy = ref[0], ref[1], ref[2], ref[3], ref[4]
-    for i in range(n):
-        f[i] -= mean
-        a = gx[i] * h11 + gy[i] * h21
-        b = gx[i] * h12 + gy[i] * h22
-        gx[i] = a
-        gy[i] = b
-        q = a * x[i] + b * y[i]
-        ref[5, i] = a * x[i]
-        ref[6, i] = a * y[i]
-        ref[7, i] = b * x[i]
-        ref[8, i] = b * y[i]
-        ref[9, i] = q * x[i]
-        ref[10, i] = q * y[i]
-    box[0] = min(x[0], x[n - subset])
-    box[1] = max(x[subset - 1], x[n - 1])
-    box[2] = min(y[0], y[subset - 1])
-    box[3] = max(y[n - subset], y[n - 1])
-    for i in range(subset):  # rows and columns bow by the lens: the box must hold every pixel
-        box[0] = min(box[0], x[i * subset])
-        box[1] = max(box[1], x[i * subset + subset - 1])
-        box[2] = min(box[2], y[i])
-        box[3] = max(box[3], y[n - subset + i])
-    return True, xc, yc, _dot(f, f, n)
+            ref[X, i] = (c - half) / half
+            ref[Y, i] = (r - half) / half
+            ref[WEIGHT, i] = 1.0
 
 
-_ROW = np.array([3, 5, 6, 4, 7, 8, 9, 10])  # where the eight columns lie in the reference
+def _product_table(degree: int) -> np.ndarray:
+    many, few = monomials(2 * degree), monomials(degree)
+    return np.array([[many.index((a[0] + b[0], a[1] + b[1])) for b in few] for a in few])
+
+
+def make_reference(degree: int) -> Any:
+    """Compile the set-up of the reference subset for patches of this degree (1 plane, 2 curved)."""
+    few, many = len(monomials(degree)), len(monomials(2 * degree))
+    n_columns = 2 * few
+    product = _product_table(degree)
+    first_fg, first_g, first_gg = 4, 4 + n_columns, 4 + 2 * n_columns
+    sum_all = sum_reference[degree]
+
+    @njit(nogil=True, error_model="numpy")
+    def set_up_reference(reference, lens, x_px, y_px, subset, ref, space):
+        """Copy the subset nearest to (x_px, y_px) and sum it.
+
+        Parameters
+        ----------
+        reference
+            Tuple of pixels, gradients along x and y, and weights, (rows, cols) float32 each; weights may be empty.
+        lens
+            Camera 1's.
+        ref
+            The subset's array, see ``loops``.
+        space
+            Work space: raw sums, a vector for the nodes; and results: node monomials (M, 16), the change of basis
+            (M, M) from monomials of a pixel's place to those of its ray, the middle of the subset's pixels from the
+            point and half its width (3,) px, sum of each column (2 M,), of f times it (2 M,), and the Gram matrix
+            (2 M, 2 M); gain and offset are projected out of the last two.
+
+        Returns
+        -------
+        tuple
+            ``inside`` (bool), the point's ray ``xc, yc``, the weights' sum, the mean of f that is left, the sum of
+            squares of f about it, and the differences of neighbours against it: 1 for white noise.
+        """
+        pixels, grad_x, grad_y, weights = reference
+        raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
+        nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        rows, cols = pixels.shape
+        half = 0.5 * (subset - 1)
+        left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
+        if left < 0 or top < 0 or left + subset > cols or top + subset > rows:
+            return nothing
+        xc, yc = undistort(lens, x_px, y_px)
+        if not np.isfinite(xc + yc):
+            return nothing
+        place[0], place[1], place[2] = left + half - x_px, top + half - y_px, half
+        if not set_up_nodes(lens, place[0], place[1], half, xc, yc, node_work, powers):
+            return nothing
+        _copy(pixels, top, left, subset, ref, F)
+        _copy(grad_x, top, left, subset, ref, GX)
+        _copy(grad_y, top, left, subset, ref, GY)
+        if weights.shape[0] > 0:
+            _copy(weights, top, left, subset, ref, WEIGHT)
+        mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
+        for i in range(subset):
+            mean += pixels[top + i, left + i]
+        for i in range(subset * subset, ref.shape[1]):
+            ref[F, i] = 0.0
+        sum_all(ref, np.int64((subset * subset + LANES - 1) // LANES), np.float32(mean / subset), raw)
+        p, offset = raw[0], raw[1] / raw[0]
+        f2 = raw[2] - raw[1] * offset
+        for i in range(n_columns):
+            sum_g[i] = raw[first_g + i]
+            sum_fg[i] = raw[first_fg + i] - offset * raw[first_g + i]
+        for j in range(few):
+            for k in range(few):
+                m = product[j, k]
+                gram[j, k] = raw[first_gg + m]
+                gram[j, few + k] = gram[few + j, k] = raw[first_gg + many + m]
+                gram[few + j, few + k] = raw[first_gg + 2 * many + m]
+        per_weight, per_f2 = 1.0 / p, 1.0 / f2
+        for i in range(n_columns):
+            a, b = sum_g[i] * per_weight, sum_fg[i] * per_f2
+            for j in range(n_columns):
+                gram[i, j] -= a * sum_g[j] + b * sum_fg[j]
+        # places -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
+        u, v = basis[1], basis[2]
+        u[1], u[2], v[1], v[2] = half * node_work[16], half * node_work[17], half * node_work[18], half * node_work[19]
+        u[0] = (u[1] * place[0] + u[2] * place[1]) / half
+        v[0] = (v[1] * place[0] + v[2] * place[1]) / half
+        if few == 6:
+            for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
+                times(s, t, basis[row])
+        return True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2
+
+    return set_up_reference, n_columns, first_gg + 3 * many
 
 
 @njit(nogil=True, error_model="numpy")
-def nine_from_eight(eight, nine):
-    """Sums over the eight columns -> over the nine ``g_a m_j``, index 3 a + j."""
-    nine[0] = -(eight[1] + eight[5])
-    nine[1] = -eight[6]
-    nine[2] = -eight[7]
-    for i in range(6):
-        nine[3 + i] = eight[i]
-
-
-@njit(nogil=True, error_model="numpy")
-def reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian):
-    """Sums of the nine columns, of f times them, and their Gram matrix with gain and offset projected out.
-
-    Parameters
-    ----------
-    ref, n, f2
-        The reference subset, its number of pixels and its grey levels' sum of squares.
-    work
-        (10, 9) work space.
-    sum_j, sum_fj
-        (9,) out.
-    hessian
-        (9, 9) out.
-    """
-    one_dot, f_dot = work[8], work[9]
-    for i in range(8):
-        a = ref[_ROW[i]]
-        total = np.float32(0.0)
-        for k in range(n):
-            total += a[k]
-        one_dot[i] = total
-        f_dot[i] = _dot(a, ref[2], n)
-        for j in range(i, 8):
-            value = _dot(a, ref[_ROW[j]], n)
-            work[i, j] = value
-            work[j, i] = value
-    nine_from_eight(one_dot, sum_j)
-    nine_from_eight(f_dot, sum_fj)
-    for i in range(8):
-        row = work[i]
-        a, b, c = -(row[1] + row[5]), -row[6], -row[7]
-        r0, r1, r2, r3, r4, r5 = row[0], row[1], row[2], row[3], row[4], row[5]
-        row[0], row[1], row[2] = a, b, c
-        row[3], row[4], row[5], row[6], row[7], row[8] = r0, r1, r2, r3, r4, r5
-    for j in range(9):
-        hessian[0, j] = -(work[1, j] + work[5, j])
-        hessian[1, j] = -work[6, j]
-        hessian[2, j] = -work[7, j]
-        for i in range(6):
-            hessian[3 + i, j] = work[i, j]
-    for i in range(9):
-        for j in range(9):
-            hessian[i, j] -= sum_j[i] * sum_j[j] / n + sum_fj[i] * sum_fj[j] / f2
+def times(s, t, out):
+    """Product of two linear polynomials (the first three entries of each) in x and y: six coefficients."""
+    out[0] = s[0] * t[0]
+    out[1] = s[0] * t[1] + s[1] * t[0]
+    out[2] = s[0] * t[2] + s[2] * t[0]
+    out[3] = s[1] * t[1]
+    out[4] = s[1] * t[2] + s[2] * t[1]
+    out[5] = s[2] * t[2]

@@ -1,156 +1,143 @@
-"""Gauss-Newton for the shape at one point: inverse depth, two slopes and the epipolar offset from one comparison."""
+"""Gauss-Newton for the shape at one point: inverse depth, its slopes and the epipolar offset from one comparison."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
-from core.matching.kernels.linear import assemble, factor, gradient, solve
+from core.matching.kernels.linear import covariance_of_last, solve
+from core.matching.kernels.noise import (
+    CONTRAST,
+    GAIN,
+    SHIFT,
+    ZNCC,
+    joint_weights,
+    noise_from_residuals,
+    share_correction,
+)
 from core.matching.kernels.point import (
-    CREEPING,
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
     OK,
     OUTSIDE_IMAGE,
+    PREDICTED_PX,
     REFREEZE_PX,
     SINGULAR,
-    WHITE_ROUGHNESS,
-    compare,
-    corner_motion,
+    WHITE,
     epipolar_shift,
-    image_matrices,
-    jacobian_blocks,
-    joint_weights,
-    noise_share,
-    residual_variance,
-    sandwich,
+    make_point,
     settled,
-    take_noise_out,
-    texture_roughness,
     texture_status,
 )
-from core.matching.kernels.reference import reference_sums, set_up_reference
-
-N_SHAPE_OUT = 9
-_WANTED = np.array([0, 3])  # w0 and e among the four
+from core.matching.kernels.vectors import LANES
+from core.matching.kernels.warp import lens_jacobian
 
 
-@njit(nogil=True, error_model="numpy")
-def shape_normal(weights, blocks, offsets, hessian, normal, half, reduced):
-    """Normal equations of shape: w0, w1, w2, e out of the thirteen."""
-    assemble(weights, blocks, offsets, hessian, 1, normal, half)
-    for i in range(4):
-        for j in range(4):
-            reduced[i, j] = normal[4 * i, 4 * j]
+def n_shape_out(terms: int) -> int:
+    """Numbers a point: ``terms`` of w, e, zncc, noise, covariance of (w0, e) as 00, 01, 11."""
+    return terms + 6
 
 
-@njit(nogil=True, error_model="numpy")
-def shape_point(reference, gradients, image2, lens1, lens2, R, t, xy, start, setting, space, out):
-    """Fit w0, w1, w2 and e of one point. ``out``: w (3), e, zncc, noise, cov(w0, e) (3), see ``fit.py``.
+def make_shape(degree: int) -> Any:
+    """Compile the fit for plane (degree 1) or curved (2) patches."""
+    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
+     texture, few) = make_point(degree, 1)  # fmt: skip
+    n = few + 1  # unknowns: w1, w2, ..., w0, e
 
-    Returns status and iterations.
-    """
-    subset, order, max_iterations, tolerance, max_sigma, max_step = setting
-    (ref, p, sums, box, poly, work, sum_both, hessian, rhs, levels, weights, M, blocks, offsets, normal, half, vectors,
-     reduced, _, inverse, G, _, denoised, noisy, columns) = space  # fmt: skip
-    n = subset * subset
-    grad_x, grad_y = gradients
-    inside, xc, yc, f2 = set_up_reference(reference, grad_x, grad_y, lens1, xy[0], xy[1], subset, ref, box, poly)
-    if not inside:
-        return OUTSIDE_IMAGE, 0
-    sum_j, sum_fj = sum_both[0], sum_both[1]
-    if not f2 > 0.0:
-        return LOW_TEXTURE, 0
-    reference_sums(ref, n, f2, work, sum_j, sum_fj, hessian)
-    roughness, weakest = texture_roughness(hessian, lens1, xc, yc, f2)
-    if not 1e-6 < roughness < WHITE_ROUGHNESS:
-        return LOW_TEXTURE, 0
-    w = vectors[0]
-    w[0], w[1], w[2] = start[0], start[1], start[2]
-    if not np.isfinite(w[0] + w[1] + w[2]):
-        return NOT_SEEDED, 0
-    nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
-    if not along > 0.0:
-        return SINGULAR, 0
-    e = 0.0
-    levels[0, 0], levels[0, 1] = 1.0, 0.0
-    step, rhs13 = vectors[1], vectors[2]
-    moved, previous = np.inf, 0.0
-    status = NOT_CONVERGED
-    iterations = 0
-    quiet = False
-    while iterations < max_iterations:
-        image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
-        if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
-            return OUTSIDE_IMAGE, iterations
-        iterations += 1
-        if levels[0, 3] == 0.0:
-            return LOW_TEXTURE, iterations
-        if iterations == CREEPING:
-            variance = residual_variance(levels, 1, n, f2, 4.0, order)
-            take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised)
-            quiet, moved = True, np.inf
-        if moved > REFREEZE_PX:
-            joint_weights(levels, 1, weights)
-            if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
-                return SINGULAR, iterations
-            if quiet:
-                shape_normal(weights, blocks, offsets, denoised, normal, half, reduced)
-                quiet = factor(reduced, 4)
-            if not quiet:
-                shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
-                if not factor(reduced, 4):
-                    return LOW_TEXTURE, iterations
-            moved = 0.0
-        gradient(weights, blocks, offsets, rhs, 1, rhs13)
-        small = vectors[3]
-        small[0], small[1], small[2], small[3] = -rhs13[0], -rhs13[4], -rhs13[8], -rhs13[12]
-        solve(reduced, small, 4)
-        for i in range(13):
-            step[i] = 0.0
-        step[0], step[4], step[8], step[12] = small[0], small[1], small[2], small[3]
-        motion = corner_motion(blocks, offsets, step, 1, box, lens1[1], lens1[2])
-        cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
-        w[0] += cut * step[0]
-        w[1] += cut * step[4]
-        w[2] += cut * step[8]
-        e += cut * step[12]
-        motion *= cut
-        moved += motion
-        if settled(motion, previous, tolerance):
-            status = OK
-            break
-        previous = motion
-    image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, 1, M)
-    if not compare(image2, lens2, M[0], order, ref, n, f2, box, p, sums, sum_j, sum_fj, levels[0], rhs[0]):
-        return OUTSIDE_IMAGE, iterations
-    if not w[0] > 0.0:  # behind camera 1
-        return NOT_CONVERGED, iterations
-    out[0], out[1], out[2], out[3], out[4] = w[0], w[1], w[2], e, levels[0, 2]
-    variance = residual_variance(levels, 1, n, f2, 4.0, order)
-    share = noise_share(variance, roughness, f2, n, order)
-    inflation = variance
-    joint_weights(levels, 1, weights)
-    if not jacobian_blocks(R, t, e, nu_x, nu_y, 1, M, inverse, blocks, offsets):
-        return SINGULAR, iterations
-    shape_normal(weights, blocks, offsets, hessian, normal, half, noisy)
-    take_noise_out(hessian, lens1, xc, yc, box, subset, variance, order, denoised)
-    shape_normal(weights, blocks, offsets, denoised, normal, half, reduced)
-    if not factor(reduced, 4):  # some deformation is seen by noise alone: the mean share has to do
-        inflation = variance / max(1.0 - share, 0.01) ** 2
-        shape_normal(weights, blocks, offsets, hessian, normal, half, reduced)
-        if not factor(reduced, 4):
-            return LOW_TEXTURE, iterations
-    covariance = vectors[3]
-    sandwich(reduced, noisy, _WANTED, 4, columns, covariance)
-    out[5] = math.sqrt(variance)
-    for i in range(3):
-        out[6 + i] = covariance[i if i < 2 else 3] * inflation
-    c00 = out[6]
-    sigma = max(math.sqrt(c00) * along, math.sqrt(out[8]))
-    share = noise_share(variance, weakest, f2, n, order)
-    status = texture_status(status, share, sigma, max_sigma, levels[0, 2])
-    return status, iterations
+    @njit(nogil=True, error_model="numpy")
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations):
+        """Set up and factor the normal equations; status."""
+        weights, block, columns, _, _, normal = equations
+        joint_weights(levels, variances, 1, weights)
+        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
+            return SINGULAR
+        assemble(equations, of_reference[7])
+        return OK if factor(normal, n) else LOW_TEXTURE
+
+    @njit(nogil=True, error_model="numpy")
+    def shape_point(reference, image2, lens1, lens2, R, t, xy, start, setting, space, out):
+        """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
+        subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
+        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
+        gram, columns, normal = of_reference[7], equations[2], equations[5]
+        inside, xc, yc, p, offset, f2, white = set_up_reference(
+            reference, lens1, xy[0], xy[1], subset, ref, of_reference
+        )
+        if not inside:
+            return OUTSIDE_IMAGE, 0
+        if not (f2 > 0.0 and p > 0.0):
+            return LOW_TEXTURE, 0
+        gradients, weakest = texture(gram)
+        if not (white < WHITE and gradients > 1e-6 * f2):
+            return LOW_TEXTURE, 0
+        w, step, small = vectors[0], vectors[1], vectors[2]
+        total = 0.0
+        for i in range(few):
+            w[i] = start[i]
+            total += w[i]
+        if not np.isfinite(total):
+            return NOT_SEEDED, 0
+        nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
+        if not along > 0.0:
+            return SINGULAR, 0
+        slopes = lens_jacobian(lens1, xc, yc)
+        blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
+        known = (blocks_of_pixels, p, offset, f2)
+        e = 0.0
+        levels[0, GAIN], levels[0, SHIFT] = 1.0, 0.0
+        moved, previous, last = np.inf, 0.0, np.inf
+        status = NOT_CONVERGED
+        iterations = 0
+        while iterations < max_iterations:
+            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+            if not compare(image2, lens2, M[0], order, ref, known, of_reference, warp_space, levels[0], rhs[0]):
+                return OUTSIDE_IMAGE, iterations
+            iterations += 1
+            if levels[0, CONTRAST] == 0.0:
+                return LOW_TEXTURE, iterations
+            if moved > REFREEZE_PX:
+                result = freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations)
+                if result != OK:
+                    return result, iterations
+                moved = 0.0
+            gradient(equations, rhs, step)
+            solve(normal, step, n)
+            motion = moves_of(columns, step, moves)
+            cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
+            for j in range(1, few):
+                w[j] += cut * step[j - 1]
+            w[0] += cut * step[few - 1]
+            e += cut * step[few]
+            last = cut * motion
+            moved += last
+            if settled(last, previous, tolerance):
+                status = OK
+                break
+            previous = last
+        if last < PREDICTED_PX:
+            predict(moves, rhs, gram, f2, levels)
+        else:
+            image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+            if not compare(image2, lens2, M[0], order, ref, known, of_reference, warp_space, levels[0], rhs[0]):
+                return OUTSIDE_IMAGE, iterations
+        if not w[0] > 0.0:  # behind camera 1
+            return NOT_CONVERGED, iterations
+        for j in range(few):
+            out[j] = w[j]
+        out[few], out[few + 1] = e, levels[0, ZNCC]
+        variance = noise_from_residuals(levels, 1, float(subset * subset), float(n))
+        out[few + 2] = math.sqrt(variance)
+        if known_noise:
+            variance = variances[0]
+        covariance_of_last(normal, n, 2, work, small)
+        factor_on = share_correction(gradients, variance, p, slope[0], slope[1]) * (1.0 if known_noise else variance)
+        out[few + 3], out[few + 4], out[few + 5] = factor_on * small[0], factor_on * small[1], factor_on * small[3]
+        sigma = max(math.sqrt(out[few + 3]) * along, math.sqrt(out[few + 5]))
+        share = slope[0] * variance * p / weakest
+        return texture_status(status, share, sigma, max_sigma, levels[0, ZNCC]), iterations
+
+    return shape_point, work_space, few

@@ -1,0 +1,112 @@
+"""Noise of the comparisons: their joint weights, its size from the residuals, its share in the gradients."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+# White noise of variance 1 behind a spline, at fraction t between pixels, along one axis: a + b cos(2 pi t), the first
+# two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
+VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
+ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
+MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
+
+# an image's levels; the misfit is the residuals' sum of squares, the last the noise of its interpolated grey levels
+# over that of its pixels
+GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED = range(6)
+
+N_LEVELS = 6
+
+
+@njit(nogil=True, error_model="numpy")
+def joint_weights(levels, variances, images, weights):
+    """Inverse covariance of the comparisons' residuals.
+
+    Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
+    diag(v_k / contrast_k^2) + v_ref 1 1^T, with the reference's variance first in ``variances``.
+    """
+    total = 1.0 / variances[0]
+    for k in range(images):
+        total += _certainty(levels, variances, k)
+    for k in range(images):
+        a = _certainty(levels, variances, k)
+        for o in range(images):
+            weights[k, o] = (a if k == o else 0.0) - a * _certainty(levels, variances, o) / total
+
+
+@njit(nogil=True, error_model="numpy")
+def _certainty(levels, variances, k):
+    s = min(max(levels[k, CONTRAST], 0.05), 20.0)
+    return s * s / variances[1 + k]
+
+
+@njit(nogil=True, error_model="numpy")
+def _spread_over(reach):
+    """Mean of cos(2 pi t) for t from -reach to reach."""
+    a = abs(2.0 * math.pi * reach)
+    if a > 8.0:
+        return 0.0
+    return math.sin(a) / a if a > 1e-3 else 1.0
+
+
+@njit(nogil=True, error_model="numpy")
+def _mean_cosine(place, along_x, along_y):
+    """Mean of cos(2 pi t) over a subset whose places run from ``place`` by up to these px each way."""
+    spread = _spread_over(along_x) * _spread_over(along_y)
+    return spread * math.cos(2.0 * math.pi * place) if spread != 0.0 else 0.0
+
+
+@njit(nogil=True, error_model="numpy")
+def interpolated_noise(warp, half, order):
+    """Variance of interpolated grey levels per variance of white noise in the pixels, mean over the subset."""
+    a, b = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
+    return (a + b * _mean_cosine(warp[0], warp[1] - half, warp[2])) * (
+        a + b * _mean_cosine(warp[10], warp[11], warp[12] - half)
+    )
+
+
+@njit(nogil=True, error_model="numpy")
+def noise_from_residuals(levels, images, n, unknowns):
+    """Variance of one image's noise at weight one, in reference grey levels squared, from the residuals.
+
+    Of three comparisons the quietest count: what raises the others' residuals are small differences of the views,
+    which do not pull the solution as noise does.
+    """
+    freedom = max(n - 2.0 - unknowns / images, 1.0)
+    smallest = np.inf
+    for k in range(images):
+        smallest = min(smallest, _one_variance(levels, k))
+    limit = smallest * (1.0 + ALIKE_SD * math.sqrt(2.0 / freedom))
+    total, count = 0.0, 0
+    for k in range(images):
+        one = _one_variance(levels, k)
+        if one <= limit:
+            total += one
+            count += 1
+    return max(total, 0.0) / max(count, 1) / freedom
+
+
+@njit(nogil=True, error_model="numpy")
+def _one_variance(levels, k):
+    s = min(max(levels[k, CONTRAST], 0.05), 20.0)
+    return levels[k, MISFIT] / (1.0 + levels[k, SMOOTHED] / (s * s))
+
+
+@njit(nogil=True, error_model="numpy")
+def share_correction(texture, variance, p, slope_noise, expected_share):
+    """Factor on the covariance where the subset's gradients hold another share of noise than the image's mean.
+
+    Parameters
+    ----------
+    texture
+        Sum of the squared gradients, mean of both directions.
+    variance, p
+        Of the noise, and the sum of the weights.
+    slope_noise, expected_share
+        ``ImageData.slope_noise`` and ``slope_share``.
+    """
+    share = min(slope_noise * variance * p / texture, MAX_NOISE_SHARE)
+    ratio = (1.0 - min(expected_share, MAX_NOISE_SHARE)) / (1.0 - share)
+    return ratio * ratio
