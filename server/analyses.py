@@ -19,6 +19,7 @@ from server.compute import run_task
 from server.io.files import sha256_of
 from server.io.images import decode_mask, read_image
 from server.jobs import Job
+from server.noise_sequence import averages_of
 from server.problem import problem_of
 from server.regions import make_grid
 from server.service import Service
@@ -133,6 +134,9 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
         **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
     }
+    noise = document["settings"].get("noise")
+    if noise:
+        checksums["noise.json"] = noise["sha256"]
     after = None
     if following is not None and displacement:
         with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
@@ -147,6 +151,13 @@ def _task(service: Service, document: dict[str, Any], n: int, previous: int | No
         previous=previous,
         settings=document["settings"],
         inputs=checksums,
+        noise=str(service.tests.analysis_path(test_id, document["id"]) / "noise.json") if noise else None,
+        averages={
+            str(path): averages_of(step.document)
+            for step in (ref, now, after)
+            if step is not None
+            for path in (step.cam1, step.cam2)
+        },
         label=now.document["label"],
         load_n=now.document["load_n"],
         following=None if after is None else (str(after.cam1), str(after.cam2)),

@@ -26,11 +26,13 @@ from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
+from core.noise import NoiseModel
 from core.stereo import StereoPair
 from core.threads import set_threads
 from server.io.calibration_any import load_calibration
 from server.io.images import GrayImage, read_image, read_mask
 from server.io.netcdf import Provenance, read_field, write_field
+from server.io.noise_json import load_noise
 from server.io.summary import summarise
 from server.regions import make_grid
 from server.tasks import StepTask
@@ -106,21 +108,31 @@ def _images_now(task: StepTask, context: _Context) -> _Pair:
     ahead, context.ahead = context.ahead, None
     if ahead is not None and ahead[0] == paths:
         return ahead[1].result()
-    return _read_pair(paths, context.options)
+    return _read_pair(paths, task, context.options)
 
 
 def _read_ahead(task: StepTask, context: _Context) -> None:
     """Begin to read the images of the step that will come next."""
     context.ahead = None
     if task.following is not None:
-        context.ahead = task.following, _reader.submit(_read_pair, task.following, context.options)
+        context.ahead = task.following, _reader.submit(_read_pair, task.following, task, context.options)
 
 
-def _read_pair(paths: tuple[str, str], options: MeasureOptions) -> _Pair:
-    one, two = (MeasureImage(read_image(path), path) for path in paths)
-    for image, noise in zip((one, two), options.noise, strict=True):
-        image.prepared(options.interpolation, noise)
+def _read_pair(paths: tuple[str, str], task: StepTask, options: MeasureOptions) -> _Pair:
+    models = _noise(task)
+    one, two = (_seen(read_image(path), path, task, model) for path, model in zip(paths, models, strict=True))
+    for image in (one, two):
+        image.prepared(options.interpolation)
     return one, two
+
+
+def _noise(task: StepTask) -> tuple[NoiseModel | None, NoiseModel | None]:
+    return (None, None) if task.noise is None else load_noise(task.noise).models
+
+
+def _seen(image: GrayImage, path: str, task: StepTask, model: NoiseModel | None) -> MeasureImage:
+    """An image with its camera's noise, which a mean of frames has less of."""
+    return MeasureImage(image, path, noise=None if model is None else model.averaged(*task.averages[path]))
 
 
 def _context_of(task: StepTask) -> _Context:
@@ -144,7 +156,12 @@ def _make_context(task: StepTask) -> _Context:
     options = MeasureOptions(
         subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"]
     )
-    return _Context(ReferencePair(calibration.pair, one, two), _grid(task, one), options)
+    models = _noise(task)
+    seen1, seen2 = (
+        _seen(image, task.images[which], task, model)
+        for image, which, model in zip((one, two), ("ref1", "ref2"), models, strict=True)
+    )
+    return _Context(ReferencePair(calibration.pair, seen1, seen2), _grid(task, one), options)
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:

@@ -21,6 +21,7 @@ from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from server.store.index import rebuild
+from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.worker import ComputeWorker
 
@@ -50,6 +51,7 @@ class Service:
             raise
         self.calibrations = CalibrationStore(self.folder)
         self.tests = TestStore(self.folder)
+        self.noise = NoiseStore(self.folder)
         self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests)
         for line in self.differences:
             _log.info("catalogue: %s", line)

@@ -6,7 +6,7 @@ The functions import the numerical modules when they are called, so that only th
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 
@@ -36,6 +36,10 @@ class StepTask:
         Name and SHA-256 of each input file.
     following
         Paths of the images of the step that will probably be asked for next, to be read meanwhile.
+    noise
+        Path of the noise models, or None.
+    averages
+        By an image's path: how many frames it is the mean of, and what its grey levels were multiplied by.
     """
 
     folder: str
@@ -50,6 +54,21 @@ class StepTask:
     label: str
     load_n: float | None
     following: tuple[str, str] | None = None
+    noise: str | None = None
+    averages: dict[str, tuple[int, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class NoiseTask:
+    """The fit of both cameras' noise models.
+
+    Parameters
+    ----------
+    folder
+        The noise measurement's folder, with its frames; ``noise.json`` goes there.
+    """
+
+    folder: str
 
 
 @dataclass(frozen=True)
@@ -85,6 +104,12 @@ def measure_step(task: StepTask) -> dict[str, Any]:
 def fit_calibration(task: FitTask) -> dict[str, Any]:
     """Find the grid in every view and fit both cameras; ``calibration.json`` is there when this returns."""
     summary: dict[str, Any] = _heavy("server.calibrating").fit_calibration(task)
+    return summary
+
+
+def fit_noise(task: NoiseTask) -> dict[str, Any]:
+    """Fit both cameras' noise models; ``noise.json`` is there when this returns."""
+    summary: dict[str, Any] = _heavy("server.noise_fitting").fit_noise(task)
     return summary
 
 

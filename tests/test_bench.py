@@ -14,6 +14,7 @@ from docs.scripts.bench_ceilings import Ceilings, CompiledLoop, fma_ir, gather_i
 from docs.scripts.bench_kernel import KINDS, Costs, Rate
 from docs.scripts.bench_page import Report
 from docs.scripts.bench_pairs import BenchScene, Errors, Request, judge, make_scene
+from docs.scripts.bench_parts import Parts
 from docs.scripts.bench_peer import Outcome, Run, peer_python, run_peer
 
 TINY = Request("tiny", "sim_paper", (150, 140), (46, 46, 106, 96), 10, 1)
@@ -122,12 +123,15 @@ def test_assembly_is_counted_in_the_innermost_loop() -> None:
     }  # fmt: skip
 
 
-def test_costs_split_a_point_s_time() -> None:
+def test_costs_and_parts_split_a_point_s_time() -> None:
     cost = Costs("cubic", 2.0, 1.0, 1.0, 3.0, 0.01, np.array([81.0]), np.array([2.0]), np.array([5.0]))
-    parts = cost.parts_us(33, 2.0)
-    assert parts["pixel loop"] == pytest.approx(3 * 1089 * 3e-3 * 2)
     assert cost.overhead_us(2.0) == pytest.approx(4.0)
-    assert sum(parts.values()) == pytest.approx(4.0 + 1.089 + 19.602)
+    assert cost.time_us(1089.0, 2.0) == pytest.approx(4.0 + 1.089 + 19.602)
+    split = Parts("cubic", 33, 2.0, 1.5, 0.1, 3.0, 0.3, 0.2, 0.1).split_us(30.0, 2.0)
+    assert split["pixel loop"] == pytest.approx(18.0)
+    assert split["warp set-up"] == pytest.approx(0.6)
+    assert split["factor, solve, covariance"] == pytest.approx(0.8)
+    assert sum(split.values()) == pytest.approx(30.0)
 
 
 def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,6 +148,7 @@ def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.Monkey
             report.iterations[f"motion, {kind}, {subset} px"] = np.array([2, 2, 3], dtype=np.int32)
         n, spent = np.array([81.0, 81.0, 441.0, 441.0]), np.array([2.0, 3.0, 2.0, 3.0])
         report.costs.append(Costs(kind, 2.0, 0.5, 1.0, 2.5, 0.03, n, spent, 2.0 + 0.01 * n * spent))
+        report.parts += [Parts(kind, subset, 2.0, 1.5, 0.1, 1.0, 0.3, 0.2, 0.1) for subset in (21, 33)]
         report.loops.append(count_loop(HERE, kind, ASSEMBLY))
     errors = Errors(0, np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.1, 0.1, 0.3, 0.2]))
     worse = Errors(2, errors.mean_um, 2.0 * errors.sd_um)
@@ -153,13 +158,11 @@ def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.Monkey
             report.ours.setdefault(scene, []).extend(Outcome(run, t, 9900, 2.0 / t, 2.0, errors) for t in (1, 2))
             report.peer.setdefault(scene, []).extend(Outcome(other, t, 9900, 24.0 / t, 24.0, worse) for t in (1, 2))
     page = bench_page.write_page(report).read_text()
-    assert "| speed over the peer's: cubic sequence, 33 px, 2 threads | 12 | >= 10 |  | yes |" in page
-    assert (
-        "| random error over the peer's, worst of u, v, w: cubic sequence, 33 px, 2 threads | 0.5 | 1 |  | yes |"
-        in page
-    )
-    assert "| motion, cubic, 33 px, 2 threads | 6.543e+04 | >= 60000 | points/s | yes |" in page
+    assert "| speed over the peer's: cubic sequence, 33 px, 2 threads | 12 |  | at least 10 | yes |" in page
+    assert "worst of u, v, w: cubic sequence, 33 px, 2 threads | 0.5 |  | at most 1 | yes |" in page
+    assert "| motion, cubic, 33 px, 2 threads | 65,400 | points/s | at least 60,000 | yes |" in page
+    assert "| motion, cubic, 21 px, 2 threads | 65,400 | points/s | at least 120,000 | **no** |" in page
     assert "| pyvale | tuned sequence, 33 px | 2 | 12.00 | 4,120 | 2 |" in page
-    for name in ("bench_peer_speed", "bench_peer_accuracy", "bench_costs", "bench_iterations"):
+    for name in ("bench_peer_speed", "bench_peer_accuracy", "bench_costs", "bench_iterations", "bench_parts"):
         assert f"figures/{name}.png" in page
         assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 5000

@@ -17,6 +17,7 @@ from PIL import Image
 from service_rig import TINY, served, wait_for_job, wait_for_rig
 
 from server.config import parse_config
+from server.io.noise_json import load_noise
 from server.service import Service
 
 API = "/api/v1"
@@ -166,6 +167,7 @@ def test_results_come_as_npy_file_and_probe(
         ({"region": {"polygon": [[10, 10], [20, 20]]}}, "invalid_request"),
         ({"region": {}}, "invalid_request"),
         ({"region": {"rectangle": RECTANGLE}, "subset_px": 24}, "invalid_request"),
+        ({"region": {"rectangle": RECTANGLE}, "patch": "bent"}, "invalid_request"),
         ({"region": {"rectangle": RECTANGLE}, "subset_px": 251}, "region_too_small"),
         ({"region": {"rectangle": RECTANGLE}, "seeds": [[300, 10]]}, "seed_outside"),
         ({"region": {"rectangle": RECTANGLE}, "steps": [1, 9]}, "step_missing"),
@@ -206,6 +208,26 @@ def test_mask_and_profile_measure_where_the_mask_is_white(client: httpx.Client, 
     white = mask[y.astype(int), x.astype(int)] > 0
     assert (status[white] == 0).mean() > 0.95
     assert (status[~white] == 2).all()
+
+
+def test_auto_patches_say_why_step_by_step(client: httpx.Client, calibration_id: str) -> None:
+    test_id = client.post(f"{API}/tests", json={"name": "sphere", "calibration_id": calibration_id}).json()["id"]
+    for load in (0.0, 0.2):
+        client.put(f"{API}/sim/scene", json={"scene": "sphere", "load": load})
+        assert client.post(f"{API}/tests/{test_id}/steps", json={"label": str(load)}).status_code == 201
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, "patch": "auto"}
+    accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
+    done = wait_for_job(client, accepted["job"], 240.0)
+    assert done["state"] == "succeeded", done["problem"]
+    reply = client.get(f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}").json()
+    shape, moved = (step["patch"] for step in reply["summary"]["steps"])
+    assert reply["settings"]["patch"] == "auto"
+    assert shape["patch"] == "curved"
+    assert shape["reason"].startswith("curved: plane patches err by")
+    assert shape["plane_error_mm"] > shape["curved_noise_mm"] > shape["plane_noise_mm"] > 0.0
+    assert moved["patch"] == "stretch"  # a sphere that moves as a block does not bend
+    url = f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}/steps/0/fields/curvature_1"
+    assert client.get(url).json()["units"] == "mm-1"
 
 
 def test_blank_step_fails_alone(client: httpx.Client, calibration_id: str, plate_test: str) -> None:
@@ -283,3 +305,43 @@ def test_stop_during_a_calibration_cancels_it_and_frees_the_hardware(client: htt
     assert client.get(f"{API}/calibrations/{accepted['calibration_id']}").json()["state"] == "failed"
     home = client.post(f"{API}/stage/home").json()["job"]
     assert wait_for_job(client, home)["state"] == "succeeded"
+
+
+def test_noise_is_measured_on_the_rig_and_used(client: httpx.Client, plate_test: str, tmp_path: Path) -> None:
+    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0})
+    accepted = client.post(f"{API}/noise", json={"frames": 12, "label": "at rest"})
+    assert accepted.status_code == 202, accepted.text
+    noise_id = accepted.json()["noise_id"]
+    done = wait_for_job(client, accepted.json()["job"])
+    assert done["state"] == "succeeded", done["problem"]
+    document = client.get(f"{API}/noise/{noise_id}").json()
+    assert document["state"] == "complete"
+    assert [n["id"] for n in client.get(f"{API}/noise").json()["noise"]] == [noise_id]
+    # the simulated sensor's own numbers: 280 electrons of 40000 for 255 grey levels, and a twelfth for rounding
+    grey = np.array([60.0, 170.0])
+    per_e = 255.0 / 40000.0
+    true = per_e**2 * (grey / per_e + 280.0**2) + 1.0 / 12.0
+    for cam in ("cam1", "cam2"):
+        c0, c1, c2 = document[cam]["coefficients"]
+        np.testing.assert_allclose(c0 + c1 * grey + c2 * grey**2, true, rtol=0.06)
+        assert document[cam]["frames"] == 12
+    (tmp_path / "noise.json").write_bytes(client.get(f"{API}/noise/{noise_id}/file").content)
+    assert load_noise(tmp_path / "noise.json").content["settings"]["cam1"]["exposure_ms"] == pytest.approx(10.0)
+
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 30, "steps": [1], "noise_id": noise_id}
+    accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body)
+    assert accepted.status_code == 202, accepted.text
+    done = wait_for_job(client, accepted.json()["job"], 240.0)
+    assert done["state"] == "succeeded", done["problem"]
+    url = f"{API}/tests/{plate_test}/analyses/{accepted.json()['analysis_id']}"
+    used = client.get(url).json()["settings"]["noise"]
+    assert used["noise_id"] == noise_id
+    assert used["cam2"]["coefficients"] == pytest.approx(document["cam2"]["coefficients"])
+    refused(
+        client.post(f"{API}/tests/{plate_test}/analyses", json={**body, "noise_id": "n000099-abcdef"}), 404, "not_found"
+    )
+
+
+def test_noise_that_cannot_be_measured_is_refused(client: httpx.Client) -> None:
+    refused(client.post(f"{API}/noise", json={"frames": 1}), 422, "invalid_request")
+    refused(client.get(f"{API}/noise/n000001"), 404, "not_found")

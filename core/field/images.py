@@ -32,6 +32,8 @@ class MeasureImage:
         (rows, cols) grey levels uint8, uint16 or float; or an image already prepared.
     name
         How errors call it.
+    noise
+        The camera's noise in this very image, where nothing else is asked for.
 
     Raises
     ------
@@ -39,19 +41,23 @@ class MeasureImage:
         ``image_shape``, ``image_type``, ``image_not_finite``.
     """
 
-    def __init__(self, image: ArrayLike | ImageData | MeasureImage, name: str = "image") -> None:
+    def __init__(
+        self, image: ArrayLike | ImageData | MeasureImage, name: str = "image", *, noise: NoiseModel | None = None
+    ) -> None:
         self.name = name
+        self.noise = noise
         self._prepared: dict[tuple[Interpolation, NoiseModel | None], ImageData] = {}
         self._features: dict[tuple[Box, int], Features] = {}
         self._variance: list[tuple[int, Float, Float]] = []  # of one set of points at most
         if isinstance(image, MeasureImage):
+            self.noise = image.noise if noise is None else noise
             self.pixels: NDArray[Any] = image.pixels
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
         elif isinstance(image, ImageData):
             self.pixels = image.pixels
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
-            # prepared with a model by hand, it keeps it where none is asked for
-            self._prepared[kind, image.noise] = self._prepared[kind, None] = image
+            self.noise = image.noise  # prepared with a model by hand, it keeps it where none is asked for
+            self._prepared[kind, image.noise] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
 
@@ -62,6 +68,7 @@ class MeasureImage:
 
     def prepared(self, interpolation: Interpolation, noise: NoiseModel | None = None) -> ImageData:
         """Return the image with its spline coefficients and the camera's noise, computed on the first call."""
+        noise = self.noise if noise is None else noise
         key = interpolation, noise
         if key not in self._prepared:
             self._prepared[key] = prepare(self.pixels, interpolation, noise)

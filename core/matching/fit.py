@@ -140,7 +140,7 @@ def fit_shape(
         _reference(images[0]), _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation),
         _own(pose.translation_mm), xy, w, setting, out, status, iterations,
     )  # fmt: skip
-    kernel = shape_points(degree)
+    kernel = shape_points[degree]
     run_ranges(lambda first, last: kernel(first, last, *fixed), n, POINTS_AT_ONCE)
     failed = status != 0
     out[failed, : terms + 1] = np.nan
@@ -213,7 +213,7 @@ def fit_motion(
         _reference(images[0]), _flat(images[1]), _flat(images[2]), _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2),
         _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out, status, iterations,
     )  # fmt: skip
-    kernel = motion_points(degree)
+    kernel = motion_points[degree]
     run_ranges(lambda first, last: kernel(first, last, *fixed), n, POINTS_AT_ONCE)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan

@@ -1,7 +1,7 @@
 """Measure speed on this machine, beside a peer and beside the machine's own limits: ``make bench``.
 
-Writes ``docs/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` is the one-minute form:
-the small rig only, no long sequences. ``--only`` runs some parts (ceilings, code, kernel, peer, whole) and prints; the page is then not written.
+Writes ``docs/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` is the one-minute form: the
+small rig only, no whole measurements. ``--quick`` and ``--only`` (some parts) print and leave the page as it is.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from core.threads import available_threads, set_threads
-from docs.scripts import bench_assembly, bench_kernel
+from docs.scripts import bench_assembly, bench_kernel, bench_parts
 from docs.scripts.bench_ceilings import measure_ceilings
 from docs.scripts.bench_page import Report, targets, thousands, write_page
 from docs.scripts.bench_pairs import MODERN, PAPER, BenchScene, make_scene
@@ -74,6 +74,9 @@ def kernel(report: Report, folder: Path) -> None:
         report.costs.append(bench_kernel.measure_costs(scene, kind, runs, 500 if report.quick else 1500))
         c = report.costs[-1]
         print(f"  {kind}: {c.loop_ns:.2f} ns a pixel, image and iteration; {c.overhead_us(2.0):.2f} us a point besides")
+        for subset in (21, 33):
+            report.parts.append(bench_parts.measure_parts(scene, kind, subset))
+            print(f"  {report.parts[-1]}")
     set_threads(available_threads())
 
 
@@ -139,10 +142,10 @@ def _told(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
 def main() -> int:
     """Run the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a minute: the small rig only")
+    parser.add_argument("--quick", action="store_true", help="a minute: the small rig only; the page is not written")
     parser.add_argument("--only", default="", help=f"some of {', '.join(PARTS)}; the page is not written")
     args = parser.parse_args()
-    wanted = [name for name in args.only.split(",") if name] or list(PARTS)
+    wanted = [name for name in args.only.split(",") if name] or list(PARTS[:-1] if args.quick else PARTS)
     report = Report(quick=args.quick)
     jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer, "whole": whole}
     with tempfile.TemporaryDirectory(prefix="stereorig_bench_") as folder:
@@ -154,7 +157,7 @@ def main() -> int:
     print("\n" + "\n".join(row.text() for row in targets(report)))
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     print(f"\nload of the machine at the end: {load:.1f}")
-    if not args.only:
+    if not (args.only or args.quick):
         print(f"wrote {write_page(report)}")
     return 0
 

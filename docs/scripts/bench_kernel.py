@@ -96,15 +96,9 @@ class Costs:
     iterations: Float
     measured_us: Float
 
-    def parts_us(self, subset_px: int, iterations: float) -> dict[str, float]:
-        """Split of one point's time."""
-        n = subset_px**2
-        return {
-            "once a point": self.point_us,
-            "once a point, per pixel": 1e-3 * n * self.reference_ns,
-            "each iteration": self.iteration_us * iterations,
-            "pixel loop": 3e-3 * n * self.loop_ns * iterations,
-        }
+    def time_us(self, pixels: float, iterations: float) -> float:
+        """Return the model's time of a point."""
+        return self.overhead_us(iterations) + 1e-3 * pixels * (self.reference_ns + 3.0 * self.loop_ns * iterations)
 
     def overhead_us(self, iterations: float) -> float:
         """Time of a fit without pixels."""

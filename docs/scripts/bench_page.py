@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from docs.scripts.bench_assembly import HERE, LoopCount
 from docs.scripts.bench_ceilings import Ceilings
 from docs.scripts.bench_kernel import Costs, Rate
+from docs.scripts.bench_parts import Parts
 from docs.scripts.bench_peer import Outcome
 from docs.scripts.table import Row
 
@@ -31,7 +32,7 @@ class Report:
     ----------
     quick
         Whether this is the short form.
-    ceilings, rates, costs, loops
+    ceilings, rates, costs, parts, loops
         See the modules of these names.
     iterations
         Iterations of each point by the fit's name.
@@ -50,6 +51,7 @@ class Report:
     rates: list[Rate] = field(default_factory=list)
     iterations: dict[str, NDArray[np.int32]] = field(default_factory=dict)
     costs: list[Costs] = field(default_factory=list)
+    parts: list[Parts] = field(default_factory=list)
     loops: list[LoopCount] = field(default_factory=list)
     ours: dict[str, list[Outcome]] = field(default_factory=dict)
     peer: dict[str, list[Outcome]] = field(default_factory=dict)
@@ -139,6 +141,17 @@ def targets(report: Report) -> list[Row]:
     return [*rows, *peer_rows(report), *report.rows]
 
 
+def target_line(row: Row) -> list[str]:
+    """One line of the page's first table."""
+
+    def figure(value: float) -> str:
+        return thousands(value) if abs(value) >= 1e3 else f"{value:.3g}"
+
+    limit = "" if row.limit is None else f"{'at least' if row.at_least else 'at most'} {figure(row.limit)}"
+    met = "" if row.limit is None else ("yes" if row.met else "**no**")
+    return [row.what, figure(row.measured), row.unit, limit, met]
+
+
 # the peer
 
 
@@ -207,8 +220,8 @@ def _speed_plot(report: Report) -> str:
         names = [o.run.name.removesuffix(", 33 px") for _, o in bars]
         drawn = ax.barh(names, [o.rate for _, o in bars], color=["C0" if p == "stereorig" else "C1" for p, _ in bars])
         ax.bar_label(drawn, [thousands(o.rate) for _, o in bars], padding=3, fontsize=8)
-        ax.set(xscale="log", xlabel="points / s", title=f"{threads} thread{'s' if threads > 1 else ''}")
-        ax.margins(x=0.25)
+        ax.set(xlabel="points / s", title=f"{threads} thread{'s' if threads > 1 else ''}")
+        ax.margins(x=0.22)
     axes[0].invert_yaxis()
     figure.suptitle("Disk to disk, 33 px: stereorig (blue), pyvale (orange)")
     return save(figure, "bench_peer_speed.png", "Points a second, ours and the peer's")
@@ -228,8 +241,9 @@ def _accuracy_plot(report: Report) -> str:
                             xytext=(4, 4), textcoords="offset points")  # fmt: skip
         ax.set(xscale="log", xlabel="points / s", ylabel="random error of the displacement / um", title=SCENES[scene])
         ax.title.set_fontsize(9)
-        ax.margins(x=0.25, y=0.15)
-        ax.set_ylim(bottom=0.0)
+        low, high = np.log10(ax.dataLim.intervalx)
+        ax.set_xlim(10 ** np.floor(low), 10 ** np.ceil(high + 0.3))
+        ax.set_ylim(0.0, 1.2 * ax.dataLim.ymax)
     return save(figure, "bench_peer_accuracy.png", "Random error against speed")
 
 
@@ -289,10 +303,10 @@ def _iterations_plot(report: Report) -> str:
 def _costs_text(report: Report) -> list[str]:
     head = [
         "spline",
-        "once a point, us",
-        "an iteration, us",
-        "once a pixel, ns",
-        "pixel loop, ns a pixel, image and iteration",
+        "a: once a point, us",
+        "b: an iteration, us",
+        "c: once a pixel, ns",
+        "d: pixel loop, ns a pixel, image and iteration",
         "misfit",
     ]
     rows = [
@@ -300,37 +314,43 @@ def _costs_text(report: Report) -> list[str]:
          f"{100 * c.misfit:.0f} %"]
         for c in report.costs
     ]  # fmt: skip
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6), layout="constrained")
+    figure, ax = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for k, c in enumerate(report.costs):
         far = c.iterations > np.median(c.iterations)
-        for subset, filled, label in ((~far, True, "near"), (far, False, "far")):
-            left.plot(c.pixels[subset], c.measured_us[subset], "o", color=f"C{k}", fillstyle="full" if filled else "none",
-                      label=f"{c.interpolation}, {label} start")  # fmt: skip
-            fit = [
-                sum(c.parts_us(round(n**0.5), i).values())
-                for n, i in zip(c.pixels[subset], c.iterations[subset], strict=True)
-            ]
-            left.plot(c.pixels[subset], fit, color=f"C{k}", lw=0.8)
-    left.set(
+        for chosen, filled, label in ((~far, True, "near"), (far, False, "far")):
+            ax.plot(c.pixels[chosen], c.measured_us[chosen], "o", color=f"C{k}", fillstyle="full" if filled else "none",
+                    label=f"{c.interpolation}, {label} start")  # fmt: skip
+            pairs = zip(c.pixels[chosen], c.iterations[chosen], strict=True)
+            ax.plot(c.pixels[chosen], [c.time_us(n, i) for n, i in pairs], color=f"C{k}", lw=0.8)
+    ax.set(
         xlabel="pixels in the subset", ylabel="us a point", title="Motion, one thread; lines: the model", xlim=0, ylim=0
     )
-    left.legend(fontsize=8)
-    names = []
-    bottoms: dict[str, float] = {}
-    for c in report.costs:
-        for subset in (21, 33):
-            name = f"{c.interpolation}\n{subset} px"
-            names.append(name)
-            spent = float(report.iterations[f"motion, {c.interpolation}, {subset} px"].mean())
-            for k, (part, us) in enumerate(c.parts_us(subset, spent).items()):
-                right.bar(
-                    name, us, bottom=bottoms.get(name, 0.0), color=f"C{k + 2}", label=part if len(names) == 1 else None
-                )
-                bottoms[name] = bottoms.get(name, 0.0) + us
-    right.set(ylabel="us a point", title="Where a motion's time goes")
-    right.legend(fontsize=8)
-    plot = save(figure, "bench_costs.png", "Time against pixels, and its parts")
-    return [COSTS_HOW, table(head, rows), plot]
+    ax.legend(fontsize=8)
+    text = [COSTS_HOW, table(head, rows), save(figure, "bench_costs.png", "Time against pixels")]
+    return text + (_parts_text(report) if report.parts else [])
+
+
+def _parts_text(report: Report) -> list[str]:
+    columns: dict[str, dict[str, float]] = {}
+    for part in report.parts:
+        spent = float(report.iterations[f"motion, {part.interpolation}, {part.subset_px} px"].mean())
+        total = 1e6 / pick_rate(report, "motion", part.interpolation, part.subset_px, 1)
+        columns[f"{part.interpolation}, {part.subset_px} px"] = part.split_us(total, spent)
+    names = list(next(iter(columns.values())))
+    rows = [[name, *(f"{column[name]:.2f}" for column in columns.values())] for name in names]
+    rows.append(["all", *(f"{sum(column.values()):.2f}" for column in columns.values())])
+    rows.append(["pixel loop alone, ns a pixel and image", *(f"{part.loop_ns:.2f}" for part in report.parts)])
+    figure, ax = plt.subplots(figsize=(7.5, 3.4), layout="constrained")
+    bottoms = np.zeros(len(columns))
+    for k, name in enumerate(names):
+        heights = np.array([column[name] for column in columns.values()])
+        ax.bar(list(columns), heights, bottom=bottoms, color=f"C{k}", label=name, width=0.6)
+        bottoms += heights
+    ax.set(ylabel="us a point", title="Where a motion's time goes, one thread")
+    handles, labels = ax.get_legend_handles_labels()
+    ax.legend(handles[::-1], labels[::-1], fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    plot = save(figure, "bench_parts.png", "Parts of a fit's time")
+    return [PARTS_HOW, table(["us a point", *columns], rows), plot]
 
 
 KERNEL_HOW = """`fit_shape` and `fit_motion` alone (stretch patch, three comparisons), 512 x 480 px, 60 degrees, noise 2 of 255, images prepared, starts within
@@ -338,6 +358,9 @@ a tenth of a pixel, as in a sequence. Best of several runs."""
 COSTS_HOW = """Nine subset sizes from 9 to 41 px and two distances of the start values, one thread, fitted by
 `time = a + b iterations + pixels (c + 3 d iterations)`: once a point (places, factors, covariance), each iteration (warps, sums' algebra, solve), once a
 pixel (the reference's rows and the sums of its normal equations), and the pixel loop."""
+
+PARTS_HOW = """The same from the other side: the kernel's own functions, each timed alone on one point, times as often as a fit calls them. "The rest" is what is left of the measured time:
+Jacobian, algebra of the sums, steps, results."""
 
 
 # the machine
@@ -409,34 +432,35 @@ def assembly_text(report: Report) -> list[str]:
         [x.target, x.loop, str(x.width_bits), str(x.instructions), *(str(x.counts[c]) for c in classes), str(x.stack)]
         for x in report.loops
     ]  # fmt: skip
-    return [ASSEMBLY_HOW, table(head, rows)]
+    gathers = sum(x.counts["gathers"] for x in report.loops)
+    how = ASSEMBLY_HOW.format(gathers="No gathers are left" if gathers == 0 else f"{gathers} gathers are left")
+    return [how, table(head, rows)]
 
 
 ASSEMBLY_HOW = """Instructions of one turn of the innermost loop (eight pixels of one image), compiled for four processors and for this one, counted in the assembly; nothing of
-it was run elsewhere. `haswell` and `znver3` have AVX2, the other two AVX-512. No gathers are left: taps come as rows of four (`vmovups` and `vinsertf128`; a quintic's
+it was run elsewhere. `haswell` and `znver3` have AVX2, the other two AVX-512. {gathers}; taps come as rows of four (`vmovups` and `vinsertf128`; a quintic's
 fifth and sixth taps as pairs). An instruction counts in one class; those with a place on the stack are counted besides."""
 
 HEAD = """# Performance, measured
 
-Everything on this page was measured by `make bench{quick}` in one run, which writes the page anew; nothing is typed in. Timings are those of this machine at that hour;
+Everything on this page was measured by `make bench` in one run, which writes the page anew; nothing is typed in. Timings are those of this machine at that hour;
 ratios within the page travel better than figures.
 """
 
 
 def write_page(report: Report) -> Path:
     """Write the page and its plots; returns its path."""
-    rows = targets(report)
-    header = Row.header().replace("at most", "limit")
+    rows = [target_line(row) for row in targets(report)]
     sections: list[tuple[str, list[str]]] = [
         ("Machine", [*(f"- {fact}" for fact in machine())]),
-        ("What was asked, and what it is", ["\n".join([header, *(row.markdown() for row in rows)])]),
+        ("What is asked, and what it is", [table(["what", "measured", "unit", "asked", "met"], rows)]),
         ("Beside pyvale", peer_text(report) if report.ours else []),
         ("One point", kernel_text(report) if report.rates else []),
         ("The machine's limits", machine_text(report) if report.ceilings else []),
         ("Generated code", assembly_text(report)),
         *((title, [text]) for title, text in report.more),
     ]
-    page = [HEAD.format(quick=" ARGS=--quick" if report.quick else "")]
+    page = [HEAD]
     for title, parts in sections:
         if parts:
             glue = "\n" if title == "Machine" else "\n\n"

@@ -2,7 +2,7 @@
 
 The texture under the subset is unknown, and so are gain and offset of every image. With the texture eliminated, the
 differences of each image to the reference, carried through the true warp, are left: their covariance is that of the
-image's noise plus the reference's, which all share. All derivatives of the warp are central differences through the
+image's noise, by the density of its pixels on the patch, plus the reference's, which all share. All derivatives of the warp are central differences through the
 cameras' own functions; grey-level slopes are those of the noise-free picture.
 """
 
@@ -77,6 +77,9 @@ class _Point:
             v[0] = self.variances[0][at[:, 1], at[:, 0]]
             for k, p in enumerate(places):
                 v[k + 1] = map_coordinates(self.variances[k + 1], p.T[::-1], order=1)
+        # an image that sees the patch larger has more pixels on it, each with noise of its own
+        scales = [np.abs(np.linalg.det(self._carried(k, unknowns, pixels, xy))) for k in range(count)]
+        v[1:] /= np.stack(scales)
         # inverse covariance (n, count, count) of the differences at each pixel, in the reference's grey levels
         C = v[0][:, None, None] + np.einsum("kn,kj->nkj", v[1:] / contrast[:, None] ** 2, np.eye(count))
         W = np.linalg.inv(C)
@@ -116,12 +119,7 @@ class _Point:
 
     def _jacobian(self, k: int, unknowns: Float, pixels: Float, xy: Float, slope: Float) -> Float:
         """Reference slopes carried through the warp, (pixels, unknowns)."""
-        h = 0.02
-        by = [
-            (self._warp(k, unknowns, pixels, d, xy) - self._warp(k, unknowns, pixels, -d, xy)) / (2 * h)
-            for d in np.eye(2) * h
-        ]
-        inverse = np.linalg.inv(np.stack(by, -1))
+        inverse = np.linalg.inv(self._carried(k, unknowns, pixels, xy))
         columns = []
         for i, step in enumerate(_STEPS[: len(unknowns)]):
             d = np.zeros(len(unknowns))
@@ -130,8 +128,14 @@ class _Point:
             columns.append(np.einsum("ni,nij,nj->n", slope, inverse, moved))
         return np.stack(columns, axis=-1)
 
-    def _warp(self, k: int, unknowns: Float, pixels: Float, d: Float, xy: Float) -> Float:
-        return self._place(k, unknowns, pixels + d, xy)
+    def _carried(self, k: int, unknowns: Float, pixels: Float, xy: Float) -> Float:
+        """Derivative (pixels, 2, 2) of comparison k's image places over the reference's."""
+        h = 0.02
+        by = [
+            (self._place(k, unknowns, pixels + d, xy) - self._place(k, unknowns, pixels - d, xy)) / (2 * h)
+            for d in np.eye(2) * h
+        ]
+        return np.stack(by, -1)
 
 
 def displacement_bound(window: Window, xy: Float, w: Float, G: Float, covariance: Float) -> Float:

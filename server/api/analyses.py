@@ -14,6 +14,7 @@ from server.api.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, m
 from server.api.models import AnalysisAccepted, AnalysisReply, AnalysisRequest
 from server.api.problems import errors
 from server.errors import NotFoundError
+from server.io.noise_json import load_noise
 from server.jobs import Phase
 from server.service import Service
 from server.store.index import analysis_entry
@@ -36,7 +37,9 @@ def create_analysis(
     calibration = service.tests.calibration_file(test_id)
     steps = analyses.steps_to_measure(service, test_id, body.reference, body.steps)
     mask = _mask_bytes(body)
-    settings = body.model_dump(exclude={"kind", "label", "steps"})
+    settings = body.model_dump(exclude={"kind", "label", "steps", "noise_id"})
+    noise = None if body.noise_id is None else service.noise.file(body.noise_id)
+    settings["noise"] = None if noise is None else {"noise_id": body.noise_id, **load_noise(noise).record()}
     settings["region"].pop("mask_png_base64")
     analyses.check_region(service, test_id, steps[0], settings, mask)
     request = mark(f"tests/{test_id}/analyses", key, body)
@@ -54,7 +57,7 @@ def create_analysis(
         }
 
         def prepare() -> dict[str, Any]:
-            stored = service.tests.create_analysis(test_id, document, mask)
+            stored = service.tests.create_analysis(test_id, document, mask, noise)
             made["analysis_id"] = stored["id"]
             return {"test_id": test_id, **made}
 

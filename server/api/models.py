@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
 
+from core.field.patch import DEFAULT_PATCH, PatchSetting
+
 
 def _not_a_truth_value(value: Any) -> Any:
     # true would be taken for 1: an axis would move by a millimetre
@@ -59,7 +61,7 @@ class JobReply(Reply):
     """Anything that takes longer than a request."""
 
     id: str = Field(description="Id of the job.", examples=["j000007-a31f0c"])
-    kind: str = Field(description="`calibration`, `analysis`, `move`, `home` or `reconnect`.")
+    kind: str = Field(description="`calibration`, `noise`, `analysis`, `move`, `home` or `reconnect`.")
     state: JobState = Field(description="Where it is in its life.")
     subject: dict[str, Any] = Field(description="Ids of what it works on.")
     progress: Progress = Field(description="How far it is.")
@@ -142,6 +144,53 @@ class SceneRequest(Request):
     params: dict[str, Number | list[Number]] = Field(
         default_factory=dict, description="Further parameters of the scene.", max_length=20
     )
+
+
+# noise ----------------------------------------------------------------------------------------------------------
+
+
+class NoiseRequest(Request):
+    """How to measure the cameras' noise."""
+
+    frames: Annotated[Whole, Field(ge=2, le=200)] = Field(
+        16, description="Pairs of frames; the scene must stand still."
+    )
+    label: Label = Field("", description="Free text.")
+
+
+class NoiseAccepted(Accepted):
+    """A noise measurement was begun."""
+
+    noise_id: str = Field(description="Id of the noise measurement.", examples=["n000001-5b1c22"])
+
+
+class NoiseModelReply(Reply):
+    """One camera's model: variance = c0 + c1 g + c2 g^2 at grey level g."""
+
+    coefficients: list[float] = Field(description="c0, c1, c2, in grey levels squared, grey levels, 1.")
+    coefficients_sd: list[float] = Field(description="Their standard deviations.")
+    range_grey: list[float | None] = Field(description="Grey levels between which it holds; null: no end.")
+    frames: int = Field(description="Frames it was measured from.")
+    misfit: float = Field(description="Scatter of the bins about it, in their own sd; 1 is chance.")
+    drift: float = Field(description="Largest relative change of brightness between frames; taken out.")
+    shift_px: float = Field(description="Largest motion of the image between frames; taken out.")
+
+
+class NoiseReply(Reply):
+    """A noise measurement."""
+
+    id: str = Field(description="Id.")
+    state: Literal["unfinished", "failed", "complete"] = Field(description="Where it is in its life.")
+    plan: dict[str, Any] = Field(description="What was asked for.")
+    problem: dict[str, Any] | None = Field(None, description="Why it has no models.")
+    cam1: NoiseModelReply | None = Field(None, description="Camera 1's model.")
+    cam2: NoiseModelReply | None = Field(None, description="Camera 2's model.")
+
+
+class NoiseList(Reply):
+    """Noise measurements, oldest first."""
+
+    noise: list[NoiseReply] = Field(description="Noise measurements, oldest first.")
 
 
 # calibrations ---------------------------------------------------------------------------------------------------
@@ -292,10 +341,18 @@ class AnalysisRequest(Request):
     region: Region = Field(description="Where points may lie.")
     subset_px: Annotated[Whole, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
     step_px: Annotated[Whole, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
-    patch: Literal["stretch", "rigid"] = Field("stretch", description="Patch model of the motion.")
+    patch: PatchSetting = Field(
+        DEFAULT_PATCH,
+        description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about "
+        "twice the noise; auto takes stretch or curved, whichever errs less on the field in all, shape and motion "
+        "apart; each step's summary has the choice and its reason under patch.",
+    )
     interpolation: Literal["cubic", "quintic"] = Field("quintic", description="B-spline order.")
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
+    )
+    noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
+        None, description="Noise measurement whose models weigh the pixels; without it, residuals tell the noise."
     )
     steps: Annotated[list[Annotated[Whole, Field(ge=0, le=9999)]], Field(min_length=1, max_length=10000)] | None = (
         Field(None, description="Steps to measure; all if left out. The reference is always measured.")

@@ -193,13 +193,17 @@ class TestStore:
         folder = self.path(test_id) / "analyses"
         return sorted(p.parent.name for p in folder.glob("a*/analysis.json") if is_id(p.parent.name, "a"))
 
-    def create_analysis(self, test_id: str, document: dict[str, Any], mask: bytes | None = None) -> dict[str, Any]:
-        """Make an analysis: settings and inputs, fixed from now on."""
+    def create_analysis(
+        self, test_id: str, document: dict[str, Any], mask: bytes | None = None, noise: Path | None = None
+    ) -> dict[str, Any]:
+        """Make an analysis: settings and inputs, fixed from now on; with its own copy of the noise models."""
         analysis_id = self._folder.ids.new("a")
         path = self.path(test_id) / "analyses" / analysis_id
         make_folder(path)
         if mask is not None:
             document = {**document, "mask_sha256": write_bytes(path / "mask.png", mask)}
+        if noise is not None:
+            write_bytes(path / "noise.json", noise.read_bytes())
         document = {"id": analysis_id, "test_id": test_id, "created_utc": now_utc(), **document}
         write_json(path / "analysis.json", document)
         return document

@@ -5,13 +5,13 @@ but its own input, so neither ranges nor threads change a digit.
 
 Only these are cached on disk. numba looks at the date of the cached function's own file alone, and all kernels are
 inlined here; so the cache's key gets a stamp of all their sources, through a closure variable, and a change in any of
-them compiles anew.
+them compiles anew. The kernels themselves are globals: as closure variables they would enter the key too, and theirs
+differs from process to process.
 """
 
 from __future__ import annotations
 
 import hashlib
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,49 +21,74 @@ from core.matching.kernels.motion import make_motion
 from core.matching.kernels.shape import make_shape
 
 
-@cache
 def _stamp() -> int:
     here = Path(__file__).parent
-    sources = [*sorted(here.glob("*.py")), here.parent / "image.py", here.parents[1] / "status.py"]
+    sources = [*sorted(here.glob("*.py")), here.parents[1] / "status.py"]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).digest()
     return int.from_bytes(digest[:7], "big")
 
 
-@cache
-def shape_points(degree: int) -> Any:
-    """Return the compiled fit of shape for plane (1) or curved (2) patches, for rows ``first`` to ``last``."""
-    stamp = _stamp() + degree
-    shape_point, work_space, _ = make_shape(degree)
+_plane_shape, _plane_shape_space = make_shape(1)
+_plane_motion, _plane_motion_space = make_motion(1)
+_curved_shape, _curved_shape_space = make_shape(2)
+_curved_motion, _curved_motion_space = make_motion(2)
 
+
+def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
     @njit(cache=True, nogil=True, error_model="numpy")
-    def run_shape(first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations):
+    def run_plane_shape(
+        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations
+    ):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        space = work_space(setting[0])
+        space = _plane_shape_space(setting[0])
         for i in range(first, last):
-            status[i], iterations[i] = shape_point(
+            status[i], iterations[i] = _plane_shape(
                 reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
             )
 
-    return run_shape
-
-
-@cache
-def motion_points(degree: int) -> Any:
-    """Return the compiled fit of shape and motion for plane (1) or curved (2) patches."""
-    stamp = _stamp() + degree
-    motion_point, work_space, _ = make_motion(degree)
-
     @njit(cache=True, nogil=True, error_model="numpy")
-    def run_motion(first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
-                   out, status, iterations):  # fmt: skip
-        if stamp < 0:  # never; it makes the stamp part of the function
+    def run_plane_motion(
+        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, out,
+        status, iterations,
+    ):  # fmt: skip
+        if stamp < 0:
             return
-        space = work_space(setting[0])
+        space = _plane_motion_space(setting[0])
         for i in range(first, last):
-            status[i], iterations[i] = motion_point(
+            status[i], iterations[i] = _plane_motion(
                 reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,
                 out[i],
             )  # fmt: skip
 
-    return run_motion
+    @njit(cache=True, nogil=True, error_model="numpy")
+    def run_curved_shape(
+        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations
+    ):
+        if stamp < 0:  # never; it makes the stamp part of the function
+            return
+        space = _curved_shape_space(setting[0])
+        for i in range(first, last):
+            status[i], iterations[i] = _curved_shape(
+                reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
+            )
+
+    @njit(cache=True, nogil=True, error_model="numpy")
+    def run_curved_motion(
+        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, out,
+        status, iterations,
+    ):  # fmt: skip
+        if stamp < 0:
+            return
+        space = _curved_motion_space(setting[0])
+        for i in range(first, last):
+            status[i], iterations[i] = _curved_motion(
+                reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,
+                out[i],
+            )  # fmt: skip
+
+    return {1: run_plane_shape, 2: run_curved_shape}, {1: run_plane_motion, 2: run_curved_motion}
+
+
+shape_points, motion_points = _wrappers(_stamp())
+"""The compiled fits, by the patch's degree: 1 plane, 2 curved."""

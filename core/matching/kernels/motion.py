@@ -87,7 +87,7 @@ def make_motion(degree: int) -> Any:
         assemble(equations, of_reference[7])
         return OK if factor(normal, n) else LOW_TEXTURE
 
-    @njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy", inline="always")
     def motion_point(
         reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out
     ):
@@ -212,4 +212,4 @@ def make_motion(degree: int) -> Any:
         share = slope[0] * variance * p / weakest
         return texture_status(status, share, sigma, max_sigma, worst), iterations
 
-    return motion_point, work_space, few
+    return motion_point, work_space

@@ -58,7 +58,7 @@ def make_shape(degree: int) -> Any:
         assemble(equations, of_reference[7])
         return OK if factor(normal, n) else LOW_TEXTURE
 
-    @njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy", inline="always")
     def shape_point(reference, image2, lens1, lens2, R, t, xy, start, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
@@ -140,4 +140,4 @@ def make_shape(degree: int) -> Any:
         share = slope[0] * variance * p / weakest
         return texture_status(status, share, sigma, max_sigma, levels[0, ZNCC]), iterations
 
-    return shape_point, work_space, few
+    return shape_point, work_space

@@ -1,0 +1,198 @@
+"""What the parts of one motion fit cost, each timed alone in a compiled loop on a real point of the bench's scene.
+
+The parts are the kernel's own functions (``core/matching/kernels``); what is left of the fit's time is the Jacobian, the
+algebra of the sums, the steps and the results.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from core.matching.image import PAD
+from core.matching.kernels.linear import covariance_of_last, make_factor, padded, solve
+from core.matching.kernels.loops import LANES, N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials, sum_reference
+from core.matching.kernels.reference import make_reference, set_up_tables, width
+from core.matching.kernels.warp import N_NODES, set_up_warp
+from core.matching.options import SPLINE_ORDER, Interpolation
+from docs.scripts.bench_kernel import KernelScene
+
+DEGREE = 1  # plane patches
+_UNKNOWNS = 13
+_LEAST_S = 0.01
+_REPEATS = 7
+
+
+@dataclass(frozen=True)
+class Parts:
+    """us of each part, once: one point, one image or one solution, whichever the part is about.
+
+    Attributes
+    ----------
+    interpolation, subset_px
+        What was timed.
+    reference_us, gram_us
+        The reference's set-up as a whole, and of it the sums for the normal equations.
+    warp_us, loop_us
+        Warp and pixel loop of one image.
+    factor_us, solve_us, covariance_us
+        Of the 13 unknowns.
+    """
+
+    interpolation: Interpolation
+    subset_px: int
+    reference_us: float
+    gram_us: float
+    warp_us: float
+    loop_us: float
+    factor_us: float
+    solve_us: float
+    covariance_us: float
+
+    @property
+    def loop_ns(self) -> float:
+        """Pixel loop, ns a pixel and image."""
+        return 1e3 * self.loop_us / self.subset_px**2
+
+    def split_us(self, total_us: float, iterations: float) -> dict[str, float]:
+        """Share out a fit's time; three images in each iteration."""
+        known = {
+            "reference: copy, rays": self.reference_us - self.gram_us,
+            "reference: Gram sums": self.gram_us,
+            "warp set-up": 3.0 * iterations * self.warp_us,
+            "pixel loop": 3.0 * iterations * self.loop_us,
+            "factor, solve, covariance": self.factor_us + iterations * self.solve_us + self.covariance_us,
+        }
+        return {**known, "the rest": max(0.0, total_us - sum(known.values()))}
+
+
+@cache
+def _timers(order: int) -> dict[str, Any]:
+    """Compiled loops around the parts."""
+    set_up_reference, _, n_raw = make_reference(DEGREE)
+    sums_of, compare = sum_reference[DEGREE], (compare_cubic if order == 3 else compare_quintic)[DEGREE]
+    factor = make_factor(int(padded(_UNKNOWNS)))
+    lead = order // 2
+
+    @njit(nogil=True, error_model="numpy")
+    def reference(n, images, lens, x, y, subset, ref, space):
+        total = 0.0
+        for _ in range(n):
+            total += set_up_reference(images, lens, x, y, subset, ref, space)[5]
+        return total
+
+    @njit(nogil=True, error_model="numpy")
+    def gram(n, ref, blocks, raw):
+        for _ in range(n):
+            sums_of(ref, np.int64(blocks), np.float32(0.0), raw)
+        return raw[0]
+
+    @njit(nogil=True, error_model="numpy")
+    def warp(n, lens, m, powers, rows, cols, stride, work, p):
+        base = 0
+        for _ in range(n):
+            base += set_up_warp(lens, m, powers, rows, cols, stride, lead, work, p)
+        return base
+
+    @njit(nogil=True, error_model="numpy")
+    def loop(n, coefficients, base, stride, p, ref, blocks, out):
+        for _ in range(n):
+            compare(coefficients, np.int64(base), np.int64(stride), p, ref, np.int64(blocks), out)
+        return out[0]
+
+    @njit(nogil=True, error_model="numpy")
+    def factors(n, normal, work):
+        for _ in range(n):
+            work[:] = normal
+            factor(work, _UNKNOWNS)
+        return work[0, 0]
+
+    @njit(nogil=True, error_model="numpy")
+    def solves(n, u, b, x):
+        for _ in range(n):
+            x[:] = b
+            solve(u, x, _UNKNOWNS)
+        return x[0]
+
+    @njit(nogil=True, error_model="numpy")
+    def covariances(n, u, work, out):
+        for _ in range(n):
+            covariance_of_last(u, _UNKNOWNS, 5, work, out)
+        return out[0]
+
+    return {
+        "n_raw": n_raw, "reference": reference, "gram": gram, "warp": warp, "loop": loop, "factor": factors, "solve": solves,
+        "covariance": covariances,
+    }  # fmt: skip
+
+
+def _us(call: Callable[[int], object]) -> float:
+    """us of one turn, best of several runs."""
+    n = 1
+    call(n)
+    while True:
+        start = time.perf_counter()
+        call(n)
+        if time.perf_counter() - start > _LEAST_S:
+            break
+        n *= 2
+    best = np.inf
+    for _ in range(_REPEATS):
+        start = time.perf_counter()
+        call(n)
+        best = min(best, time.perf_counter() - start)
+    return 1e6 * float(best) / n
+
+
+def measure_parts(scene: KernelScene, interpolation: Interpolation, subset_px: int) -> Parts:
+    """Time the parts at the middle point of the scene, seen by camera 2 at the plane's depth and slope zero."""
+    order = SPLINE_ORDER[interpolation]
+    run = _timers(order)
+    few = len(monomials(DEGREE))
+    columns = 2 * few
+    images = scene.images[interpolation]
+    x, y = scene.xy_px[len(scene.xy_px) // 2]
+    lens1, lens2 = (np.array(c.lens.kernel_parameters()) for c in (scene.pair.cam1, scene.pair.cam2))
+    weights = np.empty((0, 0), np.float32) if images[0].weights is None else images[0].weights
+    pictures = (images[0].pixels, *images[0].gradients, weights)
+    ref = np.empty((N_ROWS, int(width(subset_px))), np.float32)
+    set_up_tables(subset_px, ref)
+    raw, powers = np.empty(run["n_raw"]), np.empty((few, N_NODES))
+    space = (
+        raw, np.empty(22), powers, np.eye(few), np.empty(3), np.empty(columns), np.empty(columns), np.empty((columns, columns)),
+    )  # fmt: skip
+    reference_us = _us(lambda n: run["reference"](n, pictures, lens1, x, y, subset_px, ref, space))
+    blocks = (subset_px**2 + LANES - 1) // LANES
+    gram_us = _us(lambda n: run["gram"](n, ref, blocks, raw))
+    pose = scene.pair.cam2_from_cam1
+    xc, yc, _ = scene.pair.cam1.rays_cam(np.array([x, y])).xyz_mm
+    m = np.array([pose.rotation @ [xc, yc, 1.0], pose.rotation[:, 0], pose.rotation[:, 1]]).T
+    m[:, 0] += pose.translation_mm * scene.w0[len(scene.xy_px) // 2]
+    m = np.ascontiguousarray(m)
+    rows, cols = images[1].shape
+    stride = cols + 2 * PAD
+    work, p = np.empty(26), np.zeros(N_WARP, np.float32)
+    p[20] = 1.0
+    base = run["warp"](1, lens2, m, powers, rows, cols, stride, work, p)
+    if base < 0:
+        raise RuntimeError("the bench's point is not in camera 2's picture")
+    warp_us = _us(lambda n: run["warp"](n, lens2, m, powers, rows, cols, stride, work, p))
+    flat, sums = images[1].coefficients.ravel(), np.empty(3 + columns)
+    loop_us = _us(lambda n: run["loop"](n, flat, base, stride, p, ref, blocks, sums))
+    size = int(padded(_UNKNOWNS))
+    normal = np.full((size, size), 0.1) + np.eye(size)
+    u = np.empty_like(normal)
+    factor_us = _us(lambda n: run["factor"](n, normal, u))
+    b, small = np.ones(size), np.empty(size)
+    solve_us = _us(lambda n: run["solve"](n, u, b, small))
+    out = np.empty(25)
+    covariance_us = _us(lambda n: run["covariance"](n, u, np.empty((size, size)), out))
+    return Parts(
+        interpolation, subset_px, reference_us, gram_us, warp_us, loop_us, factor_us, solve_us, covariance_us
+    )  # fmt: skip

@@ -1,0 +1,80 @@
+"""The cameras' noise: measure, list, look."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path
+from fastapi.responses import FileResponse
+
+from server import noise_sequence
+from server.api.dependencies import KeyHeader, ServiceDep, mark
+from server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
+from server.api.problems import errors
+from server.jobs import Job, Phase
+
+router = APIRouter(prefix="/noise", tags=["noise"])
+NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurement.")]
+
+
+@router.post(
+    "",
+    summary="Measure both cameras' noise",
+    response_model=NoiseAccepted,
+    status_code=202,
+    responses=errors(409, 422, 503, 507),
+)
+def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: KeyHeader = None) -> dict[str, Any]:
+    """Take frames of what stands still before the cameras, as they are set now; fit variance against grey level."""
+    body = body or NoiseRequest.model_validate({})
+    request = mark("noise", key, body)
+
+    def make() -> dict[str, Any]:
+        made: dict[str, Any] = {}
+
+        def prepare() -> dict[str, Any]:
+            plan = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name, **request.document()}
+            made["noise_id"] = service.noise.create(plan)
+            return dict(made)
+
+        def hardware(job: Job) -> dict[str, Any]:
+            return noise_sequence.take_frames(service, job, made["noise_id"], body.frames)
+
+        def compute(job: Job) -> dict[str, Any]:
+            return noise_sequence.fit(service, job, made["noise_id"])
+
+        job = service.jobs.submit(
+            "noise",
+            "a noise measurement",
+            {},
+            [Phase("hardware", hardware), Phase("compute", compute)],
+            prepare=prepare,
+            on_end=lambda job, state: noise_sequence.close(service, job, made["noise_id"], state),
+        )
+        return {**made, "job_id": job.id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"]), "noise_id": made["noise_id"]}
+
+
+@router.get("", summary="Noise measurements, oldest first", response_model=NoiseList)
+def list_noise(service: ServiceDep) -> dict[str, Any]:
+    """Return every noise measurement that was begun, with its state."""
+    return {"noise": [_shown(service.noise.read(noise_id)) for noise_id in service.noise.ids()]}
+
+
+@router.get("/{noise_id}", summary="One noise measurement", response_model=NoiseReply, responses=errors(404))
+def get_noise(service: ServiceDep, noise_id: NoiseId) -> dict[str, Any]:
+    """Return plan, state and, once complete, both cameras' models."""
+    return _shown(service.noise.read(noise_id))
+
+
+@router.get("/{noise_id}/file", summary="noise.json as stored", response_class=FileResponse, responses=errors(404, 409))
+def get_file(service: ServiceDep, noise_id: NoiseId) -> FileResponse:
+    """Return the file, which `stereorig measure --noise` reads."""
+    return FileResponse(service.noise.file(noise_id), media_type="application/json")
+
+
+def _shown(document: dict[str, Any]) -> dict[str, Any]:
+    plan = {k: v for k, v in document["plan"].items() if k != "request"}
+    return {**document, "plan": plan}

@@ -1,0 +1,101 @@
+"""Noise measurements on disk: the frames as taken, the models.
+
+``plan.json`` is written first, ``frames.json`` when every frame is there, ``noise.json`` last: only a folder that holds
+it is a noise measurement.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from core.errors import StateError
+from server.errors import NotFoundError
+from server.io.images import GrayImage, encode_tiff
+from server.problem import RESTART, problem_of
+from server.store.durable import make_folder, read_json, write_bytes, write_json
+from server.store.folder import DataFolder, is_id, now_utc
+
+
+class NoiseStore:
+    """The noise measurements of one data folder."""
+
+    def __init__(self, folder: DataFolder) -> None:
+        self._folder = folder
+        for noise_id in self.ids():
+            folder.ids.seen(noise_id)
+            if self.read(noise_id)["state"] == "unfinished":
+                # nobody works on it any more: the job that did ended with the last service
+                self.put_failure(noise_id, problem_of(RESTART))
+
+    @property
+    def _root(self) -> Path:
+        return self._folder.root / "noise"
+
+    def path(self, noise_id: str) -> Path:
+        """Folder of an existing noise measurement.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none with this id.
+        """
+        path = self._root / noise_id if is_id(noise_id, "n") else None
+        if path is None or not (path / "plan.json").is_file():
+            raise NotFoundError(f"There is no noise measurement {noise_id[:40]!r}.", what="noise")
+        return path
+
+    def ids(self) -> list[str]:
+        """Ids of all noise measurements, finished or not, in the order of their making."""
+        return sorted(p.parent.name for p in self._root.glob("n*/plan.json") if is_id(p.parent.name, "n"))
+
+    def create(self, plan: dict[str, Any]) -> str:
+        """Make the folder of a new noise measurement and return its id."""
+        noise_id = self._folder.ids.new("n")
+        if not self._root.exists():
+            make_folder(self._root)
+        path = self._root / noise_id
+        make_folder(path)
+        make_folder(path / "frames")
+        write_json(path / "plan.json", {"id": noise_id, "created_utc": now_utc(), **plan})
+        return noise_id
+
+    def put_frame(self, noise_id: str, index: int, cam: str, image: GrayImage) -> dict[str, Any]:
+        """Store one frame; return its camera, file name and checksum."""
+        name = f"frames/{index:03d}_{cam}.tif"
+        return {"camera": cam, "file": name, "sha256": write_bytes(self.path(noise_id) / name, encode_tiff(image))}
+
+    def put_frames_done(self, noise_id: str, frames: list[dict[str, Any]], facts: dict[str, Any]) -> None:
+        """Write ``frames.json``: every frame with camera and checksum, and the cameras' settings."""
+        write_json(self.path(noise_id) / "frames.json", {**facts, "frames": frames})
+
+    def put_failure(self, noise_id: str, problem: dict[str, Any]) -> None:
+        """Record why there are no models."""
+        write_json(self.path(noise_id) / "failure.json", problem)
+
+    def read(self, noise_id: str) -> dict[str, Any]:
+        """Return plan, models and state (``unfinished``, ``failed``, ``complete``)."""
+        path = self.path(noise_id)
+        document: dict[str, Any] = {"id": noise_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
+        if (path / "noise.json").exists():
+            document = {**read_json(path / "noise.json"), **document, "state": "complete", "problem": None}
+        elif (path / "failure.json").exists():
+            document |= {"state": "failed", "problem": read_json(path / "failure.json")}
+        return document
+
+    def file(self, noise_id: str) -> Path:
+        """Path of ``noise.json``.
+
+        Raises
+        ------
+        StateError
+            ``noise_not_complete`` if it is not there.
+        """
+        path = self.path(noise_id) / "noise.json"
+        if not path.is_file():
+            raise StateError(
+                f"Noise measurement {noise_id} is {self.read(noise_id)['state']}.",
+                code="noise_not_complete",
+                remedy="Wait for its job, or measure again.",
+            )
+        return path
