@@ -23,6 +23,7 @@ from core.field.images import MeasureImage, different, features_of, same_size
 from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting, UsedPatch, asked_for
 from core.field.patch_choice import advise, choose_patch
 from core.field.plane_error import plane_error
+from core.field.predict import predict
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
 from core.field.scatter import ScatteredShape, scattered_motion, scattered_shape
@@ -336,6 +337,9 @@ class _Run:
                 if self.patch.patch == "curved":
                     self._refit_curved()
                 # the sample stands already, fitted from these very starts
+                sample = np.flatnonzero(self.points.ok)
+                if self.points.G.shape == G.shape:
+                    G = predict(self.pair, self.xy_px, G, sample, self.points.w[sample], self.points.G[sample])
                 known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
                 index = np.flatnonzero(self.usable & known & ~self.points.ok)
                 self.progress("previous", 0, len(index))
