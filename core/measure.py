@@ -20,8 +20,10 @@ from core.field.fitter import Fitter, PointFits
 from core.field.gates import GateOptions, apply_gates
 from core.field.grow import Attempts, fit_in_batches, grow
 from core.field.images import MeasureImage, different, features_of, same_size
-from core.field.patch import UsedPatch, asked_for
-from core.field.patch_choice import choose_patch
+from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting, UsedPatch, asked_for
+from core.field.patch_choice import advise, choose_patch
+from core.field.plane_error import plane_error
+from core.field.predict import predict
 from core.field.region import PointGrid, check_region, check_subset
 from core.field.result import Field
 from core.field.scatter import ScatteredShape, scattered_motion, scattered_shape
@@ -42,7 +44,7 @@ from core.field.where import box_around, scales, seen_by_camera2
 from core.lens import Bool, Float
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
-from core.matching.options import PATCH_SETTINGS, Interpolation, MatchOptions, Patch, PatchSetting
+from core.matching.options import Interpolation, MatchOptions, Patch
 from core.noise import NoiseModel
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.status import PointStatus
@@ -82,7 +84,7 @@ class MeasureOptions:
     """
 
     subset_px: int = 33
-    patch: PatchSetting = "stretch"
+    patch: PatchSetting = DEFAULT_PATCH
     interpolation: Interpolation = "quintic"
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
@@ -335,6 +337,9 @@ class _Run:
                 if self.patch.patch == "curved":
                     self._refit_curved()
                 # the sample stands already, fitted from these very starts
+                sample = np.flatnonzero(self.points.ok)
+                if self.points.G.shape == G.shape:
+                    G = predict(self.pair, self.xy_px, G, sample, self.points.w[sample], self.points.G[sample])
                 known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
                 index = np.flatnonzero(self.usable & known & ~self.points.ok)
                 self.progress("previous", 0, len(index))
@@ -461,11 +466,7 @@ class _Run:
         if self.patch.patch == "curved" and self.fitter.terms == 3:
             self._refit_curved()
         self._fill()
-        if self.options.patch == "auto" and not self.patch.kept:
-            self.patch = choose_patch(self.fitter, self.points, self.xy_px)
-            if self.patch.patch == "curved":
-                self._refit_curved()
-                self._fill()
+        self._settle_patch()
         mark_outside(self.fitter, self.points, self.xy_px, self.usable)
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
             self._forget_attempts()
@@ -476,6 +477,22 @@ class _Run:
         return assemble(
             self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape, patch=self.patch
         )
+
+    def _settle_patch(self) -> None:
+        """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
+        told = None
+        if self.fitter.terms == 3:
+            told = plane_error(
+                self.points, shape=self.grid.shape, rays=self.rays, step_px=self.grid.step_px,
+                subset_px=self.options.subset_px,
+            )  # fmt: skip
+        if self.options.patch != "auto":
+            self.patch = advise(self.patch, told)
+        elif not self.patch.kept:
+            self.patch = choose_patch(self.fitter, self.points, self.xy_px, told)
+            if self.patch.patch == "curved":
+                self._refit_curved()
+                self._fill()
 
     def _fill(self) -> None:
         """Grow, check, and grow into what the checks emptied."""

@@ -13,6 +13,7 @@ from core.field.fitter import PointFits
 from core.field.gates import GateOptions, apply_gates, neighbour_disagreement
 from core.field.kernels import compare_with_neighbours, sorting_network
 from core.field.local_fit import consistent, robust_local_fits
+from core.field.predict import predict
 from core.field.scatter import combine
 from core.field.starts import faces_both_cameras, move_matrix, move_w, position_now
 from core.field.sweep import sweep
@@ -248,3 +249,28 @@ def test_the_number_of_threads_does_not_change_a_field() -> None:
     one, two = fields
     np.testing.assert_array_equal(one.status, two.status)
     np.testing.assert_allclose(one.uvw_mm, two.uvw_mm, rtol=1e-9, atol=1e-12)
+
+
+def test_a_smooth_motion_of_a_sample_is_carried_to_all_points_and_an_erratic_one_is_not() -> None:
+    rng = np.random.default_rng(4)
+    w, still = plane_w(0.1, 0.05), no_motion(pair(), XY)
+    points = RAYS / w[:, :1]
+    shift = np.array([0.1, -0.05, 0.2]) + 1e-4 * (points[:, :1] - points[:, :1].mean()) ** 2  # bent: no affine map
+    now = still.copy()
+    now[:, :, 0] += shift * w[:, :1]
+    sample = np.sort(rng.choice(len(XY), 60, replace=False))
+    lens = pair().cam1.lens
+
+    def off_px(G: np.ndarray) -> np.ndarray:
+        a, b = (lens.image_from_normalised(g[:, :2, 0] / g[:, 2:, 0]).xy for g in (G, now))
+        return np.linalg.norm(a - b, axis=1)
+
+    found = now[sample].copy()
+    found[:3, :, 0] += 1e-3  # some of the sample went wrong
+    predicted = predict(pair(), XY, still, sample, w[sample], found)
+    assert np.median(off_px(still)) > 2.0
+    assert off_px(predicted).max() < 0.05
+    erratic = now[sample].copy()
+    erratic[:, :, 0] += 1e-3 * rng.standard_normal((len(sample), 3))
+    assert predict(pair(), XY, still, sample, w[sample], erratic) is still
+    assert predict(pair(), XY, still, sample[:5], w[sample[:5]], now[sample[:5]]) is still

@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import correlate1d, gaussian_filter, map_coordinates, spline_filter
 
 from core.matching import prepare
+from core.matching.filters import correlate, derivative
 from core.matching.image import PAD
 from core.noise import NoiseModel
 from core.threads import available_threads, set_threads, threads
@@ -34,22 +35,27 @@ def test_coefficients_are_the_recursive_ones_to_float32(interpolation, dtype, sc
     np.testing.assert_array_equal(got, np.pad(got[PAD:-PAD, PAD:-PAD], PAD, mode="reflect"))
 
 
-@pytest.mark.parametrize("interpolation", ["cubic", "quintic"])
-def test_gradients_are_the_splines_slopes(interpolation):
-    image = np.clip(textured((90, 70), 255), 0, 255).astype(np.uint8)
-    order, h = ORDER[interpolation], 1e-4
+@pytest.mark.parametrize("order", [3, 5])
+def test_derivative_taps_give_the_splines_slopes(order):
+    image, h = textured((90, 70), 255).astype(np.float32), 1e-4
     spline = spline_filter(image.astype(float), order, mode="mirror")
     y, x = np.mgrid[:90, :70].astype(float)
 
     def at(dx, dy):
         return map_coordinates(spline, [y + dy, x + dx], order=order, mode="mirror", prefilter=False)
 
-    gx, gy = prepare(image, interpolation).gradients
-    np.testing.assert_allclose(gx, (at(h, 0) - at(-h, 0)) / (2 * h), atol=3e-4)
-    np.testing.assert_allclose(gy, (at(0, h) - at(0, -h)) / (2 * h), atol=3e-4)
-    # nothing is lost where a parabola's slope is known
-    ramp = prepare(np.add.outer(np.zeros(60), 0.01 * np.arange(60.0) ** 2), interpolation).gradients[0]
-    np.testing.assert_allclose(ramp[30, 25:35], 0.02 * np.arange(25, 35), atol=1e-5)
+    def along(axis, image):
+        out = np.empty(image.shape, np.float32)
+        taps = [np.ones(1), np.ones(1)]
+        taps[axis] = derivative(order)
+        correlate(image, *taps, out)
+        return out
+
+    np.testing.assert_allclose(along(1, image), (at(h, 0) - at(-h, 0)) / (2 * h), atol=3e-4)
+    np.testing.assert_allclose(along(0, image), (at(0, h) - at(0, -h)) / (2 * h), atol=3e-4)
+    # a parabola's slope is known
+    parabola = np.add.outer(np.zeros(60), 0.01 * np.arange(60.0) ** 2)
+    np.testing.assert_allclose(along(1, parabola)[30, 25:35], 0.02 * np.arange(25, 35), atol=1e-5)
 
 
 def test_threads_do_not_change_the_result():
@@ -86,8 +92,5 @@ def test_a_noise_model_weighs_pixels_by_their_level():
     variances = [image.noise_variance / image.weights[side].mean() for side in sides]
     np.testing.assert_allclose(variances, model.variance([20.0, 220.0]), rtol=0.03)
     assert image.weights.mean() == pytest.approx(1.0, rel=0.05)
-    # the pixel's own noise hardly weighs it
-    part = sides[0]
-    assert abs(np.corrcoef(image.weights[part].ravel(), noisy[part].ravel())[0, 1]) < 0.6
     assert prepare(noisy).weights is None
     assert prepare(noisy).noise_variance is None

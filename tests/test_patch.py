@@ -26,7 +26,7 @@ def sample(bias_um: float, *, n: int = 250, wrong: int = 0, seed: int = 3) -> Pa
     difference = rng.normal(0.0, extra, (n, 3)) + bias_um * np.array([0.6, 0.0, 0.8])
     difference[:wrong] += 40.0
     variance = [np.full(n, (1e-3 * um) ** 2) for um in (PLANE_UM, CURVED_UM)]
-    return decide(1e-3 * difference, *variance, plane="stretch", what="displacement")
+    return decide(1e-3 * difference, *variance, plane="stretch")
 
 
 @pytest.mark.parametrize("bias_um", [0.8, 1.8, 6.0])

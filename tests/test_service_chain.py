@@ -167,6 +167,7 @@ def test_results_come_as_npy_file_and_probe(
         ({"region": {"polygon": [[10, 10], [20, 20]]}}, "invalid_request"),
         ({"region": {}}, "invalid_request"),
         ({"region": {"rectangle": RECTANGLE}, "subset_px": 24}, "invalid_request"),
+        ({"region": {"rectangle": RECTANGLE}, "patch": "bent"}, "invalid_request"),
         ({"region": {"rectangle": RECTANGLE}, "subset_px": 251}, "region_too_small"),
         ({"region": {"rectangle": RECTANGLE}, "seeds": [[300, 10]]}, "seed_outside"),
         ({"region": {"rectangle": RECTANGLE}, "steps": [1, 9]}, "step_missing"),
@@ -207,6 +208,26 @@ def test_mask_and_profile_measure_where_the_mask_is_white(client: httpx.Client, 
     white = mask[y.astype(int), x.astype(int)] > 0
     assert (status[white] == 0).mean() > 0.95
     assert (status[~white] == 2).all()
+
+
+def test_auto_patches_say_why_step_by_step(client: httpx.Client, calibration_id: str) -> None:
+    test_id = client.post(f"{API}/tests", json={"name": "sphere", "calibration_id": calibration_id}).json()["id"]
+    for load in (0.0, 0.2):
+        client.put(f"{API}/sim/scene", json={"scene": "sphere", "load": load})
+        assert client.post(f"{API}/tests/{test_id}/steps", json={"label": str(load)}).status_code == 201
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, "patch": "auto"}
+    accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
+    done = wait_for_job(client, accepted["job"], 240.0)
+    assert done["state"] == "succeeded", done["problem"]
+    reply = client.get(f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}").json()
+    shape, moved = (step["patch"] for step in reply["summary"]["steps"])
+    assert reply["settings"]["patch"] == "auto"
+    assert shape["patch"] == "curved"
+    assert shape["reason"].startswith("curved: plane patches err by")
+    assert shape["plane_error_mm"] > shape["curved_noise_mm"] > shape["plane_noise_mm"] > 0.0
+    assert moved["patch"] == "stretch"  # a sphere that moves as a block does not bend
+    url = f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}/steps/0/fields/curvature_1"
+    assert client.get(url).json()["units"] == "mm-1"
 
 
 def test_blank_step_fails_alone(client: httpx.Client, calibration_id: str, plate_test: str) -> None:

@@ -6,11 +6,12 @@ Apart from the choice itself, so that files can be read and written without load
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, get_args
 
-if TYPE_CHECKING:
-    from core.matching.options import PatchSetting
-
+PatchSetting = Literal["stretch", "rigid", "curved", "auto"]
+"""What can be asked for."""
+PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
+DEFAULT_PATCH: PatchSetting = "auto"
 UsedPatch = Literal["plane", "rigid", "stretch", "curved"]
 
 
@@ -27,12 +28,14 @@ class PatchChoice:
     reason
         A sentence for the user.
     sample
-        How many points were fitted both ways; 0 where nothing had to be decided.
+        How many points were fitted both ways; 0 where the field's own curvature told enough.
     plane_error_mm
-        What plane patches err by because of curvature, rms over the sample, noise taken off; of the position for a
-        shape, of the displacement for a motion. None where it was not measured, as the next two.
+        What plane patches err by because of curvature, rms, noise taken off; of the position for a shape, of the
+        displacement for a motion. None where it is not known, as the next two.
     plane_noise_mm, curved_noise_mm
-        Standard deviation of the same from image noise, rms over the sample, with plane and with curved patches.
+        Standard deviation of the same from image noise, rms, with plane and with curved patches.
+    curved_advised
+        True if plane patches were asked for and curved ones would err less.
     kept
         True if the choice was made in an earlier step of the sequence and kept.
     """
@@ -44,6 +47,7 @@ class PatchChoice:
     plane_error_mm: float | None = None
     plane_noise_mm: float | None = None
     curved_noise_mm: float | None = None
+    curved_advised: bool = False
     kept: bool = False
 
     def document(self) -> dict[str, Any]:
@@ -66,3 +70,8 @@ class PatchChoice:
 def asked_for(patch: UsedPatch, asked: PatchSetting) -> PatchChoice:
     """Return the choice that the user made."""
     return PatchChoice(patch=patch, asked=asked, reason=f"{patch}: asked for")
+
+
+def told_um(mm: float) -> str:
+    """Return a length in words, two digits."""
+    return f"{1e3 * mm:.2g} um" if mm < 0.1 else f"{mm:.2g} mm"

@@ -1,18 +1,22 @@
 """Which patch a field is measured with: what was asked for, or what errs least on this field.
 
 A plane patch on a curved surface is off by half the curvature times the subset's second moment; a curved patch is not,
-and has about twice the noise. ``auto`` weighs one against the other where it counts, on the field itself: a sample of
-its points is fitted both ways. Noise makes the two answers differ by the difference of their covariances (the plane
-patch is the more precise of the two as long as it is right, so their difference is independent of it); what they differ
-by beyond that is the plane patch's error.
+and has about twice the noise. The field that plane patches measured tells what they err by. Where that could outweigh
+the noise, ``auto`` weighs one against the other on the field itself: a sample of its points is fitted both ways. Noise
+makes the two answers differ by the difference of their covariances (the plane patch is the more precise of the two as
+long as it is right, so their difference is independent of it); what they differ by beyond that is the plane patch's
+error.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from core.field.fitter import Fitter, PointFits
-from core.field.patch import PatchChoice, UsedPatch
+from core.field.patch import PatchChoice, UsedPatch, told_um
+from core.field.plane_error import PlaneError
 from core.lens import Float
 from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
 
@@ -22,9 +26,25 @@ _SHARE = 0.7
 _FAR_PX = 1.0
 _NOT_HEARD = 0.02
 _CLEARLY = 1.1
+_CURVED_NOISE = 1.9  # over a plane patch's: the root of 3.5 for gradients alike all over the subset, as measured
+_SURELY = 1.0
 
 
-def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float) -> PatchChoice:
+def advise(choice: PatchChoice, told: PlaneError | None) -> PatchChoice:
+    """Return the user's choice of plane patches with what they err by, and whether curved ones would err less."""
+    if told is None or choice.patch == "curved":
+        return choice
+    choice = replace(choice, plane_error_mm=told.error_mm, plane_noise_mm=told.noise_mm)
+    if np.hypot(told.error_mm, told.noise_mm) <= _CLEARLY * _CURVED_NOISE * told.noise_mm:
+        return choice
+    said = (
+        f"plane patches err by {told_um(told.error_mm)} (rms) in {_what(choice.patch)} here, besides "
+        f"{told_um(told.noise_mm)} of noise; curved ones would err less"
+    )
+    return replace(choice, curved_advised=True, reason=f"{choice.reason}; {said}")
+
+
+def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, told: PlaneError | None) -> PatchChoice:
     """Decide between the plane patches that a field stands with, and curved ones.
 
     Parameters
@@ -35,6 +55,8 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float) -> PatchChoice
         (n) the field's points, fitted and checked.
     xy_px
         (n, 2) where they lie.
+    told
+        What the field says of the plane patches' error, or None.
 
     Returns
     -------
@@ -42,6 +64,14 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float) -> PatchChoice
         ``curved`` if that leaves clearly (1.1 times) less error in all, rms over a sample of the field.
     """
     plane: UsedPatch = "plane" if fitter.comparisons == 1 else "stretch"
+    if told is not None and told.below_mm < _SURELY * told.noise_mm:
+        said = (
+            f"plane patches err by {_told(told)} (rms) in {_what(plane)} here and have "
+            f"{told_um(told.noise_mm)} of noise besides; curved ones have about {_CURVED_NOISE:g} times that noise"
+        )
+        return replace(
+            _simple(plane, f"{plane}: {said}", 0), plane_error_mm=told.error_mm, plane_noise_mm=told.noise_mm
+        )
     ok = np.flatnonzero(points.ok)
     index = np.sort(np.random.default_rng(1).choice(ok, min(_SAMPLE, len(ok)), replace=False))
     curved_fitter = fitter.curved()
@@ -56,11 +86,10 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float) -> PatchChoice
         return _simple(plane, f"{plane}: curved patches find no place on {share} of the points tried", len(index))
     kept = np.flatnonzero(good)
     a, b = flat.take(kept), curved.take(kept)
-    what = "position" if plane == "plane" else "displacement"
-    return decide(*_compared(fitter, xy[kept], a, b), plane=plane, what=what)
+    return decide(*_compared(fitter, xy[kept], a, b), plane=plane)
 
 
-def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: UsedPatch, what: str) -> PatchChoice:
+def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: UsedPatch) -> PatchChoice:
     """Decide from a sample that was fitted both ways.
 
     Parameters
@@ -71,8 +100,6 @@ def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: 
         (n,) variances (traces of the covariances) of both.
     plane
         What the simple patch is called.
-    what
-        What the numbers are of, for the sentence.
 
     Notes
     -----
@@ -88,10 +115,10 @@ def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: 
     curved = np.sqrt(error2 + plane2) > _CLEARLY * curved_noise
     # what this sample could have shown, two standard deviations of a mean of squares
     shown = float(np.mean(noise[heard])) * 2.0 * np.sqrt(2.0 / len(heard))
-    err = _um(error) if error2 > shown else f"less than {_um(np.sqrt(error2 + shown))}"
+    err = told_um(error) if error2 > shown else f"less than {told_um(np.sqrt(error2 + shown))}"
     numbers = (
-        f"plane patches err by {err} (rms) in {what} here and have {_um(plane_noise)} of noise besides; "
-        f"curved ones have {_um(curved_noise)} of noise"
+        f"plane patches err by {err} (rms) in {_what(plane)} here and have {told_um(plane_noise)} of noise besides; "
+        f"curved ones have {told_um(curved_noise)} of noise"
     )
     return PatchChoice(
         patch="curved" if curved else plane,
@@ -122,5 +149,9 @@ def _simple(plane: UsedPatch, reason: str, sample: int) -> PatchChoice:
     return PatchChoice(patch=plane, asked="auto", reason=reason, sample=sample)
 
 
-def _um(mm: float) -> str:
-    return f"{1e3 * mm:.2g} um" if mm < 0.1 else f"{mm:.2g} mm"
+def _told(told: PlaneError) -> str:
+    return told_um(told.error_mm) if told.error_mm > 0.7 * told.below_mm else f"less than {told_um(told.below_mm)}"
+
+
+def _what(patch: UsedPatch) -> str:
+    return "position" if patch == "plane" else "displacement"

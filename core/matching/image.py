@@ -26,9 +26,7 @@ PAD = 4
 Float32 = NDArray[np.float32]
 _ONE = np.ones(1)
 _SAMPLE = 4  # every fourth pixel is enough for a mean variance
-_LEVEL_PX = 1.0  # reach (sd) of the surroundings whose grey level weighs a pixel
-WIENER = True
-"""Whether gradients are those of :mod:`core.matching.slopes`, or the spline's own."""
+_LEVEL_PX = 0.5  # sd of the smoothing before a grey level weighs: more would take edges' levels for one another
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +72,7 @@ class ImageData:
     def weights(self) -> Float32 | None:
         """(rows, cols) float32 inverse variance of the pixels' noise, about 1 in the mean; None where all count alike.
 
-        A pixel's own noise must not weigh it, or bright noise would count less than dark: its surroundings' level does.
+        A pixel's own noise should not weigh it, or bright noise would count less than dark: its next neighbours help.
         """
         if self.noise is None or self.noise_variance is None:
             return None
@@ -82,10 +80,10 @@ class ImageData:
         model, one = self.noise, self.noise_variance
 
         def weigh(source: NDArray[Any]) -> Any:
-            level = cv2.GaussianBlur(source.astype(np.float32), (5, 5), _LEVEL_PX, borderType=cv2.BORDER_REFLECT_101)
+            level = cv2.GaussianBlur(source.astype(np.float32), (3, 3), _LEVEL_PX, borderType=cv2.BORDER_REFLECT_101)
             return one / model.variance(level)
 
-        in_bands(self.raw, 2, weigh, out)
+        in_bands(self.raw, 1, weigh, out)
         return out
 
     @cached_property
@@ -96,17 +94,17 @@ class ImageData:
     @property
     def slope_noise(self) -> float:
         """Variance of ``gradients`` per variance of white noise in the pixels, mean of both directions."""
-        return self.slopes.gain if WIENER and self.slopes else float((derivative(self.order) ** 2).sum())
+        return self.slopes.gain if self.slopes else float((derivative(self.order) ** 2).sum())
 
     @property
     def slope_share(self) -> float:
         """Share of noise in the squares of ``gradients``, over the image's texture, that is allowed for in them."""
-        return self.slopes.share if WIENER and self.slopes else 0.0
+        return self.slopes.share if self.slopes else 0.0
 
     @cached_property
     def gradients(self) -> tuple[Float32, Float32]:
         """Derivatives along x and y at the pixel centres, (rows, cols), grey levels per px."""
-        if WIENER and self.slopes:
+        if self.slopes:
             return self.slopes.apply(self.raw)
         slope = derivative(self.order)
         gx, gy = np.empty(self.shape, np.float32), np.empty(self.shape, np.float32)

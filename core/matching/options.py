@@ -9,9 +9,7 @@ from core.errors import InputError
 
 Interpolation = Literal["cubic", "quintic"]
 Patch = Literal["rigid", "stretch", "curved"]
-PatchSetting = Literal["rigid", "stretch", "curved", "auto"]
 PATCHES: tuple[Patch, ...] = get_args(Patch)
-PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
 
 SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
 

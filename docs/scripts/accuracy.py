@@ -16,7 +16,13 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from docs.scripts import accuracy_calibration, accuracy_experiments, accuracy_matching, accuracy_noise
+from docs.scripts import (
+    accuracy_calibration,
+    accuracy_curved,
+    accuracy_experiments,
+    accuracy_matching,
+    accuracy_noise,
+)
 from docs.scripts.table import Row, Section
 
 FIGURES = Path(__file__).resolve().parents[1] / "figures"
@@ -30,6 +36,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "strain": accuracy_matching.strain,
     "rotation": accuracy_matching.rotation,
     "epipolar": accuracy_matching.epipolar,
+    **accuracy_curved.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,

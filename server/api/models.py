@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
 
+from core.field.patch import DEFAULT_PATCH, PatchSetting
+
 
 def _not_a_truth_value(value: Any) -> Any:
     # true would be taken for 1: an axis would move by a millimetre
@@ -339,7 +341,12 @@ class AnalysisRequest(Request):
     region: Region = Field(description="Where points may lie.")
     subset_px: Annotated[Whole, Field(ge=5, le=255)] = Field(33, description="Subset size, odd.")
     step_px: Annotated[Whole, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
-    patch: Literal["stretch", "rigid"] = Field("stretch", description="Patch model of the motion.")
+    patch: PatchSetting = Field(
+        DEFAULT_PATCH,
+        description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about "
+        "twice the noise; auto takes stretch or curved, whichever errs less on the field in all, shape and motion "
+        "apart; each step's summary has the choice and its reason under patch.",
+    )
     interpolation: Literal["cubic", "quintic"] = Field("quintic", description="B-spline order.")
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
 from core.field.images import check_calibrated_size
+from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS
 from server.cli.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.region import check_odd, check_region, parse_rectangle
 from server.cli.sequence import CheckedPair, MeasureJob, measure_sequence
@@ -31,7 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
     add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
     add("--step", default="10", metavar="PX", help="distance of the points (10)")
-    add("--patch", choices=("stretch", "rigid"), default="stretch", help="how a patch may move (stretch)")
+    add("--patch", choices=PATCH_SETTINGS, default=DEFAULT_PATCH,
+        help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: "
+        f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})")  # fmt: skip
     add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
     add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
     add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")

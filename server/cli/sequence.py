@@ -17,6 +17,7 @@ from typing import Any, Literal
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import MeasurementError
 from core.field.images import MeasureImage
+from core.field.patch import PatchSetting
 from core.field.result import Field
 from server.cli.image_lists import ImagePair
 from server.cli.region import RegionRequest
@@ -52,7 +53,7 @@ class MeasureJob:
     region: RegionRequest
     subset_px: int
     step_px: int
-    patch: Literal["stretch", "rigid"]
+    patch: PatchSetting
     interpolation: Literal["cubic", "quintic"]
     mask_file: Path | None
     out: Path
@@ -140,6 +141,7 @@ class _Runner:
         self._n = 0
         self._shape: Field | None = None
         self._last: Field | None = None
+        self._chosen: tuple[str, bool] | None = None
         self._done = 0.0
 
     def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
@@ -190,7 +192,19 @@ class _Runner:
             f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
             f"{residual}{duration(summary['seconds'])}"
         )
+        self._say_choice(n, result)
         return summary
+
+    def _say_choice(self, n: int, result: Field) -> None:
+        """Say what the patch was chosen for: of the shape, of the first step, and where it changes."""
+        choice = result.patch
+        if choice is None:
+            return
+        new = (choice.patch, choice.curved_advised)
+        if (choice.asked == "auto" and n <= 1) or (new != self._chosen and (choice.asked == "auto" or new[1])):
+            self._progress.note(f"{'shape' if n == 0 else f'step {n}'}: {choice.reason}")
+        if n > 0:
+            self._chosen = new
 
     def _shower(self, n: int) -> Any:
         count = len(self._job.pairs)
