@@ -205,8 +205,8 @@ def warm_up(threads: int) -> None:
     pair = StereoPair(Camera.from_paper(**common, x0_mm=0.0), Camera.from_paper(**common, x0_mm=-0.6))
     grid = PointGrid.rectangle(40.0, 40.0, 88.0, 88.0, step_px=8.0)
     seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
-    # the other patch and interpolation compile when first asked for; compiled kernels are kept on disk
-    options = MeasureOptions(subset_px=21)
+    # other patches and the other interpolation compile when first asked for; compiled kernels are kept on disk
+    options = MeasureOptions(subset_px=21, patch="stretch")
     reference = ReferencePair(pair, left, right)
     shape = reference.shape(grid, options, seeds=seeds)
     reference.motion(left.copy(), right.copy(), grid, options, shape=shape)

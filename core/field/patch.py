@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 PatchSetting = Literal["stretch", "rigid", "curved", "auto"]
 """What can be asked for."""
 PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
-DEFAULT_PATCH: PatchSetting = "stretch"
+DEFAULT_PATCH: PatchSetting = "auto"
 UsedPatch = Literal["plane", "rigid", "stretch", "curved"]
 
 

@@ -109,12 +109,12 @@ def _runs(scene: str, threads: int, quick: bool) -> tuple[list[Run], list[Run]]:
         for kind in ("cubic", "quintic"):
             options = {"interpolation": kind}
             own.append(Run(f"{kind} single, {subset} px", subset, 1, options, repeats=2))
-            own.append(Run(f"{kind} sequence, {subset} px", subset, steps, options, repeats=2))
+            own.append(Run(f"{kind} sequence of {steps}, {subset} px", subset, steps, options, repeats=2))
         settings = ["tuned"] if large or not most or subset == 21 or quick else ["tuned", "loose", "unfiltered"]
         for setting in settings:
             if setting == "tuned":
                 other.append(Run(f"tuned single, {subset} px", subset, 1, PEER_SETTINGS["tuned"]))
-            other.append(Run(f"{setting} sequence, {subset} px", subset, steps, PEER_SETTINGS[setting]))
+            other.append(Run(f"{setting} sequence of {steps}, {subset} px", subset, steps, PEER_SETTINGS[setting]))
     if large and most:
         other.append(Run("default single, 33 px", 33, 1, PEER_SETTINGS["default"]))
     warm = [Run(f"{WARM} {kind}", 33, 1, {"interpolation": kind}) for kind in ("cubic", "quintic")]

@@ -181,6 +181,9 @@ def measure_rates(scene: KernelScene, threads: int, runs: int) -> tuple[list[Rat
                     Rate(name, kind, subset, threads, len(w) / best_time(fit, runs), float(spent.mean()))
                 )  # fmt: skip
                 counts[f"{name}, {kind}, {subset} px"] = spent
+            w, G = shifted(fitted, FAR)
+            far = fit_motion(scene.pair, *images, fitted.xy_px, w, G, fitted.options)
+            counts[f"motion, {kind}, {subset} px, far start"] = far.iterations
     return rates, counts
 
 
