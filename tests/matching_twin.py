@@ -51,8 +51,8 @@ class Twin:
         # over normalised offsets: pixel per normalised unit by differences of the back-projection
         h = 1e-2
         ray = [pair.cam1.rays_cam(xy + np.array(d)).xyz_mm[:2] for d in ((h, 0), (-h, 0), (0, h), (0, -h))]
-        to_px = np.linalg.inv(np.stack([ray[0] - ray[1], ray[2] - ray[3]], -1) / (2 * h))
-        self.gradient = gradient @ to_px
+        self.to_px = np.linalg.inv(np.stack([ray[0] - ray[1], ray[2] - ray[3]], -1) / (2 * h))
+        self.gradient = gradient @ self.to_px
         w0 = 1.0 / 400.0
         a, b = (pair.image2_at_depth(xy, 1.0 / (w0 * s)) for s in (1.0001, 0.9999))
         along = (a - b) / np.linalg.norm(a - b)
@@ -108,13 +108,22 @@ class Twin:
             columns.append((self.gradient * np.einsum("nij,nj->ni", inverse, moved)).sum(-1))
         return np.stack(columns, -1)
 
+    def density(self, k: int, unknowns: NDArray) -> float:
+        """Pixels of comparison k that show what one pixel of the reference shows."""
+        h = 1e-6
+        by_x, by_y = (
+            (self.place(k, unknowns, h * d[None]) - self.place(k, unknowns, -h * d[None]))[0] / (2 * h)
+            for d in np.eye(2)
+        )
+        return abs(np.linalg.det(np.stack([by_x, by_y]))) / abs(np.linalg.det(self.to_px))
+
     def equations(self, unknowns: NDArray, free: NDArray) -> tuple[NDArray, NDArray]:
         """The weighted sums that vanish at the solution, and their Gauss-Newton matrix; ``free`` spans the steps."""
         count = len(self.splines) - 1
         terms = self.terms(unknowns)
         steps = np.array([*_W_STEPS[:terms], 1e-3, *(_G_STEPS[:terms] * 3)])[: len(unknowns)]
         residuals, contrasts, _ = zip(*(self.residual(k, unknowns) for k in range(count)), strict=True)
-        s2 = np.array(contrasts) ** 2
+        s2 = np.array(contrasts) ** 2 * [self.density(k, unknowns) for k in range(count)]
         W = np.diag(s2) - np.outer(s2, s2) / (1.0 + s2.sum())
         J = [self.jacobian(k, unknowns, steps) @ free for k in range(count)]
         g = sum(W[k, o] * J[k].T @ residuals[o] for k in range(count) for o in range(count))

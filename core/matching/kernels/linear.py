@@ -12,6 +12,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from core.matching.kernels.loops import data
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 QUAD = 4
@@ -127,7 +128,7 @@ def make_factor(row: int) -> Any:
 
         return sig, codegen
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(f"{row}")
     def factor(a, n):
         """Cholesky factor U, ``a = U^T U``, of the leading (n, n) in place; reads and fills the upper triangle.
 

@@ -9,9 +9,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from core.matching.kernels.linear import covariance_of_last, solve
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
@@ -52,7 +52,7 @@ def make_motion(degree: int) -> Any:
      texture, few) = make_point(degree, 3)  # fmt: skip
     unknowns = 4 * few + 1
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(f"{degree}")
     def compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs):
         """All three comparisons; status."""
         for k in range(3):
@@ -64,7 +64,7 @@ def make_motion(degree: int) -> Any:
                 return LOW_TEXTURE
         return OK
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(f"{degree}")
     def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid):
         """Set up and factor the normal equations; status."""
         weights, block, columns, half, _, normal = equations
@@ -87,7 +87,7 @@ def make_motion(degree: int) -> Any:
         assemble(equations, of_reference[7])
         return OK if factor(normal, n) else LOW_TEXTURE
 
-    @njit(nogil=True, error_model="numpy", inline="always")
+    @kernel(f"{degree}", inline="always")
     def motion_point(
         reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out
     ):

@@ -13,11 +13,10 @@ VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
 ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
 MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
 
-# an image's levels; the misfit is the residuals' sum of squares, the last the noise of its interpolated grey levels
-# over that of its pixels
-GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED = range(6)
-
-N_LEVELS = 6
+# an image's levels; the misfit is the residuals' sum of squares, then the noise of its interpolated grey levels over
+# that of its pixels, and how many of its pixels show what one pixel of the reference shows
+GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED, DENSITY = range(7)
+N_LEVELS = 7
 
 
 @njit(nogil=True, error_model="numpy")
@@ -25,7 +24,8 @@ def joint_weights(levels, variances, images, weights):
     """Inverse covariance of the comparisons' residuals.
 
     Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
-    diag(v_k / contrast_k^2) + v_ref 1 1^T, with the reference's variance first in ``variances``.
+    diag(v_k / (contrast_k^2 density_k)) + v_ref 1 1^T, with the reference's variance first in ``variances``. The noise
+    of an image that shows the subset on more pixels averages out the more.
     """
     total = 1.0 / variances[0]
     for k in range(images):
@@ -39,7 +39,7 @@ def joint_weights(levels, variances, images, weights):
 @njit(nogil=True, error_model="numpy")
 def _certainty(levels, variances, k):
     s = min(max(levels[k, CONTRAST], 0.05), 20.0)
-    return s * s / variances[1 + k]
+    return s * s * levels[k, DENSITY] / variances[1 + k]
 
 
 @njit(nogil=True, error_model="numpy")

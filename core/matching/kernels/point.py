@@ -17,6 +17,7 @@ what the patch does in its own coordinates then is ``d = M_k^-1 dM_k m``, from w
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,10 @@ from numba import njit
 
 from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
 from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
     CONTRAST,
+    DENSITY,
     GAIN,
     MAX_NOISE_SHARE,
     MISFIT,
@@ -102,6 +105,57 @@ def texture_status(status, share, sigma_px, max_sigma_px, zncc):
     return status
 
 
+@cache
+def make_compare(degree: int) -> Any:
+    """Compile the comparison of one image with the reference; shape and motion use the same."""
+    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    n_columns = 2 * len(monomials(degree))
+    made_for = f"{degree}"
+
+    @kernel(made_for)
+    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
+        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
+
+        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
+        """
+        coefficients, rows, cols, stride = image
+        blocks, p, offset, f2 = known
+        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
+        warp, places, sums = space
+        base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
+        if base < 0:
+            return False
+        warp[20] = levels[GAIN]
+        warp[21] = levels[SHIFT]
+        if order == 3:
+            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        else:
+            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
+        gain, shift = float(warp[20]), float(warp[21])
+        mean = sums[0] / p
+        fd = sums[1] - offset * sums[0]
+        y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
+        if not y2 > FLAT * gain * gain * f2:
+            levels[ZNCC] = 0.0
+            levels[CONTRAST] = 0.0
+            return True
+        c = math.sqrt(y2 / f2)
+        for i in range(n_columns):
+            rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
+        levels[GAIN] = gain / c
+        levels[SHIFT] = (shift + mean + offset) / c - offset
+        levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
+        levels[CONTRAST] = c / gain
+        levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
+        half = of_reference[4][2]
+        levels[SMOOTHED] = interpolated_noise(warp, half, order)
+        levels[DENSITY] = min(max(abs(warp[1] * warp[12] - warp[2] * warp[11]) / (half * half), 0.01), 100.0)
+        return True
+
+    return compare
+
+
 def make_point(degree: int, images: int) -> Any:
     """Compile what the fits share, for patches of this degree (1 plane, 2 curved) and one or three comparisons."""
     few = len(monomials(degree))
@@ -109,10 +163,11 @@ def make_point(degree: int, images: int) -> Any:
     unknowns = each * few + 1
     row = (unknowns + QUAD - 1) // QUAD * QUAD
     set_up_reference, n_columns, n_raw = make_reference(degree)
-    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    compare = make_compare(degree)
     product, factor = make_product(row), make_factor(row)
+    made_for = f"{degree}_{images}"
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def work_space(subset):
         """Everything one thread needs, so that no point allocates."""
         ref = np.empty((N_ROWS, width(subset)), np.float32)
@@ -155,46 +210,7 @@ def make_point(degree: int, images: int) -> Any:
             np.empty((5, 5)),  # work
         )
 
-    @njit(nogil=True, error_model="numpy")
-    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
-        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
-
-        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
-        """
-        coefficients, rows, cols, stride = image
-        blocks, p, offset, f2 = known
-        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
-        warp, places, sums = space
-        base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
-        if base < 0:
-            return False
-        warp[20] = levels[GAIN]
-        warp[21] = levels[SHIFT]
-        if order == 3:
-            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
-        else:
-            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
-        # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
-        gain, shift = float(warp[20]), float(warp[21])
-        mean = sums[0] / p
-        fd = sums[1] - offset * sums[0]
-        y2 = sums[2] - sums[0] * mean + 2.0 * fd + f2
-        if not y2 > FLAT * gain * gain * f2:
-            levels[ZNCC] = 0.0
-            levels[CONTRAST] = 0.0
-            return True
-        c = math.sqrt(y2 / f2)
-        for i in range(n_columns):
-            rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
-        levels[GAIN] = gain / c
-        levels[SHIFT] = (shift + mean + offset) / c - offset
-        levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
-        levels[CONTRAST] = c / gain
-        levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
-        levels[SMOOTHED] = interpolated_noise(warp, of_reference[4][2], order)
-        return True
-
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M):
         """The matrices through which the images see the patch."""
         for i in range(3):
@@ -212,7 +228,7 @@ def make_point(degree: int, images: int) -> Any:
                 M[k, 0, j] += e * nu_x * M[k, 2, j]
                 M[k, 1, j] += e * nu_y * M[k, 2, j]
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
         """What each unknown does to the patch, px in the reference, as coefficients of ``columns``; False if singular.
 
@@ -269,7 +285,7 @@ def make_point(degree: int, images: int) -> Any:
                             out[few + by_y, c] -= d * place[2]
         return True
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def assemble(equations, gram):
         """Normal equations: sum over comparisons k, o of ``weights_ko columns_k^T gram columns_o``."""
         weights, _, columns, half, weighted, normal = equations
@@ -285,7 +301,7 @@ def make_point(degree: int, images: int) -> Any:
                 product(weights, 4, half[0, r:], wide, weighted[0, r:], wide, images, images)
         product(columns[0], row, weighted[0], row, normal, row, images * n_columns, unknowns)
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def gradient(equations, rhs, out):
         """Right-hand side in the unknowns from each image's sums ``rhs``, with the sign of a step downhill."""
         weights, columns = equations[0], equations[2]
@@ -299,7 +315,7 @@ def make_point(degree: int, images: int) -> Any:
                 for c in range(row):
                     out[c] += columns[k, r, c] * s
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def moves_of(columns, step, moves):
         """Each image's motion of the patch (coefficients) for a step; returns the largest corner motion, camera 1 px.
 
@@ -319,7 +335,7 @@ def make_point(degree: int, images: int) -> Any:
             largest = max(largest, x * x + y * y)
         return math.sqrt(largest)
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def predict(moves, rhs, gram, f2, levels):
         """Correlations after a small last step, from the quadratic form that the step was found with."""
         for k in range(images):
@@ -332,7 +348,7 @@ def make_point(degree: int, images: int) -> Any:
             levels[k, MISFIT] = max(levels[k, MISFIT] + change, 0.0)
             levels[k, ZNCC] = 1.0 - 0.5 * levels[k, MISFIT] / f2
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(made_for)
     def texture(gram):
         """Squared gradients (per px): mean over directions, and in the weakest direction."""
         xx, xy, yy = gram[0, 0], gram[0, few], gram[few, few]

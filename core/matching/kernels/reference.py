@@ -13,6 +13,7 @@ also the sensitivity of their sums to a displacement.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from core.matching.kernels.loops import GX, GY, WEIGHT, F, X, Y, monomials, sum_reference
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 
@@ -86,6 +88,7 @@ def _product_table(degree: int) -> np.ndarray:
     return np.array([[many.index((a[0] + b[0], a[1] + b[1])) for b in few] for a in few])
 
 
+@cache
 def make_reference(degree: int) -> Any:
     """Compile the set-up of the reference subset for patches of this degree (1 plane, 2 curved)."""
     few, many = len(monomials(degree)), len(monomials(2 * degree))
@@ -94,7 +97,7 @@ def make_reference(degree: int) -> Any:
     first_fg, first_g, first_gg = 4, 4 + n_columns, 4 + 2 * n_columns
     sum_all = sum_reference[degree]
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(f"{degree}")
     def set_up_reference(reference, lens, x_px, y_px, subset, ref, space):
         """Copy the subset nearest to (x_px, y_px) and sum it.
 

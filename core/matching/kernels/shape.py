@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from core.matching.kernels.linear import covariance_of_last, solve
+from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
@@ -48,7 +48,7 @@ def make_shape(degree: int) -> Any:
      texture, few) = make_point(degree, 1)  # fmt: skip
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
-    @njit(nogil=True, error_model="numpy")
+    @kernel(f"{degree}")
     def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations):
         """Set up and factor the normal equations; status."""
         weights, block, columns, _, _, normal = equations
@@ -58,7 +58,7 @@ def make_shape(degree: int) -> Any:
         assemble(equations, of_reference[7])
         return OK if factor(normal, n) else LOW_TEXTURE
 
-    @njit(nogil=True, error_model="numpy", inline="always")
+    @kernel(f"{degree}", inline="always")
     def shape_point(reference, image2, lens1, lens2, R, t, xy, start, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
