@@ -375,7 +375,7 @@ COSTS_HOW = """Nine subset sizes from 9 to 41 px and two distances of the start 
 pixel (the reference's rows and the sums of its normal equations), and the pixel loop."""
 
 PARTS_HOW = """The same from the other side: the kernel's own functions, each timed alone on one point, times as often as a fit calls them. "The rest" is what is left of the measured time:
-Jacobian, algebra of the sums, steps, results."""
+tests, updates, correlations, results, calls, and memory that is not in the first cache."""
 
 
 # the machine
