@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-COMPILING = "compiling kernels, once per machine, about 20 s"
+COMPILING = "compiling kernels, once per machine, about half a minute"
 """What to tell a user."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from core.errors import ImageError, InputError
 from core.noise import NoiseModel, measure_noise
-from server.io.images import read_image
+from server.io.noise_frames import read_frames
 from server.io.noise_json import CAMERAS, noise_content, write_noise
 from server.tasks import NoiseTask
 
@@ -29,7 +29,7 @@ def fit_noise(task: NoiseTask) -> dict[str, Any]:
         files = [entry for entry in document["frames"] if entry["camera"] == cam]
         try:
             models[cam] = measure_noise(
-                [read_image(folder / entry["file"]) for entry in files],
+                read_frames([folder / entry["file"] for entry in files]),
                 full_scale=float((1 << document["bit_depth"][cam]) - 1),
             )
         except (ImageError, InputError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import llvmlite.binding as llvm
@@ -11,10 +12,10 @@ import pytest
 from docs.scripts import bench_page, bench_worker
 from docs.scripts.bench_assembly import HERE, count_loop, innermost_loops
 from docs.scripts.bench_ceilings import Ceilings, CompiledLoop, fma_ir, gather_ir, load_ir, rows_ir, vector_width
-from docs.scripts.bench_kernel import KINDS, Costs, Rate
+from docs.scripts.bench_kernel import KINDS, Costs, Rate, make_kernel_scene
 from docs.scripts.bench_page import Report
 from docs.scripts.bench_pairs import BenchScene, Errors, Request, judge, make_scene
-from docs.scripts.bench_parts import Parts
+from docs.scripts.bench_parts import Parts, measure_parts
 from docs.scripts.bench_peer import Outcome, Run, peer_python, run_peer
 
 TINY = Request("tiny", "sim_paper", (150, 140), (46, 46, 106, 96), 10, 1)
@@ -127,11 +128,22 @@ def test_costs_and_parts_split_a_point_s_time() -> None:
     cost = Costs("cubic", 2.0, 1.0, 1.0, 3.0, 0.01, np.array([81.0]), np.array([2.0]), np.array([5.0]))
     assert cost.overhead_us(2.0) == pytest.approx(4.0)
     assert cost.time_us(1089.0, 2.0) == pytest.approx(4.0 + 1.089 + 19.602)
-    split = Parts("cubic", 33, 2.0, 1.5, 0.1, 3.0, 0.3, 0.2, 0.1).split_us(30.0, 2.0)
+    split = Parts("cubic", 33, 2.0, 1.5, 0.1, 3.0, 0.4, 0.5, 0.3, 0.2, 0.1, 0.25).split_us(30.0, 2.0)
     assert split["pixel loop"] == pytest.approx(18.0)
     assert split["warp set-up"] == pytest.approx(0.6)
     assert split["factor, solve, covariance"] == pytest.approx(0.8)
+    assert split["Jacobian, normal equations"] == pytest.approx(0.9)
+    assert split["right-hand sides, moves"] == pytest.approx(0.5)
     assert sum(split.values()) == pytest.approx(30.0)
+
+
+@pytest.mark.slow
+def test_parts_of_a_fit_are_timed() -> None:
+    parts = measure_parts(make_kernel_scene(40), "cubic", 9)
+    times = [v for v in asdict(parts).values() if isinstance(v, float)]
+    assert len(times) == 10
+    assert np.isfinite(times).all()
+    assert min(times) > 0.0
 
 
 def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,7 +160,7 @@ def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.Monkey
             report.iterations[f"motion, {kind}, {subset} px"] = np.array([2, 2, 3], dtype=np.int32)
         n, spent = np.array([81.0, 81.0, 441.0, 441.0]), np.array([2.0, 3.0, 2.0, 3.0])
         report.costs.append(Costs(kind, 2.0, 0.5, 1.0, 2.5, 0.03, n, spent, 2.0 + 0.01 * n * spent))
-        report.parts += [Parts(kind, subset, 2.0, 1.5, 0.1, 1.0, 0.3, 0.2, 0.1) for subset in (21, 33)]
+        report.parts += [Parts(kind, subset, 2.0, 1.5, 0.1, 1.0, 0.4, 0.5, 0.3, 0.2, 0.1, 0.25) for subset in (21, 33)]
         report.loops.append(count_loop(HERE, kind, ASSEMBLY))
     errors = Errors(0, np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.1, 0.1, 0.3, 0.2]))
     worse = Errors(2, errors.mean_um, 2.0 * errors.sd_um)

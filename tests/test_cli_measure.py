@@ -313,7 +313,7 @@ def test_the_specimen(specimen_dir: Path, tmp_path: Path) -> None:
             assert np.abs(off).max() <= 5 * 0.08
 
 
-def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path) -> None:
+def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from core.noise import NoiseModel
     from server.io.noise_json import load_noise, noise_content, write_noise
 
@@ -328,3 +328,9 @@ def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path) -> None
         settings, inputs = (json.loads(data.attrs[name]) for name in ("settings", "inputs_sha256"))
     assert inputs["noise"] == load_noise(file).sha256
     assert settings["noise"]["cam1"] == {"coefficients": [1.96, 0.0128, 0.0], "frames": 8}
+    assert "these cameras' gain" not in capsys.readouterr().err
+    wrong = NoiseModel(coefficients=(12.0, 0.0, 0.0), frames=8)
+    write_noise(file, noise_content({"cam1": wrong, "cam2": wrong}))
+    assert main(command(folder, out, noise=str(file), roi="90,80,130,110", cam1=[str(folder / "cam1_0.tif")],
+                        cam2=[str(folder / "cam2_0.tif")])) == 0  # fmt: skip
+    assert "the noise file says 3.46" in capsys.readouterr().err

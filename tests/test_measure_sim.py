@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from field_bench import Images, grid, pair, scene, take, truth
 
 from core.errors import Cancelled, ImageError, InputError, RegionError, SeedError
+from core.field import fitter
 from core.field.result import Field
 from core.field.scatter import refuse_swapped
 from core.field.seeds import Seed
@@ -114,6 +116,33 @@ def test_what_is_covered_in_one_step_is_refused_and_comes_back_in_the_next(
 
 
 @pytest.mark.fault(36)
+def test_points_that_stay_lost_are_tried_once_a_step_at_most(
+    reference: ReferencePair, shape: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = (slice(60, 150), slice(90, 200))
+    other, _ = take("sphere", 0.0, seed=5)
+
+    def covered(load: float) -> Images:
+        first, second = take("block", load)
+        return paste(first, other, where), second
+
+    before = reference.motion(*covered(0.1), GRID, OPTIONS, shape=shape)
+    lost = int((~before.valid).sum())
+    assert lost > 30
+    fitted: list[int] = []
+    fit = fitter.fit_motion
+
+    def counted(*args: Any) -> Any:
+        fitted.append(len(args[5]))
+        return fit(*args)
+
+    monkeypatch.setattr(fitter, "fit_motion", counted)
+    after = reference.motion(*covered(0.2), GRID, OPTIONS, shape=shape, previous=before)
+    assert int((~after.valid).sum()) > 0.8 * lost
+    refused = int((before.valid & ~after.valid).sum())  # these may be tried again
+    assert sum(fitted) <= int(before.valid.sum()) + lost + 4 * refused + 60  # and the sample that did not stand
+
+
 def test_points_without_texture_are_refused_and_their_neighbours_stand() -> None:
     first, second = take("block")
     rng = np.random.default_rng(4)

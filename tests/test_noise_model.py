@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import fourier_shift, gaussian_filter
 
 from core.errors import ImageError, InputError
-from core.noise import NoiseModel, measure_noise
+from core.noise import NoiseModel, measure_noise, rows_looked_at
 from sim.sensor import Sensor
 
 SENSORS = {
@@ -97,6 +97,17 @@ def test_one_grey_level_gives_one_variance():
     sensor, rng = SENSORS["shot noise rules, 12 bit"], np.random.default_rng(1)
     model = measure_noise([sensor.expose(np.full((128, 128), 0.5), rng) for _ in range(5)])
     np.testing.assert_allclose(model.variance([0.0, 2048.0, 4095.0]), true_variance(sensor, 2047.5), rtol=0.05)
+
+
+def test_large_frames_are_looked_at_in_part():
+    sensor, rng = SENSORS["shot noise rules, 12 bit"], np.random.default_rng(1)
+    bright = np.tile(scene((100, 320)), (24, 1))
+    frames = [sensor.expose(bright, rng) for _ in range(3)]
+    rows = rows_looked_at(frames[0].shape)
+    assert frames[0][rows].size < frames[0].size
+    whole, part = measure_noise(frames), measure_noise([f[rows] for f in frames])
+    assert whole.coefficients == part.coefficients
+    np.testing.assert_allclose(whole.variance([800.0, 3000.0]), true_variance(sensor, [800.0, 3000.0]), rtol=0.04)
 
 
 def test_means_of_frames_have_less_noise():

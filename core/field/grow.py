@@ -148,8 +148,13 @@ def grow(
         attempts.tried[todo, choice] = True
         attempts.left[todo] -= 1
         offset = rays[todo, :2] - rays[parent, :2]
-        w = move_w(points.w[parent], offset)
-        G = move_matrix(points.G[parent], offset) if fitter.comparisons == 3 else None
+        parent_w, parent_G = points.w[parent], points.G[parent]
+        if fitter.terms > 3:
+            # second-order terms reach further, their noise too: every other attempt goes without
+            flat = attempts.left[todo] % 2 == 0
+            parent_w[flat, 3:], parent_G[flat, :, 3:] = 0.0, 0.0
+        w = move_w(parent_w, offset)
+        G = move_matrix(parent_G, offset) if fitter.comparisons == 3 else None
         good = fit_in_batches(fitter, points, todo, xy_px, w, G, far_px=_FAR_PX, cancel=cancel)
         front[todo[good | (attempts.left[todo] <= 0)]] = False
         new = todo[good]

@@ -103,8 +103,12 @@ def compare_with_neighbours(first, last, network, ok, rays, w, G, motion, differ
     for r in range(first, last):
         for start in range(0, cols, _BLOCK):
             stop = min(start + _BLOCK, cols)
-            values[:] = np.inf
-            n[:] = 0
+            for k in range(_BLOCK):
+                n[k] = 0
+            for q in range(quantities):
+                for s in range(_NEIGHBOURS):
+                    for k in range(_BLOCK):
+                        values[q, s, k] = np.inf
             place = 0
             for dr in range(-REACH, REACH + 1):
                 for dc in range(-REACH, REACH + 1):
@@ -170,7 +174,8 @@ def least_median(first, last, x, v, triplets, flat_below, residual, least):
     half = samples // 2
     for m in range(first, last):
         least[m] = np.inf
-        residual[m, :] = np.inf
+        for n in range(samples):
+            residual[m, n] = np.inf
         for s in range(triplets.shape[0]):
             i, j, k = triplets[s, 0], triplets[s, 1], triplets[s, 2]
             xi, yi = x[m, i, 0], x[m, i, 1]
@@ -195,4 +200,5 @@ def least_median(first, last, x, v, triplets, flat_below, residual, least):
             middle = ordered[half] if samples % 2 == 1 else 0.5 * (ordered[half - 1] + ordered[half])
             if middle < least[m]:
                 least[m] = middle
-                residual[m, :] = r
+                for n in range(samples):
+                    residual[m, n] = r[n]

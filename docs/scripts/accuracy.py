@@ -1,7 +1,8 @@
 """Measure every figure of docs/accuracy.md and write that page with its plots: ``make accuracy``.
 
 Truth comes from the simulated rigs' formulas; pictures carry noise of 2 of 255 unless a row says noise-free.
-Options: ``--only NAME[,NAME]`` measures some sections (the page is then not written), ``--list`` names them.
+Options: ``--only NAME[,NAME]`` measures some sections (the page is then not written), ``--write`` puts these into the
+page as it is, ``--list`` names them.
 """
 
 from __future__ import annotations
@@ -70,10 +71,27 @@ rounded either). 1 px is 33 um on the paper's rig. "At most" is what the project
 """
 
 
+def _put_in(text: str, page: _Page) -> str:
+    """The page's text with some sections measured anew; one that was not there comes before the experiments."""
+    parts = ("\n" + text).split("\n## ")
+    new = ("\n" + "\n".join(page.lines)).split("\n## ")[1:]
+    for section in new:
+        title = section.split("\n", 1)[0]
+        same = [i for i, part in enumerate(parts) if part.split("\n", 1)[0] == title]
+        before = [i for i, part in enumerate(parts) if part.startswith("Clamped plate")] or [len(parts)]
+        section = section.rstrip() + "\n"
+        if same:
+            parts[same[0]] = section
+        else:
+            parts.insert(before[0], section)
+    return "\n## ".join(parts).lstrip("\n").rstrip() + "\n"
+
+
 def main() -> int:
     """Run the sections asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="")
+    parser.add_argument("--write", action="store_true")
     parser.add_argument("--list", action="store_true")
     args = parser.parse_args()
     if args.list:
@@ -93,6 +111,9 @@ def main() -> int:
         for note in section.notes:
             print("  " + note)
         page.add(section)
+    if args.only and args.write:
+        PAGE.write_text(_put_in(PAGE.read_text(), page))
+        print(f"\nput into {PAGE}")
     if not args.only:
         PAGE.write_text("\n".join(page.lines).rstrip() + "\n")
         print(f"\nwrote {PAGE}")

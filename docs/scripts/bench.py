@@ -1,7 +1,7 @@
 """Measure speed on this machine, beside a peer and beside the machine's own limits: ``make bench``.
 
 Writes ``docs/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` is the one-minute form: the
-small rig only, no whole measurements. ``--quick`` and ``--only`` (some parts) print and leave the page as it is.
+small rig only, no whole measurements. ``--quick`` and ``--only`` (some parts) print and leave the page as it is, unless ``--page`` is given.
 """
 
 from __future__ import annotations
@@ -144,6 +144,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a minute: the small rig only; the page is not written")
     parser.add_argument("--only", default="", help=f"some of {', '.join(PARTS)}; the page is not written")
+    parser.add_argument("--page", action="store_true", help="write the page all the same, without the parts left out")
     args = parser.parse_args()
     wanted = [name for name in args.only.split(",") if name] or list(PARTS[:-1] if args.quick else PARTS)
     report = Report(quick=args.quick)
@@ -157,7 +158,7 @@ def main() -> int:
     print("\n" + "\n".join(row.text() for row in targets(report)))
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     print(f"\nload of the machine at the end: {load:.1f}")
-    if not (args.only or args.quick):
+    if args.page or not (args.only or args.quick):
         print(f"wrote {write_page(report)}")
     return 0
 

@@ -121,7 +121,15 @@ def targets(report: Report) -> list[Row]:
         most = max(r.threads for r in report.rates)
         for fit, subset, least in (("motion", 33, 6e4), ("motion", 21, 1.2e5), ("shape", 33, 2e5)):
             rate = pick_rate(report, fit, "cubic", subset, most)
-            rows.append(Row(f"{fit}, cubic, {subset} px, {most} threads", rate, "points/s", least, at_least=True))
+            rows.append(
+                Row(
+                    f"{fit}, cubic, {subset} px, {most} thread{'s' if most > 1 else ''}",
+                    rate,
+                    "points/s",
+                    least,
+                    at_least=True,
+                )
+            )
         slower = pick_rate(report, "motion", "cubic", 33, 1) / pick_rate(report, "motion", "quintic", 33, 1)
         rows.append(Row("quintic over cubic, motion, 33 px, time", slower, "", 1.8))
     for cost in report.costs:
@@ -375,7 +383,7 @@ COSTS_HOW = """Nine subset sizes from 9 to 41 px and two distances of the start 
 pixel (the reference's rows and the sums of its normal equations), and the pixel loop."""
 
 PARTS_HOW = """The same from the other side: the kernel's own functions, each timed alone on one point, times as often as a fit calls them. "The rest" is what is left of the measured time:
-Jacobian, algebra of the sums, steps, results."""
+tests, updates, correlations, results, calls, and memory that is not in the first cache."""
 
 
 # the machine

@@ -1,7 +1,7 @@
 """What the parts of one motion fit cost, each timed alone in a compiled loop on a real point of the bench's scene.
 
-The parts are the kernel's own functions (``core/matching/kernels``); what is left of the fit's time is the Jacobian, the
-algebra of the sums, the steps and the results.
+The parts are the kernel's own functions (``core/matching/kernels``); what is left of the fit's time is what lies between
+them: tests, updates, correlations, covariances, results, and memory that is not in the first cache.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 from numba import njit
 
 from core.matching.image import PAD
-from core.matching.kernels.linear import covariance_of_last, make_factor, padded, solve
-from core.matching.kernels.loops import LANES, N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials, sum_reference
-from core.matching.kernels.reference import make_reference, set_up_tables, width
-from core.matching.kernels.warp import N_NODES, set_up_warp
+from core.matching.kernels.linear import covariance_of_last, solve
+from core.matching.kernels.loops import LANES, compare_cubic, compare_quintic, sum_reference
+from core.matching.kernels.point import make_point
+from core.matching.kernels.warp import lens_jacobian, set_up_warp
 from core.matching.options import SPLINE_ORDER, Interpolation
 from docs.scripts.bench_kernel import KernelScene
 
@@ -41,8 +41,12 @@ class Parts:
         The reference's set-up as a whole, and of it the sums for the normal equations.
     warp_us, loop_us
         Warp and pixel loop of one image.
+    jacobian_us, assemble_us
+        Of all three images, and the normal equations from them.
     factor_us, solve_us, covariance_us
         Of the 13 unknowns.
+    step_us
+        Right-hand side, and how far a step moves the patch.
     """
 
     interpolation: Interpolation
@@ -51,9 +55,12 @@ class Parts:
     gram_us: float
     warp_us: float
     loop_us: float
+    jacobian_us: float
+    assemble_us: float
     factor_us: float
     solve_us: float
     covariance_us: float
+    step_us: float
 
     @property
     def loop_ns(self) -> float:
@@ -67,6 +74,8 @@ class Parts:
             "reference: Gram sums": self.gram_us,
             "warp set-up": 3.0 * iterations * self.warp_us,
             "pixel loop": 3.0 * iterations * self.loop_us,
+            "Jacobian, normal equations": self.jacobian_us + self.assemble_us,
+            "right-hand sides, moves": iterations * self.step_us,
             "factor, solve, covariance": self.factor_us + iterations * self.solve_us + self.covariance_us,
         }
         return {**known, "the rest": max(0.0, total_us - sum(known.values()))}
@@ -75,9 +84,8 @@ class Parts:
 @cache
 def _timers(order: int) -> dict[str, Any]:
     """Compiled loops around the parts."""
-    set_up_reference, _, n_raw = make_reference(DEGREE)
+    set_up_reference, work_space, _, _, jacobian, assemble, factor, gradient, moves_of, *_ = make_point(DEGREE, 3)
     sums_of, compare = sum_reference[DEGREE], (compare_cubic if order == 3 else compare_quintic)[DEGREE]
-    factor = make_factor(int(padded(_UNKNOWNS)))
     lead = order // 2
 
     @njit(nogil=True, error_model="numpy")
@@ -107,6 +115,27 @@ def _timers(order: int) -> dict[str, Any]:
         return out[0]
 
     @njit(nogil=True, error_model="numpy")
+    def jacobians(n, R, t, M, slopes, of_reference, inverse, equations):
+        ok = True
+        for _ in range(n):
+            ok &= jacobian(R, t, 0.0, 1e-5, 1e-5, M, slopes, of_reference, inverse, equations[1], equations[2])
+        return ok
+
+    @njit(nogil=True, error_model="numpy")
+    def assembles(n, equations, gram):
+        for _ in range(n):
+            assemble(equations, gram)
+        return equations[5][0, 0]
+
+    @njit(nogil=True, error_model="numpy")
+    def steps(n, equations, rhs, small, moves):
+        total = 0.0
+        for _ in range(n):
+            gradient(equations, rhs, small)
+            total += moves_of(equations[2], small, moves)
+        return total
+
+    @njit(nogil=True, error_model="numpy")
     def factors(n, normal, work):
         for _ in range(n):
             work[:] = normal
@@ -127,7 +156,7 @@ def _timers(order: int) -> dict[str, Any]:
         return out[0]
 
     return {
-        "n_raw": n_raw, "reference": reference, "gram": gram, "warp": warp, "loop": loop, "factor": factors, "solve": solves,
+        "work_space": work_space, "jacobian": jacobians, "assemble": assembles, "step": steps, "reference": reference, "gram": gram, "warp": warp, "loop": loop, "factor": factors, "solve": solves,
         "covariance": covariances,
     }  # fmt: skip
 
@@ -152,47 +181,47 @@ def _us(call: Callable[[int], object]) -> float:
 
 def measure_parts(scene: KernelScene, interpolation: Interpolation, subset_px: int) -> Parts:
     """Time the parts at the middle point of the scene, seen by camera 2 at the plane's depth and slope zero."""
-    order = SPLINE_ORDER[interpolation]
-    run = _timers(order)
-    few = len(monomials(DEGREE))
-    columns = 2 * few
+    run = _timers(SPLINE_ORDER[interpolation])
     images = scene.images[interpolation]
-    x, y = scene.xy_px[len(scene.xy_px) // 2]
+    middle = len(scene.xy_px) // 2
+    x, y = scene.xy_px[middle]
     lens1, lens2 = (np.array(c.lens.kernel_parameters()) for c in (scene.pair.cam1, scene.pair.cam2))
     weights = np.empty((0, 0), np.float32) if images[0].weights is None else images[0].weights
     pictures = (images[0].pixels, *images[0].gradients, weights)
-    ref = np.empty((N_ROWS, int(width(subset_px))), np.float32)
-    set_up_tables(subset_px, ref)
-    raw, powers = np.empty(run["n_raw"]), np.empty((few, N_NODES))
-    space = (
-        raw, np.empty(22), powers, np.eye(few), np.empty(3), np.empty(columns), np.empty(columns), np.empty((columns, columns)),
-    )  # fmt: skip
-    reference_us = _us(lambda n: run["reference"](n, pictures, lens1, x, y, subset_px, ref, space))
+    ref, of_reference, warp_space, rhs, _, M, equations, moves, vectors, inverse, *_ = run["work_space"](subset_px)
+    raw, powers, gram = of_reference[0], of_reference[2], of_reference[7]
+    reference_us = _us(lambda n: run["reference"](n, pictures, lens1, x, y, subset_px, ref, of_reference))
     blocks = (subset_px**2 + LANES - 1) // LANES
     gram_us = _us(lambda n: run["gram"](n, ref, blocks, raw))
     pose = scene.pair.cam2_from_cam1
+    R, t = np.array(pose.rotation), np.array(pose.translation_mm)
     xc, yc, _ = scene.pair.cam1.rays_cam(np.array([x, y])).xyz_mm
-    m = np.array([pose.rotation @ [xc, yc, 1.0], pose.rotation[:, 0], pose.rotation[:, 1]]).T
-    m[:, 0] += pose.translation_mm * scene.w0[len(scene.xy_px) // 2]
-    m = np.ascontiguousarray(m)
+    M[1] = [[xc, 1.0, 0.0], [yc, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    M[0] = M[2] = R @ M[1] + np.outer(t, [scene.w0[middle], 0.0, 0.0])
     rows, cols = images[1].shape
     stride = cols + 2 * PAD
-    work, p = np.empty(26), np.zeros(N_WARP, np.float32)
+    p, work, sums = warp_space
     p[20] = 1.0
-    base = run["warp"](1, lens2, m, powers, rows, cols, stride, work, p)
+    base = run["warp"](1, lens2, M[0], powers, rows, cols, stride, work, p)
     if base < 0:
         raise RuntimeError("the bench's point is not in camera 2's picture")
-    warp_us = _us(lambda n: run["warp"](n, lens2, m, powers, rows, cols, stride, work, p))
-    flat, sums = images[1].coefficients.ravel(), np.empty(3 + columns)
+    warp_us = _us(lambda n: run["warp"](n, lens2, M[0], powers, rows, cols, stride, work, p))
+    flat = images[1].coefficients.ravel()
     loop_us = _us(lambda n: run["loop"](n, flat, base, stride, p, ref, blocks, sums))
-    size = int(padded(_UNKNOWNS))
-    normal = np.full((size, size), 0.1) + np.eye(size)
-    u = np.empty_like(normal)
-    factor_us = _us(lambda n: run["factor"](n, normal, u))
-    b, small = np.ones(size), np.empty(size)
-    solve_us = _us(lambda n: run["solve"](n, u, b, small))
-    out = np.empty(25)
-    covariance_us = _us(lambda n: run["covariance"](n, u, np.empty((size, size)), out))
+    slopes = lens_jacobian(lens1, xc, yc)
+    jacobian_us = _us(lambda n: run["jacobian"](n, R, t, M, slopes, of_reference, inverse, equations))
+    equations[0][:3, :3] = 1.5 * np.eye(3) - 0.4  # inverse covariance of comparisons that share the reference's noise
+    assemble_us = _us(lambda n: run["assemble"](n, equations, gram))
+    normal = equations[5].copy()
+    factor_us = _us(lambda n: run["factor"](n, normal, equations[5]))
+    rhs[:] = 1.0
+    step_us = _us(lambda n: run["step"](n, equations, rhs, vectors[2], moves))
+    solve_us = _us(lambda n: run["solve"](n, equations[5], vectors[2], vectors[3]))
+    few, out = np.empty((5, 5)), np.empty(25)
+    covariance_us = _us(lambda n: run["covariance"](n, equations[5], few, out))
+    if not np.isfinite(out).all():
+        raise RuntimeError("the bench's normal equations cannot be solved")
     return Parts(
-        interpolation, subset_px, reference_us, gram_us, warp_us, loop_us, factor_us, solve_us, covariance_us
+        interpolation, subset_px, reference_us, gram_us, warp_us, loop_us, jacobian_us, assemble_us, factor_us, solve_us,
+        covariance_us, step_us,
     )  # fmt: skip

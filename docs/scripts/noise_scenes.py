@@ -34,7 +34,7 @@ LOOKS = {
     "coarse": Look(speckle_px=8.0, blur_px=1.1),
     "fine": Look(speckle_px=3.0),
     "sharp": Look(rim=0.2, blur_px=0.4),
-    "low contrast": Look(contrast=0.3),
+    "low contrast": Look(contrast=0.5),
 }
 
 

@@ -11,7 +11,7 @@ from core.errors import InputError
 from core.noise import NoiseModel, measure_noise
 from server.cli.image_lists import expand
 from server.io.files import make_folder, sha256_of
-from server.io.images import read_image
+from server.io.noise_frames import read_frames
 from server.io.noise_json import CAMERAS, noise_content, write_noise
 
 SHOWN_LEVELS = 5
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         files, note = expand(option if option == "FRAMES" else f"--{option}", items)
         if note:
             print(f"note: {note}")
-        model = measure_noise([read_image(file) for file in files], full_scale=args.full_scale)
+        model = measure_noise(read_frames(files), full_scale=args.full_scale)
         source = [{"file": str(file), "sha256": sha256_of(file)} for file in files]
         for cam in CAMERAS if option == "FRAMES" else (option,):
             models[cam], sources[cam] = model, source

@@ -14,6 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import MeasurementError
 from core.field.images import MeasureImage
@@ -31,6 +33,7 @@ from server.io.summary import summarise, to_json
 from server.overlap import ReadAhead, WriteBehind
 from server.version import software_version
 
+_LEAST_OF_STATED, _MOST_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
 _RESULT = re.compile(r"step_\d{4}\.nc")
 
@@ -173,6 +176,7 @@ class _Runner:
             )
         if n == 0:
             self._remove_older()
+            self._doubt_noise(result)
         self._written.put(self._write, n, result, started)
         self._n += 1
 
@@ -230,6 +234,19 @@ class _Runner:
             frame="target" if job.calibration.source == "calibration_json" else "camera1",
             extra={"cam1_file": str(now.files.cam1), "cam2_file": str(now.files.cam2)},
         )  # fmt: skip
+
+    def _doubt_noise(self, shape: Field) -> None:
+        """Say so where the residuals and the noise file tell different stories."""
+        model = self._options.noise[0]
+        stated = self._reference.image1.prepared(self._options.interpolation, model).noise_variance
+        if stated is None:
+            return
+        found, expected = float(np.nanmedian(shape.noise_grey)), float(np.sqrt(stated))
+        if not _LEAST_OF_STATED < found / expected < _MOST_OF_STATED:
+            self._progress.note(
+                f"note: residuals show a noise of {found:.2f} grey levels, the noise file says {expected:.2f}; "
+                "was it measured with these cameras' gain?"
+            )
 
     def _remove_older(self) -> None:
         """Remove an earlier run's results: more steps than now, or its summary, would pass for this one's."""

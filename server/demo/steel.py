@@ -24,7 +24,10 @@ def run(session: Session, calibration_id: str) -> Outcome:
     for n in range(CAPTURES):
         client.capture(test, "the pair" if n == 0 else f"once more, for the noise ({n})")
     session.say(f"captured {CAPTURES} pairs")
-    analysis = client.analyse(test, "profile", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, step_px=STEP_PX)
+    # plane patches: the truth below is the surface as a plane of the subset's size sees it
+    analysis = client.analyse(
+        test, "profile", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, step_px=STEP_PX, patch="stretch"
+    )
     fields = session.fetch(analysis, range(CAPTURES))
 
     use = np.logical_and.reduce([f.valid for f in fields])
