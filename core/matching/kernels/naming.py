@@ -18,6 +18,6 @@ def kernel(made_for: str, **options: Any) -> Callable[[Any], Any]:
 
     def compile_it(function: Any) -> Any:
         function.__qualname__ = f"{function.__qualname__}_{made_for}"
-        return njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
+        return njit(nogil=True, error_model="numpy", **options)(function)
 
     return compile_it
