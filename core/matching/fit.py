@@ -12,7 +12,7 @@ from core.camera import Camera
 from core.errors import ImageError, InputError
 from core.lens import Float
 from core.matching.image import PAD, ImageData, prepare
-from core.matching.kernels.drivers import motion_points, shape_points
+from core.matching.kernels.drivers import motion_points, motion_space, shape_points, shape_space
 from core.matching.kernels.motion import n_motion_out
 from core.matching.kernels.shape import n_shape_out
 from core.matching.options import SPLINE_ORDER, MatchOptions
@@ -134,14 +134,15 @@ def fit_shape(
     w = _starts("start", start, (n,), terms)
     out = np.full((n, n_shape_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
+    results = (out, status, iterations)
     pose = pair.cam2_from_cam1
     setting = _setting(options, images)
     fixed = (
         _reference(images[0]), _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation),
-        _own(pose.translation_mm), xy, w, setting, out, status, iterations,
+        _own(pose.translation_mm), xy, w, setting,
     )  # fmt: skip
-    kernel = shape_points[degree]
-    run_ranges(lambda first, last: kernel(first, last, *fixed), n, POINTS_AT_ONCE)
+    kernel, space = shape_points[degree], shape_space[degree]
+    run_ranges(lambda first, last: kernel(first, last, *fixed, space(options.subset_px), *results), n, POINTS_AT_ONCE)
     failed = status != 0
     out[failed, : terms + 1] = np.nan
     out[failed, terms + 3 :] = np.nan
@@ -207,14 +208,15 @@ def fit_motion(
     G = _starts("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
     out = np.full((n, n_motion_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
+    results = (out, status, iterations)
     pose = pair.cam2_from_cam1
     setting = (*_setting(options, images), options.patch == "rigid")
     fixed = (
         _reference(images[0]), _flat(images[1]), _flat(images[2]), _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2),
-        _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting, out, status, iterations,
+        _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting,
     )  # fmt: skip
-    kernel = motion_points[degree]
-    run_ranges(lambda first, last: kernel(first, last, *fixed), n, POINTS_AT_ONCE)
+    kernel, space = motion_points[degree], motion_space[degree]
+    run_ranges(lambda first, last: kernel(first, last, *fixed, space(options.subset_px), *results), n, POINTS_AT_ONCE)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan
     out[failed, at + 5 :] = np.nan

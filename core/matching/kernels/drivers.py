@@ -28,8 +28,8 @@ def _stamp() -> int:
     return int.from_bytes(digest[:7], "big")
 
 
-_plane_shape, _plane_shape_space = make_shape(1)
-_plane_motion, _plane_motion_space = make_motion(1)
+_plane_shape, _shape_space = make_shape(1)
+_plane_motion, _motion_space = make_motion(1)
 _curved_shape, _curved_shape_space = make_shape(2)
 _curved_motion, _curved_motion_space = make_motion(2)
 
@@ -37,11 +37,10 @@ _curved_motion, _curved_motion_space = make_motion(2)
 def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
     @njit(cache=True, nogil=True, error_model="numpy")
     def run_plane_shape(
-        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations
+        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
     ):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        space = _plane_shape_space(setting[0])
         for i in range(first, last):
             status[i], iterations[i] = _plane_shape(
                 reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
@@ -49,12 +48,11 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     def run_plane_motion(
-        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, out,
-        status, iterations,
+        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
+        out, status, iterations,
     ):  # fmt: skip
         if stamp < 0:
             return
-        space = _plane_motion_space(setting[0])
         for i in range(first, last):
             status[i], iterations[i] = _plane_motion(
                 reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,
@@ -63,11 +61,10 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     def run_curved_shape(
-        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, out, status, iterations
+        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
     ):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        space = _curved_shape_space(setting[0])
         for i in range(first, last):
             status[i], iterations[i] = _curved_shape(
                 reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
@@ -75,12 +72,11 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     def run_curved_motion(
-        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, out,
-        status, iterations,
+        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
+        out, status, iterations,
     ):  # fmt: skip
         if stamp < 0:
             return
-        space = _curved_motion_space(setting[0])
         for i in range(first, last):
             status[i], iterations[i] = _curved_motion(
                 reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,
@@ -92,3 +88,6 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
 
 shape_points, motion_points = _wrappers(_stamp())
 """The compiled fits, by the patch's degree: 1 plane, 2 curved."""
+shape_space = {1: _shape_space, 2: _curved_shape_space}
+motion_space = {1: _motion_space, 2: _curved_motion_space}
+"""What makes their work space for a subset's width; one call at a time may use it."""

@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 
 from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
-from core.matching.kernels.loops import N_ROWS, N_WARP, compare_cubic, compare_quintic, monomials
+from core.matching.kernels.loops import N_WARP, compare_cubic, compare_quintic, monomials
 from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
     CONTRAST,
@@ -38,7 +38,7 @@ from core.matching.kernels.noise import (
     ZNCC,
     interpolated_noise,
 )
-from core.matching.kernels.reference import make_reference, set_up_tables, width
+from core.matching.kernels.reference import make_reference, subset_array
 from core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
 from core.status import PointStatus
 
@@ -167,11 +167,9 @@ def make_point(degree: int, images: int) -> Any:
     product, factor = make_product(row), make_factor(row)
     made_for = f"{degree}_{images}"
 
-    @kernel(made_for)
-    def work_space(subset):
+    def work_space(subset: int) -> tuple[Any, ...]:
         """Everything one thread needs, so that no point allocates."""
-        ref = np.empty((N_ROWS, width(subset)), np.float32)
-        set_up_tables(subset, ref)
+        ref = subset_array(subset)
         basis = np.zeros((few, few))
         basis[0, 0] = 1.0
         reference = (

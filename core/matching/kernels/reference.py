@@ -21,16 +21,21 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.matching.kernels.loops import GX, GY, WEIGHT, F, X, Y, monomials, sum_reference
+from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
 from core.matching.kernels.naming import kernel
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 
 
-@njit(nogil=True, error_model="numpy")
-def width(subset):
-    """Row length of the reference subset's array."""
-    return (subset * subset + LANES - 1) // LANES * LANES + LANES
+def subset_array(subset: int) -> np.ndarray:
+    """Return an array for the reference subset, its rows that all points share filled; the surplus is zero."""
+    width = (subset * subset + LANES - 1) // LANES * LANES + LANES
+    ref = np.zeros((N_ROWS, width), np.float32)
+    place = np.linspace(-1.0, 1.0, subset)
+    n = subset * subset
+    ref[X, :n], ref[Y, :n] = (axis.ravel() for axis in np.meshgrid(place, place))
+    ref[WEIGHT, :n] = 1.0
+    return ref
 
 
 @intrinsic
@@ -68,19 +73,6 @@ def _copy(image, top, left, subset, ref, row):
     for r in range(subset):
         for c in range(subset):
             ref[row, r * subset + c] = image[top + r, left + c]
-
-
-@njit(nogil=True, error_model="numpy")
-def set_up_tables(subset, ref):
-    """Fill the rows that all points share: places of the pixels and weights of one; the surplus is zero."""
-    half = 0.5 * (subset - 1)
-    ref[:] = np.float32(0.0)
-    for r in range(subset):
-        for c in range(subset):
-            i = r * subset + c
-            ref[X, i] = (c - half) / half
-            ref[Y, i] = (r - half) / half
-            ref[WEIGHT, i] = 1.0
 
 
 def _product_table(degree: int) -> np.ndarray:
