@@ -42,8 +42,8 @@ STAGES = (
     ("read and decode", "server.cli.sequence", "read_image"),
     ("splines", "core.field.images", "prepare"),
     ("fit", "core.field.fitter", "fit_motion"),
-    ("gates", "core.measure", "apply_gates"),
-    ("assemble", "core.measure", "assemble"),
+    ("gates", "core.field.run", "apply_gates"),
+    ("assemble", "core.field.run", "assemble"),
     ("summary", "server.cli.sequence", "summarise"),
     ("write", "server.cli.sequence", "write_field"),
 )
@@ -255,10 +255,10 @@ def measure_seeds(folder: Path, *, threads: int, runs: int = 3) -> list[SeedFigu
 
 
 def _seeds_once(files: SequenceFiles, grid: PointGrid, options: MeasureOptions, what: str, threads: int) -> SeedFigures:
-    from core.measure import _Run
+    from core.field.run import Run
 
     now = _images(files, 1) if what == "motion" else (None, None)
-    run = _Run(files.pair, *_images(files, 0), *now, grid, options, None, None)
+    run = Run(files.pair, *_images(files, 0), *now, grid, options, None, None)
     start = time.perf_counter(), time.process_time()
     seeds = run._match_seeds()
     return SeedFigures(what, threads, time.perf_counter() - start[0], time.process_time() - start[1], seeds)

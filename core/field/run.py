@@ -1,0 +1,353 @@
+"""One measurement of a field: seeds, growth, checks, a second growth into what the checks emptied, checks again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import SeedError
+from core.field.assemble import assemble
+from core.field.features import Box
+from core.field.fitter import Fitter, PointFits
+from core.field.gates import apply_gates
+from core.field.grow import Attempts, fit_in_batches, grow
+from core.field.images import MeasureImage, different, features_of, same_size
+from core.field.patch import UsedPatch, asked_for
+from core.field.patch_choice import advise, choose_patch
+from core.field.plane_error import plane_error
+from core.field.predict import predict
+from core.field.region import PointGrid, check_region
+from core.field.result import Field
+from core.field.scatter import ScatteredShape, scattered_motion, scattered_shape
+from core.field.seeds import (
+    Seed,
+    as_seeds,
+    nearest_points,
+    refine,
+    search_motion,
+    seeds_from_matches,
+    spread,
+    sweep_shape,
+    swept_places,
+)
+from core.field.settings import MeasureOptions
+from core.field.starts import Starts
+from core.field.unreached import mark_outside
+from core.field.where import box_around, scales, seen_by_camera2
+from core.lens import Bool, Float
+from core.matching.fit import no_motion
+from core.matching.image import ImageData
+from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
+from core.status import PointStatus
+from core.stereo import StereoPair
+
+Image = ArrayLike | ImageData | MeasureImage
+Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
+
+_FEWEST_MATCHES = 12
+_SAMPLE_FAR_PX = 3.0
+_SAMPLE_SHARE = 0.7
+_REACH_STEPS = 2.0
+_LEFT_OVER = 0.02
+
+
+class Run:
+    """One computation: its images, its points, and the stages that fill them."""
+
+    def __init__(
+        self,
+        pair: StereoPair,
+        ref1: Image,
+        ref2: Image,
+        cur1: Image | None,
+        cur2: Image | None,
+        grid: PointGrid,
+        options: MeasureOptions | None,
+        progress: Progress | None,
+        cancel: CancelToken | None,
+    ) -> None:
+        self.options = options or MeasureOptions()
+        self.pair, self.grid, self.cancel = pair, grid, cancel
+        self.progress: Progress = progress or no_progress
+        self.ref1, self.ref2 = MeasureImage(ref1, "camera 1's image"), MeasureImage(ref2, "camera 2's image")
+        self.cur1 = None if cur1 is None else MeasureImage(cur1, "camera 1's image at t")
+        self.cur2 = None if cur2 is None else MeasureImage(cur2, "camera 2's image at t")
+        self.fits_image = check_region(grid, image_shape=self.ref1.shape, subset_px=self.options.subset_px)
+        if self.cur1 is None or self.cur2 is None:
+            self.ref1.refuse_blank(grid.extent_px)
+            self.ref2.refuse_blank()
+            different(self.ref1, self.ref2)
+        else:
+            same_size(self.ref1, self.cur1)
+            same_size(self.ref2, self.cur2)
+            self.cur1.refuse_blank()
+            self.cur2.refuse_blank()
+            different(self.cur1, self.cur2)
+        self.xy_px = grid.xy_px.reshape(-1, 2)
+        self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
+        self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
+        kind, (noise1, noise2) = self.options.interpolation, self.options.noise
+        self.fitter = Fitter(
+            pair=pair,
+            ref1=self.ref1.prepared(kind, noise1),
+            ref2=self.ref2.prepared(kind, noise2),
+            cur1=None if self.cur1 is None else self.cur1.prepared(kind, noise1),
+            cur2=None if self.cur2 is None else self.cur2.prepared(kind, noise2),
+            options=self.options.match_options(),
+            least_zncc=self.options.least_zncc,
+        )
+        asked = self.options.patch
+        plane: UsedPatch = "plane" if cur1 is None else self.fitter.options.patch
+        self.patch = asked_for("curved" if asked == "curved" else plane, asked)
+        self.points = self.fitter.empty(len(self.xy_px))
+        self.known_w: Float | None = None
+        self.hoped_for = self.usable  # where new seeds are worth their time
+        self.checked = False  # whether every point that stands went through the gates
+        self.attempts = Attempts.on(grid.shape)
+        self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px)
+
+    # seeds
+
+    def seed_shape(self, seeds: Seeds | None) -> None:
+        """Put the first points of a shape down."""
+        self.progress("seeds", 0, 1)
+        if seeds is not None:
+            self._user_shape(as_seeds(seeds))
+        elif self._match_seeds() == 0:
+            self._swept_shape()
+        self.progress("seeds", 1, 1)
+
+    def seed_motion(self, shape: Field, previous: Field | None, seeds: Seeds | None) -> None:
+        """Put the first points of a motion down: from the last step, where they stood, or from matches."""
+        self.usable = self.usable & shape.valid.ravel()
+        if not self.usable.any():
+            return
+        self._keep_patch(previous)
+        self.points.status[~self.usable & self.fits_image.ravel()] = shape.status.ravel()[
+            ~self.usable & self.fits_image.ravel()
+        ]
+        if shape.starts is not None:
+            self.known_w = shape.starts.w.reshape(len(self.xy_px), -1)
+        if previous is not None:
+            self.hoped_for = self.usable & previous.valid.ravel()
+        else:
+            self.hoped_for = self.usable
+        self._forget_attempts()
+        if previous is not None and previous.starts is not None and previous.starts.G is not None:
+            n = len(self.xy_px)
+            w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
+            if self._sample_holds(w, G):
+                if self.patch.patch == "curved":
+                    self._refit_curved()
+                # the sample stands already, fitted from these very starts
+                sample = np.flatnonzero(self.points.ok)
+                if self.points.G.shape == G.shape:
+                    G = predict(self.pair, self.xy_px, G, sample, self.points.w[sample], self.points.G[sample])
+                known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+                index = np.flatnonzero(self.usable & known & ~self.points.ok)
+                self.progress("previous", 0, len(index))
+                fit_in_batches(
+                    self.fitter, self.points, index, self.xy_px, w[index], G[index], far_px=_SAMPLE_FAR_PX,
+                    cancel=self.cancel,
+                )  # fmt: skip
+                self._gate()
+                return
+        self.progress("seeds", 0, 1)
+        if seeds is not None:
+            self._user_motion(as_seeds(seeds))
+        elif not (self.known_w is not None and self._sample_holds(self.known_w, no_motion(self.pair, self.xy_px))):
+            self.points.status[self.usable] = PointStatus.NOT_SEEDED
+            if self._match_seeds() == 0:
+                self._searched_motion()
+        self.progress("seeds", 1, 1)
+
+    def _sample_holds(self, w: Float, G: Float) -> bool:
+        """Fit a spread sample from given starts; True (and the sample stands as seeds) if nearly all of it matches."""
+        usable = self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+        if usable.sum() < 1:
+            return False
+        index = spread(self.xy_px, usable, np.zeros(len(usable)))[0]
+        fits = refine(self.fitter, self.xy_px[index], Starts(w[index], G[index]), far_px=_SAMPLE_FAR_PX)
+        if fits.ok.mean() < _SAMPLE_SHARE:
+            return False
+        good = np.flatnonzero(fits.ok)
+        self.points.put(index[good], fits.take(good))
+        return True
+
+    def _match_seeds(self) -> int:
+        """Seeds from feature matches; how many stand. Large images are reduced, less and less until seeds are found."""
+        reach = self.options.subset_px + self.grid.step_px
+        box1 = box_around(self.xy_px[self.usable], reach, self.ref1.shape)
+        box2 = seen_by_camera2(self.pair, box1, self.ref2.shape)
+        for scale in scales((box1, box2), (self.ref1.shape, self.ref2.shape)):
+            found = self._match_seeds_at(scale, box1, box2)
+            if found > 0:
+                return found
+        return 0
+
+    def _match_seeds_at(self, scale: int, box1: Box, box2: Box) -> int:
+        raise_if_cancelled(self.cancel)
+        wanted = [(self.ref1, box1)]
+        if self.known_w is None:
+            wanted.append((self.ref2, box2))
+        if self.cur1 is not None and self.cur2 is not None:
+            wanted += [(image, (0, 0, *image.shape[::-1])) for image in (self.cur1, self.cur2)]
+        features = features_of(wanted, scale)
+        raise_if_cancelled(self.cancel)
+        shape = ScatteredShape.empty() if self.known_w is not None else scattered_shape(self.pair, *features[:2])
+        motion = shape_now = None
+        if self.cur1 is not None:
+            motion = scattered_motion(features[0], features[-2])
+            raise_if_cancelled(self.cancel)
+            shape_now = scattered_shape(self.pair, *features[-2:])
+        elif len(shape.xy_px) < _FEWEST_MATCHES:
+            return 0
+        return seeds_from_matches(
+            self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
+        )
+
+    def _swept_shape(self) -> None:
+        for i in swept_places(self.xy_px, self.usable):
+            raise_if_cancelled(self.cancel)
+            found = sweep_shape(self.fitter, self.ref1.pixels, self.ref2.pixels, self.xy_px[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+
+    def _searched_motion(self) -> None:
+        if self.known_w is None:
+            return
+        known = self.usable & np.isfinite(self.known_w).all(axis=1)
+        for i in swept_places(self.xy_px, known)[:6]:
+            raise_if_cancelled(self.cancel)
+            found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+
+    def _user_shape(self, seeds: tuple[Seed, ...]) -> None:
+        reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
+        for seed, i in zip(seeds, nearest_points(seeds, self.xy_px, self.usable, reach_px=reach), strict=True):
+            raise_if_cancelled(self.cancel)
+            found = PointFits.empty(1, 1)
+            if seed.xy2_px is not None:
+                p = self.pair.triangulate(np.array([seed.xy_px]), np.array([seed.xy2_px]))
+                depth = self.pair.cam1.cam_from_sys.apply(p.xyz_mm)[:, 2]
+                found = refine(
+                    self.fitter.shape_only(),
+                    self.xy_px[i : i + 1],
+                    Starts(np.array([[1.0 / depth[0], 0.0, 0.0]])),
+                )
+            if not found.ok[0]:
+                found = sweep_shape(self.fitter, self.ref1.pixels, self.ref2.pixels, self.xy_px[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+
+    def _user_motion(self, seeds: tuple[Seed, ...]) -> None:
+        if self.known_w is None:
+            raise SeedError("a seed for a motion needs the shape that was measured before it.")
+        usable = self.usable & np.isfinite(self.known_w).all(axis=1)
+        reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
+        index = nearest_points(seeds, self.xy_px, usable, reach_px=reach)
+        for i in index:
+            raise_if_cancelled(self.cancel)
+            found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
+            if found.ok[0]:
+                self.points.put(np.array([i]), found)
+        if not self.points.ok.any():
+            # turned or stretched too far for a template: matches about the seed know how
+            self._match_seeds()
+
+    # field
+
+    def finish(self, automatic: bool, shape: Field | None) -> Field:
+        """Grow, check, grow into the gaps, check again, and hand over."""
+        if not self.points.ok.any() and (shape is None or shape.valid.any()):
+            raise SeedError(
+                "no point of the region could be matched between the images from any start.",
+                remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
+                "these images, or give a seed point.",
+            )
+        if self.patch.patch == "curved" and self.fitter.terms == 3:
+            self._refit_curved()
+        self._fill()
+        self._settle_patch()
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
+        if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
+            self._forget_attempts()
+            self._grow()
+            self._gate()
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
+        self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
+        return assemble(
+            self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape, patch=self.patch
+        )
+
+    def _settle_patch(self) -> None:
+        """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
+        told = None
+        if self.fitter.terms == 3:
+            told = plane_error(
+                self.points, shape=self.grid.shape, rays=self.rays, step_px=self.grid.step_px,
+                subset_px=self.options.subset_px,
+            )  # fmt: skip
+        if self.options.patch != "auto":
+            self.patch = advise(self.patch, told)
+        elif not self.patch.kept:
+            self.patch = choose_patch(self.fitter, self.points, self.xy_px, told)
+            if self.patch.patch == "curved":
+                self._refit_curved()
+                self._fill()
+
+    def _fill(self) -> None:
+        """Grow, check, and grow into what the checks emptied."""
+        for _ in range(3):
+            if self._grow() == 0 and self.checked:
+                break
+            self._gate()
+
+    def _keep_patch(self, previous: Field | None) -> None:
+        """Where a sequence went over to curved patches by itself, it stays with them."""
+        choice = None if previous is None or not previous.has_motion else previous.patch
+        if self.options.patch == "auto" and choice is not None and choice.patch == "curved":
+            self.patch = choice.for_next_step()
+
+    def _refit_curved(self) -> None:
+        """Measure the points that stand anew with curved patches; the others keep their status and are tried again."""
+        flat = self.points
+        index = np.flatnonzero(flat.ok)
+        self.fitter = self.fitter.curved()
+        self.points = self.fitter.empty(len(flat.status))
+        self.points.status[:] = flat.status
+        self._forget_attempts()
+        G = None if self.fitter.comparisons == 1 else flat.G[index]
+        fit_in_batches(
+            self.fitter, self.points, index, self.xy_px, flat.w[index], G, far_px=_SAMPLE_FAR_PX, cancel=self.cancel
+        )
+        self.checked = False
+
+    def _unreached(self) -> float:
+        """Share of the usable points that nothing reached; those lost in an earlier step do not count again."""
+        untouched = self.hoped_for & (self.points.status == PointStatus.NOT_SEEDED)
+        return float(untouched.sum()) / max(int(self.usable.sum()), 1)
+
+    def _forget_attempts(self) -> None:
+        """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
+        self.attempts = Attempts.on(self.grid.shape)
+        self.attempts.left[self.usable & ~self.hoped_for] = 1
+
+    def _grow(self) -> int:
+        added = grow(
+            self.fitter, self.points, attempts=self.attempts, xy_px=self.xy_px, rays=self.rays, usable=self.usable,
+            progress=self.progress, cancel=self.cancel,
+        )  # fmt: skip
+        self.checked = self.checked and added == 0
+        return added
+
+    def _gate(self) -> None:
+        apply_gates(
+            self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
+            options=self.options.gates,
+        )  # fmt: skip
+        self.checked = True
