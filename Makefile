@@ -17,8 +17,8 @@ help:
 	@echo "make test    run every test"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls"
-	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a minute)"
-	@echo "make accuracy   measure every figure of docs/accuracy.md again (about ten minutes)"
+	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a few minutes)"
+	@echo "make accuracy   measure every figure of docs/accuracy.md again (about twenty minutes)"
 
 $(STAMP): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }
