@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +24,7 @@ from core.threads import run_ranges
 Int = NDArray[np.int32]
 Status = NDArray[np.int8]
 
-POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to set it up
+POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to call it
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +143,8 @@ def fit_shape(
         _reference(images[0]), _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation),
         _own(pose.translation_mm), xy, w, setting,
     )  # fmt: skip
-    kernel, space = shape_points[degree], shape_space[degree]
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(options.subset_px), *results), n, POINTS_AT_ONCE)
+    kernel, space = shape_points[degree], _one_a_thread(shape_space[degree], options.subset_px)
+    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE)
     failed = status != 0
     out[failed, : terms + 1] = np.nan
     out[failed, terms + 3 :] = np.nan
@@ -215,8 +217,8 @@ def fit_motion(
         _reference(images[0]), _flat(images[1]), _flat(images[2]), _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2),
         _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting,
     )  # fmt: skip
-    kernel, space = motion_points[degree], motion_space[degree]
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(options.subset_px), *results), n, POINTS_AT_ONCE)
+    kernel, space = motion_points[degree], _one_a_thread(motion_space[degree], options.subset_px)
+    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan
     out[failed, at + 5 :] = np.nan
@@ -226,6 +228,18 @@ def fit_motion(
         epipolar_sigma_px=np.sqrt(covariance[:, 4, 4]), zncc=out[:, at + 1 : at + 4], noise=out[:, at + 4],
         covariance=covariance, iterations=iterations, status=status,
     )  # fmt: skip
+
+
+def _one_a_thread(make: Callable[[int], Any], subset: int) -> Callable[[], Any]:
+    """Return what gives each thread its own work space, once: one for each range would cost as much as ten points."""
+    own = threading.local()
+
+    def space() -> Any:
+        if not hasattr(own, "space"):
+            own.space = make(subset)
+        return own.space
+
+    return space
 
 
 def _points(xy_px: ArrayLike) -> tuple[Float, int]:
