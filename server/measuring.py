@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from core.camera import Camera
+from core.compiling import told_when_compiling
 from core.errors import FileFormatError
 from core.field.images import MeasureImage, check_calibrated_size
 from core.field.region import PointGrid
@@ -29,6 +30,7 @@ from core.measure import MeasureOptions, ReferencePair
 from core.noise import NoiseModel
 from core.stereo import StereoPair
 from core.threads import set_threads
+from server.compile_aside import CompileAside
 from server.io.calibration_any import load_calibration
 from server.io.images import GrayImage, read_image, read_mask
 from server.io.netcdf import Provenance, read_field, write_field
@@ -207,6 +209,8 @@ def warm_up(threads: int) -> None:
     seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
     # other patches and the other interpolation compile when first asked for; compiled kernels are kept on disk
     options = MeasureOptions(subset_px=21, patch="stretch")
-    reference = ReferencePair(pair, left, right)
-    shape = reference.shape(grid, options, seeds=seeds)
-    reference.motion(left.copy(), right.copy(), grid, options, shape=shape)
+    with CompileAside(options.patch) as aside, told_when_compiling(aside.start):
+        reference = ReferencePair(pair, left, right)
+        shape = reference.shape(grid, options, seeds=seeds)
+        aside.wait()
+        reference.motion(left.copy(), right.copy(), grid, options, shape=shape)

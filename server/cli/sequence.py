@@ -24,6 +24,7 @@ from core.field.result import Field
 from server.cli.image_lists import ImagePair
 from server.cli.region import RegionRequest
 from server.cli.terminal import ProgressLine, duration
+from server.compile_aside import CompileAside
 from server.io.calibration_any import LoadedCalibration
 from server.io.files import make_folder, sha256_of, write_bytes
 from server.io.images import read_image
@@ -83,14 +84,22 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
         As the measurement raises them. Results of steps that were finished before stay; no summary is written.
     """
     started = time.monotonic()
+
+    def on_compiling() -> None:
+        progress.note(f"{COMPILING} ...")
+        if len(job.pairs) > 1:
+            aside.start()
+
     with (
         _output_folder(job.out),
-        told_when_compiling(lambda: progress.note(f"{COMPILING} ...")),
+        CompileAside(job.patch) as aside,
+        told_when_compiling(on_compiling),
         WriteBehind[dict[str, Any]]() as written,
     ):
         runner = _Runner(job, progress, written)
         with ReadAhead(runner.read, job.pairs[1:]) as pairs:
             runner.measure(None)
+            aside.wait()
             for images in pairs:
                 runner.measure(images)
         steps = written.finish()

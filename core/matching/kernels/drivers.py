@@ -15,9 +15,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from numba import njit
-
 from core.matching.kernels.motion import make_motion
+from core.matching.kernels.naming import entry
 from core.matching.kernels.shape import make_shape
 
 
@@ -35,7 +34,7 @@ _curved_motion, _curved_motion_space = make_motion(2)
 
 
 def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @entry
     def run_plane_shape(
         first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
     ):
@@ -46,7 +45,7 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
                 reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
             )
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @entry
     def run_plane_motion(
         first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
         out, status, iterations,
@@ -59,7 +58,7 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
                 out[i],
             )  # fmt: skip
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @entry
     def run_curved_shape(
         first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
     ):
@@ -70,7 +69,7 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
                 reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
             )
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @entry
     def run_curved_motion(
         first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
         out, status, iterations,

@@ -7,24 +7,18 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
 from core.matching.kernels.loops import data
-from core.matching.kernels.naming import kernel
+from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 QUAD = 4
 
 
-@njit(nogil=True, error_model="numpy")
-def padded(n):
-    """Row length for ``n`` unknowns: whole vectors of doubles."""
-    return (n + QUAD - 1) // QUAD * QUAD
-
-
-@njit(nogil=True, error_model="numpy")
+@inner
 def invert3(m, out):
     """Inverse of the leading 3 x 3 of a matrix; False if it has none."""
     c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
@@ -148,7 +142,7 @@ def make_factor(row: int) -> Any:
     return factor
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def solve(u, b, n):
     """Solve ``U^T U x = b`` in place with the factor from :func:`make_factor`."""
     for i in range(n):
@@ -163,7 +157,7 @@ def solve(u, b, n):
         b[i] = s * u[i, i]
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def covariance_of_last(u, n, m, work, out):
     """Inverse's trailing (m, m) block from :func:`make_factor`'s factor, row by row into ``out``."""
     first = n - m

@@ -1,4 +1,4 @@
-"""Compile kernels that factories make, under names of their own.
+"""Compile kernels, those that factories make under names of their own.
 
 A compiled kernel's symbol is made of its qualified name, its argument types and a count that depends on what the
 process compiled before. Two kernels from one factory may differ in none of the first two; loaded from the disk cache,
@@ -12,12 +12,20 @@ from typing import Any
 
 from numba import njit
 
+_ALL: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {**_ALL, "no_cpython_wrapper": True}
+
+inner = njit(**_INNER)
+"""Compile a function that only kernels call: what Python would need to call it takes longer to compile than itself."""
+entry = njit(cache=True, **_ALL)
+"""Compile a function that Python calls, and keep it on disk."""
+
 
 def kernel(made_for: str, **options: Any) -> Callable[[Any], Any]:
     """Compile as all kernels are, with ``made_for`` (what the factory was called with) in the name."""
 
     def compile_it(function: Any) -> Any:
         function.__qualname__ = f"{function.__qualname__}_{made_for}"
-        return njit(nogil=True, error_model="numpy", **options)(function)
+        return njit(**_INNER, **options)(function)
 
     return compile_it

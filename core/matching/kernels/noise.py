@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from core.matching.kernels.naming import inner
 
 # White noise of variance 1 behind a spline, at fraction t between pixels, along one axis: a + b cos(2 pi t), the first
 # two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
@@ -19,7 +20,7 @@ GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED, DENSITY = range(7)
 N_LEVELS = 7
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def joint_weights(levels, variances, images, weights):
     """Inverse covariance of the comparisons' residuals.
 
@@ -36,13 +37,13 @@ def joint_weights(levels, variances, images, weights):
             weights[k, o] = (a if k == o else 0.0) - a * _certainty(levels, variances, o) / total
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _certainty(levels, variances, k):
     s = min(max(levels[k, CONTRAST], 0.05), 20.0)
     return s * s * levels[k, DENSITY] / variances[1 + k]
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _spread_over(reach):
     """Mean of cos(2 pi t) for t from -reach to reach."""
     a = abs(2.0 * math.pi * reach)
@@ -51,14 +52,14 @@ def _spread_over(reach):
     return math.sin(a) / a if a > 1e-3 else 1.0
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _mean_cosine(place, along_x, along_y):
     """Mean of cos(2 pi t) over a subset whose places run from ``place`` by up to these px each way."""
     spread = _spread_over(along_x) * _spread_over(along_y)
     return spread * math.cos(2.0 * math.pi * place) if spread != 0.0 else 0.0
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def interpolated_noise(warp, half, order):
     """Variance of interpolated grey levels per variance of white noise in the pixels, mean over the subset."""
     a, b = VALUE_NOISE[0] if order == 3 else VALUE_NOISE[1]
@@ -67,7 +68,7 @@ def interpolated_noise(warp, half, order):
     )
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def noise_from_residuals(levels, images, n, unknowns):
     """Variance of one image's noise at weight one, in reference grey levels squared, from the residuals.
 
@@ -88,13 +89,13 @@ def noise_from_residuals(levels, images, n, unknowns):
     return max(total, 0.0) / max(count, 1) / freedom
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _one_variance(levels, k):
     s = min(max(levels[k, CONTRAST], 0.05), 20.0)
     return levels[k, MISFIT] / (1.0 + levels[k, SMOOTHED] / (s * s))
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def share_correction(texture, variance, p, slope_noise, expected_share):
     """Factor on the covariance where the subset's gradients hold another share of noise than the image's mean.
 

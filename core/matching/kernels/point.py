@@ -21,11 +21,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
 from core.matching.kernels.loops import N_WARP, compare_cubic, compare_quintic, monomials
-from core.matching.kernels.naming import kernel
+from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.noise import (
     CONTRAST,
     DENSITY,
@@ -57,7 +56,7 @@ FLAT = 1e-6  # squared contrast below which an image shows nothing
 WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def epipolar_shift(lens2, R, t, xc, yc, w0):
     """Camera 2's normalised shift (nu_x, nu_y) that moves the point's image by 1 px across its epipolar line.
 
@@ -84,7 +83,7 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
     return i11 * gx + i12 * gy, i21 * gx + i22 * gy, along
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def settled(motion, previous, tolerance):
     """Whether the steps still to come, as a geometric series, move no corner further than the tolerance."""
     if motion < tolerance:
@@ -93,7 +92,7 @@ def settled(motion, previous, tolerance):
     return rate < 0.9 and motion * rate / (1.0 - rate) < tolerance
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def texture_status(status, share, sigma_px, max_sigma_px, zncc):
     """Final status: a point that settled, or did not, on noise taken for texture or on a match that scatters."""
     if status == OK and share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:

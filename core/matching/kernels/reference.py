@@ -17,12 +17,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
-from core.matching.kernels.naming import kernel
+from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 
@@ -65,7 +65,7 @@ def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, 
     return sig, codegen
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _copy(image, top, left, subset, ref, row):
     if subset >= LANES:
         _copy_square(image, np.int64(top), np.int64(left), np.int64(subset), ref, np.int64(row))
@@ -127,11 +127,11 @@ def make_reference(degree: int) -> Any:
         place[0], place[1], place[2] = left + half - x_px, top + half - y_px, half
         if not set_up_nodes(lens, place[0], place[1], half, xc, yc, node_work, powers):
             return nothing
-        _copy(pixels, top, left, subset, ref, F)
-        _copy(grad_x, top, left, subset, ref, GX)
-        _copy(grad_y, top, left, subset, ref, GY)
+        _copy(pixels, top, left, subset, ref, np.int64(F))
+        _copy(grad_x, top, left, subset, ref, np.int64(GX))
+        _copy(grad_y, top, left, subset, ref, np.int64(GY))
         if weights.shape[0] > 0:
-            _copy(weights, top, left, subset, ref, WEIGHT)
+            _copy(weights, top, left, subset, ref, np.int64(WEIGHT))
         mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
         for i in range(subset):
             mean += pixels[top + i, left + i]
@@ -167,7 +167,7 @@ def make_reference(degree: int) -> Any:
     return set_up_reference, n_columns, first_gg + 3 * many
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def times(s, t, out):
     """Product of two linear polynomials (the first three entries of each) in x and y: six coefficients."""
     out[0] = s[0] * t[0]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from core.matching.kernels.naming import inner
 
 N_RIGID = 10
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _frame(tangents, frame):
     """Orthonormal frame (columns) on two tangent vectors (rows): along their bisectors, so neither is preferred."""
     a, b = tangents[0], tangents[1]
@@ -34,7 +35,7 @@ def _frame(tangents, frame):
     return np.isfinite(ls + ld)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def nearest_rotation(xc, yc, w, G, rotation):
     """Rotation that carries the reference patch's tangents closest to those in ``G``."""
     tangents, before, after = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -58,7 +59,7 @@ def nearest_rotation(xc, yc, w, G, rotation):
     return True
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def rotate(rotation, a, b, c):
     """Replace ``rotation`` by exp([(a, b, c)]x) ``rotation``, exactly (Rodrigues)."""
     angle = math.sqrt(a * a + b * b + c * c)
@@ -75,7 +76,7 @@ def rotate(rotation, a, b, c):
         rotation[2, j] = z + s * c1z + v * c2z
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def rigid_columns(xc, yc, w, rotation, G):
     """Fill G's second and third column from w, the first column and the rotation."""
     for j in range(2):
@@ -85,7 +86,7 @@ def rigid_columns(xc, yc, w, rotation, G):
             G[i, 1 + j] = rotation[i, j] + r * (G[i, 0] - turned)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def rigid_chain(xc, yc, w, rotation, G, chain):
     """d(thirteen unknowns) / d(w1, w2, rotation vector, w0, G0, e), (13, 10), at the present state."""
     for i in range(13):

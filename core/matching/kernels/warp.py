@@ -18,12 +18,13 @@ from numba.extending import intrinsic
 from core.lens import SEIDEL
 from core.matching.image import PAD
 from core.matching.kernels.loops import data, monomials
+from core.matching.kernels.naming import inner
 from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 _NEWTON_STEPS = 20
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def lens_expansion(lens, u, v):
     """Expand a lens about the normalised point (u, v).
 
@@ -67,7 +68,7 @@ def lens_jacobian(lens, u, v):
     return lens[1] * a11 + lens[3] * a12, lens[1] * a12 + lens[3] * a22, lens[2] * a12, lens[2] * a22
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def undistort(lens, x, y):
     """Normalised point (u, v) of a pixel; NaN outside the lens model's domain."""
     yd = (y - lens[5]) / lens[2]
