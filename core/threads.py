@@ -11,6 +11,7 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 
 import numba
 
@@ -62,12 +63,23 @@ def apply_threads() -> None:
     numba.set_num_threads(min(_threads, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
 
 
-def run_ranges(function: Callable[[int, int], None], n: int, size: int) -> None:
+def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: int | None = None) -> None:
     """Call ``function(first, last)`` over 0 ... n in ranges of ``size``, on all threads; the caller's is one of them.
 
     The first exception is raised again, once all threads have stopped.
+
+    Parameters
+    ----------
+    function
+        What to call.
+    n, size
+        End of the last range, and length of a range.
+    least
+        Length down to which the last ranges shrink, so that all threads end at about the same time; all are of one
+        length when left out.
     """
-    ranges = iter([(i, min(n, i + size)) for i in range(0, n, size)])
+    cuts = _cuts(n, size, least or size)
+    ranges = iter(pairwise(cuts))
     take = threading.Lock()
 
     def work() -> None:
@@ -78,7 +90,7 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int) -> None:
                 return
             function(*item)
 
-    pending = _submit(work, min(_threads, (n + size - 1) // size) - 1)
+    pending = _submit(work, min(_threads, len(cuts) - 1) - 1)
     try:
         work()
     finally:
@@ -89,6 +101,14 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int) -> None:
     for future in pending:
         if not future.cancelled():
             future.result()
+
+
+def _cuts(n: int, size: int, least: int) -> list[int]:
+    cuts = [0]
+    while cuts[-1] < n:
+        left = n - cuts[-1]
+        cuts.append(cuts[-1] + min(left, size, max(least, left // (2 * _threads))))
+    return cuts
 
 
 def _submit(work: Callable[[], None], helpers: int) -> list[Future[None]]:

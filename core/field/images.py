@@ -49,10 +49,12 @@ class MeasureImage:
         self._prepared: dict[tuple[Interpolation, NoiseModel | None], ImageData] = {}
         self._features: dict[tuple[Box, int], Features] = {}
         self._variance: list[tuple[int, Float, Float]] = []  # of one set of points at most
+        self._contrast: dict[tuple[float, float, float, float] | None, tuple[float, float, float]] = {}
         if isinstance(image, MeasureImage):
             self.noise = image.noise if noise is None else noise
             self.pixels: NDArray[Any] = image.pixels
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
+            self._contrast = image._contrast
         elif isinstance(image, ImageData):
             self.pixels = image.pixels
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
@@ -102,18 +104,27 @@ class MeasureImage:
         self._variance[:] = [(subset_px, np.array(xy_px), out)]
         return out
 
+    def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
+        """Return smallest and largest grey level and the most that neighbouring pixels correlate, in a box or anywhere.
+
+        Found on the first call; zero structure where there is one grey level.
+        """
+        if box not in self._contrast:
+            pixels = self.pixels
+            if box is not None:
+                x0, y0, x1, y1 = (round(v) for v in box)
+                pixels = pixels[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1]
+            low, high = float(pixels.min()), float(pixels.max())
+            self._contrast[box] = low, high, largest_structure(pixels) if low < high else 0.0
+        return self._contrast[box]
+
     def refuse_blank(self, box: tuple[float, float, float, float] | None = None) -> None:
         """Raise ``image_blank`` if nothing but noise is seen in (x0, y0, x1, y1), or anywhere when left out."""
-        pixels = self.pixels
-        if box is not None:
-            x0, y0, x1, y1 = (round(v) for v in box)
-            pixels = pixels[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1]
-        low, high = float(pixels.min()), float(pixels.max())
+        low, high, structure = self.contrast(box)
         where = f"{self.name}" if box is None else f"{self.name} in the region"
         remedy = "Check lens cap, light, exposure and that the specimen carries a pattern."
         if low == high:
             raise ImageError(f"{where} shows one grey level, {low:g}, everywhere.", code="image_blank", remedy=remedy)
-        structure = largest_structure(pixels)
         if structure < _LEAST_STRUCTURE:
             raise ImageError(
                 f"{where} shows noise only: neighbouring pixels correlate by {structure:.2f} at most, a pattern by "

@@ -25,6 +25,7 @@ Int = NDArray[np.int32]
 Status = NDArray[np.int8]
 
 POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to call it
+FEWEST_AT_ONCE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +145,7 @@ def fit_shape(
         _own(pose.translation_mm), xy, w, setting,
     )  # fmt: skip
     kernel, space = shape_points[degree], _one_a_thread(shape_space[degree], options.subset_px)
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE)
+    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
     failed = status != 0
     out[failed, : terms + 1] = np.nan
     out[failed, terms + 3 :] = np.nan
@@ -218,7 +219,7 @@ def fit_motion(
         _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting,
     )  # fmt: skip
     kernel, space = motion_points[degree], _one_a_thread(motion_space[degree], options.subset_px)
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE)
+    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan
     out[failed, at + 5 :] = np.nan

@@ -1,5 +1,11 @@
 """The ``stereorig`` command."""
 
-from server.cli.main import main
+import os
+
+# our threads are our own: a second set, of the linear algebra library, only gets in their way. Read when it is loaded
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+from server.cli.main import main  # noqa: E402
 
 __all__ = ["main"]

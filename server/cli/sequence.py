@@ -157,10 +157,11 @@ class _Runner:
         self._done = 0.0
 
     def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
-        """Read both images of a step and prepare them for matching."""
+        """Read both images of a step; what will be asked of them is found on this thread."""
         one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.files.cam1, pair.files.cam2))
         for image, noise in zip((one, two), self._options.noise, strict=True):
             image.prepared(self._options.interpolation, noise)
+            image.contrast()
         return one, two
 
     def measure(self, images: tuple[MeasureImage, MeasureImage] | None) -> None:
