@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from core.field.result import Field
 from core.field.scatter import refuse_swapped
 from core.field.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair, measure_motion, measure_shape
+from core.noise import NoiseModel
 from core.progress import Cancel
 from core.status import PointStatus
 from sim.rig import SimRig
@@ -226,6 +228,14 @@ def test_unrelated_images_give_no_field() -> None:
     with pytest.raises(SeedError) as error:
         measure_shape(pair(), first, np.ascontiguousarray(other[::-1]), GRID, OPTIONS)
     assert error.value.code == "not_seeded"
+
+
+def test_a_noise_model_that_takes_all_texture_for_noise_is_named() -> None:
+    first, second = take("block")
+    loud = NoiseModel(coefficients=(100.0**2, 0.0, 0.0))
+    with pytest.raises(SeedError) as error:
+        measure_shape(pair(), first, second, GRID, replace(OPTIONS, noise=(loud, loud)))
+    assert "noise model says 100.0 grey levels" in str(error.value.remedy)
 
 
 @pytest.mark.fault(43)

@@ -264,11 +264,17 @@ class Run:
     def finish(self, automatic: bool, shape: Field | None) -> Field:
         """Grow, check, grow into the gaps, check again, and hand over."""
         if not self.points.ok.any() and (shape is None or shape.valid.any()):
-            raise SeedError(
-                "no point of the region could be matched between the images from any start.",
-                remedy="Check that both cameras see the same textured surface and that the calibration belongs to "
-                "these images, or give a seed point.",
+            remedy = (
+                "Check that both cameras see the same textured surface and that the calibration belongs to these "
+                "images, or give a seed point."
             )
+            stated = self.fitter.ref1.noise_variance
+            if stated is not None:
+                remedy += (
+                    f" The noise model says {stated**0.5:.1f} grey levels: with too much, texture passes for noise; "
+                    "try without it."
+                )
+            raise SeedError("no point of the region could be matched between the images from any start.", remedy=remedy)
         if self.patch.patch == "curved" and self.fitter.terms == 3:
             self._refit_curved()
         self._fill()
