@@ -195,10 +195,21 @@ def check_region(
     Raises
     ------
     RegionError
-        ``subset_invalid``, ``region_outside_image``, ``region_too_small``, ``region_empty``, ``mask_size``.
+        ``subset_invalid``, ``region_outside_image``, ``region_too_small``, ``region_empty``, ``mask_size``,
+        ``cut_outside_image``.
     """
     rows, cols = image_shape
     check_subset(subset_px)
+    for line in grid.cuts.lines_px if grid.cuts else ():
+        off = (line < -0.5).any(axis=1) | (line[:, 0] > cols - 0.5) | (line[:, 1] > rows - 0.5)
+        if off.any():
+            x, y = line[int(np.argmax(off))]
+            raise RegionError(
+                f"a crack or a hole's border goes through ({x:g}, {y:g}), outside camera 1's image of "
+                f"{cols} x {rows} px.",
+                code="cut_outside_image",
+                remedy="Draw it in camera 1's reference image.",
+            )
     if mask_shape is not None and tuple(mask_shape) != (rows, cols):
         raise RegionError(
             f"the mask is {mask_shape[1]} x {mask_shape[0]} px, camera 1's image {cols} x {rows} px.",

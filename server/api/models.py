@@ -313,7 +313,10 @@ class StepReply(Reply):
 
 
 class Region(Request):
-    """Where points may lie: one of rectangle and polygon, and a mask if wanted."""
+    """Where points may lie: one of rectangle and polygon, a mask if wanted, cracks and holes.
+
+    No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
+    """
 
     rectangle: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None, description="x0, y0, x1, y1 in camera 1's reference image, inclusive.", examples=[[120, 100, 400, 380]]
@@ -321,6 +324,18 @@ class Region(Request):
     polygon: list[tuple[Pixel, Pixel]] | None = Field(None, description="Corners.", min_length=3, max_length=1000)
     mask_png_base64: Annotated[str, StringConstraints(max_length=20_000_000)] | None = Field(
         None, description="Image of camera 1's size, white where points may lie."
+    )
+    cracks: list[Annotated[list[tuple[Pixel, Pixel]], Field(min_length=2, max_length=1000)]] = Field(
+        [],
+        description="Lines in camera 1's reference image, each the points that it goes through.",
+        max_length=100,
+        examples=[[[[150, 240], [260, 238.5], [362, 241]]]],
+    )
+    holes: list[Annotated[list[tuple[Pixel, Pixel]], Field(min_length=3, max_length=1000)]] = Field(
+        [],
+        description="Corners of polygons in camera 1's reference image inside which nothing is measured.",
+        max_length=100,
+        examples=[[[[200, 180], [240, 180], [240, 220], [200, 220]]]],
     )
 
     @model_validator(mode="after")
