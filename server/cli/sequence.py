@@ -18,6 +18,7 @@ import numpy as np
 
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import MeasurementError
+from core.field.extrapolated import mark_extrapolated
 from core.field.images import MeasureImage
 from core.field.patch import PatchSetting
 from core.field.result import Field
@@ -26,6 +27,7 @@ from server.cli.region import RegionRequest
 from server.cli.terminal import ProgressLine, duration
 from server.compile_aside import CompileAside
 from server.io.calibration_any import LoadedCalibration
+from server.io.calibration_volume import volume_of
 from server.io.files import make_folder, sha256_of, write_bytes
 from server.io.images import read_image
 from server.io.netcdf import Provenance, write_field
@@ -150,6 +152,7 @@ class _Runner:
             noise=(None, None) if job.noise is None else job.noise.models,
         )
         self._reference = measure.ReferencePair(job.calibration.pair, *self.read(job.pairs[0]))
+        self._volume = volume_of(job.calibration)
         self._n = 0
         self._shape: Field | None = None
         self._last: Field | None = None
@@ -193,6 +196,7 @@ class _Runner:
     def _write(self, n: int, result: Field, started: float) -> dict[str, Any]:
         """Write the file of a step, say so, return its summary."""
         pair = self._job.pairs[n]
+        result = mark_extrapolated(result, self._volume)
         name = f"step_{n:04d}.nc"
         write_field(self._job.out / name, result, self._provenance(n))
         summary = {
