@@ -1,7 +1,8 @@
-"""The calibrated volume of a calibration.json: from its target, its views and its covariance."""
+"""What a calibration.json tells a measurement besides its cameras: the calibrated volume and its own error."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from core.calibration.volume import CalibratedVolume, calibrated_volume
@@ -37,6 +38,19 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
         calibration.pair, grid.all_points_mm(), (sizes[0], sizes[1]), positions, pitch_mm=grid.pitch_mm,
         covariance=covariance_in(content, name="calibration.json"),
     )  # fmt: skip
+
+
+def rbe_of(calibration: LoadedCalibration) -> float | None:
+    """Return the calibration's reprojection error, of held-out positions where there are any; None if not told."""
+    checks = calibration.details.get("checks")
+    if not isinstance(checks, dict):
+        return None
+    for name in ("held_out", "fitted"):
+        measures = checks.get(name)
+        value = measures.get("rbe_px") if isinstance(measures, dict) else None
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0.0:
+            return float(value)
+    return None
 
 
 def _positions(views: list[Any], camera: str) -> list[float]:
