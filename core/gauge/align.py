@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import MeasurementError, RegionError
 from core.field.result import Field
-from core.gauge.sampling import Crossing, sample
+from core.gauge.sampling import sample
 from core.gauge.shared_pixels import SharedPixels, roots_of
 
 Float = NDArray[np.float64]
@@ -112,13 +112,11 @@ def align_plane(
     return Alignment(R, origin, full, rms, len(x))
 
 
-def align_3_2_1(
-    field: Field, places_px: ArrayLike, *, shared: SharedPixels, crosses: Crossing | None = None
-) -> Alignment:
+def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
     """Lay the frame through six places of the reference: three on the plane, two on the X axis, one at its origin.
 
-    Z is the normal of the first three on the side of the old Z; X runs from the fourth to the fifth, laid into the plane;
-    Y = 0 on that line, X = 0 at the sixth, Z = 0 in the plane. A place may be named more than once.
+    Z is the normal of the first three on the side of the old Z; X runs from the fourth to the fifth, laid into the
+    plane; Y = 0 on that line, X = 0 at the sixth, Z = 0 in the plane. A place may be named more than once.
 
     Parameters
     ----------
@@ -128,8 +126,6 @@ def align_3_2_1(
         (6, 2) in camera 1's reference image.
     shared
         The correlation of neighbouring points.
-    crosses
-        See :func:`core.gauge.sampling.sample`.
 
     Raises
     ------
@@ -142,7 +138,7 @@ def align_3_2_1(
     if xy.shape != (6, 2):
         raise RegionError(f"3-2-1 takes six places, got an array of shape {xy.shape}.", code="gauge_unusable",
                           remedy="Give three places on the plane, two on the line, one at the origin.")  # fmt: skip
-    places = sample(field, xy, crosses=crosses)
+    places = sample(field, xy)
     if not places.found.all():
         k = int(np.argmin(places.found))
         raise MeasurementError(

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import RegionError
 from core.field.result import Field
 from core.gauge.reading import MISSING, Reading
-from core.gauge.sampling import Crossing, Samples, sample
+from core.gauge.sampling import Samples, sample
 from core.gauge.shared_pixels import SharedPixels
 
 Float = NDArray[np.float64]
@@ -44,9 +44,7 @@ class Extensometer:
     missing: str = ""
 
 
-def extensometer(
-    field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: SharedPixels, crosses: Crossing | None = None
-) -> Extensometer:
+def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: SharedPixels) -> Extensometer:
     """Read a virtual extensometer between two places of camera 1's reference image.
 
     It may span a cut or a hole: only its ends need measured points about them.
@@ -59,8 +57,6 @@ def extensometer(
         Its ends (x, y).
     shared
         The correlation of neighbouring points.
-    crosses
-        See :func:`core.gauge.sampling.sample`.
 
     Raises
     ------
@@ -71,7 +67,7 @@ def extensometer(
     if np.array_equal(ends[0], ends[1]):
         raise RegionError(f"Both ends of the extensometer lie at ({ends[0, 0]:g}, {ends[0, 1]:g}) px.",
                           code="gauge_unusable", remedy="Give two different places.")  # fmt: skip
-    places = sample(field, ends, crosses=crosses)
+    places = sample(field, ends)
     why = [f"end {k}: {text}" for k, text in zip("ab", places.missing, strict=True) if text]
     if why:
         return Extensometer(missing=", ".join(why))

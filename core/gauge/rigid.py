@@ -1,8 +1,8 @@
 """The rigid motion of a field, and the field without it.
 
-A point X that moved by U is seen at X + U = c + d + R (X - c) + r. R and d make the sum of r^T W r least, W the inverse of
-r's covariance; c is the centre of the points used. The parameters' covariance comes from the points' own and from what
-overlapping subsets share. It holds the noise only: where the body deforms, the fit is the weighted mean motion.
+A point X that moved by U is seen at X + U = c + d + R (X - c) + r. R and d make the sum of r^T W r least, W the inverse
+of r's covariance; c is the centre of the points used. The parameters' covariance comes from the points' own and from
+what overlapping subsets share. It holds the noise only: where the body deforms, the fit is the weighted mean motion.
 """
 
 from __future__ import annotations

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
+from core.field.cuts import crosses
 from core.field.result import Field
 from core.gauge.shared_pixels import SharedPixels, roots_of, steps_px
 from core.status import PointStatus
 
 Float = NDArray[np.float64]
-#: (a_px (n, 2), b_px (n, 2)) -> (n,) True where the way from a to b is cut
-Crossing = Callable[[Float, Float], NDArray[np.bool_]]
 
 _ON_A_POINT = 1e-9
 _CUT = "cut"
@@ -82,7 +80,7 @@ class Samples:
         return np.asarray(np.einsum("kij,kiab,kjcb->kac", w, roots[a], roots[b], optimize=True))
 
 
-def sample(field: Field, xy_px: ArrayLike, *, crosses: Crossing | None = None) -> Samples:
+def sample(field: Field, xy_px: ArrayLike) -> Samples:
     """Lay places into the grid's cells.
 
     A place takes its values from the four corners of its cell, bilinearly; from three if the fourth failed or lies
@@ -92,11 +90,9 @@ def sample(field: Field, xy_px: ArrayLike, *, crosses: Crossing | None = None) -
     Parameters
     ----------
     field
-        Any field on a regular grid.
+        Any field on a regular grid, with its cuts.
     xy_px
         (m, 2) places in camera 1's reference image.
-    crosses
-        Tells which straight ways are cut; None without cuts.
 
     Raises
     ------
@@ -131,10 +127,8 @@ def sample(field: Field, xy_px: ArrayLike, *, crosses: Crossing | None = None) -
     weight = across * down
     status = field.status.ravel()[index]
     failed = ~np.isin(status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
-    cut = np.zeros(index.shape, bool)
-    if crosses is not None:
-        corner = np.stack([field.x_px.ravel()[index], field.y_px.ravel()[index]], axis=-1)
-        cut = crosses(np.repeat(xy, 4, axis=0), corner.reshape(-1, 2)).reshape(-1, 4)
+    corner = np.stack([field.x_px.ravel()[index], field.y_px.ravel()[index]], axis=-1)
+    cut = crosses(xy[:, None, :], corner, field.cuts)
     needed = weight > 0.0
     bad = needed & (failed | cut)
     missing = [""] * len(xy)

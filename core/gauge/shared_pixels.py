@@ -41,7 +41,9 @@ class SharedPixels:
     def __post_init__(self) -> None:
         """Refuse a subset without width, ``invalid_input``."""
         if not (np.isfinite(self.subset_px) and self.subset_px >= 1.0):
-            raise InputError(f"The subset is {self.subset_px} px wide.", remedy="Give the subset the field was made with.")
+            raise InputError(
+                f"The subset is {self.subset_px} px wide.", remedy="Give the subset the field was made with."
+            )
 
     @staticmethod
     def of(field: Field, subset_px: float) -> SharedPixels:
