@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 
 from core.errors import FileFormatError, StorageError
+from core.field.cuts import Cuts
 from core.field.patch import PatchChoice
 from core.field.result import Field
 from core.status import PointStatus
@@ -49,6 +50,7 @@ def a_field(*, motion: bool, curved: bool = False) -> Field:
         stretch=numbers(3) if motion else None, curvature_per_mm=numbers(2) if curved else None,
         patch=PatchChoice(patch="curved", asked="auto", reason="curved: Gründe", sample=200, plane_error_mm=1.8e-3)
         if curved else None,
+        cuts=Cuts([[(1.5, 2.0), (30.25, 40.0), (1e-3, 7.0)], [(50.0, 60.0), (50.0, 61.0)]]) if motion else None,
     )  # fmt: skip
 
 
@@ -65,6 +67,8 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool)
             assert b is None
         elif item.name == "patch":
             assert b == a
+        elif item.name == "cuts":
+            assert [line.tolist() for line in b.lines_px] == [line.tolist() for line in a.lines_px]
         elif item.name in single:
             np.testing.assert_allclose(b, a, rtol=1e-6)
         else:
@@ -94,6 +98,7 @@ def test_xarray_understands_the_file(tmp_path: Path) -> None:
             "rotation_y_rad": "rad", "rotation_z_rad": "rad", "stretch_11": "1", "stretch_22": "1", "stretch_12": "1",
             "theta_rad": "rad", "phi_rad": "rad", "zp_mm": "mm", "zncc": "1", "epipolar_px": "pixel",
             "iterations": "1", "status": "1", "covariance": "mm2", "noise_grey": "count",
+            "cut_x_px": "pixel", "cut_y_px": "pixel", "cut_line": "1",
             **{f"sigma_{a}_mm": "mm" for a in "xyzuvw"},
         }  # fmt: skip
         assert {name: variable.attrs["units"] for name, variable in data.variables.items()} == expected

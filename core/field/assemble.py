@@ -98,5 +98,6 @@ def assemble(
         stretch=scatter(m.stretch, 3) if motion else None,
         curvature_per_mm=scatter(principal_curvatures(pair, xy, w), 2) if w.shape[1] == 6 else None,
         patch=patch,
+        cuts=grid.cuts,
         starts=Starts(scatter(w, w.shape[1]), scatter(G, 3, w.shape[1]) if motion else None),
     )

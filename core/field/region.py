@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
+from core.field.cuts import Cuts
 from core.lens import Bool, Float
 
 _MOST_POINTS = 20_000_000
@@ -27,6 +28,8 @@ class PointGrid:
         Distance of neighbouring points.
     extent_px
         (x0, y0, x1, y1) of the region that was asked for.
+    cuts
+        Lines over which nothing reaches, or None.
     """
 
     x_px: Float
@@ -34,6 +37,7 @@ class PointGrid:
     allowed: Bool
     step_px: float
     extent_px: tuple[float, float, float, float]
+    cuts: Cuts | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

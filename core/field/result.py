@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.cuts import Cuts
 from core.field.patch import PatchChoice
 from core.field.starts import Starts
 from core.status import PointStatus
@@ -54,6 +55,8 @@ class Field:
         the cameras; None unless the patches were curved.
     patch
         What patch the field was measured with, and why; None in a field from an older file.
+    cuts
+        Cracks and borders of holes over which nothing reaches; None where there are none.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
@@ -77,6 +80,7 @@ class Field:
     stretch: Float | None = None
     curvature_per_mm: Float | None = None
     patch: PatchChoice | None = None
+    cuts: Cuts | None = None
     starts: Starts | None = None
 
     @property

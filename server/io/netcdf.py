@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import FileFormatError
+from core.field.cuts import Cuts, as_arrays, from_arrays
 from core.field.patch import PatchChoice
 from core.field.result import Field
 from core.status import STATUS_MEANINGS, PointStatus
@@ -168,6 +169,8 @@ def _fill(dataset: Any, result: Field, provenance: Provenance) -> None:
          long_name="zero-mean normalised correlation of each comparison", dtype="f4")  # fmt: skip
     dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
     _put_covariance(dataset, result, sparse=sparse)
+    if result.cuts:
+        _put_cuts(dataset, result.cuts)
     dataset.setncatts(_attributes(provenance, moved=result.has_motion))
     if result.patch is not None:
         dataset.setncatts({
@@ -189,6 +192,24 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     for k, name in enumerate(names):
         _put(dataset, f"sigma_{name}", sigma[..., k], ("row", "col"), units="mm",
              long_name=f"standard deviation of {name}", dtype="f4", sparse=sparse)  # fmt: skip
+
+
+def _put_cuts(dataset: Any, cuts: Cuts) -> None:
+    points, of_line = as_arrays(cuts)
+    dataset.createDimension("cut_point", len(points))
+    for k, (name, along) in enumerate((("cut_x_px", "column"), ("cut_y_px", "row"))):
+        _put(dataset, name, points[:, k], ("cut_point",), units="pixel",
+             long_name=f"{along} in camera 1's reference image of a point of a cut: nothing reaches over it",
+             dtype="f8")  # fmt: skip
+    _put(dataset, "cut_line", of_line, ("cut_point",), units="1", long_name="which cut the point belongs to",
+         dtype="i4")  # fmt: skip
+
+
+def _cuts_of(variables: Any) -> Cuts | None:
+    if "cut_line" not in variables:
+        return None
+    points = np.stack([np.asarray(variables[name][...], dtype=np.float64) for name in ("cut_x_px", "cut_y_px")], axis=1)
+    return from_arrays(points, np.asarray(variables["cut_line"][...], dtype=np.int32))
 
 
 def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
@@ -287,6 +308,7 @@ def read_field(path: str | Path) -> Field:
             zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
             covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
             patch=None if choice is None else PatchChoice.from_document(json.loads(choice)),
+            cuts=_cuts_of(variables),
         )
 
 
