@@ -110,7 +110,7 @@ class StrainField:
         along = np.stack([c**2, s**2, 2.0 * c * s], axis=-1)
         across = np.stack([s**2, c**2, -2.0 * c * s], axis=-1)
         variance = [np.einsum("...i,...ij,...j", j, self.covariance, j) for j in (along, across)]
-        return np.sqrt(np.maximum(np.stack(variance, axis=-1), 0.0))
+        return np.asarray(np.sqrt(np.maximum(np.stack(variance, axis=-1), 0.0)))
 
 
 def principal_of(strain: Float) -> Float:
