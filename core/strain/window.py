@@ -175,8 +175,9 @@ def _crossed(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | 
 def _seen(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
     """(m, n) which points of the windows can be reached from their centres over valid points alone.
 
-    ``there`` is the padded grid, ``here`` (m,) the centres' flat places in it. The way goes from cell to cell of the grid. Over a corner it goes where one of the two cells beside it is valid: an
-    empty line of cells, however it slants, is not passed.
+    ``there`` is the padded grid, ``here`` (m,) the centres' flat places in it. The way goes from cell to cell. Over a
+    corner it goes where one of the two cells beside it is valid: an empty line of cells, however it slants, is not
+    passed.
     """
     offsets, before = _offsets(half)
     flat, width = there.ravel(), there.shape[1]
