@@ -19,9 +19,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from core.calibration.volume import CalibratedVolume
 from core.camera import Camera
 from core.compiling import told_when_compiling
 from core.errors import FileFormatError
+from core.field.extrapolated import mark_extrapolated
 from core.field.images import MeasureImage, check_calibrated_size
 from core.field.region import PointGrid
 from core.field.result import Field
@@ -32,6 +34,7 @@ from core.stereo import StereoPair
 from core.threads import set_threads
 from server.compile_aside import CompileAside
 from server.io.calibration_any import load_calibration
+from server.io.calibration_volume import rbe_of, volume_of
 from server.io.images import GrayImage, read_image, read_mask
 from server.io.netcdf import Provenance, read_field, write_field
 from server.io.noise_json import load_noise
@@ -52,6 +55,8 @@ class _Context:
     reference: ReferencePair
     grid: PointGrid
     options: MeasureOptions
+    volume: CalibratedVolume | None
+    rbe_px: float | None
     fields: dict[int, Field] = field(default_factory=dict)
     ahead: tuple[tuple[str, str], Future[_Pair]] | None = None
 
@@ -97,10 +102,11 @@ def measure_step(task: StepTask) -> dict[str, Any]:
     provenance = Provenance(
         settings=task.settings, inputs=task.inputs, software_version=software_version(), step=task.n, extra=extra
     )
-    write_field(_result_path(task, task.n), result, provenance)
+    marked = mark_extrapolated(result, context.volume)
+    write_field(_result_path(task, task.n), marked, provenance)
     # the next step needs these two, nobody the others
     context.fields = {n: f for n, f in context.fields.items() if n == task.reference} | {task.n: result}
-    summary = summarise(result)
+    summary = summarise(marked, rbe_px=context.rbe_px)
     return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
 
 
@@ -163,7 +169,8 @@ def _make_context(task: StepTask) -> _Context:
         _seen(image, task.images[which], task, model)
         for image, which, model in zip((one, two), ("ref1", "ref2"), models, strict=True)
     )
-    return _Context(ReferencePair(calibration.pair, seen1, seen2), _grid(task, one), options)
+    reference = ReferencePair(calibration.pair, seen1, seen2)
+    return _Context(reference, _grid(task, one), options, volume_of(calibration), rbe_of(calibration))
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:

@@ -18,6 +18,7 @@ import numpy as np
 
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import MeasurementError
+from core.field.extrapolated import mark_extrapolated
 from core.field.images import MeasureImage
 from core.field.patch import PatchSetting
 from core.field.result import Field
@@ -26,6 +27,7 @@ from server.cli.region import RegionRequest
 from server.cli.terminal import ProgressLine, duration
 from server.compile_aside import CompileAside
 from server.io.calibration_any import LoadedCalibration
+from server.io.calibration_volume import rbe_of, volume_of
 from server.io.files import make_folder, sha256_of, write_bytes
 from server.io.images import read_image
 from server.io.netcdf import Provenance, write_field
@@ -151,10 +153,12 @@ class _Runner:
             noise=(None, None) if job.noise is None else job.noise.models,
         )
         self._reference = measure.ReferencePair(job.calibration.pair, *self.read(job.pairs[0]))
+        self._volume, self._rbe_px = volume_of(job.calibration), rbe_of(job.calibration)
         self._n = 0
         self._shape: Field | None = None
         self._last: Field | None = None
         self._chosen: tuple[str, bool] | None = None
+        self._checked = "ok"
         self._done = 0.0
 
     def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
@@ -194,11 +198,12 @@ class _Runner:
     def _write(self, n: int, result: Field, started: float) -> dict[str, Any]:
         """Write the file of a step, say so, return its summary."""
         pair = self._job.pairs[n]
+        result = mark_extrapolated(result, self._volume)
         name = f"step_{n:04d}.nc"
         write_field(self._job.out / name, result, self._provenance(n))
         summary = {
             "step": n, "file": name, "cam1": str(pair.files.cam1), "cam2": str(pair.files.cam2),
-            "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]}, **summarise(result),
+            "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]}, **summarise(result, rbe_px=self._rbe_px),
             "seconds": round(time.monotonic() - started, 3),
         }  # fmt: skip
         rms = summary["epipolar_residual_rms_px"]
@@ -208,6 +213,10 @@ class _Runner:
             f"{residual}{duration(summary['seconds'])}"
         )
         self._say_choice(n, result)
+        check = summary["epipolar_check"]
+        if check is not None and check["level"] != self._checked:
+            self._checked = check["level"]
+            self._progress.note(f"{check['level']}: step {n}: {check['reason']}")
         return summary
 
     def _say_choice(self, n: int, result: Field) -> None:

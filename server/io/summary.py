@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.epipolar_check import check_epipolar
 from core.field.result import Field
 from core.status import PointStatus
 from server.io.netcdf import COMPARISONS
@@ -25,8 +26,15 @@ def _rms(values: NDArray[np.float64]) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def summarise(result: Field) -> dict[str, Any]:
+def summarise(result: Field, *, rbe_px: float | None = None) -> dict[str, Any]:
     """Summarise one field.
+
+    Parameters
+    ----------
+    result
+        The field.
+    rbe_px
+        The calibration's own reprojection error, where it is known.
 
     Returns
     -------
@@ -35,9 +43,11 @@ def summarise(result: Field) -> dict[str, Any]:
         across the epipolar line in camera 2, ``epipolar_px``: ``epipolar_offset_mean_px`` (what the calibration is
         off), ``epipolar_offset_rms_px`` and ``epipolar_offset_sd_px`` (about the mean); ``epipolar_residual_rms_px``
         (the error left in each image when both cameras share the misfit equally: half of
-        ``epipolar_offset_rms_px``), ``plane_residual_rms_mm`` (of the reference positions), ``zncc_median`` and
-        ``sigma_median_mm``, ``patch`` (what the field was measured with, why, and the numbers of the choice; see
-        :class:`core.field.patch.PatchChoice`), for displacements also ``displacement_mm`` (mean, min, max of u, v, w).
+        ``epipolar_offset_rms_px``), ``epipolar_check`` (whether the cameras still stand as calibrated, see
+        :class:`core.field.epipolar_check.EpipolarCheck`), ``plane_residual_rms_mm`` (of the reference positions),
+        ``zncc_median`` and ``sigma_median_mm``, ``patch`` (what the field was measured with, why, and the numbers of
+        the choice; see :class:`core.field.patch.PatchChoice`), for displacements also ``displacement_mm`` (mean, min,
+        max of u, v, w).
         What cannot be told is None.
     """
     status = result.status
@@ -45,6 +55,7 @@ def summarise(result: Field) -> dict[str, Any]:
     points = int((status != PointStatus.MASKED).sum())
     n = int(valid.sum())
     epipolar = result.epipolar_px[valid]
+    check = check_epipolar(result, rbe_px)
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
     summary: dict[str, Any] = {
         "kind": "displacement" if result.has_motion else "shape",
@@ -56,6 +67,7 @@ def summarise(result: Field) -> dict[str, Any]:
         "epipolar_offset_rms_px": _rms(epipolar),
         "epipolar_offset_sd_px": float(epipolar.std()) if n else None,
         "epipolar_residual_rms_px": _rms(epipolar / 2),
+        "epipolar_check": None if check is None else check.document(),
         "plane_residual_rms_mm": _rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
         "zncc_median": {
             name: float(np.median(result.zncc[valid][:, k])) if n else None

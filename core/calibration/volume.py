@@ -1,0 +1,142 @@
+"""The volume in which a calibration was made, and what it leaves uncertain about points inside and outside.
+
+Each camera saw the target's intersections up to some distance from its optical axis and over some range of depths.
+Further out the lens's distortion, further away the pose rests on the model alone. The parameters' covariance tells what
+that costs, as far as the model holds at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from core.calibration.model import N_CAMERA
+from core.calibration.uncertainty import point_derivatives
+from core.camera import Camera
+from core.lens import Bool, Float
+from core.stereo import StereoPair
+
+_FEWEST_POINTS = 8
+_AT_ONCE = 20_000
+_TEN = [*range(10), *range(N_CAMERA, N_CAMERA + 10)]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedVolume:
+    """Where a pair was calibrated: in each camera's frame a piece of a cone about the optical axis.
+
+    Attributes
+    ----------
+    pair
+        The cameras.
+    slope
+        (2,) largest distance from the optical axis over depth, of either camera.
+    depth_mm
+        (2, 2) smallest and largest depth, of either camera.
+    covariance
+        (20, 20) of both cameras' ten parameters, None where it is not known.
+    """
+
+    pair: StereoPair
+    slope: Float
+    depth_mm: Float
+    covariance: Float | None = None
+
+    def contains(self, points_mm: ArrayLike) -> Bool:
+        """Whether both cameras were calibrated where points (..., 3) of the system frame lie; False for NaN."""
+        points = np.asarray(points_mm, dtype=np.float64)
+        inside = np.isfinite(points).all(axis=-1)
+        for c, camera in enumerate((self.pair.cam1, self.pair.cam2)):
+            p = camera.cam_from_sys.apply(points)
+            depth = p[..., 2]
+            with np.errstate(invalid="ignore"):
+                inside &= (depth >= self.depth_mm[c, 0]) & (depth <= self.depth_mm[c, 1])
+                inside &= np.hypot(p[..., 0], p[..., 1]) <= self.slope[c] * depth
+        return np.asarray(inside)
+
+    def covariance_mm2(self, points_mm: Float, displaced_mm: Float | None = None) -> Float:
+        """Covariance that the calibration alone gives points and displacements.
+
+        Parameters
+        ----------
+        points_mm
+            (n, 3) points, system frame.
+        displaced_mm
+            (n, 3) where they are now.
+
+        Returns
+        -------
+        Float
+            (n, 3, 3) of X, Y, Z; with ``displaced_mm`` (n, 6, 6) of X, Y, Z, U, V, W. Zero where the calibration's own
+            covariance is not known.
+        """
+        n, size = len(points_mm), 3 if displaced_mm is None else 6
+        out = np.zeros((n, size, size))
+        if self.covariance is None:
+            return out
+        for first in range(0, n, _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            J = point_derivatives(self.pair, points_mm[part])[..., _TEN]
+            if displaced_mm is not None:
+                J = np.concatenate([J, point_derivatives(self.pair, displaced_mm[part])[..., _TEN] - J], axis=1)
+            out[part] = J @ self.covariance @ np.swapaxes(J, 1, 2)
+        return out
+
+
+def calibrated_volume(
+    pair: StereoPair,
+    nodes_mm: ArrayLike,
+    sizes_px: Sequence[tuple[int, int]],
+    positions_mm: Sequence[Sequence[float]],
+    *,
+    pitch_mm: float,
+    covariance: Float | None = None,
+) -> CalibratedVolume | None:
+    """Build the volume from what the cameras saw.
+
+    It ends one pitch beyond the outermost intersection that was seen, and before and behind at as much again as the
+    camera travelled.
+
+    Parameters
+    ----------
+    pair
+        The cameras at dZ = 0.
+    nodes_mm
+        (n, 2) or (a, b, 2) the target's intersections, Z = 0.
+    sizes_px
+        (width, height) of each camera's images.
+    positions_mm
+        Each camera's travels dZ of the views that were fitted.
+    pitch_mm
+        Distance of neighbouring intersections.
+    covariance
+        (20, 20) of the parameters.
+
+    Returns
+    -------
+    CalibratedVolume or None
+        None if a camera saw too little at too few distances.
+    """
+    nodes = np.asarray(nodes_mm, dtype=np.float64).reshape(-1, 2)
+    points = np.column_stack([nodes, np.zeros(len(nodes))])
+    slope, depth = np.empty(2), np.empty((2, 2))
+    for c, (camera, size, positions) in enumerate(zip((pair.cam1, pair.cam2), sizes_px, positions_mm, strict=True)):
+        travel = float(np.ptp(positions)) if len(positions) else 0.0
+        if not travel > 0.0:
+            return None
+        seen = np.concatenate([_seen(camera.moved(dz), points, size) for dz in sorted(set(positions))])
+        if len(seen) < _FEWEST_POINTS:
+            return None
+        slope[c] = ((np.hypot(seen[:, 0], seen[:, 1]) + pitch_mm) / seen[:, 2]).max()
+        depth[c] = seen[:, 2].min() - travel, seen[:, 2].max() + travel
+    return CalibratedVolume(pair, slope, depth, covariance)
+
+
+def _seen(camera: Camera, points: Float, size: tuple[int, int]) -> Float:
+    """Camera coordinates of the points that lie in the image."""
+    image = camera.project(points)
+    inside = image.valid & (image.xy >= 0.0).all(axis=-1) & (image.xy <= np.array(size) - 1.0).all(axis=-1)
+    return np.asarray(camera.cam_from_sys.apply(points)[inside])

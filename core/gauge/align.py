@@ -1,0 +1,208 @@
+"""Frames of the user's choice: best-fit plane, 3-2-1; and fields expressed in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import MeasurementError, RegionError
+from core.field.result import Field
+from core.gauge.sampling import sample
+from core.gauge.shared_pixels import SharedPixels, roots_of
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+_STRAIGHT = 1e-6
+_ROUNDS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A frame: x_new = R (x - o).
+
+    Attributes
+    ----------
+    rotation
+        (3, 3) R; its rows are the new axes in the old frame.
+    origin_mm
+        (3,) o, the new origin in the old frame.
+    covariance
+        (6, 6) of the frame's own errors from the points it was laid through: small rotations about the new X, Y, Z
+        (rad), and the origin's error along them (mm). The frame is what the user defines by these points, so it is
+        told here and not added to every point's covariance.
+    residual_rms_mm
+        Distance of the points from the plane; 0 for 3-2-1, which goes through its points.
+    points
+        How many points defined it.
+    """
+
+    rotation: Float
+    origin_mm: Float
+    covariance: Float
+    residual_rms_mm: float
+    points: int
+
+
+def align_plane(
+    field: Field, *, shared: SharedPixels, chosen: Bool | None = None, x_direction: ArrayLike = (1.0, 0.0, 0.0)
+) -> Alignment:
+    """Lay the frame into the best-fit plane of the reference shape.
+
+    Z is the plane's normal on the side of the old Z, X the given direction laid into the plane, the origin the mean of
+    the points laid onto the plane. Distances count by their expected noise.
+
+    Parameters
+    ----------
+    field
+        Any field; its reference positions are used.
+    shared
+        The correlation of neighbouring points.
+    chosen
+        (r, c) points that take part; None for all. Failed points never do.
+    x_direction
+        (3,) in the old frame.
+
+    Raises
+    ------
+    MeasurementError
+        ``too_few_points`` for fewer than three points or points on one line.
+    RegionError
+        ``gauge_unusable`` if the direction stands on the plane.
+    """
+    used = field.valid if chosen is None else field.valid & chosen
+    x = field.xyz_mm[used]
+    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) if len(x) >= 3 else np.zeros(2)
+    if spread[1] <= _STRAIGHT * spread[0]:
+        raise MeasurementError(
+            f"{len(x)} points are left, or they lie on one line: no plane can be laid through them.",
+            code="too_few_points",
+            remedy="Choose three or more valid points that span an area.",
+        )
+    centre = x.mean(axis=0)
+    arm = x - centre
+    normal = np.linalg.svd(arm, full_matrices=False)[2][2]
+    normal *= 1.0 if normal[2] >= 0.0 else -1.0
+    cov = field.covariance[used][:, :3, :3]
+    offset = 0.0
+    for _ in range(_ROUNDS):
+        R = _frame(normal, np.asarray(x_direction, dtype=np.float64))
+        local = arm @ R.T
+        weight = 1.0 / np.einsum("a,nab,b->n", normal, cov, normal)
+        A = np.column_stack([local[:, 1], -local[:, 0], np.ones(len(x))])  # z = a y - b x + offset: turns a, b
+        H = (A.T * weight) @ A
+        a, b, offset = np.linalg.solve(H, A.T @ (weight * local[:, 2]))
+        normal = R.T @ np.array([b, -a, 1.0])
+        normal /= np.linalg.norm(normal)
+        if max(abs(a), abs(b)) < 1e-14:
+            break
+    R = _frame(normal, np.asarray(x_direction, dtype=np.float64))
+    origin = centre + offset * normal
+    gain = np.zeros((*field.shape, 3, 3))
+    gain[used] = np.linalg.solve(H, (A * weight[:, None]).T).T[:, :, None] * R[2]
+    roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
+    each = gain @ roots
+    three = np.einsum("rcij,rckj->ik", each, shared.summed(field, each))
+    full = np.zeros((6, 6))
+    place = np.ix_([0, 1, 5], [0, 1, 5])
+    full[place] = 0.5 * (three + three.T)
+    rms = float(np.sqrt(np.mean(((x - origin) @ normal) ** 2)))
+    return Alignment(R, origin, full, rms, len(x))
+
+
+def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
+    """Lay the frame through six places of the reference: three on the plane, two on the X axis, one at its origin.
+
+    Z is the normal of the first three on the side of the old Z; X runs from the fourth to the fifth, laid into the
+    plane; Y = 0 on that line, X = 0 at the sixth, Z = 0 in the plane. A place may be named more than once.
+
+    Parameters
+    ----------
+    field
+        Any field; its reference positions are used.
+    places_px
+        (6, 2) in camera 1's reference image.
+    shared
+        The correlation of neighbouring points.
+
+    Raises
+    ------
+    RegionError
+        ``gauge_outside``; ``gauge_unusable`` for other than six places, three on one line, or two that are one.
+    MeasurementError
+        ``too_few_points`` if a place has no measured point about it.
+    """
+    xy = np.asarray(places_px, dtype=np.float64)
+    if xy.shape != (6, 2):
+        raise RegionError(f"3-2-1 takes six places, got an array of shape {xy.shape}.", code="gauge_unusable",
+                          remedy="Give three places on the plane, two on the line, one at the origin.")  # fmt: skip
+    places = sample(field, xy)
+    if not places.found.all():
+        k = int(np.argmin(places.found))
+        raise MeasurementError(
+            f"Place {k + 1} of 3-2-1, ({xy[k, 0]:g}, {xy[k, 1]:g}) px, has no measured point about it: "
+            f"{places.missing[k]}.",
+            code="too_few_points",
+            remedy="Choose places where the shape was measured.",
+        )
+    x = places.of(field.xyz_mm)
+    R, origin = _three_two_one(x)
+    first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
+    blocks = places.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
+    joint = np.swapaxes(blocks, 1, 2).reshape(18, 18)
+    slope = np.empty((6, 18))
+    step = 1e-5 * float(np.abs(x - x.mean(axis=0)).max())
+    for k in range(18):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = x.copy().ravel()
+            moved[k] += sign * step
+            R2, o2 = _three_two_one(moved.reshape(6, 3))
+            turn = R @ R2.T  # of the new axes, told along the new axes
+            ends.append(np.concatenate([[turn[2, 1], turn[0, 2], turn[1, 0]], R @ (o2 - origin)]))
+        slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
+    return Alignment(R, origin, slope @ joint @ slope.T, 0.0, 6)
+
+
+def _three_two_one(x: Float) -> tuple[Float, Float]:
+    normal = np.cross(x[1] - x[0], x[2] - x[0])
+    size = float(np.linalg.norm(normal))
+    reach = max(float(np.linalg.norm(x[1] - x[0])), float(np.linalg.norm(x[2] - x[0])))
+    if size <= _STRAIGHT * reach**2:
+        raise RegionError("The three places of the plane lie on one line.", code="gauge_unusable",
+                          remedy="Choose three places that span a plane.")  # fmt: skip
+    normal *= (1.0 if normal[2] >= 0.0 else -1.0) / size
+    R = _frame(normal, x[4] - x[3])
+    along = np.array([R[0] @ x[5], R[1] @ x[3], R[2] @ x[0]])
+    return R, R.T @ along
+
+
+def _frame(normal: Float, direction: Float) -> Float:
+    x = direction - (direction @ normal) * normal
+    size = float(np.linalg.norm(x))
+    if not np.isfinite(size) or size <= _STRAIGHT * float(np.linalg.norm(direction)):
+        raise RegionError("The direction of X stands on the plane, or has no length.", code="gauge_unusable",
+                          remedy="Give a direction that runs along the plane.")  # fmt: skip
+    x /= size
+    return np.stack([x, np.cross(normal, x), normal])
+
+
+def aligned(field: Field, alignment: Alignment) -> Field:
+    """Return the field in the new frame: positions, normals, displacements, rotations, covariances.
+
+    Camera quantities (pixels, Eq. (12)'s angles), stretch and curvature belong to the patch and stay.
+    """
+    R = alignment.rotation
+    n = field.covariance.shape[-1] // 3
+    J = np.kron(np.eye(n), R)
+    return replace(
+        field,
+        xyz_mm=(field.xyz_mm - alignment.origin_mm) @ R.T,
+        normal_sys=field.normal_sys @ R.T,
+        uvw_mm=None if field.uvw_mm is None else field.uvw_mm @ R.T,
+        rotation_rad=None if field.rotation_rad is None else field.rotation_rad @ R.T,
+        covariance=J @ field.covariance @ J.T,
+        starts=None,
+    )

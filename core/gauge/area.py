@@ -1,0 +1,112 @@
+"""Statistics over an area, with the uncertainty of the mean that overlapping subsets leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import RegionError
+from core.field.region import PointGrid
+from core.field.result import Field
+from core.gauge.shared_pixels import SharedPixels, steps_px
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class AreaStatistics:
+    """Statistics of one variable over the measured points of an area.
+
+    Attributes
+    ----------
+    count
+        Points with a value.
+    points
+        Points of the grid in the area, measured or not.
+    mean, sd, minimum, maximum, rms
+        Of the values; ``sd`` about the mean, with count - 1. NaN without values.
+    mean_sigma
+        Standard uncertainty of the mean from the points' noise and their common pixels; NaN where it is unknown.
+    """
+
+    count: int
+    points: int
+    mean: float
+    sd: float
+    minimum: float
+    maximum: float
+    rms: float
+    mean_sigma: float
+
+
+def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
+    """Return (r, c) which points lie in a polygon (n, 2) of camera 1's reference image, its border included.
+
+    Parameters
+    ----------
+    field
+        Gives the grid.
+    polygon_px
+        Corners in order; None for the whole field.
+
+    Raises
+    ------
+    RegionError
+        ``gauge_outside`` if no point of the grid lies within; ``region_unusable`` or ``region_empty`` for no polygon.
+    """
+    if polygon_px is None:
+        return np.ones(field.shape, bool)
+    x0, y0, x1, y1 = field.x_px[0, 0], field.y_px[0, 0], field.x_px[-1, -1], field.y_px[-1, -1]
+    grid = PointGrid(field.x_px, field.y_px, np.ones(field.shape, bool), max(steps_px(field)), (x0, y0, x1, y1))
+    inside = grid.within_polygon(polygon_px).allowed
+    if not inside.any():
+        raise RegionError(
+            f"No point of the field lies in the area; its points lie {steps_px(field)[0]:g} px apart from "
+            f"({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px.",
+            code="gauge_outside",
+            remedy="Give an area that holds measurement points, in pixels of camera 1's reference image.",
+        )
+    return inside
+
+
+def area_statistics(
+    field: Field, values: Float, sigma: Float | None, inside: Bool, *, shared: SharedPixels
+) -> AreaStatistics:
+    """Return the statistics of values over an area.
+
+    Parameters
+    ----------
+    field
+        Gives the grid and which points are valid.
+    values
+        (r, c) any variable of the field.
+    sigma
+        (r, c) its standard deviations; None if they are not known.
+    inside
+        (r, c) the area, see :func:`points_within`.
+    shared
+        The correlation of neighbouring points.
+    """
+    used = inside & field.valid & np.isfinite(values)
+    v = values[used]
+    n = int(v.size)
+    mean_sigma = float("nan")
+    if n and sigma is not None and np.isfinite(sigma[used]).all():
+        s = np.where(used, sigma, 0.0)
+        mean_sigma = float(np.sqrt(max(float(np.sum(s * shared.summed(field, s))), 0.0)) / n)
+    if not n:
+        nan = float("nan")
+        return AreaStatistics(0, int(inside.sum()), nan, nan, nan, nan, nan, nan)
+    return AreaStatistics(
+        count=n,
+        points=int(inside.sum()),
+        mean=float(v.mean()),
+        sd=float(v.std(ddof=1)) if n > 1 else float("nan"),
+        minimum=float(v.min()),
+        maximum=float(v.max()),
+        rms=float(np.sqrt(np.mean(v**2))),
+        mean_sigma=mean_sigma,
+    )

@@ -1,0 +1,51 @@
+"""Values along a line drawn in camera 1's reference image."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import RegionError
+from core.field.result import Field
+from core.gauge.shared_pixels import steps_px
+
+Float = NDArray[np.float64]
+MOST_PLACES = 100_000
+
+
+def places_along(field: Field, vertices_px: ArrayLike, count: int | None = None) -> tuple[Float, Float]:
+    """Lay places evenly along a polyline, both ends included.
+
+    Parameters
+    ----------
+    field
+        Gives the grid.
+    vertices_px
+        (n, 2), n >= 2.
+    count
+        How many places; None for as many as the grid's finer step gives.
+
+    Returns
+    -------
+    xy_px, distance_px
+        (m, 2) the places, (m,) how far along the line each lies.
+
+    Raises
+    ------
+    RegionError
+        ``gauge_unusable`` for a line without length or a count under 2.
+    """
+    v = np.asarray(vertices_px, dtype=np.float64)
+    if v.ndim != 2 or v.shape[1:] != (2,) or len(v) < 2 or not np.isfinite(v).all():
+        raise RegionError("A line needs two or more finite (x, y) places.", code="gauge_unusable")
+    reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(v, axis=0), axis=1))])
+    if reach[-1] == 0.0:
+        raise RegionError("The line has no length.", code="gauge_unusable", remedy="Give two different places.")
+    if count is None:
+        count = min(int(np.floor(reach[-1] / min(steps_px(field)))) + 1, MOST_PLACES)
+        count = max(count, 2)
+    if not 2 <= count <= MOST_PLACES:
+        raise RegionError(f"A line of {count} places cannot be read.", code="gauge_unusable",
+                          remedy=f"Give 2 to {MOST_PLACES} places.")  # fmt: skip
+    at = np.linspace(0.0, reach[-1], count)
+    return np.column_stack([np.interp(at, reach, v[:, 0]), np.interp(at, reach, v[:, 1])]), at

@@ -1,0 +1,213 @@
+"""The rigid motion of a field, and the field without it.
+
+A point X that moved by U is seen at X + U = c + d + R (X - c) + r. R and d make the sum of r^T W r least, W the inverse
+of r's covariance; c is the centre of the points used. The parameters' covariance comes from the points' own and from
+what overlapping subsets share. It holds the noise only: where the body deforms, the fit is the weighted mean motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from core.errors import InputError, MeasurementError
+from core.field.result import Field
+from core.gauge.shared_pixels import SharedPixels, roots_of
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+_FEWEST = 3
+_ROUNDS = 50
+_CONVERGED = 1e-11
+_TUKEY = 4.685  # 95 % efficiency on normal errors
+_MAD = 1.4826
+_LINE = 1e-6  # spread across a line of points, relative to the spread along it
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """A rigid motion with its uncertainty.
+
+    Attributes
+    ----------
+    rotation
+        (3, 3) R.
+    rotation_vector_rad
+        (3,) axis times angle of R, system frame.
+    translation_mm
+        (3,) d, how far the centre moved.
+    centre_mm
+        (3,) c.
+    covariance
+        (6, 6) of the rotation vector (rad) and the translation (mm).
+    small_covariance
+        (6, 6) the same with the small rotation that follows R in place of the rotation vector.
+    points
+        How many points took part with a weight above zero.
+    residual_rms_mm
+        Of r over these points, all three components together: what is left is deformation and noise.
+    noise_ratio
+        Root mean square of r in units of its expected noise; 1 for a rigid body with the stated noise.
+    """
+
+    rotation: Float
+    rotation_vector_rad: Float
+    translation_mm: Float
+    centre_mm: Float
+    covariance: Float
+    small_covariance: Float
+    points: int
+    residual_rms_mm: float
+    noise_ratio: float
+    gain: Float
+    """(r, c, 6, 3) the fit's derivative over each point's r, zero for points without weight."""
+
+
+def skew(v: Float) -> Float:
+    """Return the matrices (..., 3, 3) that make v x."""
+    zero = np.zeros(v.shape[:-1])
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
+
+
+def rigid_motion(
+    field: Field, *, shared: SharedPixels, chosen: Bool | None = None, robust: bool = False
+) -> RigidMotion:
+    """Fit the rigid motion of a displacement field.
+
+    Parameters
+    ----------
+    field
+        With displacements.
+    shared
+        The correlation of neighbouring points.
+    chosen
+        (r, c) points that take part; None for all. Failed points never do.
+    robust
+        Give points far off the others (Tukey's biweight) less weight, down to none.
+
+    Raises
+    ------
+    InputError
+        ``no_displacement`` for a shape.
+    MeasurementError
+        ``too_few_points`` if fewer than three valid points, or points along one line, are left.
+    """
+    if field.uvw_mm is None:
+        raise InputError("A shape has no motion.", code="no_displacement", remedy="Use a step with displacements.")
+    used = field.valid if chosen is None else field.valid & chosen
+    x, moved = field.xyz_mm[used], (field.xyz_mm + field.uvw_mm)[used]
+    _check_spread(x)
+    cov = field.covariance[used]
+    centre = x.mean(axis=0)
+    arm = x - centre
+    R, d = _unweighted(arm, moved - centre)
+    weight = np.ones(len(x))
+    H, A, W = np.eye(6), np.empty(0), np.empty(0)
+    r = np.empty(0)
+    for _ in range(_ROUNDS):
+        turned = arm @ R.T
+        r = moved - centre - d - turned
+        M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)  # r's noise is (I - R) dX + dU
+        W = np.linalg.inv(M @ cov @ M.T)
+        distance2 = np.einsum("na,nab,nb->n", r, W, r)
+        weight = _biweight(distance2) if robust else weight
+        A = np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
+        WA = weight[:, None, None] * (W @ A)
+        H = np.einsum("nai,naj->ij", A, WA)
+        change = np.linalg.solve(H, np.einsum("nai,na->i", WA, r))
+        R, d = Rotation.from_rotvec(change[:3]).as_matrix() @ R, d + change[3:]
+        if np.abs(change).max() < _CONVERGED * max(1.0, float(np.abs(arm).max())):
+            break
+    kept = weight > 0.0
+    _check_spread(x[kept])
+    gain = np.zeros((*field.shape, 6, 3))
+    gain[used] = np.linalg.solve(H, np.swapaxes(weight[:, None, None] * (W @ A), 1, 2))
+    small = _fit_covariance(field, shared, gain, R)
+    vector = Rotation.from_matrix(R).as_rotvec()
+    to_vector = np.eye(6)
+    to_vector[:3, :3] = _vector_slope(vector)
+    return RigidMotion(
+        rotation=R, rotation_vector_rad=vector, translation_mm=d, centre_mm=centre,
+        covariance=to_vector @ small @ to_vector.T, small_covariance=small, points=int(kept.sum()),
+        residual_rms_mm=float(np.sqrt(np.mean(np.sum(r[kept] ** 2, axis=1)))),
+        noise_ratio=float(np.sqrt(np.mean(distance2[kept]) / 3.0)), gain=gain,
+    )  # fmt: skip
+
+
+def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPixels) -> Field:
+    """Return the field with the body moved back: U' = R^T (X + U - c - d) + c - X.
+
+    Shape, normals and stretch stay; rotations become R^T times theirs. The covariance holds the points' own noise, the
+    fitted motion's, and what both have in common.
+    """
+    assert field.uvw_mm is not None
+    R, valid = motion.rotation, field.valid
+    back = (field.xyz_mm + field.uvw_mm - motion.centre_mm - motion.translation_mm) @ R  # rows times R: R^T applied
+    uvw = back + motion.centre_mm - field.xyz_mm
+    rotation = field.rotation_rad
+    if rotation is not None:
+        turned = np.full(rotation.shape, np.nan)
+        if valid.any():
+            turned[valid] = (Rotation.from_matrix(R.T) * Rotation.from_rotvec(rotation[valid])).as_rotvec()
+        rotation = turned
+    # dX' = dX; dU' = (R^T - I) dX + R^T dU - R^T [-(R (X - c)) x, I] dp
+    J = np.block([[np.eye(3), np.zeros((3, 3))], [R.T - np.eye(3), R.T]])
+    arm = (field.xyz_mm - motion.centre_mm) @ R.T
+    P = np.zeros((*field.shape, 6, 6))
+    P[..., 3:, :3] = R.T @ skew(arm)
+    P[..., 3:, 3:] = -R.T
+    roots = roots_of(np.where(valid[..., None, None], field.covariance, 0.0))
+    M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)
+    common = shared.summed(field, motion.gain @ (M @ roots)) @ roots  # (r, c, 6, 6) of dp with dX, dU of the point
+    mixed = P @ common @ J.T
+    cov = J @ field.covariance @ J.T + mixed + np.swapaxes(mixed, -1, -2)
+    cov = cov + P @ motion.small_covariance @ np.swapaxes(P, -1, -2)
+    cov[~valid] = np.nan
+    return replace(field, uvw_mm=uvw, rotation_rad=rotation, covariance=cov, starts=None)
+
+
+def _fit_covariance(field: Field, shared: SharedPixels, gain: Float, R: Float) -> Float:
+    M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)
+    roots = roots_of(np.where(field.valid[..., None, None], field.covariance, 0.0))
+    each = gain @ (M @ roots)  # (r, c, 6, 6): white noise to parameters
+    total = np.einsum("rcij,rckj->ik", each, shared.summed(field, each))
+    return np.asarray(0.5 * (total + total.T))
+
+
+def _unweighted(arm: Float, moved: Float) -> tuple[Float, Float]:
+    """Kabsch's start."""
+    d = moved.mean(axis=0)
+    R = Rotation.align_vectors(moved - d, arm)[0].as_matrix()
+    return R, d
+
+
+def _biweight(distance2: Float) -> Float:
+    distance = np.sqrt(distance2 / 3.0)
+    scale = _MAD * float(np.median(np.abs(distance))) + 1e-30
+    u2 = np.minimum(distance2 / 3.0 / (_TUKEY * scale) ** 2, 1.0)
+    return np.asarray((1.0 - u2) ** 2)
+
+
+def _vector_slope(v: Float) -> Float:
+    """Derivative of the rotation vector of exp(w) R over a small w: the inverse left Jacobian of SO(3)."""
+    angle = float(np.linalg.norm(v))
+    K = skew(v)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) - 0.5 * K + K @ K / 12.0)
+    factor = 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    return np.asarray(np.eye(3) - 0.5 * K + factor * K @ K)
+
+
+def _check_spread(x: Float) -> None:
+    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) if len(x) >= _FEWEST else np.zeros(2)
+    if spread[1] <= _LINE * spread[0]:
+        raise MeasurementError(
+            f"{len(x)} points are left, or they lie on one line: no rigid motion can be told from them.",
+            code="too_few_points",
+            remedy="Choose three or more valid points that span an area.",
+        )
