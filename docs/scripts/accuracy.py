@@ -23,6 +23,7 @@ from docs.scripts import (
     accuracy_experiments,
     accuracy_matching,
     accuracy_noise,
+    accuracy_strain,
 )
 from docs.scripts.table import Row, Section
 
@@ -38,6 +39,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "rotation": accuracy_matching.rotation,
     "epipolar": accuracy_matching.epipolar,
     **accuracy_curved.SECTIONS,
+    **accuracy_strain.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,
