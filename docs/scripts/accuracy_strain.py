@@ -16,7 +16,7 @@ from core.measure import MeasureOptions, ReferencePair
 from core.strain import StrainField, StrainOptions, surface_strain
 from docs.scripts.paper_rig import Rig, load_rig, plane_scene, turn
 from docs.scripts.table import Row, Section
-from sim.scene import Scene
+from sim.scene import UPRIGHT, Scene
 
 Float = NDArray[np.float64]
 REGION = (90, 90, 420, 390)
@@ -39,7 +39,8 @@ class Case:
         """exx, eyy, exy of 1/2 (F^T F - I)."""
         if self.in_plane is None:
             return np.zeros(3)
-        e = 0.5 * (self.in_plane.T @ self.in_plane - np.eye(2))
+        to_sys = UPRIGHT.rotation[:2, :2]  # the body lies at 45 degrees to the system's axes
+        e = to_sys @ (0.5 * (self.in_plane.T @ self.in_plane - np.eye(2))) @ to_sys.T
         return np.array([e[0, 0], e[1, 1], e[0, 1]])
 
 
