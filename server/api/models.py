@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
 
 from core.field.patch import DEFAULT_PATCH, PatchSetting
+from core.strain.options import DEFAULT_WINDOW, WIDEST_WINDOW, StrainTensor
 
 
 def _not_a_truth_value(value: Any) -> Any:
@@ -347,6 +348,24 @@ class Region(Request):
         return self
 
 
+class StrainRequest(Request):
+    """Strain over a virtual gauge, (window - 1) step_px + subset_px wide."""
+
+    window: Annotated[Whole, Field(ge=3, le=WIDEST_WINDOW)] = Field(
+        DEFAULT_WINDOW, description="Points across the gauge, odd."
+    )
+    order: Literal[1, 2] = Field(
+        1, description="Fit planes or quadratics; they differ only where an edge, a hole or a cut takes points away."
+    )
+    tensor: StrainTensor = Field("green_lagrange", description="Which strain is told.")
+
+    @model_validator(mode="after")
+    def _odd(self) -> Self:
+        if self.window % 2 == 0:
+            raise ValueError(f"window must be odd, got {self.window}")
+        return self
+
+
 class AnalysisRequest(Request):
     """What to compute over a test's steps."""
 
@@ -373,6 +392,9 @@ class AnalysisRequest(Request):
         Field(None, description="Steps to measure; all if left out. The reference is always measured.")
     )
     reference: Annotated[Whole, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
+    strain: StrainRequest | None = Field(
+        default_factory=lambda: StrainRequest.model_validate({}), description="Strain of a displacement; null: none."
+    )
     label: Label = Field("", description="Free text.")
 
     @model_validator(mode="after")
