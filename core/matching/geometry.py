@@ -152,7 +152,7 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
     # rows of R^T: tangents in the system frame, (N, 3, 2), both in units of 1 / w0
     before = np.einsum("ji,njk->nik", R, basis[..., 1:] - basis[..., :1] * slopes)
     after = np.einsum("ji,njk->nik", R, G[..., 1:] - G[..., :1] * slopes)
-    frame = _tangent_frames(_plane(ray, w) @ R)
+    frame = tangent_frames(_plane(ray, w) @ R)
     coordinates = np.swapaxes(frame[..., :2], -1, -2) @ before
     gradient = after @ _inverse2(coordinates)  # (N, 3, 2): tangent coordinates -> deformed tangents
     right = _root2(np.swapaxes(gradient, -1, -2) @ gradient)
@@ -194,7 +194,7 @@ def _plane(ray: Float, w: Float) -> Float:
     return np.stack([w[..., 1], w[..., 2], w[..., 0] - w[..., 1] * ray[..., 0] - w[..., 2] * ray[..., 1]], axis=-1)
 
 
-def _tangent_frames(normals: Float) -> Float:
+def tangent_frames(normals: Float) -> Float:
     """Columns: X_sys projected on the patch (Y_sys where the patch is normal to X_sys), its partner, the normal."""
     n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     steep = np.abs(n[..., :1]) > 0.999

@@ -46,7 +46,8 @@ def summarise(result: Field, *, rbe_px: float | None = None) -> dict[str, Any]:
         ``epipolar_offset_rms_px``), ``epipolar_check`` (whether the cameras still stand as calibrated, see
         :class:`core.field.epipolar_check.EpipolarCheck`), ``plane_residual_rms_mm`` (of the reference positions),
         ``zncc_median`` and ``sigma_median_mm``, ``patch`` (what the field was measured with, why, and the numbers of
-        the choice; see :class:`core.field.patch.PatchChoice`), for displacements also ``displacement_mm`` (mean, min, max of u, v, w).
+        the choice; see :class:`core.field.patch.PatchChoice`), for displacements also ``displacement_mm`` (mean, min,
+        max of u, v, w).
         What cannot be told is None.
     """
     status = result.status

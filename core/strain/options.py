@@ -1,0 +1,78 @@
+"""How strain is computed: what a user can set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from core.errors import InputError
+
+StrainTensor = Literal["green_lagrange", "infinitesimal", "hencky"]
+"""Which strain is told."""
+STRAIN_TENSORS: tuple[StrainTensor, ...] = get_args(StrainTensor)
+DEFAULT_WINDOW = 9
+"""Points across a window unless asked otherwise."""
+WIDEST_WINDOW = 101
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrainOptions:
+    """How strain is computed from a field of displacements.
+
+    Parameters
+    ----------
+    window
+        Points across the square window, odd, 3 to 101. The gauge is (window - 1) step + subset wide.
+    order
+        1: the window's positions are fitted by planes; 2: by quadratics. In a whole window both give the same strain,
+        since its quadratic terms do not touch the slope in its middle. In a window that an edge has cut, planes tell
+        the strain in the middle of the points that are left, quadratics that at the point itself, with several times
+        the noise.
+    tensor
+        ``green_lagrange`` 1/2 (C - I), ``infinitesimal`` (the symmetric gradient; not free of rotation), or ``hencky``
+        1/2 log C.
+    least_share
+        Share of the window's points that must be left where edges, holes or cuts take some away. At a half, windows
+        on a straight edge are kept and those in a corner are not.
+    most_amplification
+        How many times noisier a cut window's strain may be than a whole window's; beyond it its points lie too much
+        on one side.
+
+    Raises
+    ------
+    InputError
+        ``strain_window_invalid`` or ``option_out_of_range``.
+    """
+
+    window: int = DEFAULT_WINDOW
+    order: Literal[1, 2] = 1
+    tensor: StrainTensor = "green_lagrange"
+    least_share: float = 0.5
+    most_amplification: float = 12.0
+
+    def __post_init__(self) -> None:
+        w = self.window
+        if isinstance(w, bool) or int(w) != w or not 3 <= w <= WIDEST_WINDOW or w % 2 == 0:
+            raise InputError(
+                f"the strain window is {w} points wide; it must be an odd whole number, 3 to {WIDEST_WINDOW}.",
+                code="strain_window_invalid",
+                remedy=f"Give {DEFAULT_WINDOW}, for example, or switch strain off.",
+            )
+        if self.order not in (1, 2):
+            _refuse("order", self.order, "1 or 2")
+        if self.tensor not in STRAIN_TENSORS:
+            _refuse("tensor", self.tensor, ", ".join(STRAIN_TENSORS))
+        if not 0.0 < self.least_share <= 1.0:
+            _refuse("least_share", self.least_share, "above 0 and 1 at most")
+        if not (np.isfinite(self.most_amplification) and self.most_amplification >= 1.0):
+            _refuse("most_amplification", self.most_amplification, "1 or more")
+
+
+def _refuse(name: str, value: object, allowed: str) -> None:
+    raise InputError(
+        f"the strain option {name} is {value!r}, it must be {allowed}.",
+        code="option_out_of_range",
+        remedy=f"Give {name} as named above.",
+    )

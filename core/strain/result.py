@@ -1,0 +1,120 @@
+"""Strain over the grid of measurement points of one step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.strain.options import StrainOptions
+
+Float = NDArray[np.float64]
+
+
+class StrainStatus(IntEnum):
+    """What can be said about the strain at a point; every status but ``OK`` means that it has none."""
+
+    OK = 0
+    NO_POINT = 1
+    TOO_FEW = 2
+    ONE_SIDED = 3
+
+
+STRAIN_STATUS_MEANINGS: dict[StrainStatus, str] = {
+    StrainStatus.OK: "computed",
+    StrainStatus.NO_POINT: "the point itself was not measured",
+    StrainStatus.TOO_FEW: "edges, holes or cuts leave too few points in the window",
+    StrainStatus.ONE_SIDED: "the window's points lie too much on one side or on one line",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StrainField:
+    """Strain at (r, c) points, in each point's tangent frame; NaN where ``status`` is not ``OK``.
+
+    Axis 1 is X_sys projected on the reference surface (Y_sys where the surface is normal to X_sys), axis 2 completes
+    it with the normal. Strain has no unit; shear is the tensor's, half the engineering shear.
+
+    Attributes
+    ----------
+    options
+        How it was computed.
+    step_px
+        Distance of neighbouring points.
+    subset_px
+        Width of the subset that the displacements were measured with.
+    gauge_px
+        Width of the virtual gauge, (window - 1) step + subset.
+    gauge_mm
+        The same on the surface, median of the field; NaN where nothing was computed.
+    status
+        (r, c) int8, :class:`StrainStatus`.
+    strain
+        (r, c, 3) exx, eyy, exy of the gauge.
+    covariance
+        (r, c, 3, 3) of these, from the covariances of the points.
+    patch
+        (r, c, 3) exx, eyy, exy that the stretch patch of each point has seen by itself, the same tensor; NaN where the
+        point was not measured, None where patches could not stretch.
+    """
+
+    options: StrainOptions
+    step_px: float
+    subset_px: int
+    gauge_px: float
+    gauge_mm: float
+    status: NDArray[np.int8]
+    strain: Float
+    covariance: Float
+    patch: Float | None = None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(r, c) True where there is a strain."""
+        return np.asarray(self.status == StrainStatus.OK)
+
+    @property
+    def sigma(self) -> Float:
+        """(r, c, 3) standard deviations of exx, eyy, exy."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def principal(self) -> Float:
+        """(r, c, 2) principal strains, the larger first."""
+        return principal_of(self.strain)
+
+    @property
+    def angle_rad(self) -> Float:
+        """(r, c) from axis 1 to the direction of the larger principal strain, towards axis 2; -pi/2 to pi/2."""
+        e = self.strain
+        return np.asarray(0.5 * np.arctan2(2.0 * e[..., 2], e[..., 0] - e[..., 1]))
+
+    @property
+    def max_shear(self) -> Float:
+        """(r, c) largest in-plane shear of the tensor, (e1 - e2) / 2; half the engineering shear."""
+        e = self.principal
+        return np.asarray(0.5 * (e[..., 0] - e[..., 1]))
+
+    @property
+    def von_mises(self) -> Float:
+        """(r, c) sqrt(e1^2 - e1 e2 + e2^2). Noise alone makes it positive."""
+        one, two = np.moveaxis(self.principal, -1, 0)
+        return np.asarray(np.sqrt(one**2 - one * two + two**2))
+
+    @property
+    def sigma_principal(self) -> Float:
+        """(r, c, 2) standard deviations of the principal strains, linearised: they hold where e1 - e2 exceeds these."""
+        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        along = np.stack([c**2, s**2, 2.0 * c * s], axis=-1)
+        across = np.stack([s**2, c**2, -2.0 * c * s], axis=-1)
+        variance = [np.einsum("...i,...ij,...j", j, self.covariance, j) for j in (along, across)]
+        return np.asarray(np.sqrt(np.maximum(np.stack(variance, axis=-1), 0.0)))
+
+
+def principal_of(strain: Float) -> Float:
+    """Return the principal values (..., 2), the larger first, of exx, eyy, exy (..., 3)."""
+    mean = 0.5 * (strain[..., 0] + strain[..., 1])
+    apart = np.hypot(0.5 * (strain[..., 0] - strain[..., 1]), strain[..., 2])
+    return np.stack([mean + apart, mean - apart], axis=-1)

@@ -1,0 +1,123 @@
+"""Strain of a field of displacements: the surface's metric before and after."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from core.errors import InputError
+from core.field.result import Field
+from core.lens import Bool, Float
+from core.matching.geometry import tangent_frames
+from core.strain.options import StrainOptions
+from core.strain.result import StrainField, StrainStatus
+from core.strain.tensors import strain_covariance, strain_of, strain_of_stretch
+from core.strain.window import window_slopes
+
+
+def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
+    """Strain at each point, from a fit over the window about it.
+
+    Reference and deformed positions of the window's points are fitted by the same polynomial in the grid's column and
+    row. The slopes of the first give the tangent plane, its frame and the tangents F0 in it; those of the second the
+    same tangents deformed, F1. With B = E^T F0 and E the frame, P = F1 B^-1 is the surface's deformation gradient and
+    C = P^T P, free of any rotation.
+
+    Parameters
+    ----------
+    field
+        A displacement on a regular grid; its ``cuts`` and empty points end windows.
+    options
+        Defaults to ``StrainOptions()``.
+    subset_px
+        Width of the subset that the field was measured with.
+
+    Returns
+    -------
+    StrainField
+        With the covariance that follows from the points'; neighbours go together by the pixels that they share.
+
+    Raises
+    ------
+    InputError
+        ``strain_needs_motion`` for a shape.
+
+    Notes
+    -----
+    A fit over a window takes chords for arcs. Where the surface keeps its shape this cancels; where it bends from flat
+    to a radius R, planes over a window of half width h tell up to h^2 / (10 R^2) too little.
+    """
+    options = StrainOptions() if options is None else options
+    if field.uvw_mm is None:
+        raise InputError(
+            "the field is a shape and has no displacement.",
+            code="strain_needs_motion",
+            remedy="Give the field of a later step.",
+        )
+    curved = field.patch is not None and field.patch.patch == "curved"
+    values = np.concatenate([field.xyz_mm, field.uvw_mm], axis=-1)
+    xy_px = np.stack([field.x_px, field.y_px], axis=-1)
+    slopes = window_slopes(values, field.valid, xy_px, field.cuts, options, subset_px=subset_px, curved=curved)
+    status = slopes.status
+    good = status == StrainStatus.OK
+    slope = slopes.slope[good]
+    frame = _frames(slope[:, :3], field.normal_sys[good])
+    tangents = np.swapaxes(frame, -1, -2) @ slope[:, :3]
+    area, per_mm = np.abs(np.linalg.det(tangents)), np.linalg.inv(tangents)
+    gradient = slope[:, 3:] @ per_mm
+    found = strain_of(frame, gradient, options.tensor)
+    spread = np.swapaxes(per_mm, -1, -2) @ slopes.spread[good] @ per_mm
+    around = _mean_around(field.covariance, field.valid, options.window)[good]
+    strain = np.full((*field.shape, 3), np.nan)
+    covariance = np.full((*field.shape, 3, 3), np.nan)
+    strain[good] = found
+    covariance[good] = strain_covariance(frame, gradient, options.tensor, around, spread, found)
+    step_px = _step(field)
+    gauge_px = (options.window - 1) * step_px + subset_px
+    return StrainField(
+        options=options,
+        step_px=step_px,
+        subset_px=subset_px,
+        gauge_px=gauge_px,
+        gauge_mm=float(gauge_px / step_px * np.median(np.sqrt(area))) if good.any() else np.nan,
+        status=status,
+        strain=strain,
+        covariance=covariance,
+        patch=_patch_strain(field, options),
+    )
+
+
+def _frames(tangents: Float, towards: Float) -> Float:
+    """Frame (n, 3, 2) of the plane of tangents (n, 3, 2), its normal on the side of ``towards`` (n, 3)."""
+    normal = np.cross(tangents[..., 0], tangents[..., 1])
+    normal = np.where((normal * towards).sum(-1, keepdims=True) < 0.0, -normal, normal)
+    return tangent_frames(normal)[..., :2]
+
+
+def _mean_around(covariance: Float, valid: Bool, window: int) -> Float:
+    """Mean (r, c, 6, 6) of the valid points' covariance over each window."""
+    size = (window, window, 1, 1)
+    kept = np.where(valid[..., None, None], covariance, 0.0)
+    share = ndimage.uniform_filter(valid.astype(np.float64), size=window, mode="constant")
+    total = ndimage.uniform_filter(kept, size=size, mode="constant")
+    return np.asarray(total / np.maximum(share, 0.5 / window**2)[..., None, None])
+
+
+def _patch_strain(field: Field, options: StrainOptions) -> Float | None:
+    """Strain (r, c, 3) that each patch has seen by itself; None where patches could not stretch."""
+    rigid = field.patch is not None and field.patch.patch == "rigid"
+    if rigid or field.stretch is None or field.rotation_rad is None:
+        return None
+    ok = field.valid
+    out = np.full((*field.shape, 3), np.nan)
+    frame = tangent_frames(field.normal_sys[ok])[..., :2]
+    out[ok] = strain_of_stretch(field.stretch[ok], field.rotation_rad[ok], frame, options.tensor)
+    return out
+
+
+def _step(field: Field) -> float:
+    """Distance of neighbouring points, px."""
+    x, y = field.x_px, field.y_px
+    if x.shape[1] > 1:
+        return float(x[0, 1] - x[0, 0])
+    return float(y[1, 0] - y[0, 0]) if x.shape[0] > 1 else 1.0

@@ -1,0 +1,142 @@
+"""From displacement gradients on the surface to strain tensors, and how their errors follow.
+
+``frame`` (..., 3, 2) holds the unit tangents of the reference surface in its columns, ``gradient`` (..., 3, 2) the
+derivatives of the displacement along them. The deformed tangents are P = frame + gradient and C = P^T P.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from core.lens import Float
+from core.strain.options import StrainTensor
+from core.strain.result import principal_of
+
+
+def strain_of(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
+    """Strain exx, eyy, exy (..., 3) of a surface's displacement gradient.
+
+    Built from the gradient itself and not from C - I, so that small strains keep their digits.
+    """
+    along = _transposed(frame) @ gradient
+    small = 0.5 * (along + _transposed(along))
+    if tensor == "infinitesimal":
+        return _components(small)
+    green = _components(small + 0.5 * _transposed(gradient) @ gradient)
+    return hencky_of_green(green) if tensor == "hencky" else green
+
+
+def strain_of_stretch(stretch: Float, rotation_rad: Float, frame: Float, tensor: StrainTensor) -> Float:
+    """Strain (n, 3) of patches whose stretch minus one (Biot strain) e11, e22, e12 and rotation vector are known.
+
+    Parameters
+    ----------
+    stretch
+        (n, 3) in the tangent frame.
+    rotation_rad
+        (n, 3) rotation vectors, system frame.
+    frame
+        (n, 3, 2) unit tangents of the reference patch, system frame.
+    tensor
+        Which strain.
+    """
+    biot = _matrix(stretch)
+    if tensor == "infinitesimal":
+        moved = Rotation.from_rotvec(rotation_rad).as_matrix() @ frame
+        return strain_of(frame, moved @ (np.eye(2) + biot) - frame, tensor)
+    green = _components(biot + 0.5 * biot @ biot)
+    return hencky_of_green(green) if tensor == "hencky" else green
+
+
+def hencky_of_green(green: Float) -> Float:
+    """1/2 log C (..., 3) from Green-Lagrange strain 1/2 (C - I) (..., 3)."""
+    e = principal_of(green)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        h = 0.5 * np.log1p(2.0 * e)
+        apart = e[..., 0] - e[..., 1]
+        # h = a I + b e with the same principal axes; where both principal values meet, b is the derivative
+        slope = np.where(apart > 1e-12, (h[..., 0] - h[..., 1]) / apart, 1.0 / (1.0 + e[..., 0] + e[..., 1]))
+    rest = 0.5 * (h[..., 0] + h[..., 1]) - slope * 0.5 * (e[..., 0] + e[..., 1])
+    return np.stack([slope * green[..., 0] + rest, slope * green[..., 1] + rest, slope * green[..., 2]], axis=-1)
+
+
+def strain_covariance(
+    frame: Float, gradient: Float, tensor: StrainTensor, points: Float, spread: Float, strain: Float
+) -> Float:
+    """Covariance (n, 3, 3) of exx, eyy, exy.
+
+    Parameters
+    ----------
+    frame, gradient
+        (n, 3, 2) as above.
+    tensor
+        Which strain.
+    points
+        (n, 6, 6) covariance of X Y Z U V W of the window's points.
+    spread
+        (n, 2, 2) sum over pairs of points of c_k rho_kl c_l^T in 1/mm^2, c the weights with which points make the
+        gradient and rho the correlation of their errors.
+    strain
+        (n, 3) the strain itself.
+
+    Notes
+    -----
+    An error of the positions makes the tangents off by d_j = sum c_kj (dX, dU)_k, six numbers for each of j = 1, 2.
+    The strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
+    """
+    moved = frame + gradient
+    if tensor == "infinitesimal":
+        of_motion = frame
+        # E^T dP with P's own basis off by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
+        of_place = frame - frame @ _transposed(_transposed(frame) @ moved)
+    else:
+        of_motion = moved
+        of_place = moved - frame @ (_transposed(moved) @ moved)
+    A = _transposed(np.concatenate([of_place, of_motion], axis=-2))  # (n, 2, 6)
+    Q = A @ points @ _transposed(A)
+    q11, q22, q12 = Q[..., 0, 0], Q[..., 1, 1], Q[..., 0, 1]
+    k11, k22, k12 = spread[..., 0, 0], spread[..., 1, 1], spread[..., 0, 1]
+    out = np.empty((*q11.shape, 3, 3))
+    out[..., 0, 0] = k11 * q11
+    out[..., 1, 1] = k22 * q22
+    out[..., 2, 2] = 0.25 * (k22 * q11 + k11 * q22 + 2.0 * k12 * q12)
+    out[..., 0, 1] = out[..., 1, 0] = k12 * q12
+    out[..., 0, 2] = out[..., 2, 0] = 0.5 * (k12 * q11 + k11 * q12)
+    out[..., 1, 2] = out[..., 2, 1] = 0.5 * (k22 * q12 + k12 * q22)
+    if tensor == "hencky":
+        J = _hencky_slope(strain)
+        out = J @ out @ _transposed(J)
+    return out
+
+
+def _hencky_slope(hencky: Float) -> Float:
+    """(..., 3, 3) derivative of Hencky strain over Green-Lagrange strain, components exx, eyy, exy."""
+    h = principal_of(hencky)
+    inverse = np.exp(-2.0 * h)  # 1 / C
+    apart = h[..., 0] - h[..., 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shear = np.where(apart > 1e-9, 2.0 * apart / (1.0 / inverse[..., 0] - 1.0 / inverse[..., 1]), inverse[..., 0])
+    angle = 0.5 * np.arctan2(2.0 * hencky[..., 2], hencky[..., 0] - hencky[..., 1])
+    diagonal = np.stack([inverse[..., 0], inverse[..., 1], shear], axis=-1)
+    return np.asarray(_turn(-angle) @ (diagonal[..., None] * _turn(angle)))
+
+
+def _turn(angle: Float) -> Float:
+    """(..., 3, 3) components in axes turned by ``angle`` from those in the old ones."""
+    c, s = np.cos(angle), np.sin(angle)
+    rows = [[c**2, s**2, 2.0 * c * s], [s**2, c**2, -2.0 * c * s], [-c * s, c * s, c**2 - s**2]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _transposed(m: Float) -> Float:
+    return np.asarray(np.swapaxes(m, -1, -2))
+
+
+def _components(m: Float) -> Float:
+    return np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 0, 1]], axis=-1)
+
+
+def _matrix(e: Float) -> Float:
+    rows = [e[..., 0], e[..., 2], e[..., 2], e[..., 1]]
+    return np.stack(rows, axis=-1).reshape(*e.shape[:-1], 2, 2)
