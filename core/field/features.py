@@ -131,9 +131,13 @@ def detect_all(pictures: Sequence[Picture], *, scale: int = 1, max_keypoints: in
 
 
 def _with_rim(picture: Picture, scale: int) -> Box:
-    """The box with a rim for the filters."""
-    rows, cols = picture.image.shape[:2]
-    x0, y0, x1, y1 = picture.box
+    return with_rim((picture.image.shape[0], picture.image.shape[1]), picture.box, scale)
+
+
+def with_rim(shape: tuple[int, int], box: Box, scale: int) -> Box:
+    """Return a box with a rim for the filters, as far as the image of this shape goes."""
+    rows, cols = shape
+    x0, y0, x1, y1 = box
     rim = _RIM_PX * scale
     return max(x0 - rim, 0), max(y0 - rim, 0), min(x1 + rim, cols), min(y1 + rim, rows)
 

@@ -21,7 +21,7 @@ from core.field.plane_error import plane_error
 from core.field.predict import predict
 from core.field.region import PointGrid, check_region
 from core.field.result import Field
-from core.field.scatter import ScatteredShape, scattered_motion, scattered_shape
+from core.field.scatter import ScatteredMotion, ScatteredShape, scattered_motion, scattered_shape, stretched_motion
 from core.field.seeds import (
     Seed,
     as_seeds,
@@ -205,9 +205,17 @@ class Run:
             shape_now = scattered_shape(self.pair, *features[-2:])
         elif len(shape.xy_px) < _FEWEST_MATCHES:
             return 0
-        return seeds_from_matches(
-            self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
-        )
+
+        def put_seeds(motion: ScatteredMotion | None) -> int:
+            return seeds_from_matches(
+                self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
+            )
+
+        found = put_seeds(motion)
+        if found == 0 and motion is not None:
+            # a strain or tilt too large for the features' own tolerance
+            found = put_seeds(stretched_motion(self.ref1.pixels, box1, features[-2], scale))
+        return found
 
     def _swept_shape(self) -> None:
         for i in swept_places(self.xy_px, self.usable):

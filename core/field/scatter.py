@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.errors import ImageError
-from core.field.features import Features, match
+from core.field.features import Box, Features, match
 from core.field.local_fit import consistent, robust_local_fits
 from core.field.starts import Starts, depth_per_px
+from core.field.stretched import stretched_features, stretches
 from core.lens import Bool, Float
 from core.stereo import StereoPair
 
@@ -93,6 +96,14 @@ def scattered_motion(features_ref: Features, features_now: Features) -> Scattere
     scale = max(features_ref.scale, features_now.scale)
     right = consistent(xy, now, tolerance=2.0 * _MOTION_TOLERANCE_PX * _looser(scale))
     return ScatteredMotion(xy[right], now[right], scale)
+
+
+def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scale: int) -> ScatteredMotion:
+    """Match stretched copies of camera 1's image at t0 with its image at t; the copy with the most matches counts."""
+    tries = [
+        scattered_motion(stretched_features(image, box, stretch, scale=scale), features_now) for stretch in stretches()
+    ]
+    return max(tries, key=lambda motion: len(motion.xy_px))
 
 
 def _looser(scale: int) -> float:

@@ -21,6 +21,7 @@ from docs.scripts import (
     accuracy_calibration,
     accuracy_curved,
     accuracy_experiments,
+    accuracy_large,
     accuracy_matching,
     accuracy_noise,
 )
@@ -38,6 +39,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "rotation": accuracy_matching.rotation,
     "epipolar": accuracy_matching.epipolar,
     **accuracy_curved.SECTIONS,
+    "large": accuracy_large.large_motion,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,
