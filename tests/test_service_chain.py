@@ -184,6 +184,24 @@ def test_gauges_read_what_the_fields_hold(client: httpx.Client, analysis: tuple[
 
 
 @pytest.mark.fault(40)
+def test_strain_comes_with_the_displacement(client: httpx.Client, analysis: tuple[str, dict[str, Any]]) -> None:
+    url, done = analysis
+    assert client.get(url).json()["settings"]["strain"] == {"window": 9, "order": 1, "tensor": "green_lagrange"}
+    shape, *moved = done["result"]["steps"]
+    assert shape["strain"] is None
+    assert all(step["strain"]["gauge_px"] == 8 * 10 + 25 for step in moved)
+    reply = client.get(f"{url}/steps/{moved[0]['n']}/fields/exx").json()
+    assert "Green-Lagrange" in reply["long_name"]
+    found = sum(value is not None for row in reply["values"] for value in row)
+    assert found == moved[0]["strain"]["points"]
+
+
+def test_strain_that_cannot_be_is_refused(client: httpx.Client, plate_test: str) -> None:
+    for strain in ({"window": 8}, {"window": 9, "order": 3}, {"tensor": "almansi"}, {"width": 3}):
+        body = {"region": {"rectangle": RECTANGLE}, "strain": strain}
+        assert client.post(f"{API}/tests/{plate_test}/analyses", json=body).status_code == 422
+
+
 @pytest.mark.parametrize(
     ("change", "code"),
     [
