@@ -40,6 +40,7 @@ from server.io.netcdf import Provenance, read_field, write_field
 from server.io.noise_json import load_noise
 from server.io.summary import summarise
 from server.regions import make_grid
+from server.straining import strain_of_step, strain_options, summarise_strain
 from server.tasks import StepTask
 from server.version import software_version
 from server.worker_process import current_task
@@ -103,10 +104,12 @@ def measure_step(task: StepTask) -> dict[str, Any]:
         settings=task.settings, inputs=task.inputs, software_version=software_version(), step=task.n, extra=extra
     )
     marked = mark_extrapolated(result, context.volume)
-    write_field(_result_path(task, task.n), marked, provenance)
+    strain = strain_of_step(marked, strain_options(task.settings.get("strain")), subset_px=task.settings["subset_px"])
+    write_field(_result_path(task, task.n), marked, provenance, strain)
     # the next step needs these two, nobody the others
     context.fields = {n: f for n, f in context.fields.items() if n == task.reference} | {task.n: result}
     summary = summarise(marked, rbe_px=context.rbe_px)
+    summary["strain"] = None if strain is None else summarise_strain(strain)
     return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
 
 

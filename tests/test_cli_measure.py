@@ -187,6 +187,46 @@ def test_defaults_are_the_measurements_own() -> None:
     )
 
 
+def test_strain_is_in_files_and_summary(measured: Path) -> None:
+    """A block moves as a whole: its strain is noise, of the size that is told."""
+    summary = json.loads((measured / "summary.json").read_text())
+    assert summary["settings"]["strain"] == {"window": 9, "order": 1, "tensor": "green_lagrange"}
+    assert summary["steps"][0]["strain"] is None
+    for step in summary["steps"][1:]:
+        strain = step["strain"]
+        assert strain["gauge_px"] == 8 * 10 + 21
+        assert strain["gauge_mm"] == pytest.approx(101 * 0.033, rel=0.1)
+        with xr.open_dataset(measured / step["file"]) as data:
+            whole = (slice(4, -4), slice(4, -4))
+            assert (data["strain_status"].values[whole] == 0).all()
+            for name in ("exx", "eyy", "exy"):
+                off, sigma = (1e6 * data[n].values[whole] for n in (name, f"sigma_{name}"))
+                assert np.abs(off).max() < 5 * sigma.max()
+                assert np.median(data[f"sigma_{name}"].values[data["strain_status"].values == 0]) * 1e6 == (
+                    pytest.approx(strain["noise_floor_microstrain"][name], rel=1e-4)
+                )
+                assert sigma.max() < 150.0
+            assert np.isnan(data["exx"].values[data["strain_status"].values != 0]).all()
+    with xr.open_dataset(measured / "step_0000.nc") as data:
+        assert "exx" not in data
+
+
+def test_strain_off_and_other_strain(folder: Path, tmp_path: Path) -> None:
+    two = {name: [str(folder / f"{name}_{n}.tif") for n in (0, 2)] for name in ("cam1", "cam2")}
+    assert main(command(folder, tmp_path / "off", roi="60,60,120,120", strain="off", **two)) == 0
+    summary = json.loads((tmp_path / "off" / "summary.json").read_text())
+    assert summary["settings"]["strain"] is None
+    assert summary["steps"][1]["strain"] is None
+    with xr.open_dataset(tmp_path / "off" / "step_0001.nc") as data:
+        assert "exx" not in data
+    more = {"strain": "5", "strain-order": "2", "strain-tensor": "hencky"}
+    assert main(command(folder, tmp_path / "on", roi="60,60,120,120", **more, **two)) == 0
+    with xr.open_dataset(tmp_path / "on" / "step_0001.nc") as data:
+        assert "Hencky" in data["exx"].long_name
+        assert data["exx"].window_points == 5
+        assert json.loads(data.attrs["strain"])["order"] == 2
+
+
 def fails(arguments: list[str], code: str, word: str, capfd: Any) -> None:
     assert main(arguments) == 1
     err = capfd.readouterr().err
@@ -199,6 +239,9 @@ def fails(arguments: list[str], code: str, word: str, capfd: Any) -> None:
 
 
 BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
+    ({"strain": "4"}, "option_out_of_range", "--strain"),
+    ({"strain": "wide"}, "option_out_of_range", "--strain"),
+    ({"strain": "103"}, "option_out_of_range", "--strain"),
     ({"cam1": "IN/none_*.tif"}, "file_missing", "none_"),
     ({"cam2": ["IN/cam2_0.tif", "IN/none.tif"]}, "file_missing", "none.tif"),
     ({"cam2": ["IN/cam2_0.tif"]}, "counts_differ", "3 images"),

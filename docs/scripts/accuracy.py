@@ -24,6 +24,7 @@ from docs.scripts import (
     accuracy_large,
     accuracy_matching,
     accuracy_noise,
+    accuracy_strain,
 )
 from docs.scripts.table import Row, Section
 
@@ -39,6 +40,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "rotation": accuracy_matching.rotation,
     "epipolar": accuracy_matching.epipolar,
     **accuracy_curved.SECTIONS,
+    **accuracy_strain.SECTIONS,
     "large": accuracy_large.large_motion,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,

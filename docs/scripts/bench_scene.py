@@ -78,7 +78,7 @@ class SequenceFiles:
         """Arguments of ``stereorig measure``."""
         return [
             "measure", "--cam1", f"{self.folder}/cam1_*.{self.suffix}", "--cam2", f"{self.folder}/cam2_*.{self.suffix}",
-            "--calibration", str(self.folder / "calibration.json"), "--roi", roi, "--out", str(out), *more,
+            "--calibration", str(self.folder / "calibration.json"), "--roi", roi, "--out", str(out), "--strain", "off", *more,
         ]  # fmt: skip
 
 

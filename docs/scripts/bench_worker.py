@@ -26,7 +26,7 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
     arguments = [
         "measure", "--cam1", *job["files1"][:last], "--cam2", *job["files2"][:last],
         "--calibration", job["calibration"], "--roi", ",".join(map(str, run["region_px"])),
-        "--subset", str(run["subset_px"]), "--step", str(job["step_px"]), "--out", str(out),
+        "--subset", str(run["subset_px"]), "--step", str(job["step_px"]), "--out", str(out), "--strain", "off",
         *(text for name, value in run["options"].items() for text in (f"--{name}", str(value))),
     ]  # fmt: skip
     said = io.StringIO()

@@ -9,6 +9,7 @@ from pathlib import Path
 from core.errors import FileFormatError, ImageError, InputError
 from core.field.images import check_calibrated_size
 from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS
+from core.strain.options import DEFAULT_WINDOW, STRAIN_TENSORS, WIDEST_WINDOW, StrainOptions
 from server.cli.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.region import check_odd, check_region, parse_rectangle
 from server.cli.sequence import CheckedPair, MeasureJob, measure_sequence
@@ -30,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
     add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
+    add("--crack", action="append", default=[], metavar="X0,Y0,X1,Y1[,...]",
+        help="a line over which nothing reaches, through these places of camera 1's first image")  # fmt: skip
+    add("--hole", action="append", default=[], metavar="X0,Y0,X1,Y1,X2,Y2[,...]",
+        help="a polygon inside which nothing is measured")  # fmt: skip
     add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
     add("--step", default="10", metavar="PX", help="distance of the points (10)")
     add("--patch", choices=PATCH_SETTINGS, default=DEFAULT_PATCH,
@@ -38,6 +43,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
     add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
     add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
+    add(
+        "--strain",
+        default=str(DEFAULT_WINDOW),
+        metavar="WINDOW|off",
+        help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide ({DEFAULT_WINDOW})",
+    )
+    add("--strain-order", choices=("1", "2"), default="1", help="fit planes (1) or quadratics (2) over the gauge (1)")
+    add("--strain-tensor", choices=STRAIN_TENSORS, default="green_lagrange",
+        help="which strain is told (green_lagrange)")  # fmt: skip
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
@@ -53,6 +67,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _missing(option: str) -> InputError:
     return InputError(f"{option} is missing.", code="option_missing", remedy="See stereorig measure --help.")
+
+
+def _strain_options(args: argparse.Namespace) -> StrainOptions | None:
+    if args.strain == "off":
+        return None
+    window = check_odd("--strain", args.strain, low=3, high=WIDEST_WINDOW, odd=True)
+    return StrainOptions(window=window, order=2 if args.strain_order == "2" else 1, tensor=args.strain_tensor)
 
 
 def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
@@ -78,6 +99,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     subset = check_odd("--subset", args.subset, low=SUBSET_RANGE_PX[0], high=SUBSET_RANGE_PX[1], odd=True)
     step = check_odd("--step", args.step, low=STEP_RANGE_PX[0], high=STEP_RANGE_PX[1], odd=False)
     rectangle = None if args.roi is None else parse_rectangle(args.roi)
+    strain = _strain_options(args)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
     calibration_file = Path(args.calibration) if args.calibration or folder is None else folder / "calibration.json"
@@ -91,12 +113,12 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     mask_file = None if args.mask is None else Path(args.mask)
     noise = None if args.noise is None else load_noise(args.noise)
     region = check_region(rectangle, image_shape=shapes[0], subset_px=subset, step_px=step,
-                          mask_path=mask_file, seeds=args.seed)  # fmt: skip
+                          mask_path=mask_file, seeds=args.seed, cracks=args.crack, holes=args.hole)  # fmt: skip
     pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     return MeasureJob(
         calibration=calibration, calibration_file=calibration_file, pairs=pairs, region=region, subset_px=subset,
         step_px=step, patch=args.patch, interpolation=args.interpolation, mask_file=mask_file, out=out,
-        noise=noise,
+        noise=noise, strain=strain,
     )  # fmt: skip
 
 

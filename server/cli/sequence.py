@@ -22,6 +22,7 @@ from core.field.extrapolated import mark_extrapolated
 from core.field.images import MeasureImage
 from core.field.patch import PatchSetting
 from core.field.result import Field
+from core.strain import StrainOptions
 from server.cli.image_lists import ImagePair
 from server.cli.region import RegionRequest
 from server.cli.terminal import ProgressLine, duration
@@ -34,11 +35,22 @@ from server.io.netcdf import Provenance, write_field
 from server.io.noise_json import LoadedNoise
 from server.io.summary import summarise, to_json
 from server.overlap import ReadAhead, WriteBehind
+from server.straining import strain_of_step, strain_settings, summarise_strain
 from server.version import software_version
 
 _LEAST_OF_STATED, _MOST_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
 _RESULT = re.compile(r"step_\d{4}\.nc")
+
+
+def _strain_noise(strain: dict[str, Any] | None) -> str:
+    """What a step's line says of its strain."""
+    if strain is None:
+        return ""
+    if strain["points"] == 0:
+        return f"no strain (no window of {strain['window']} points is whole enough), "
+    floor = strain["noise_floor_microstrain"]["exx"]
+    return f"strain noise {floor:.0f} microstrain over {strain['gauge_mm']:.3g} mm, "
 
 
 @dataclass(frozen=True)
@@ -64,6 +76,7 @@ class MeasureJob:
     mask_file: Path | None
     out: Path
     noise: LoadedNoise | None = None
+    strain: StrainOptions | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return what the result depends on besides its inputs."""
@@ -72,8 +85,10 @@ class MeasureJob:
             "roi": list(self.region.rectangle_px), "subset_px": self.subset_px, "step_px": self.step_px,
             "patch": self.patch, "interpolation": self.interpolation,
             "seeds": None if seeds is None else seeds.tolist(),
+            "cracks": list(self.region.cracks_px), "holes": list(self.region.holes_px),
             "mask": None if self.mask_file is None else str(self.mask_file),
             "noise": None if self.noise is None else self.noise.record(),
+            "strain": strain_settings(self.strain),
         }  # fmt: skip
 
 
@@ -199,17 +214,19 @@ class _Runner:
         pair = self._job.pairs[n]
         result = mark_extrapolated(result, self._volume)
         name = f"step_{n:04d}.nc"
-        write_field(self._job.out / name, result, self._provenance(n))
+        strain = strain_of_step(result, self._job.strain, subset_px=self._job.subset_px)
+        write_field(self._job.out / name, result, self._provenance(n), strain)
         summary = {
             "step": n, "file": name, "cam1": str(pair.files.cam1), "cam2": str(pair.files.cam2),
             "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]}, **summarise(result, rbe_px=self._rbe_px),
+            "strain": None if strain is None else summarise_strain(strain),
             "seconds": round(time.monotonic() - started, 3),
         }  # fmt: skip
         rms = summary["epipolar_residual_rms_px"]
         residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
             f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
-            f"{residual}{duration(summary['seconds'])}"
+            f"{residual}{_strain_noise(summary['strain'])}{duration(summary['seconds'])}"
         )
         self._say_choice(n, result)
         check = summary["epipolar_check"]

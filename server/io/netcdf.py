@@ -24,7 +24,9 @@ from core.field.cuts import Cuts, as_arrays, from_arrays
 from core.field.patch import PatchChoice
 from core.field.result import Field
 from core.status import STATUS_MEANINGS, PointStatus
+from core.strain import StrainField
 from server.io.files import written_aside
+from server.io.strain_netcdf import put_strain
 
 FORMAT_VERSION = 1
 _NEARLY_FULL_BYTES = 1 << 20
@@ -149,7 +151,7 @@ def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
     )
 
 
-def _fill(dataset: Any, result: Field, provenance: Provenance) -> None:
+def _fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainField | None) -> None:
     dataset.set_fill_off()
     rows, cols = result.shape
     sparse = float(np.mean(~result.valid)) >= _MANY_EMPTY
@@ -171,6 +173,8 @@ def _fill(dataset: Any, result: Field, provenance: Provenance) -> None:
     _put_covariance(dataset, result, sparse=sparse)
     if result.cuts:
         _put_cuts(dataset, result.cuts)
+    if strain is not None:
+        put_strain(dataset, strain, sparse=sparse)
     dataset.setncatts(_attributes(provenance, moved=result.has_motion))
     if result.patch is not None:
         dataset.setncatts({
@@ -229,7 +233,7 @@ def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
     }
 
 
-def write_field(path: str | Path, result: Field, provenance: Provenance) -> None:
+def write_field(path: str | Path, result: Field, provenance: Provenance, strain: StrainField | None = None) -> None:
     """Write one result file: aside, synced, renamed.
 
     Parameters
@@ -240,6 +244,8 @@ def write_field(path: str | Path, result: Field, provenance: Provenance) -> None
         A shape (no ``uvw_mm``) or a displacement field.
     provenance
         What it was made from and how.
+    strain
+        Of the same points, if it was computed; :func:`server.io.strain_netcdf.read_strain` reads it back.
 
     Raises
     ------
@@ -249,7 +255,7 @@ def write_field(path: str | Path, result: Field, provenance: Provenance) -> None
     with written_aside(Path(path)) as aside:
         try:
             with netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
-                _fill(dataset, result, provenance)
+                _fill(dataset, result, provenance, strain)
         except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
             full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
@@ -326,3 +332,12 @@ def read_attributes(path: str | Path) -> dict[str, Any]:
         if name in attributes:
             attributes[name] = json.loads(attributes[name])
     return attributes
+
+
+def field_variable(result: Field, name: str) -> tuple[NDArray[np.float64], str, str] | None:
+    """Return values (r, c), unit and meaning of a variable as a result file would hold it; None for others."""
+    for v in _SHAPE + _MOTION + _CURVATURE:
+        values = getattr(result, v.attribute) if v.name == name else None
+        if values is not None:
+            return values if v.component is None else values[..., v.component], v.units, v.long_name
+    return None
