@@ -18,7 +18,8 @@ def make_grid(settings: Mapping[str, Any], mask: NDArray[np.bool_] | None, image
     Parameters
     ----------
     settings
-        ``region`` (``rectangle``, ``polygon``), ``step_px``, ``subset_px`` and ``seeds`` as the API takes them.
+        ``region`` (``rectangle``, ``polygon``, ``cracks``, ``holes``), ``step_px``, ``subset_px`` and
+        ``seeds`` as the API takes them.
     mask
         (rows, cols) True where points may lie, or None.
     image_shape
@@ -27,7 +28,8 @@ def make_grid(settings: Mapping[str, Any], mask: NDArray[np.bool_] | None, image
     Raises
     ------
     RegionError
-        ``region_empty``, ``region_outside_image``, ``region_too_small``, ``mask_size``, ``seed_outside``.
+        ``region_empty``, ``region_outside_image``, ``region_too_small``, ``mask_size``, ``seed_outside``,
+        ``cut_invalid``, ``cut_outside_image``.
     """
     if mask is not None and mask.shape != image_shape:
         raise RegionError(
@@ -47,6 +49,8 @@ def make_grid(settings: Mapping[str, Any], mask: NDArray[np.bool_] | None, image
         raise RegionError("The region names no rectangle, no polygon and no mask.", code="region_empty")
     if mask is not None:
         grid = grid.within_mask(mask)
+    # analyses from before there were cracks and holes do not name them
+    grid = grid.without_holes(region.get("holes") or []).with_cracks(region.get("cracks") or [])
     check_region(grid, image_shape=image_shape, subset_px=settings["subset_px"])
     rows, cols = image_shape
     for x, y in settings["seeds"] or []:

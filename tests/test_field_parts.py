@@ -195,7 +195,17 @@ def test_the_neighbour_kernel_knows_no_blocks() -> None:
     w[..., 0] = depth
     difference, spread = np.full((2, rows, cols, 4), np.nan)
     count = np.zeros((rows, cols), np.int32)
-    arrays = (np.zeros((rows, cols, 3)), w, np.zeros((rows, cols, 3, 3)), False, difference, spread, count)
+    nothing_between = np.zeros((0, 0), np.uint32)
+    arrays = (
+        nothing_between,
+        np.zeros((rows, cols, 3)),
+        w,
+        np.zeros((rows, cols, 3, 3)),
+        False,
+        difference,
+        spread,
+        count,
+    )
     for r in range(rows):
         compare_with_neighbours(r, r + 1, sorting_network(24), ok, *arrays)
     for r, c in np.ndindex(rows, cols):

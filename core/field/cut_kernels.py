@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 from numba import njit
 
 
@@ -29,3 +32,182 @@ def cross(first, last, a, b, pieces, out):
     """Fill ``out`` (n,) bool: whether the lines from a (n, 2) to b (n, 2) meet any of the pieces (m, 4)."""
     for i in range(first, last):
         out[i] = meets(a[i, 0], a[i, 1], b[i, 0], b[i, 1], pieces)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def stays_white(ax, ay, bx, by, white):
+    """Whether the line from a to b stays on the white of a mask (rows, cols), which may be empty: no mask.
+
+    Looked at every half pixel or closer; what lies off the mask's array counts as white.
+    """
+    rows, cols = white.shape
+    if rows == 0:
+        return True
+    steps = math.ceil(2.0 * max(abs(bx - ax), abs(by - ay)))
+    for s in range(steps + 1):
+        t = s / steps if steps > 0 else 0.0
+        c, r = math.floor(ax + t * (bx - ax) + 0.5), math.floor(ay + t * (by - ay) + 0.5)
+        if 0 <= c < cols and 0 <= r < rows and white[r, c] == 0:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def part(first, last, a, b, pieces, white, out):
+    """Fill ``out`` (n,) bool: whether the lines from a to b (n, 2) meet a piece or leave the white."""
+    for i in range(first, last):
+        out[i] = meets(a[i, 0], a[i, 1], b[i, 0], b[i, 1], pieces) or not stays_white(
+            a[i, 0], a[i, 1], b[i, 0], b[i, 1], white
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def parted_neighbours(first, last, x, y, reach, pieces, white, out):
+    """Fill ``out`` (r, c) uint32: bit k is set where neighbour k of a point cannot be seen from it.
+
+    Neighbours in rows and columns from -reach to reach, row by row, the point itself left out.
+    """
+    rows, cols = x.shape
+    for r in range(first, last):
+        for c in range(cols):
+            bits, bit = np.uint32(0), np.uint32(1)
+            for dr in range(-reach, reach + 1):
+                for dc in range(-reach, reach + 1):
+                    if dr == 0 and dc == 0:
+                        continue
+                    i, j = r + dr, c + dc
+                    inside = 0 <= i < rows and 0 <= j < cols
+                    if inside and (
+                        meets(x[r, c], y[r, c], x[i, j], y[i, j], pieces)
+                        or not stays_white(x[r, c], y[r, c], x[i, j], y[i, j], white)
+                    ):
+                        bits |= bit
+                    bit <<= np.uint32(1)
+            out[r, c] = bits
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def passes_box(piece, x0, y0, x1, y1):
+    """Whether a piece (4,) has a point in a box (Liang and Barsky's clipping)."""
+    t0, t1 = 0.0, 1.0
+    for k in range(2):
+        start, along = piece[k], piece[2 + k] - piece[k]
+        low, high = (x0, x1) if k == 0 else (y0, y1)
+        if along == 0.0:
+            if start < low or start > high:
+                return False
+            continue
+        a, b = (low - start) / along, (high - start) / along
+        t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
+        if t0 > t1:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def squared_distance(x, y, piece):
+    """Square of the distance of a place from a piece (4,)."""
+    ux, uy = piece[2] - piece[0], piece[3] - piece[1]
+    length = ux * ux + uy * uy
+    t = ((x - piece[0]) * ux + (y - piece[1]) * uy) / length if length > 0.0 else 0.0
+    t = min(max(t, 0.0), 1.0)
+    dx, dy = x - piece[0] - t * ux, y - piece[1] - t * uy
+    return dx * dx + dy * dy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_near(first, last, xy, subset, margin, pieces, black_sums, out):
+    """Fill ``out`` (n,) bool: whether a piece or black pixels lie in a point's subset, or within ``margin`` px of it.
+
+    ``black_sums`` is the integral image of the mask's black, (rows + 1, cols + 1), or empty.
+    """
+    half = 0.5 * (subset - 1) + margin
+    rows, cols = black_sums.shape[0] - 1, black_sums.shape[1] - 1
+    for i in range(first, last):
+        x, y = xy[i, 0], xy[i, 1]
+        near = False
+        if rows > 0:
+            left, right = math.floor(x - half - 0.5), math.ceil(x + half + 0.5) + 1
+            top, bottom = math.floor(y - half - 0.5), math.ceil(y + half + 0.5) + 1
+            left, right = min(max(left, 0), cols), min(max(right, 0), cols)
+            top, bottom = min(max(top, 0), rows), min(max(bottom, 0), rows)
+            near = (
+                black_sums[bottom, right] - black_sums[top, right] - black_sums[bottom, left] + black_sums[top, left]
+            ) > 0
+        for m in range(pieces.shape[0]):
+            if near:
+                break
+            # the subset's pixels lie about the pixel nearest to the point
+            near = passes_box(pieces[m], x - half - 0.5, y - half - 0.5, x + half + 0.5, y + half + 0.5)
+        out[i] = near
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def look(first, last, xy, subset, margin, pieces, white, clear, patches, counts):
+    """Fill ``patches`` (n, subset, subset) uint8: 1 where the point sees the pixel, and the pixel may count.
+
+    Parameters
+    ----------
+    first, last
+        Points to do.
+    xy
+        (n, 2) points.
+    subset, margin
+        Width of the subset, and how near to a piece no pixel counts, px.
+    pieces
+        (m, 4).
+    white, clear
+        The mask's white, along which lines must stay, and what of it may count; both empty without a mask.
+    patches, counts
+        Out; counts (n,) int32 the number of ones.
+    """
+    rows, cols = white.shape
+    half = 0.5 * (subset - 1)
+    near = np.empty(pieces.shape)
+    for i in range(first, last):
+        x, y = xy[i, 0], xy[i, 1]
+        left, top = math.floor(x - half + 0.5), math.floor(y - half + 0.5)
+        n_near = 0
+        reach = half + margin + 0.5
+        for m in range(pieces.shape[0]):
+            if passes_box(pieces[m], x - reach, y - reach, x + reach, y + reach):
+                for k in range(4):
+                    near[n_near, k] = pieces[m, k]
+                n_near += 1
+        local = near[:n_near]
+        count = 0
+        for r in range(subset):
+            for c in range(subset):
+                px, py = float(left + c), float(top + r)
+                seen = True
+                if rows > 0 and 0 <= top + r < rows and 0 <= left + c < cols:
+                    seen = clear[top + r, left + c] != 0
+                for m in range(n_near):
+                    if not seen:
+                        break
+                    seen = squared_distance(px, py, local[m]) >= margin * margin
+                seen = seen and not meets(x, y, px, py, local) and stays_white(x, y, px, py, white)
+                patches[i, r, c] = 1 if seen else 0
+                count += 1 if seen else 0
+        counts[i] = count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def variances(first, last, image, xy, patches, out):
+    """Fill ``out`` (n,): variance of an image's grey levels over the pixels that count of each point's patch."""
+    subset = patches.shape[1]
+    half = 0.5 * (subset - 1)
+    rows, cols = image.shape
+    for i in range(first, last):
+        left, top = math.floor(xy[i, 0] - half + 0.5), math.floor(xy[i, 1] - half + 0.5)
+        n, s, ss, base = 0, 0.0, 0.0, 0.0
+        for r in range(subset):
+            for c in range(subset):
+                if patches[i, r, c] != 0 and 0 <= top + r < rows and 0 <= left + c < cols:
+                    g = float(image[top + r, left + c])
+                    if n == 0:
+                        base = g
+                    n += 1
+                    s += g - base
+                    ss += (g - base) ** 2
+        out[i] = max(ss - s * s / n, 0.0) / n if n > 0 else 0.0

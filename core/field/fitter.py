@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.sight import Sight
 from core.field.starts import depth_per_px, faces_both_cameras
 from core.lens import Bool, Float
 from core.matching.fit import fit_motion, fit_shape
@@ -99,6 +100,8 @@ class Fitter:
     ----------
     least_zncc
         Correlation below which no comparison counts as a match, whatever the field looks like.
+    sight
+        What the points see of their subsets; None: all of it.
     """
 
     pair: StereoPair
@@ -108,6 +111,7 @@ class Fitter:
     cur2: ImageData | None
     options: MatchOptions
     least_zncc: float
+    sight: Sight | None = None
 
     @property
     def comparisons(self) -> int:
@@ -134,15 +138,16 @@ class Fitter:
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and refuse those that cannot be right on their own."""
         n = len(xy_px)
+        visible = None if self.sight is None else self.sight.at(xy_px)
         w, G = self._terms_of(w), None if G is None else self._terms_of(G)
         if self.cur1 is None or self.cur2 is None:
-            s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options)
+            s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options, visible)
             fits = PointFits(
                 s.w, np.full((n, 3, self.terms), np.nan), s.zncc, s.epipolar_px, s.epipolar_sigma_px, s.noise,
                 s.covariance, s.iterations, s.status,
             )  # fmt: skip
         else:
-            m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options)
+            m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options, visible)
             fits = PointFits(
                 m.w, m.G, m.zncc, m.epipolar_px, m.epipolar_sigma_px, m.noise, m.covariance, m.iterations, m.status,
             )  # fmt: skip

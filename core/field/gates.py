@@ -12,9 +12,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from core.field.fitter import PointFits
 from core.field.kernels import N_QUANTITIES, compare_with_neighbours, sorting_network
+from core.field.sight import Sight
 from core.field.starts import depth_per_px
 from core.lens import Bool, Float
 from core.status import PointStatus
@@ -71,6 +74,7 @@ def apply_gates(
     rays: Float,
     texture: Float,
     options: GateOptions,
+    sight: Sight | None = None,
 ) -> int:
     """Refuse points in place; returns how many.
 
@@ -88,6 +92,8 @@ def apply_gates(
         (n,) grey-level variance of camera 1's subset.
     options
         Limits.
+    sight
+        Which points see each other; all of them when left out.
     """
     before = int(points.ok.sum())
     few = before < _FEW
@@ -95,11 +101,11 @@ def apply_gates(
     if not few:
         _gate_correlation(points, terms, texture, options)
     for _ in range(2):
-        if _gate_neighbours(points, pair, shape, rays, options, few=few) == 0:
+        if _gate_neighbours(points, pair, shape, rays, options, sight, few=few) == 0:
             break
     if not few:
         _gate_epipolar(points, terms, options)
-        _gate_clusters(points, shape, options)
+        _gate_clusters(points, shape, options, sight)
     return before - int(points.ok.sum())
 
 
@@ -140,7 +146,7 @@ def _gate_epipolar(points: PointFits, terms: Float, options: GateOptions) -> Non
 
 
 def neighbour_disagreement(
-    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float
+    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, sight: Sight | None = None
 ) -> tuple[Float, Float, NDArray[np.int32]]:
     """Return (n, 4) disagreement with the neighbours and its local spread in px, and how many neighbours spoke.
 
@@ -152,8 +158,9 @@ def neighbour_disagreement(
     spread = np.full((rows, cols, N_QUANTITIES), np.nan)
     count = np.zeros((rows, cols), np.int32)
     motion = points.zncc.shape[1] == 3
+    parted = np.zeros((0, 0), np.uint32) if sight is None else sight.parted
     arrays = (
-        _NETWORK, points.ok.reshape(shape), np.ascontiguousarray(rays.reshape(rows, cols, 3)),
+        _NETWORK, points.ok.reshape(shape), parted, np.ascontiguousarray(rays.reshape(rows, cols, 3)),
         np.ascontiguousarray(points.w.reshape(rows, cols, -1)),
         np.ascontiguousarray(points.G.reshape(rows, cols, 3, -1)), motion, difference, spread, count,
     )  # fmt: skip
@@ -174,10 +181,11 @@ def _gate_neighbours(
     shape: tuple[int, int],
     rays: Float,
     options: GateOptions,
+    sight: Sight | None,
     *,
     few: bool,
 ) -> int:
-    difference, spread, count = neighbour_disagreement(points, pair, shape, rays)
+    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, sight)
     ok = points.ok
     bad = np.zeros(len(ok), bool)
     heard = ok & (count >= 2)
@@ -196,13 +204,32 @@ def _gate_neighbours(
     return int(bad.sum())
 
 
-def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions) -> None:
+def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions, sight: Sight | None) -> None:
+    if sight is not None:
+        group = _connected(points.ok, shape, sight)
+        points.refuse(points.ok & (np.bincount(group)[group] < options.least_cluster), PointStatus.NEIGHBOUR_MISMATCH)
+        return
     n, labels, facts, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
     if n < 2:
         return
     size = facts[:, cv2.CC_STAT_AREA].copy()
     size[0] = options.least_cluster
     points.refuse((size[labels] < options.least_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
+
+
+def _connected(ok: Bool, shape: tuple[int, int], sight: Sight) -> NDArray[np.int32]:
+    """Label (n,) the groups of points that are connected through neighbours that see each other."""
+    rows, cols = shape
+    place = np.arange(rows * cols).reshape(shape)
+    ends = []
+    for dr, dc in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        here = place[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
+        there = here + dr * cols + dc
+        together = ok[here] & ok[there] & ~sight.parted_at(dr, dc)[here]
+        ends.append(np.stack([here[together], there[together]]))
+    a, b = np.concatenate(ends, axis=1)
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
 
 
 def _smooth_terms(xy: Float) -> Float:

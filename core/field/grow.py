@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.fitter import Fitter, PointFits
+from core.field.sight import Sight
 from core.field.starts import move_matrix, move_w
 from core.lens import Bool, Float
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
@@ -61,7 +62,7 @@ class Attempts:
     Attributes
     ----------
     neighbours
-        (n, 8) index of each point's neighbours, -1 outside the grid.
+        (n, 8) index of each point's neighbours, -1 outside the grid and where a cut lies between.
     tried
         (n, 8) from which of them the point was started before.
     left
@@ -73,13 +74,16 @@ class Attempts:
     left: NDArray[np.int8]
 
     @staticmethod
-    def on(shape: tuple[int, int]) -> Attempts:
+    def on(shape: tuple[int, int], sight: Sight | None = None) -> Attempts:
         """Return the attempts of a grid of (rows, cols) on which nothing was tried."""
         n = shape[0] * shape[1]
         places = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
         places[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
         rows, cols = slice(1, -1), slice(1, -1)
         neighbours = np.stack([np.roll(places, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1)
+        if sight is not None:
+            for k, (dr, dc) in enumerate(_OFFSETS):
+                neighbours[sight.parted_at(int(dr), int(dc)), k] = -1
         return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
 
 

@@ -74,7 +74,7 @@ def _medians(values, network, n, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def compare_with_neighbours(first, last, network, ok, rays, w, G, motion, difference, spread, count):
+def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion, difference, spread, count):
     """Own value minus the median of the neighbours' predictions, and the predictions' median absolute deviation.
 
     Parameters
@@ -85,6 +85,8 @@ def compare_with_neighbours(first, last, network, ok, rays, w, G, motion, differ
         ``sorting_network(24)``.
     ok
         (r, c) bool.
+    parted
+        (r, c) uint32, see ``core.field.cut_kernels.parted_neighbours``; empty where nothing parts neighbours.
     rays, w, G
         (r, c, 3), (r, c, 3 or more), (r, c, 3, 3 or more).
     motion
@@ -119,6 +121,8 @@ def compare_with_neighbours(first, last, network, ok, rays, w, G, motion, differ
                         for c in range(max(start, -dc), min(stop, cols - dc)):
                             j = c + dc
                             if not ok[r, c] or not ok[i, j]:
+                                continue
+                            if parted.shape[0] > 0 and (parted[r, c] >> np.uint32(place)) & np.uint32(1):
                                 continue
                             k = c - start
                             n[k] += 1

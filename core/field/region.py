@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,9 @@ class PointGrid:
     extent_px
         (x0, y0, x1, y1) of the region that was asked for.
     cuts
-        Lines over which nothing reaches, or None.
+        Lines over which nothing reaches, cracks and borders of holes; or None.
+    white
+        (rows, cols) of camera 1's image, True where the mask lets the surface be seen; None without a mask.
     """
 
     x_px: Float
@@ -38,6 +41,7 @@ class PointGrid:
     step_px: float
     extent_px: tuple[float, float, float, float]
     cuts: Cuts | None = None
+    white: Bool | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -117,10 +121,41 @@ class PointGrid:
             border |= _distance_to_segment(self.x_px, self.y_px, xa, ya, xb, yb) < 1e-9
         return replace(self, allowed=self.allowed & (inside | border))
 
+    def with_cracks(self, lines_px: Iterable[ArrayLike]) -> PointGrid:
+        """Add cracks: polylines (n, 2) over which nothing reaches.
+
+        Raises
+        ------
+        RegionError
+            ``cut_invalid``.
+        """
+        return self._with_cuts(Cuts(lines_px))
+
+    def without_holes(self, polygons_px: Iterable[ArrayLike]) -> PointGrid:
+        """Take the points inside holes (polygons, (n, 2)) away, and let nothing reach over their borders.
+
+        Raises
+        ------
+        RegionError
+            As :meth:`polygon`.
+        """
+        grid = self
+        for polygon in polygons_px:
+            v = _vertices(polygon)
+            inside = replace(grid, allowed=np.ones(grid.shape, bool)).within_polygon(v).allowed
+            border = Cuts([np.concatenate([v, v[:1]])])
+            grid = replace(grid, allowed=grid.allowed & ~inside)._with_cuts(border)
+        return grid
+
+    def _with_cuts(self, more: Cuts) -> PointGrid:
+        lines = (*(self.cuts.lines_px if self.cuts else ()), *more.lines_px)
+        return replace(self, cuts=Cuts(lines) if lines else None)
+
     def within_mask(self, mask: ArrayLike) -> PointGrid:
         """Keep only the points whose centre lies on the white (non-zero) of a mask the size of camera 1's image.
 
-        Points off the mask's array are left alone: they lie outside the image, and are refused as such.
+        Their subsets are cut to the white that the centre sees. Points off the mask's array are left
+        alone: they lie outside the image, and are refused as such.
         """
         m = np.asarray(mask).astype(bool)
         if m.ndim != 2:
@@ -128,7 +163,8 @@ class PointGrid:
         col, row = np.rint(self.x_px).astype(np.int64), np.rint(self.y_px).astype(np.int64)
         off = (col < 0) | (row < 0) | (col >= m.shape[1]) | (row >= m.shape[0])
         white = m[np.clip(row, 0, m.shape[0] - 1), np.clip(col, 0, m.shape[1] - 1)]
-        return replace(self, allowed=self.allowed & (white | off))
+        both = m if self.white is None or self.white.shape != m.shape else m & self.white
+        return replace(self, allowed=self.allowed & (white | off), white=both)
 
 
 def check_region(
@@ -159,10 +195,21 @@ def check_region(
     Raises
     ------
     RegionError
-        ``subset_invalid``, ``region_outside_image``, ``region_too_small``, ``region_empty``, ``mask_size``.
+        ``subset_invalid``, ``region_outside_image``, ``region_too_small``, ``region_empty``, ``mask_size``,
+        ``cut_outside_image``.
     """
     rows, cols = image_shape
     check_subset(subset_px)
+    for line in grid.cuts.lines_px if grid.cuts else ():
+        off = (line < -0.5).any(axis=1) | (line[:, 0] > cols - 0.5) | (line[:, 1] > rows - 0.5)
+        if off.any():
+            x, y = line[int(np.argmax(off))]
+            raise RegionError(
+                f"a crack or a hole's border goes through ({x:g}, {y:g}), outside camera 1's image of "
+                f"{cols} x {rows} px.",
+                code="cut_outside_image",
+                remedy="Draw it in camera 1's reference image.",
+            )
     if mask_shape is not None and tuple(mask_shape) != (rows, cols):
         raise RegionError(
             f"the mask is {mask_shape[1]} x {mask_shape[0]} px, camera 1's image {cols} x {rows} px.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from core.field.features import Box
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import apply_gates
 from core.field.grow import Attempts, fit_in_batches, grow
-from core.field.images import MeasureImage, different, features_of, same_size
+from core.field.images import MeasureImage, different, features_of, refuse_stale, same_size
 from core.field.patch import UsedPatch, asked_for
 from core.field.patch_choice import advise, choose_patch
 from core.field.plane_error import plane_error
@@ -34,6 +35,7 @@ from core.field.seeds import (
     swept_places,
 )
 from core.field.settings import MeasureOptions
+from core.field.sight import sight_of
 from core.field.starts import Starts
 from core.field.unreached import mark_outside
 from core.field.where import box_around, scales, seen_by_camera2
@@ -75,6 +77,9 @@ class Run:
         self.ref1, self.ref2 = MeasureImage(ref1, "camera 1's image"), MeasureImage(ref2, "camera 2's image")
         self.cur1 = None if cur1 is None else MeasureImage(cur1, "camera 1's image at t")
         self.cur2 = None if cur2 is None else MeasureImage(cur2, "camera 2's image at t")
+        self.sight = sight_of(grid, self.options.subset_px)
+        if self.sight is not None:
+            self.grid = grid = replace(grid, allowed=grid.allowed & self.sight.enough)
         self.fits_image = check_region(grid, image_shape=self.ref1.shape, subset_px=self.options.subset_px)
         if self.cur1 is None or self.cur2 is None:
             self.ref1.refuse_blank(grid.extent_px)
@@ -86,6 +91,7 @@ class Run:
             self.cur1.refuse_blank()
             self.cur2.refuse_blank()
             different(self.cur1, self.cur2)
+            refuse_stale(self.ref1, self.ref2, self.cur1, self.cur2)
         self.xy_px = grid.xy_px.reshape(-1, 2)
         self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
         self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
@@ -98,6 +104,7 @@ class Run:
             cur2=None if self.cur2 is None else self.cur2.prepared(kind, noise2),
             options=self.options.match_options(),
             least_zncc=self.options.least_zncc,
+            sight=self.sight,
         )
         asked = self.options.patch
         plane: UsedPatch = "plane" if cur1 is None else self.fitter.options.patch
@@ -106,8 +113,10 @@ class Run:
         self.known_w: Float | None = None
         self.hoped_for = self.usable  # where new seeds are worth their time
         self.checked = False  # whether every point that stands went through the gates
-        self.attempts = Attempts.on(grid.shape)
+        self.attempts = Attempts.on(grid.shape, self.sight)
         self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px)
+        if self.sight is not None:
+            self.texture = self.sight.correct_variance(self.texture, self.ref1.pixels)
 
     # seeds
 
@@ -218,7 +227,7 @@ class Run:
         return found
 
     def _swept_shape(self) -> None:
-        for i in swept_places(self.xy_px, self.usable):
+        for i in swept_places(self.xy_px, self._rather_whole(self.usable)):
             raise_if_cancelled(self.cancel)
             found = sweep_shape(self.fitter, self.ref1.pixels, self.ref2.pixels, self.xy_px[i])
             if found.ok[0]:
@@ -228,11 +237,16 @@ class Run:
         if self.known_w is None:
             return
         known = self.usable & np.isfinite(self.known_w).all(axis=1)
-        for i in swept_places(self.xy_px, known)[:6]:
+        for i in swept_places(self.xy_px, self._rather_whole(known))[:6]:
             raise_if_cancelled(self.cancel)
             found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
             if found.ok[0]:
                 self.points.put(np.array([i]), found)
+
+    def _rather_whole(self, usable: Bool) -> Bool:
+        """Of usable points those that see all of their subset, where there are any: searches compare whole squares."""
+        whole = usable if self.sight is None else usable & self.sight.whole
+        return whole if whole.any() else usable
 
     def _user_shape(self, seeds: tuple[Seed, ...]) -> None:
         reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
@@ -348,7 +362,7 @@ class Run:
 
     def _forget_attempts(self) -> None:
         """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
-        self.attempts = Attempts.on(self.grid.shape)
+        self.attempts = Attempts.on(self.grid.shape, self.sight)
         self.attempts.left[self.usable & ~self.hoped_for] = 1
 
     def _grow(self) -> int:
@@ -362,6 +376,6 @@ class Run:
     def _gate(self) -> None:
         apply_gates(
             self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
-            options=self.options.gates,
+            options=self.options.gates, sight=self.sight,
         )  # fmt: skip
         self.checked = True

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.errors import ImageError
 from core.field.features import Box, Features, match
-from core.field.local_fit import consistent, robust_local_fits
+from core.field.local_fit import Apart, consistent, robust_local_fits
 from core.field.starts import Starts, depth_per_px
 from core.field.stretched import stretched_features, stretches
 from core.lens import Bool, Float
@@ -116,13 +116,16 @@ def _depth_tolerance(pair: StereoPair, xy1: Float, w0: Float, scale: int) -> flo
     return _DEPTH_TOLERANCE_PX * _looser(scale) * per_px
 
 
-def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float) -> Starts:
-    """Return ``w`` (n, 3) at places ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree."""
+def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float, apart: Apart | None = None) -> Starts:
+    """Return ``w`` (n, 3) at places ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree.
+
+    ``apart`` says which places do not see each other, see :func:`core.field.local_fit.robust_local_fits`.
+    """
     w = np.full((len(xy_px), 3), np.nan)
     if len(shape.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w)
     tolerance = _depth_tolerance(pair, shape.xy_px, shape.w0, shape.scale)
-    fits = robust_local_fits(xy_px, shape.xy_px, shape.w0[:, None], tolerance=tolerance)
+    fits = robust_local_fits(xy_px, shape.xy_px, shape.w0[:, None], tolerance=tolerance, apart=apart)
     centre = pair.cam1.rays_cam(xy_px).xyz_mm
     per_norm = pair.cam1.lens.image_jacobian(centre[:, :2])
     w[:, 0] = fits.value[:, 0]
@@ -131,14 +134,22 @@ def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float) -> Start
 
 
 def motion_starts(
-    pair: StereoPair, w: Float, motion: ScatteredMotion, shape_now: ScatteredShape, xy_px: Float
+    pair: StereoPair,
+    w: Float,
+    motion: ScatteredMotion,
+    shape_now: ScatteredShape,
+    xy_px: Float,
+    apart: Apart | None = None,
 ) -> Starts:
-    """Return start values at places ``xy_px`` with known shape ``w`` (n, 3), from the matches in time and at t."""
+    """Return start values at places ``xy_px`` with known shape ``w`` (n, 3), from the matches in time and at t.
+
+    ``apart`` as in :func:`shape_starts`, at t0.
+    """
     G = np.full((len(xy_px), 3, 3), np.nan)
     if len(motion.xy_px) < 4 or len(shape_now.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w, G)
     tolerance = _MOTION_TOLERANCE_PX * _looser(motion.scale)
-    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=tolerance)
+    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=tolerance, apart=apart)
     known = np.isfinite(fits.value).all(axis=1)
     if known.any():
         w_now = shape_starts(pair, shape_now, fits.value[known]).w

@@ -20,6 +20,7 @@ from core.field.scatter import (
     motion_starts,
     shape_starts,
 )
+from core.field.sight import Sight
 from core.field.starts import Starts, depth_per_px
 from core.field.sweep import sweep
 from core.lens import Bool, Float
@@ -166,13 +167,21 @@ def seeds_from_matches(
     if len(source) < 4:
         return 0
     support = np.asarray(cKDTree(source).query(xy_px, k=min(8, len(source)))[0])[:, -1]
+    if fitter.sight is not None:  # next to a cut only where there is nothing else
+        support = np.where(fitter.sight.whole, support, support + np.ptp(xy_px))
     found = 0
     for choice in spread(xy_px, usable & (points.status == PointStatus.NOT_SEEDED), support):
         index = choice
         if len(index) == 0:
             continue
         starts = starts_at(
-            fitter.pair, xy_px[index], shape, motion, shape_now, None if known_w is None else known_w[index]
+            fitter.pair,
+            xy_px[index],
+            shape,
+            motion,
+            shape_now,
+            None if known_w is None else known_w[index],
+            fitter.sight,
         )
         finite = np.isfinite(starts.w).all(axis=1)
         if starts.G is not None:
@@ -196,15 +205,17 @@ def starts_at(
     motion: ScatteredMotion | None,
     shape_now: ScatteredShape | None,
     known_w: Float | None,
+    sight: Sight | None = None,
 ) -> Starts:
-    """Return start values at places from the matches about them, taking the measured shape where there is one."""
-    w = shape_starts(pair, shape, xy_px).w
+    """Return start values at places from the matches that they see, taking the measured shape where there is one."""
+    apart = None if sight is None else sight.apart
+    w = shape_starts(pair, shape, xy_px, apart).w
     if known_w is not None:
         measured = np.isfinite(known_w).all(axis=1)
         w[measured] = known_w[measured, :3]
     if motion is None or shape_now is None:
         return Starts(w)
-    return motion_starts(pair, w, motion, shape_now, xy_px)
+    return motion_starts(pair, w, motion, shape_now, xy_px, apart)
 
 
 def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_px: Float) -> PointFits:

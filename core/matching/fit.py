@@ -29,6 +29,22 @@ FEWEST_AT_ONCE = 16
 
 
 @dataclass(frozen=True, eq=False)
+class VisiblePixels:
+    """Which pixels of a subset count, for the points that do not see all of theirs.
+
+    Attributes
+    ----------
+    patches
+        (k, subset, subset) uint8 in camera 1's reference image, zero where a pixel does not count.
+    of_point
+        (N,) int32 which patch is a point's; -1 where all pixels count.
+    """
+
+    patches: NDArray[np.uint8]
+    of_point: Int
+
+
+@dataclass(frozen=True, eq=False)
 class ShapeFit:
     """Shape at N points. Numbers of points whose ``status`` is not OK are NaN, but ``zncc`` and ``noise`` stay.
 
@@ -103,6 +119,7 @@ def fit_shape(
     xy_px: ArrayLike,
     start: ArrayLike,
     options: MatchOptions | None = None,
+    visible: VisiblePixels | None = None,
 ) -> ShapeFit:
     """Measure inverse depth, slopes and epipolar offset at points of camera 1.
 
@@ -119,6 +136,8 @@ def fit_shape(
         as NOT_SEEDED.
     options
         Defaults to ``MatchOptions()``.
+    visible
+        Which pixels of the points' subsets count; all of them when left out.
 
     Raises
     ------
@@ -141,8 +160,8 @@ def fit_shape(
     pose = pair.cam2_from_cam1
     setting = _setting(options, images)
     fixed = (
-        _reference(images[0]), _flat(images[1]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation),
-        _own(pose.translation_mm), xy, w, setting,
+        _reference(images[0]), _visible(visible, n, options.subset_px), _flat(images[1]), _lens(pair.cam1),
+        _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, setting,
     )  # fmt: skip
     kernel, space = shape_points[degree], _one_a_thread(shape_space[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
@@ -167,6 +186,7 @@ def fit_motion(
     start_w: ArrayLike,
     start_G: ArrayLike | None = None,
     options: MatchOptions | None = None,
+    visible: VisiblePixels | None = None,
 ) -> MotionFit:
     """Measure shape and motion at points of camera 1 from three comparisons at once.
 
@@ -184,6 +204,8 @@ def fit_motion(
         (N, 3, 3), or for curved patches (N, 3, 6), start values of ``G``; no motion when left out.
     options
         Defaults to ``MatchOptions()``.
+    visible
+        Which pixels of the points' subsets count; all of them when left out.
 
     Raises
     ------
@@ -215,8 +237,9 @@ def fit_motion(
     pose = pair.cam2_from_cam1
     setting = (*_setting(options, images), options.patch == "rigid")
     fixed = (
-        _reference(images[0]), _flat(images[1]), _flat(images[2]), _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2),
-        _own(pose.rotation), _own(pose.translation_mm), xy, w, G, setting,
+        _reference(images[0]), _visible(visible, n, options.subset_px), _flat(images[1]), _flat(images[2]),
+        _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, G,
+        setting,
     )  # fmt: skip
     kernel, space = motion_points[degree], _one_a_thread(motion_space[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
@@ -276,6 +299,21 @@ def _setting(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...]:
         options.max_sigma_px, options.max_step_px, (images[0].slope_noise, images[0].slope_share),
         tuple(variances) if known else (1.0,) * len(images), known,
     )  # fmt: skip
+
+
+def _visible(visible: VisiblePixels | None, n: int, subset: int) -> tuple[NDArray[np.uint8], Int]:
+    if visible is None or not (visible.of_point >= 0).any():
+        return np.zeros((0, subset, subset), np.uint8), np.full(n, -1, np.int32)
+    patches, of_point = np.ascontiguousarray(visible.patches, np.uint8), np.array(visible.of_point, np.int32)
+    if patches.ndim != 3 or patches.shape[1:] != (subset, subset) or of_point.shape != (n,):
+        raise InputError(
+            f"visible has patches of shape {patches.shape} for {of_point.shape} points, it must be "
+            f"(k, {subset}, {subset}) for ({n},).",
+            code="shape_mismatch",
+        )
+    if of_point.max() >= len(patches):
+        raise InputError(f"visible names patch {of_point.max()} of {len(patches)}.", code="shape_mismatch")
+    return patches, of_point
 
 
 def _reference(image: ImageData) -> tuple[Any, ...]:

@@ -314,7 +314,10 @@ class StepReply(Reply):
 
 
 class Region(Request):
-    """Where points may lie: one of rectangle and polygon, and a mask if wanted."""
+    """Where points may lie: one of rectangle and polygon, a mask if wanted, cracks and holes.
+
+    No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
+    """
 
     rectangle: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None, description="x0, y0, x1, y1 in camera 1's reference image, inclusive.", examples=[[120, 100, 400, 380]]
@@ -322,6 +325,18 @@ class Region(Request):
     polygon: list[tuple[Pixel, Pixel]] | None = Field(None, description="Corners.", min_length=3, max_length=1000)
     mask_png_base64: Annotated[str, StringConstraints(max_length=20_000_000)] | None = Field(
         None, description="Image of camera 1's size, white where points may lie."
+    )
+    cracks: list[Annotated[list[tuple[Pixel, Pixel]], Field(min_length=2, max_length=1000)]] = Field(
+        [],
+        description="Lines in camera 1's reference image, each the points that it goes through.",
+        max_length=100,
+        examples=[[[[150, 240], [260, 238.5], [362, 241]]]],
+    )
+    holes: list[Annotated[list[tuple[Pixel, Pixel]], Field(min_length=3, max_length=1000)]] = Field(
+        [],
+        description="Corners of polygons in camera 1's reference image inside which nothing is measured.",
+        max_length=100,
+        examples=[[[[200, 180], [240, 180], [240, 220], [200, 220]]]],
     )
 
     @model_validator(mode="after")
@@ -427,3 +442,30 @@ class ProbeReply(Reply):
     distance_px: float = Field(description="Distance of the pixel asked for from the point.")
     status: str = Field(description="Status of the point.")
     values: dict[str, Any] = Field(description="Its numbers; null where it failed.")
+
+
+class GaugeStep(Reply):
+    """What the gauges read in one step."""
+
+    n: int = Field(description="Number of the step.")
+    kind: str = Field(description="`shape` or `displacement`.")
+    label: str = Field(description="The step's label.")
+    load_n: float | None = Field(None, description="The step's load in newton.")
+    rigid_motion: dict[str, Any] | None = Field(None, description="The motion that was taken out, with its covariance.")
+    points: list[dict[str, Any]] = Field(default_factory=list, description="Values at places.")
+    extensometers: list[dict[str, Any]] = Field(default_factory=list, description="Lengths, elongations, strains.")
+    lines: list[dict[str, Any]] = Field(default_factory=list, description="Values along lines; null where missing.")
+    areas: list[dict[str, Any]] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
+    problem: JobProblem | None = Field(None, description="Why the step has no readings.")
+
+
+class GaugesReply(Reply):
+    """Readings over the steps; each number with `value`, `sigma` (standard uncertainty) and `units`."""
+
+    software_version: str = Field(description="Program that read them.")
+    settings: dict[str, Any] = Field(description="The request, with its defaults.")
+    inputs_sha256: dict[str, str] = Field(description="Checksum of each result file.")
+    frame: str = Field(description="Frame of all positions and displacements.")
+    subset_px: float = Field(description="Subset of the measurement; tells which pixels neighbours share.")
+    alignment: dict[str, Any] | None = Field(None, description="The frame that was laid, and its uncertainty.")
+    steps: list[GaugeStep] = Field(description="Readings of each step.")

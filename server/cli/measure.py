@@ -31,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
     add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
+    add("--crack", action="append", default=[], metavar="X0,Y0,X1,Y1[,...]",
+        help="a line over which nothing reaches, through these places of camera 1's first image")  # fmt: skip
+    add("--hole", action="append", default=[], metavar="X0,Y0,X1,Y1,X2,Y2[,...]",
+        help="a polygon inside which nothing is measured")  # fmt: skip
     add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
     add("--step", default="10", metavar="PX", help="distance of the points (10)")
     add("--patch", choices=PATCH_SETTINGS, default=DEFAULT_PATCH,
@@ -109,7 +113,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     mask_file = None if args.mask is None else Path(args.mask)
     noise = None if args.noise is None else load_noise(args.noise)
     region = check_region(rectangle, image_shape=shapes[0], subset_px=subset, step_px=step,
-                          mask_path=mask_file, seeds=args.seed)  # fmt: skip
+                          mask_path=mask_file, seeds=args.seed, cracks=args.crack, holes=args.hole)  # fmt: skip
     pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     return MeasureJob(
         calibration=calibration, calibration_file=calibration_file, pairs=pairs, region=region, subset_px=subset,

@@ -16,11 +16,12 @@ from core.field.region import check_region as check_points
 from server.io.images import read_mask
 
 Rectangle = tuple[float, float, float, float]
+Line = list[list[float]]
 
 
 @dataclass(frozen=True)
 class RegionRequest:
-    """What ``--roi``, ``--mask`` and ``--seed`` say, checked.
+    """What ``--roi``, ``--mask``, ``--crack``, ``--hole`` and ``--seed`` say, checked.
 
     Attributes
     ----------
@@ -30,11 +31,15 @@ class RegionRequest:
         The points, those on the mask's black not allowed.
     seeds_px
         (n, 2) in camera 1's reference image; None = found by the program.
+    cracks_px, holes_px
+        Lines and polygons, as given; the grid knows them.
     """
 
     rectangle_px: Rectangle
     grid: PointGrid
     seeds_px: NDArray[np.float64] | None
+    cracks_px: tuple[Line, ...] = ()
+    holes_px: tuple[Line, ...] = ()
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -70,6 +75,25 @@ def parse_rectangle(text: str) -> Rectangle:
     return x0, y0, x1, y1
 
 
+def parse_line(option: str, text: str, fewest: int) -> Line:
+    """Read ``X0,Y0,X1,Y1,...`` of ``fewest`` points or more; returns [x, y] each.
+
+    Raises
+    ------
+    RegionError
+        ``cut_invalid``.
+    """
+    form = ",".join(f"X{k},Y{k}" for k in range(fewest))
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) < 2 * fewest or len(numbers) % 2 or not all(math.isfinite(v) for v in numbers):
+        raise RegionError(f"{option} {text!r} is no list of {fewest} points or more.", code="cut_invalid",
+                          remedy=f"Give {option} {form},... in pixels of camera 1's first image.")  # fmt: skip
+    return [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
+
+
 def check_odd(option: str, text: str, *, low: int, high: int, odd: bool) -> int:
     """Read a whole number in a range, odd where it must be.
 
@@ -97,22 +121,27 @@ def check_region(
     step_px: int,
     mask_path: Path | None,
     seeds: Sequence[str],
+    cracks: Sequence[str] = (),
+    holes: Sequence[str] = (),
 ) -> RegionRequest:
-    """Check region, mask and seeds against camera 1's image, and lay the points.
+    """Check region, mask, cracks, holes and seeds against camera 1's image, and lay the points.
 
     Raises
     ------
     RegionError
-        Outside the image, smaller than a subset, no white under any point, a mask of another size, a seed outside.
+        Outside the image, smaller than a subset, no white under any point, a mask of another size, a seed outside,
+        a crack or hole that is none.
     ImageError
         If the mask cannot be read.
     """
     grid = PointGrid.rectangle(*rectangle, step_px=step_px)
     mask = None if mask_path is None else read_mask(mask_path)
-    checked = grid if mask is None else grid.within_mask(mask)
+    crack_lines = tuple(parse_line("--crack", text, 2) for text in cracks)
+    hole_lines = tuple(parse_line("--hole", text, 3) for text in holes)
+    checked = (grid if mask is None else grid.within_mask(mask)).without_holes(hole_lines).with_cracks(crack_lines)
     mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
     check_points(checked, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
-    return RegionRequest(rectangle, checked, _seeds(seeds, rectangle, mask))
+    return RegionRequest(rectangle, checked, _seeds(seeds, rectangle, mask), crack_lines, hole_lines)
 
 
 def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> NDArray[np.float64] | None:

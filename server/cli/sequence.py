@@ -85,6 +85,7 @@ class MeasureJob:
             "roi": list(self.region.rectangle_px), "subset_px": self.subset_px, "step_px": self.step_px,
             "patch": self.patch, "interpolation": self.interpolation,
             "seeds": None if seeds is None else seeds.tolist(),
+            "cracks": list(self.region.cracks_px), "holes": list(self.region.holes_px),
             "mask": None if self.mask_file is None else str(self.mask_file),
             "noise": None if self.noise is None else self.noise.record(),
             "strain": strain_settings(self.strain),

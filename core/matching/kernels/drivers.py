@@ -36,50 +36,54 @@ _curved_motion, _curved_motion_space = make_motion(2)
 def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
     @entry
     def run_plane_shape(
-        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
+        first, last, reference, visible, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
     ):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
+        patches, which = visible
         for i in range(first, last):
             status[i], iterations[i] = _plane_shape(
-                reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
+                reference, patches, which[i], image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
             )
 
     @entry
     def run_plane_motion(
-        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
-        out, status, iterations,
+        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
+        space, out, status, iterations,
     ):  # fmt: skip
         if stamp < 0:
             return
+        patches, which = visible
         for i in range(first, last):
             status[i], iterations[i] = _plane_motion(
-                reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,
-                out[i],
+                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i],
+                start_g[i], setting, space, out[i],
             )  # fmt: skip
 
     @entry
     def run_curved_shape(
-        first, last, reference, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
+        first, last, reference, visible, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
     ):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
+        patches, which = visible
         for i in range(first, last):
             status[i], iterations[i] = _curved_shape(
-                reference, image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
+                reference, patches, which[i], image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
             )
 
     @entry
     def run_curved_motion(
-        first, last, reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space,
-        out, status, iterations,
+        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
+        space, out, status, iterations,
     ):  # fmt: skip
         if stamp < 0:
             return
+        patches, which = visible
         for i in range(first, last):
             status[i], iterations[i] = _curved_motion(
-                reference, image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i], start_g[i], setting, space,
-                out[i],
+                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i],
+                start_g[i], setting, space, out[i],
             )  # fmt: skip
 
     return {1: run_plane_shape, 2: run_curved_shape}, {1: run_plane_motion, 2: run_curved_motion}

@@ -89,15 +89,30 @@ def make_motion(degree: int) -> Any:
 
     @kernel(f"{degree}", inline="always")
     def motion_point(
-        reference, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting, space, out
+        reference,
+        patches,
+        which,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        start_w,
+        start_g,
+        setting,
+        space,
+        out,
     ):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise, rigid = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain,
          work) = space  # fmt: skip
         gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2, white = set_up_reference(
-            reference, lens1, xy[0], xy[1], subset, ref, of_reference
+        inside, xc, yc, p, offset, f2, white, count = set_up_reference(
+            reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
         )
         if not inside:
             return OUTSIDE_IMAGE, 0
@@ -197,7 +212,7 @@ def make_motion(degree: int) -> Any:
         for k in range(3):
             out[at + 1 + k] = levels[k, ZNCC]
             worst = min(worst, levels[k, ZNCC])
-        variance = noise_from_residuals(levels, 3, float(subset * subset), float(n))
+        variance = noise_from_residuals(levels, 3, count, float(n))
         out[at + 4] = math.sqrt(variance)
         if known_noise:
             variance = variances[0]

@@ -75,6 +75,27 @@ def _copy(image, top, left, subset, ref, row):
             ref[row, r * subset + c] = image[top + r, left + c]
 
 
+@inner
+def _count_visible(patches, which, subset, weighted, ref):
+    """Take out of the weights what the point's patch does not show; returns how many pixels are left."""
+    n = subset * subset
+    if which < 0:
+        if not weighted:  # the last point may have left its own
+            for i in range(n):
+                ref[WEIGHT, i] = 1.0
+        return n
+    count = 0
+    for r in range(subset):
+        for c in range(subset):
+            if patches[which, r, c] == 0:
+                ref[WEIGHT, r * subset + c] = 0.0
+            else:
+                count += 1
+                if not weighted:
+                    ref[WEIGHT, r * subset + c] = 1.0
+    return count
+
+
 def _product_table(degree: int) -> np.ndarray:
     many, few = monomials(2 * degree), monomials(degree)
     return np.array([[many.index((a[0] + b[0], a[1] + b[1])) for b in few] for a in few])
@@ -90,13 +111,15 @@ def make_reference(degree: int) -> Any:
     sum_all = sum_reference[degree]
 
     @kernel(f"{degree}")
-    def set_up_reference(reference, lens, x_px, y_px, subset, ref, space):
+    def set_up_reference(reference, patches, which, lens, x_px, y_px, subset, ref, space):
         """Copy the subset nearest to (x_px, y_px) and sum it.
 
         Parameters
         ----------
         reference
             Tuple of pixels, gradients along x and y, and weights, (rows, cols) float32 each; weights may be empty.
+        patches, which
+            (k, subset, subset) uint8, zero where a pixel does not count, and which of them is the point's; -1 = none.
         lens
             Camera 1's.
         ref
@@ -111,11 +134,12 @@ def make_reference(degree: int) -> Any:
         -------
         tuple
             ``inside`` (bool), the point's ray ``xc, yc``, the weights' sum, the mean of f that is left, the sum of
-            squares of f about it, and the differences of neighbours against it: 1 for white noise.
+            squares of f about it, the differences of neighbours against it (1 for white noise), and how many pixels
+            count.
         """
         pixels, grad_x, grad_y, weights = reference
         raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
-        nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
         left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
@@ -132,6 +156,9 @@ def make_reference(degree: int) -> Any:
         _copy(grad_y, top, left, subset, ref, np.int64(GY))
         if weights.shape[0] > 0:
             _copy(weights, top, left, subset, ref, np.int64(WEIGHT))
+        count = subset * subset
+        if patches.shape[0] > 0:
+            count = _count_visible(patches, which, subset, weights.shape[0] > 0, ref)
         mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
         for i in range(subset):
             mean += pixels[top + i, left + i]
@@ -162,7 +189,7 @@ def make_reference(degree: int) -> Any:
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])
-        return True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2
+        return True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count)
 
     return set_up_reference, n_columns, first_gg + 3 * many
 

@@ -59,13 +59,13 @@ def make_shape(degree: int) -> Any:
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def shape_point(reference, image2, lens1, lens2, R, t, xy, start, setting, space, out):
+    def shape_point(reference, patches, which, image2, lens1, lens2, R, t, xy, start, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
         (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
         gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2, white = set_up_reference(
-            reference, lens1, xy[0], xy[1], subset, ref, of_reference
+        inside, xc, yc, p, offset, f2, white, count = set_up_reference(
+            reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
         )
         if not inside:
             return OUTSIDE_IMAGE, 0
@@ -129,7 +129,7 @@ def make_shape(degree: int) -> Any:
         for j in range(few):
             out[j] = w[j]
         out[few], out[few + 1] = e, levels[0, ZNCC]
-        variance = noise_from_residuals(levels, 1, float(subset * subset), float(n))
+        variance = noise_from_residuals(levels, 1, count, float(n))
         out[few + 2] = math.sqrt(variance)
         if known_noise:
             variance = variances[0]
