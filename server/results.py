@@ -17,7 +17,7 @@ from core.status import PointStatus
 from server.errors import NotFoundError
 
 # the netCDF and HDF5 libraries are not built for several threads at once
-_library = threading.Lock()
+library = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def read_variable(path: Path, name: str) -> Variable:
     NotFoundError
         ``field_missing``, with the names that there are.
     """
-    with _library, _open(path) as data:
+    with library, _open(path) as data:
         if name not in data.variables:
             raise NotFoundError(
                 f"{path.name} has no variable {name!r}.",
@@ -68,7 +68,7 @@ def read_variable(path: Path, name: str) -> Variable:
 
 def list_variables(path: Path) -> list[dict[str, Any]]:
     """Return name, unit, meaning and dimensions of every variable of a result file."""
-    with _library, _open(path) as data:
+    with library, _open(path) as data:
         return [
             {
                 "name": name,
@@ -83,7 +83,7 @@ def list_variables(path: Path) -> list[dict[str, Any]]:
 
 def read_residuals(path: Path) -> dict[str, Any]:
     """Return a calibration's residuals: for each view its facts, and lists of found places and residuals."""
-    with _library, _open(path) as data:
+    with library, _open(path) as data:
         found, residual = _values(data.variables["found_px"]), _values(data.variables["residual_px"])
         facts = json.loads(data.getncattr("views"))
     views = [
@@ -95,7 +95,7 @@ def read_residuals(path: Path) -> dict[str, Any]:
 
 def probe_result(path: Path, x_px: float, y_px: float) -> dict[str, Any]:
     """Return the point nearest to a pixel: place, status, and every number of two-dimensional variables."""
-    with _library, _open(path) as data:
+    with library, _open(path) as data:
         arrays = {name: _values(v) for name, v in data.variables.items() if len(v.dimensions) >= 2}
         units = {name: str(getattr(data.variables[name], "units", "1")) for name in arrays}
     distance = np.hypot(arrays["x_px"] - x_px, arrays["y_px"] - y_px)

@@ -156,6 +156,33 @@ def test_results_come_as_npy_file_and_probe(
     refused(client.get(f"{url}/export", params={"format": "exe", "step": 0}), 422, "invalid_request")
 
 
+def test_gauges_read_what_the_fields_hold(client: httpx.Client, analysis: tuple[str, dict[str, Any]]) -> None:
+    url, _ = analysis
+    w = np.array(client.get(f"{url}/steps/2/fields/w_mm").json()["values"], dtype=float)
+    sigma = np.array(client.get(f"{url}/steps/2/fields/sigma_w_mm").json()["values"], dtype=float)
+    x = np.array(client.get(f"{url}/steps/2/fields/x_px").json()["values"])
+    y = np.array(client.get(f"{url}/steps/2/fields/y_px").json()["values"])
+    body = {
+        "points": [{"xy_px": [x[6, 6], y[6, 6]]}],
+        "extensometers": [{"a_px": [x[6, 2], y[6, 2]], "b_px": [x[6, 10], y[6, 10]]}],
+        "areas": [{}],
+    }
+    answer = client.post(f"{url}/gauges", json=body)
+    assert answer.status_code == 200, answer.text
+    steps = answer.json()["steps"]
+    assert [s["n"] for s in steps] == [0, 1, 2]
+    assert [s["label"] for s in steps] == ["0.0 kPa", "344.5 kPa", "689.0 kPa"]
+    point, area = steps[2]["points"][0]["values"]["w_mm"], steps[2]["areas"][0]["values"]["w_mm"]
+    assert point["value"] == w[6, 6]
+    assert point["sigma"] == pytest.approx(sigma[6, 6], rel=1e-5)
+    assert area["mean"] == pytest.approx(np.nanmean(w))
+    assert 0.1 * np.nanmedian(sigma) < area["mean_sigma"] < np.nanmedian(sigma)
+    # a bent plate's face: the ends move by half the thickness times the slope, micrometres over millimetres
+    strain = steps[2]["extensometers"][0]["values"]["strain"]
+    assert abs(strain["value"]) < 3e-3
+    assert 0.0 < strain["sigma"] < 1e-3
+
+
 @pytest.mark.fault(40)
 def test_strain_comes_with_the_displacement(client: httpx.Client, analysis: tuple[str, dict[str, Any]]) -> None:
     url, done = analysis

@@ -11,7 +11,7 @@ from anyio import CapacityLimiter
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 
-from server.api import analyses, calibrations, jobs, noise, problems, results, rig, stage, system, tests
+from server.api import analyses, calibrations, gauges, jobs, noise, problems, results, rig, stage, system, tests
 from server.api.guard import LOOPBACK_NAMES, Guard
 from server.service import Service
 from server.version import software_version
@@ -54,7 +54,7 @@ def create_app(service: Service, *, hosts: frozenset[str] = LOOPBACK_NAMES, clos
     app.state.streams = 0
     app.state.view_limiter = CapacityLimiter(4)
     problems.install(app)
-    for module in (system, rig, stage, noise, calibrations, tests, analyses, results, jobs):
+    for module in (system, rig, stage, noise, calibrations, tests, analyses, results, gauges, jobs):
         app.include_router(module.router, prefix=PREFIX)
     app.add_api_route("/healthz", system.healthz, include_in_schema=False)
     app.add_api_route("/metrics", system.metrics, include_in_schema=False)

@@ -442,3 +442,30 @@ class ProbeReply(Reply):
     distance_px: float = Field(description="Distance of the pixel asked for from the point.")
     status: str = Field(description="Status of the point.")
     values: dict[str, Any] = Field(description="Its numbers; null where it failed.")
+
+
+class GaugeStep(Reply):
+    """What the gauges read in one step."""
+
+    n: int = Field(description="Number of the step.")
+    kind: str = Field(description="`shape` or `displacement`.")
+    label: str = Field(description="The step's label.")
+    load_n: float | None = Field(None, description="The step's load in newton.")
+    rigid_motion: dict[str, Any] | None = Field(None, description="The motion that was taken out, with its covariance.")
+    points: list[dict[str, Any]] = Field(default_factory=list, description="Values at places.")
+    extensometers: list[dict[str, Any]] = Field(default_factory=list, description="Lengths, elongations, strains.")
+    lines: list[dict[str, Any]] = Field(default_factory=list, description="Values along lines; null where missing.")
+    areas: list[dict[str, Any]] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
+    problem: JobProblem | None = Field(None, description="Why the step has no readings.")
+
+
+class GaugesReply(Reply):
+    """Readings over the steps; each number with `value`, `sigma` (standard uncertainty) and `units`."""
+
+    software_version: str = Field(description="Program that read them.")
+    settings: dict[str, Any] = Field(description="The request, with its defaults.")
+    inputs_sha256: dict[str, str] = Field(description="Checksum of each result file.")
+    frame: str = Field(description="Frame of all positions and displacements.")
+    subset_px: float = Field(description="Subset of the measurement; tells which pixels neighbours share.")
+    alignment: dict[str, Any] | None = Field(None, description="The frame that was laid, and its uncertainty.")
+    steps: list[GaugeStep] = Field(description="Readings of each step.")

@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("server.cli.calibrate", "calibrate a pair of cameras from grid images"),
     "noise": ("server.cli.noise", "measure the cameras' noise from repeated frames"),
     "measure": ("server.cli.measure", "measure shape and displacement from image files"),
+    "gauge": ("server.cli.gauge", "read extensometers, lines and areas off measured results"),
 }
 
 _NEGATIVE_LIST = re.compile(r"-[\d.]+(e[-+]?\d+)?,")

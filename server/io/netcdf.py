@@ -332,3 +332,12 @@ def read_attributes(path: str | Path) -> dict[str, Any]:
         if name in attributes:
             attributes[name] = json.loads(attributes[name])
     return attributes
+
+
+def field_variable(result: Field, name: str) -> tuple[NDArray[np.float64], str, str] | None:
+    """Return values (r, c), unit and meaning of a variable as a result file would hold it; None for others."""
+    for v in _SHAPE + _MOTION + _CURVATURE:
+        values = getattr(result, v.attribute) if v.name == name else None
+        if values is not None:
+            return values if v.component is None else values[..., v.component], v.units, v.long_name
+    return None
