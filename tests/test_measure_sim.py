@@ -238,6 +238,18 @@ def test_a_noise_model_that_takes_all_texture_for_noise_is_named() -> None:
     assert "noise model says 100.0 grey levels" in str(error.value.remedy)
 
 
+@pytest.mark.fault(20)
+def test_an_image_that_was_not_renewed_is_refused() -> None:
+    first, second = take("block")
+    now1, now2 = take("block", 1.0)
+    for stale in ((first, now2), (now1, second)):
+        with pytest.raises(ImageError) as error:
+            measure_motion(pair(), first, second, *stale, GRID, OPTIONS)
+        assert error.value.code == "stale_image"
+    still = measure_motion(pair(), first, second, first.copy(), second.copy(), GRID, OPTIONS)
+    assert np.nanmax(np.abs(still.uvw_mm)) < 1e-4  # both references again: a test that nothing moved
+
+
 @pytest.mark.fault(43)
 def test_a_cancel_is_heard_and_progress_is_told(reference: ReferencePair) -> None:
     cancel = Cancel()

@@ -106,7 +106,8 @@ def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: 
     Mean square of the difference = square of the plane patch's error + (curved - plane) variance: Hausman's test.
     The two per cent of the sample that differ most, for their noise, are not heard: a wrong fit must not decide.
     """
-    noise = np.maximum(curved_mm2 - plane_mm2, 0.05 * curved_mm2)
+    # an image matched with itself has none
+    noise = np.maximum(np.maximum(curved_mm2 - plane_mm2, 0.05 * curved_mm2), np.finfo(np.float64).tiny)
     square = (difference_mm**2).sum(axis=1)
     heard = np.argsort(square / noise)[: len(square) - int(np.ceil(_NOT_HEARD * len(square)))]
     error2 = max(float(np.mean(square[heard] - noise[heard])), 0.0)

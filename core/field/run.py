@@ -15,7 +15,7 @@ from core.field.features import Box
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import apply_gates
 from core.field.grow import Attempts, fit_in_batches, grow
-from core.field.images import MeasureImage, different, features_of, same_size
+from core.field.images import MeasureImage, different, features_of, refuse_stale, same_size
 from core.field.patch import UsedPatch, asked_for
 from core.field.patch_choice import advise, choose_patch
 from core.field.plane_error import plane_error
@@ -91,6 +91,7 @@ class Run:
             self.cur1.refuse_blank()
             self.cur2.refuse_blank()
             different(self.cur1, self.cur2)
+            refuse_stale(self.ref1, self.ref2, self.cur1, self.cur2)
         self.xy_px = grid.xy_px.reshape(-1, 2)
         self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
         self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)

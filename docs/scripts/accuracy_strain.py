@@ -103,7 +103,7 @@ def strains(figures: Path) -> Section:
     return Section(
         "Strain over a virtual gauge",
         f"A plane on the paper's rig with the true calibration, {SUBSET} px subsets, step 10 px; Green-Lagrange strain over "
-        "9 points (113 px, 3.7 mm) unless a row says otherwise. ue: microstrain.",
+        "9 points (113 px, 4.1 mm) unless a row says otherwise. ue: microstrain.",
         rows,
         [("accuracy_strain_false.png", "False strain exx after rigid motions, noise 2"),
          ("accuracy_strain_noise.png", "Noise of exx against the gauge's width")],
@@ -218,6 +218,11 @@ def _plot_noise(path: Path, curve: dict[int, tuple[float, float, float]]) -> Non
         ylabel="sd of exx / microstrain",
         title=f"{SUBSET} px subsets, step 10 px, noise 2 of 255",
     )
+    ax.set_xlim(1.7, 8.0)
+    ax.set_ylim(8.0, 150.0)
+    ax.set_xticks([2, 3, 4, 6], ["2", "3", "4", "6"])
+    ax.set_yticks([10, 20, 50, 100], ["10", "20", "50", "100"])
+    ax.minorticks_off()
     ax.legend()
     fig.savefig(path, dpi=110)
     plt.close(fig)
