@@ -19,6 +19,7 @@ mpl.use("Agg")
 
 from docs.scripts import (
     accuracy_calibration,
+    accuracy_cracks,
     accuracy_curved,
     accuracy_experiments,
     accuracy_gauges,
@@ -43,6 +44,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     **accuracy_curved.SECTIONS,
     **accuracy_strain.SECTIONS,
     **accuracy_gauges.SECTIONS,
+    "cracks": accuracy_cracks.cracks,
     "large": accuracy_large.large_motion,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
