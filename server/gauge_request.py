@@ -10,6 +10,7 @@ from pydantic import Field, StringConstraints, model_validator
 from server.api.models import Number, Pixel, Request, Whole
 
 Place = tuple[Pixel, Pixel]
+PlaceMm = tuple[Number, Number]
 Name = Annotated[str, StringConstraints(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f,;\"]+$")]
 Variable = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 _MOST = 200
@@ -22,14 +23,43 @@ class _Named(Request):
 class PointGauge(_Named):
     """Values at one place."""
 
-    xy_px: Place = Field(description="Where, in camera 1's reference image.", examples=[[210.0, 180.5]])
+    xy_px: Place | None = Field(None, description="Where, in camera 1's reference image.", examples=[[210.0, 180.5]])
+    xy_mm: PlaceMm | None = Field(
+        None, description="Where, as X and Y of the reference in the frame asked for; in place of xy_px."
+    )
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        if (self.xy_px is None) == (self.xy_mm is None):
+            raise ValueError("give xy_px or xy_mm")
+        return self
+
+    def places(self) -> tuple[list[PlaceMm], bool]:
+        """Return the place, and True if it is told in mm."""
+        return [p for p in (self.xy_px, self.xy_mm) if p is not None], self.xy_px is None
 
 
 class ExtensometerGauge(_Named):
     """A virtual extensometer."""
 
-    a_px: Place = Field(description="One end.", examples=[[150.0, 200.0]])
-    b_px: Place = Field(description="The other end.", examples=[[350.0, 200.0]])
+    a_px: Place | None = Field(None, description="One end.", examples=[[150.0, 200.0]])
+    b_px: Place | None = Field(None, description="The other end.", examples=[[350.0, 200.0]])
+    ends_mm: tuple[PlaceMm, PlaceMm] | None = Field(
+        None, description="Both ends as X and Y of the reference in the frame asked for; in place of a_px and b_px."
+    )
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        given = [v is not None for v in (self.a_px, self.b_px, self.ends_mm)]
+        if given not in ([True, True, False], [False, False, True]):
+            raise ValueError("give a_px and b_px, or ends_mm")
+        return self
+
+    def places(self) -> tuple[list[PlaceMm], bool]:
+        """Return both ends, and True if they are told in mm."""
+        if self.a_px is not None and self.b_px is not None:
+            return [self.a_px, self.b_px], False
+        return list(self.ends_mm or ()), True
 
 
 class LineGauge(_Named):

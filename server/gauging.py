@@ -16,11 +16,12 @@ from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
 from core.gauge.line import places_along
+from core.gauge.locate import places_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
 from core.gauge.shared_pixels import SharedPixels
-from server.gauge_request import GaugeRequest, LineGauge, PlaneAlignment
+from server.gauge_request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
 from server.gauge_variables import Variables, component_of
 from server.io.files import sha256_of
 from server.io.netcdf import COVARIANCE_NAMES, read_attributes, read_field
@@ -28,6 +29,7 @@ from server.results import library, read_variable
 from server.version import software_version
 
 Float = NDArray[np.float64]
+_Placed = dict[str | None, list[tuple[float, float]]]
 MOST_NUMBERS = 3_000_000
 _CALIBRATION = ("calibration", "calibration.json")
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
@@ -90,6 +92,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
     hashes, steps = {}, []
     moved_by: set[str] = set()
     found: set[str] = set()
+    placed: _Placed = {}
     numbers = 0
     for path in chosen:
         step = _read(path)
@@ -99,11 +102,13 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
         hashes[path.name] = step.sha256
         if request.align is not None and alignment is None:
             alignment = _alignment(step, request)
+        if first is step.attributes:
+            placed = _placed(step.field if alignment is None else aligned(step.field, alignment), request)
         numbers += _count(step.field, request.lines, len(request.variables or COVARIANCE_NAMES))
         if numbers > MOST_NUMBERS:
             raise InputError(f"The lines hold more than {MOST_NUMBERS:,} numbers.", code="gauge_too_large",
                              remedy="Ask for fewer places, variables or steps.")  # fmt: skip
-        steps.append(_read_step(step, alignment, request, found))
+        steps.append(_read_step(step, alignment, request, placed, found))
     for name in request.variables or ():
         if name not in found and any("problem" not in s for s in steps):
             read_variable(chosen[-1], name)  # says which there are
@@ -184,7 +189,20 @@ def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
     return align_3_2_1(step.field, asked.places_px, shared=step.shared)
 
 
-def _read_step(step: _Step, alignment: Alignment | None, request: GaugeRequest, found: set[str]) -> dict[str, Any]:
+def _placed(field: Field, request: GaugeRequest) -> _Placed:
+    """Return the pixels of each named point and extensometer; those told in mm are found on the first step's shape."""
+    placed: _Placed = {}
+    gauges: list[PointGauge | ExtensometerGauge] = [*request.points, *request.extensometers]
+    for gauge in gauges:
+        places, in_mm = gauge.places()
+        xy = places_from_mm(field, places) if in_mm else places
+        placed[gauge.name] = [(float(x), float(y)) for x, y in xy]
+    return placed
+
+
+def _read_step(
+    step: _Step, alignment: Alignment | None, request: GaugeRequest, placed: _Placed, found: set[str]
+) -> dict[str, Any]:
     field = step.field if alignment is None else aligned(step.field, alignment)
     document = step.head
     if request.remove_rigid is not None and field.has_motion:
@@ -202,8 +220,8 @@ def _read_step(step: _Step, alignment: Alignment | None, request: GaugeRequest, 
     found.update(names)
     return {
         **document,
-        "points": [_point(variables, names, p.name, p.xy_px) for p in request.points],
-        "extensometers": [_extensometer(variables, e.name, e.a_px, e.b_px) for e in request.extensometers],
+        "points": [_point(variables, names, p.name, *placed[p.name]) for p in request.points],
+        "extensometers": [_extensometer(variables, e.name, *placed[e.name]) for e in request.extensometers],
         "lines": [_line(variables, names, line) for line in request.lines],
         "areas": [_area(variables, names, a.name, a.corners()) for a in request.areas],
     }

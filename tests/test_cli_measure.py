@@ -17,6 +17,7 @@ from PIL import Image
 from core.measure import MeasureOptions
 from server.cli import main, measure
 from server.io.images import read_image, write_image
+from server.io.netcdf import read_field
 from sim.render import RenderOptions, render
 from sim.rig import CAMERA_NAMES, SimRig
 from sim.scenes import make_scene
@@ -121,6 +122,42 @@ def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> Non
         assert min(step["zncc_median"].values()) > 0.95
         assert Path(step["cam1"]).name == f"cam1_{step['step']}.tif"
     assert summary["steps"][0]["plane_residual_rms_mm"] < 0.5e-3  # the block's face is flat
+
+
+def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) -> None:
+    arguments = command(folder, tmp_path / "out", cam1=str(folder / "cam1_0.tif"), cam2=str(folder / "cam2_0.tif"))
+    crack, hole = "50,100.2,90.5,101.7,130,96.4", "140,60,165,60,165,85,140,85"
+    assert main([*arguments, "--crack", crack, "--hole", hole]) == 0
+    with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
+        settings = json.loads(data.attrs["settings"])
+        assert settings["cracks"] == [[[50.0, 100.2], [90.5, 101.7], [130.0, 96.4]]]
+        assert settings["holes"] == [[[140.0, 60.0], [165.0, 60.0], [165.0, 85.0], [140.0, 85.0]]]
+        inside = (data["x_px"] >= 140) & (data["x_px"] <= 165) & (data["y_px"] >= 60) & (data["y_px"] <= 85)
+        assert (data["status"].values[inside.values] == 2).all()
+        assert (data["status"].values[~inside.values] == 0).mean() > 0.97
+        assert data["cut_line"].values.tolist() == [0] * 5 + [1] * 3  # the hole's border is closed
+        assert data["cut_y_px"].values[5:].tolist() == [100.2, 101.7, 96.4]
+    cuts = read_field(tmp_path / "out" / "step_0000.nc").cuts
+    assert cuts is not None
+    assert cuts.lines_px[1].tolist() == settings["cracks"][0]
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "code"),
+    [
+        ("--crack", "50,100", "cut_invalid"), ("--crack", "50,100,60", "cut_invalid"),
+        ("--crack", "a,b,c,d", "cut_invalid"),
+        ("--crack", "50,100,nan,100", "cut_invalid"), ("--crack", "60,100,60,100", "cut_invalid"),
+        ("--crack", "50,100,500,100", "cut_outside_image"), ("--hole", "50,60,70,60", "cut_invalid"),
+        ("--hole", "50,60,70,80,60,70", "region_empty"), ("--hole", "10,10,200,10,200,180,10,180", "region_empty"),
+    ],
+)  # fmt: skip
+def test_cracks_and_holes_that_are_none(
+    originals: Path, tmp_path: Path, capfd: Any, option: str, text: str, code: str
+) -> None:
+    assert main([*command(originals, tmp_path / "out"), option, text]) != 0
+    assert code in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_several_paths_a_mask_seeds_and_the_other_models(folder: Path, tmp_path: Path, capfd: Any) -> None:

@@ -17,6 +17,7 @@ from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import Extensometer, extensometer
 from core.gauge.line import places_along
+from core.gauge.locate import places_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import rigid_motion, without_rigid_motion
 from core.gauge.sampling import sample
@@ -220,6 +221,30 @@ def test_line_places_run_evenly_round_a_corner() -> None:
     for line, count in (([(1, 1), (1, 1)], None), ([(1, 1)], None), ([(1, 1), (2, 2)], 1)):
         with pytest.raises(RegionError):
             places_along(field, line, count)
+
+
+# millimetres ----------------------------------------------------------------------------------------------------
+
+
+def test_places_in_mm_are_found_where_the_shape_has_them() -> None:
+    failed = np.zeros((14, 17), bool)
+    failed[3, 4] = True  # at 68, 81
+    field = make_field(rigid, shape=lambda x, y: surface(x, y) @ TURN.T + SHIFT, failed=failed)
+    xy = np.array([(40.0, 60.0), (152.0, 151.0), (61.0, 95.0), (100.3, 71.9)])
+    on_it = sample(field, xy).of(field.xyz_mm)
+    assert places_from_mm(field, on_it[:, :2]) == pytest.approx(xy, abs=1e-6)
+    lost = surface(np.array(70.0), np.array(83.0)) @ TURN.T + SHIFT
+    for place in (lost[:2], [500.0, 0.0]):
+        with pytest.raises(RegionError) as caught:
+            places_from_mm(field, [place])
+        assert caught.value.code == "gauge_outside"
+
+
+def test_a_place_that_a_folded_surface_has_twice_is_refused() -> None:
+    folded = make_field(rigid, shape=lambda x, y: np.stack([abs(x - 93.0), y, x], axis=-1))
+    with pytest.raises(RegionError) as caught:
+        places_from_mm(folded, [(20.0, 100.0)])
+    assert caught.value.code == "gauge_ambiguous"
 
 
 # rigid motion ---------------------------------------------------------------------------------------------------

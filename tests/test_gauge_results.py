@@ -21,6 +21,7 @@ from service_rig import new_test, served, tiny_config, wait_for_rig
 
 from core.field.cuts import Cuts
 from core.field.result import Field
+from core.strain import StrainOptions, surface_strain
 from server.cli.main import main
 from server.io.netcdf import Provenance, write_field
 from server.service import Service
@@ -118,6 +119,28 @@ def test_time_histories_of_a_known_stretch(results: Path, tmp_path: Path, capsys
     assert set(line["missing"]) == {"", "low_correlation"}
 
 
+def test_gauges_in_mm_read_what_those_in_pixels_do(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ends = ",".join(str(v) for xy in (A, B) for v in flat(*map(np.array, xy))[:2])
+    place = ",".join(str(v) for v in flat(np.array(60.0), np.array(80.0))[:2])
+    mm = ("--extensometer-mm", f"far={ends}", "--point-mm", place)
+    rc, _, err = gauge(capsys, results, *OPTIONS, *mm, "--out", tmp_path / "g.json")
+    assert (rc, err) == (0, "")
+    for step in json.loads((tmp_path / "g.json").read_text())["steps"]:
+        for kind in ("points", "extensometers"):
+            px, by_mm = step[kind]
+            for name, number in px["values"].items():
+                for part in ("value", "sigma"):
+                    truth = None if number[part] is None else pytest.approx(number[part], rel=1e-6, abs=1e-12)
+                    assert by_mm["values"][name][part] == truth
+    # the origin of the plane's frame lies in the middle of the points
+    rc, _, _ = gauge(capsys, results, "--align", "plane", "--point-mm", "0.1,-0.2", "--out", tmp_path / "h.json")
+    assert rc == 0
+    values = json.loads((tmp_path / "h.json").read_text())["steps"][0]["points"][0]["values"]
+    assert (values["x_mm"]["value"], values["y_mm"]["value"]) == pytest.approx((0.1, -0.2), abs=1e-9)
+
+
 def test_csv_holds_the_same_numbers_as_json(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for kind in ("csv", "json"):
         assert gauge(capsys, results, *OPTIONS, "--remove-rigid", "--out", tmp_path / f"g.{kind}")[0] == 0
@@ -192,6 +215,22 @@ def test_any_scalar_variable_of_the_file_can_be_read(tmp_path: Path, capsys: pyt
     assert err.startswith("stereorig: field_not_scalar:")
 
 
+def test_strain_of_the_result_file_is_read_at_gauges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = stretched(0.03)
+    strain = surface_strain(field, StrainOptions(window=3), subset_px=SUBSET)
+    path = tmp_path / "step_0001.nc"
+    write_field(path, field, Provenance({"subset_px": SUBSET}, INPUTS, "1", step=1), strain)
+    rc, _, err = gauge(capsys, tmp_path, "--point", "82,95", "--area", "all", "--variable", "exx", "--variable", "eyy",
+                       "--align", "plane", "--remove-rigid", "--out", tmp_path / "g.json")  # fmt: skip
+    assert (rc, err) == (0, "")
+    (step,) = json.loads((tmp_path / "g.json").read_text())["steps"]
+    for name, stretch in (("exx", 1.03), ("eyy", 1.0 - 0.3 * 0.03)):
+        number = step["points"][0]["values"][name]
+        assert number["value"] == pytest.approx(0.5 * (stretch**2 - 1.0), abs=1e-6)
+        assert 0.0 < number["sigma"] < 0.02
+        assert step["areas"][0]["values"][name]["mean"] == pytest.approx(0.5 * (stretch**2 - 1.0), abs=1e-6)
+
+
 @pytest.mark.fault(40)
 @pytest.mark.parametrize(
     ("options", "code"),
@@ -202,6 +241,7 @@ def test_any_scalar_variable_of_the_file_can_be_read(tmp_path: Path, capsys: pyt
         (("--area", "0,0,20,20"), "gauge_outside"),
         (("--extensometer", "60,80,60,80"), "gauge_unusable"),
         (("--extensometer", "60,80,60"), "gauge_unusable"),
+        (("--point-mm", "99,0"), "gauge_outside"),
         (("--point", "here"), "gauge_unusable"),
         (("--point", "nan,5"), "gauge_unusable"),
         (("--point", "-1e9,5"), "gauge_unusable"),
@@ -342,6 +382,10 @@ def test_api_and_command_line_give_the_same_document(
         ({"points": [{"xy_px": [60, 1e308]}]}, 422, "invalid_request"),
         ({"points": [{"xy_px": [60, 80], "name": "a"}, {"xy_px": [61, 80], "name": "a"}]}, 422, "invalid_request"),
         ({"areas": [{"rectangle_px": [60, 80, 10, 20]}]}, 422, "invalid_request"),
+        ({"points": [{}]}, 422, "invalid_request"),
+        ({"points": [{"xy_px": [60, 80], "xy_mm": [0, 0]}]}, 422, "invalid_request"),
+        ({"extensometers": [{"a_px": [60, 80]}]}, 422, "invalid_request"),
+        ({"extensometers": [{"ends_mm": [[0, 0], [99, 0]]}]}, 422, "gauge_outside"),
         ({"align": {"kind": "2-2-2"}}, 422, "invalid_request"),
         ({"points": [{"xy_px": [6, 8]}]}, 422, "gauge_outside"),
         ({"areas": [{}], "variables": ["colour"]}, 404, "field_missing"),

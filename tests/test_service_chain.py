@@ -217,6 +217,11 @@ def test_strain_that_cannot_be_is_refused(client: httpx.Client, plate_test: str)
         ({"region": {"rectangle": RECTANGLE}, "seeds": [[300, 10]]}, "seed_outside"),
         ({"region": {"rectangle": RECTANGLE}, "steps": [1, 9]}, "step_missing"),
         ({"region": {"mask_png_base64": "!!"}}, "mask_unreadable"),
+        ({"region": {"rectangle": RECTANGLE, "cracks": [[[100, 100]]]}}, "invalid_request"),
+        ({"region": {"rectangle": RECTANGLE, "cracks": [[[100, 100], [100, 100]]]}}, "cut_invalid"),
+        ({"region": {"rectangle": RECTANGLE, "cracks": [[[100, 100], [300, 100]]]}}, "cut_outside_image"),
+        ({"region": {"rectangle": RECTANGLE, "holes": [[[100, 100], [110, 110], [120, 120]]]}}, "region_empty"),
+        ({"region": {"rectangle": RECTANGLE, "holes": [[[0, 0], [255, 0], [255, 239], [0, 239]]]}}, "region_empty"),
         ({}, "invalid_request"),
     ],
 )
@@ -232,6 +237,31 @@ def test_black_or_wrong_sized_mask_is_refused(client: httpx.Client, plate_test: 
         Image.fromarray(np.zeros(shape, dtype=np.uint8)).save(buffer, "PNG")
         region = {"mask_png_base64": base64.b64encode(buffer.getvalue()).decode()}
         refused(client.post(f"{API}/tests/{plate_test}/analyses", json={"region": region}), 422, code)
+
+
+def test_a_crack_and_a_hole_are_kept_to_and_told(client: httpx.Client, plate_test: str) -> None:
+    crack, hole = [[80, 118.3], [120, 118.9]], [[95, 80], [115, 80], [115, 100], [95, 100]]
+    body = {
+        "kind": "profile", "subset_px": 25, "step_px": 5, "steps": [0],
+        "region": {"rectangle": [70, 70, 140, 140], "cracks": [crack], "holes": [hole]},
+    }  # fmt: skip
+    accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body).json()
+    done = wait_for_job(client, accepted["job"])
+    assert done["state"] == "succeeded", done["problem"]
+    url = f"{API}/tests/{plate_test}/analyses/{accepted['analysis_id']}"
+    told = client.get(url).json()["settings"]["region"]
+    assert told["cracks"] == [crack]
+    assert told["holes"] == [hole]
+    status, x, y, sigma = (
+        np.array(client.get(f"{url}/steps/0/fields/{name}").json()["values"], dtype=float)
+        for name in ("status", "x_px", "y_px", "sigma_z_mm")
+    )
+    inside = (x >= 95) & (x <= 115) & (y >= 80) & (y <= 100)
+    assert (status[inside] == 2).all()
+    assert (status[~inside] == 0).mean() > 0.97
+    # half a subset says less than a whole one
+    lips = (np.abs(y - 118.6) < 4) & (x > 85) & (x < 115)
+    assert np.nanmedian(sigma[lips]) > 1.3 * np.nanmedian(sigma[y > 133])
 
 
 def test_mask_and_profile_measure_where_the_mask_is_white(client: httpx.Client, plate_test: str) -> None:

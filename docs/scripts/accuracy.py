@@ -19,8 +19,10 @@ mpl.use("Agg")
 
 from docs.scripts import (
     accuracy_calibration,
+    accuracy_cracks,
     accuracy_curved,
     accuracy_experiments,
+    accuracy_gauges,
     accuracy_large,
     accuracy_matching,
     accuracy_noise,
@@ -41,6 +43,8 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "epipolar": accuracy_matching.epipolar,
     **accuracy_curved.SECTIONS,
     **accuracy_strain.SECTIONS,
+    **accuracy_gauges.SECTIONS,
+    "cracks": accuracy_cracks.cracks,
     "large": accuracy_large.large_motion,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,

@@ -29,6 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--point", **many, metavar="X,Y", help="values at a place; repeatable, as all gauges; places are px of camera "
         "1's reference image; NAME= in front names a gauge")  # fmt: skip
     add("--extensometer", **many, metavar="X0,Y0,X1,Y1", help="length, elongation, engineering and true strain")
+    add("--point-mm", **many, metavar="X,Y", help="a place by X and Y of the reference, in the frame asked for")
+    add("--extensometer-mm", **many, metavar="X0,Y0,X1,Y1", help="an extensometer between two such places")
     add("--line", **many, metavar="X0,Y0,X1,Y1[,N]", help="values at N places along a line (one a grid step)")
     add("--area", **many, metavar="X0,Y0,X1,Y1", help="statistics over a rectangle; six or more numbers: a polygon; "
         "all: the whole field")  # fmt: skip
@@ -77,9 +79,13 @@ def result_files(folder: Path) -> list[Path]:
 
 def _request(args: argparse.Namespace) -> GaugeRequest:
     body: dict[str, Any] = {
-        "points": [_named("--point", t, lambda v: {"xy_px": v}, (2,)) for t in args.point],
+        "points": [
+            *(_named("--point", t, lambda v: {"xy_px": v}, (2,)) for t in args.point),
+            *(_named("--point-mm", t, lambda v: {"xy_mm": v}, (2,)) for t in args.point_mm),
+        ],
         "extensometers": [
-            _named("--extensometer", t, lambda v: {"a_px": v[:2], "b_px": v[2:]}, (4,)) for t in args.extensometer
+            *(_named("--extensometer", t, lambda v: {"a_px": v[:2], "b_px": v[2:]}, (4,)) for t in args.extensometer),
+            *(_named("--extensometer-mm", t, lambda v: {"ends_mm": _pairs(v)}, (4,)) for t in args.extensometer_mm),
         ],
         "lines": [_named("--line", t, _line, (4, 5)) for t in args.line],
         "areas": [_named("--area", t, _area, None) for t in args.area],

@@ -1,0 +1,93 @@
+"""Where in camera 1's image a place given in millimetres lies."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import RegionError
+from core.field.result import Field
+from core.gauge.shared_pixels import steps_px
+
+Float = NDArray[np.float64]
+
+_ROUNDS = 20
+_ON_THE_EDGE = 1e-9
+_SAME = 1e-6  # of a cell: two cells that meet there
+
+
+def places_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
+    """Return (m, 2) pixels of camera 1's reference image at which the reference shape has these X and Y.
+
+    Parameters
+    ----------
+    field
+        Gives the reference shape, in the frame that the places are told in.
+    xy_mm
+        (m, 2) X and Y.
+
+    Raises
+    ------
+    RegionError
+        ``gauge_outside`` where no cell of four valid points holds a place; ``gauge_ambiguous`` where two parts of a
+        surface that folds over do.
+    """
+    wanted = np.atleast_2d(np.asarray(xy_mm, dtype=np.float64))
+    if wanted.ndim != 2 or wanted.shape[1] != 2 or not np.isfinite(wanted).all():
+        raise RegionError(f"Places are (n, 2) finite millimetres, got an array of shape {wanted.shape}.",
+                          code="gauge_unusable")  # fmt: skip
+    steps = np.array(steps_px(field))
+    xy = field.xyz_mm[..., :2]
+    valid = field.valid
+    whole = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
+    row, col = np.nonzero(whole)
+    corners = np.stack([xy[row, col], xy[row, col + 1], xy[row + 1, col], xy[row + 1, col + 1]], axis=1)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    out = np.empty_like(wanted)
+    for k, place in enumerate(wanted):
+        near = np.flatnonzero(((low <= place) & (place <= high)).all(axis=1))
+        t = _inside(corners[near], place)
+        held = ((t >= -_ON_THE_EDGE) & (t <= 1.0 + _ON_THE_EDGE)).all(axis=1)
+        if not held.any():
+            reach = ""
+            if valid.any():
+                (x0, y0), (x1, y1) = xy[valid].min(axis=0), xy[valid].max(axis=0)
+                reach = f"; X runs from {x0:.6g} to {x1:.6g} mm there, Y from {y0:.6g} to {y1:.6g} mm"
+            raise RegionError(
+                f"({place[0]:g}, {place[1]:g}) mm does not lie between measured points of the reference{reach}.",
+                code="gauge_outside",
+                remedy="Give a place on the measured surface, in the frame that was asked for.",
+            )
+        cell = near[held]
+        px = np.stack([field.x_px[row[cell], col[cell]], field.y_px[row[cell], col[cell]]], axis=1) + t[held] * steps
+        if np.abs(px - px[0]).max() > _SAME * steps.max():
+            raise RegionError(
+                f"The surface has ({place[0]:g}, {place[1]:g}) mm at more than one pixel.",
+                code="gauge_ambiguous",
+                remedy="Give the place in pixels, or a frame in which the surface does not fold over.",
+            )
+        out[k] = px[0]
+    return out
+
+
+def _inside(corners: Float, place: Float) -> Float:
+    """Solve bilinear cells (n, 4, 2) for a place by Newton's method; (n, 2) across and down, NaN where it fails."""
+    a, b, c, d = (corners[:, k] for k in range(4))
+    t = np.full((len(corners), 2), 0.5)
+    for _ in range(_ROUNDS):
+        u, v = t[:, :1], t[:, 1:]
+        r = (1 - u) * (1 - v) * a + u * (1 - v) * b + (1 - u) * v * c + u * v * d - place
+        du, dv = (1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)
+        det = _cross(du, dv)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = np.stack(
+                [r[:, 0] * dv[:, 1] - r[:, 1] * dv[:, 0], du[:, 0] * r[:, 1] - du[:, 1] * r[:, 0]], axis=1
+            )
+            t = t - change / det[:, None]
+        # far outside its cell the map may fold over: that place is not in this cell
+        t = np.where(np.abs(t) < 10.0, t, np.nan)
+    return t
+
+
+def _cross(a: Float, b: Float) -> Float:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
