@@ -21,6 +21,7 @@ from service_rig import new_test, served, tiny_config, wait_for_rig
 
 from core.field.cuts import Cuts
 from core.field.result import Field
+from core.strain import StrainOptions, surface_strain
 from server.cli.main import main
 from server.io.netcdf import Provenance, write_field
 from server.service import Service
@@ -212,6 +213,22 @@ def test_any_scalar_variable_of_the_file_can_be_read(tmp_path: Path, capsys: pyt
     assert err.startswith("stereorig: field_missing:")
     rc, _, err = gauge(capsys, tmp_path, "--variable", "zncc", "--area", "all")
     assert err.startswith("stereorig: field_not_scalar:")
+
+
+def test_strain_of_the_result_file_is_read_at_gauges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = stretched(0.03)
+    strain = surface_strain(field, StrainOptions(window=3), subset_px=SUBSET)
+    path = tmp_path / "step_0001.nc"
+    write_field(path, field, Provenance({"subset_px": SUBSET}, INPUTS, "1", step=1), strain)
+    rc, _, err = gauge(capsys, tmp_path, "--point", "82,95", "--area", "all", "--variable", "exx", "--variable", "eyy",
+                       "--align", "plane", "--remove-rigid", "--out", tmp_path / "g.json")  # fmt: skip
+    assert (rc, err) == (0, "")
+    (step,) = json.loads((tmp_path / "g.json").read_text())["steps"]
+    for name, stretch in (("exx", 1.03), ("eyy", 1.0 - 0.3 * 0.03)):
+        number = step["points"][0]["values"][name]
+        assert number["value"] == pytest.approx(0.5 * (stretch**2 - 1.0), abs=1e-6)
+        assert 0.0 < number["sigma"] < 0.02
+        assert step["areas"][0]["values"][name]["mean"] == pytest.approx(0.5 * (stretch**2 - 1.0), abs=1e-6)
 
 
 @pytest.mark.fault(40)

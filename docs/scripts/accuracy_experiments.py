@@ -59,7 +59,8 @@ def panel(figures: Path) -> Section:
     return _demo("panel", figures)
 
 
-def _shared() -> Path:
+def specimen_folder() -> Path:
+    """Where the real images lie."""
     named = os.environ.get("STEREORIG_SHARED")
     folders = [Path(named)] if named else []
     folders += [ROOT.parent / "shared", ROOT.parent.parent / "shared"]
@@ -75,7 +76,7 @@ def _plane_rms_um(field: Any) -> float:
 
 def specimen(figures: Path) -> Section:
     """Real images."""
-    data = _shared()
+    data = specimen_folder()
     with tempfile.TemporaryDirectory() as folder:
         command = [
             sys.executable,
