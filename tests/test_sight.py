@@ -12,6 +12,7 @@ from core.field.cuts import Cuts, crosses
 from core.field.grow import Attempts
 from core.field.local_fit import robust_local_fits
 from core.field.region import PointGrid, check_region
+from core.field.seeds import as_seeds, nearest_points
 from core.field.sight import LEAST_SHARE, MARGIN_PX, sight_of
 
 SUBSET = 21
@@ -129,6 +130,19 @@ def test_local_fits_hear_only_what_they_see() -> None:
     np.testing.assert_allclose(heard.value[:, 0], value(places), atol=1e-9)
     plain = robust_local_fits(places, points, value(points)[:, None], **options)
     assert np.abs(plain.value[:, 0] - value(places)).max() > 1.0
+
+
+def test_a_click_starts_on_its_own_side() -> None:
+    """The nearest point lies just over the line."""
+    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=10.0).with_cracks([[(15.0, 49.0), (85.0, 49.0)]])
+    sight = sight_of(grid, SUBSET)
+    xy, usable = grid.xy_px.reshape(-1, 2), np.ones(49, bool)
+    seeds = as_seeds([(50.0, 48.0), (50.0, 51.0)])
+    found = nearest_points(seeds, xy, usable, reach_px=20.0, sight=sight)
+    assert xy[found].tolist() == [[50.0, 40.0], [50.0, 50.0]]
+    with pytest.raises(RegionError) as caught:
+        nearest_points(seeds, xy, usable & (xy[:, 1] > 49.0), reach_px=20.0, sight=sight)
+    assert caught.value.code == "seed_outside"
 
 
 def test_a_crack_outside_the_image_is_refused() -> None:

@@ -248,9 +248,12 @@ class Run:
         whole = usable if self.sight is None else usable & self.sight.whole
         return whole if whole.any() else usable
 
-    def _user_shape(self, seeds: tuple[Seed, ...]) -> None:
+    def _nearest(self, seeds: tuple[Seed, ...], usable: Bool) -> NDArray[np.intp]:
         reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
-        for seed, i in zip(seeds, nearest_points(seeds, self.xy_px, self.usable, reach_px=reach), strict=True):
+        return nearest_points(seeds, self.xy_px, usable, reach_px=reach, sight=self.sight)
+
+    def _user_shape(self, seeds: tuple[Seed, ...]) -> None:
+        for seed, i in zip(seeds, self._nearest(seeds, self.usable), strict=True):
             raise_if_cancelled(self.cancel)
             found = PointFits.empty(1, 1)
             if seed.xy2_px is not None:
@@ -270,8 +273,7 @@ class Run:
         if self.known_w is None:
             raise SeedError("a seed for a motion needs the shape that was measured before it.")
         usable = self.usable & np.isfinite(self.known_w).all(axis=1)
-        reach = max(_REACH_STEPS * self.grid.step_px, float(self.options.subset_px))
-        index = nearest_points(seeds, self.xy_px, usable, reach_px=reach)
+        index = self._nearest(seeds, usable)
         for i in index:
             raise_if_cancelled(self.cancel)
             found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])

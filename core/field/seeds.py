@@ -80,8 +80,10 @@ def as_seeds(seeds: Sequence[Seed | Sequence[float]] | NDArray[Any]) -> tuple[Se
     return tuple(out)
 
 
-def nearest_points(seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_px: float) -> NDArray[np.intp]:
-    """Return the index of the measurable point nearest to each seed.
+def nearest_points(
+    seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_px: float, sight: Sight | None = None
+) -> NDArray[np.intp]:
+    """Return the index of the measurable point nearest to each seed, on the seed's own side of cuts.
 
     Raises
     ------
@@ -92,10 +94,14 @@ def nearest_points(seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_p
     out = []
     for seed in seeds:
         distance = np.linalg.norm(xy_px[candidates] - np.asarray(seed.xy_px), axis=1)
+        if sight is not None:
+            place = np.broadcast_to(np.asarray(seed.xy_px, dtype=np.float64), (len(candidates), 2))
+            distance[sight.apart(place, xy_px[candidates])] = np.inf
         best = int(np.argmin(distance))
         if distance[best] > reach_px:
+            far = f"{distance[best]:.0f} px" if np.isfinite(distance[best]) else "across a crack or a mask's black"
             raise RegionError(
-                f"the seed ({seed.xy_px[0]:g}, {seed.xy_px[1]:g}) lies {distance[best]:.0f} px from the nearest point "
+                f"the seed ({seed.xy_px[0]:g}, {seed.xy_px[1]:g}) lies {far} from the nearest point "
                 f"that can be measured.",
                 code="seed_outside",
                 remedy="Give a seed inside the region, in camera 1's reference image.",
