@@ -259,3 +259,31 @@ def test_speed():
     start = time.process_time()
     _strain(field)
     assert time.process_time() - start < 2.0
+
+
+def test_clamped_plate():
+    """Deflection w0 (1 - r^2/a^2)^2; the face moves in the plane by half the thickness times the slope."""
+    w0, a, thick = 0.4, 12.0, 1.5
+
+    def slope(r):
+        return -4.0 * w0 * r / a**2 * (1.0 - r**2 / a**2)
+
+    def press(p):
+        r = np.hypot(p[..., 0], p[..., 1])
+        inward = -0.5 * thick * slope(r) / np.where(r > 0, r, 1.0)
+        return p + np.stack([inward * p[..., 0], inward * p[..., 1], w0 * (1.0 - r**2 / a**2) ** 2], axis=-1)
+
+    field = make_field(lambda x, y: np.stack([x, y, 0 * x], axis=-1), press, shape=(41, 41))
+    found = _strain(field, window=3)
+    x, y = field.xyz_mm[..., 0], field.xyz_mm[..., 1]
+    r, phi = np.hypot(x, y), np.arctan2(y, x)
+    stretch = 2.0 * thick * w0 / a**2 * (1.0 - 3.0 * r**2 / a**2)  # d u_r / d r
+    hoop = 2.0 * thick * w0 / a**2 * (1.0 - r**2 / a**2)  # u_r / r
+    radial = stretch + 0.5 * (stretch**2 + slope(r) ** 2)
+    around = hoop + 0.5 * hoop**2
+    c, s = np.cos(phi), np.sin(phi)
+    exact = np.stack([radial * c**2 + around * s**2, radial * s**2 + around * c**2, (radial - around) * c * s], axis=-1)
+    inner = (slice(1, -1), slice(1, -1))
+    # three points h apart take h^2 / 6 of the third derivative 12 t w0 / a^4 for slope, along and across the window
+    assert np.abs(found.strain[inner] - exact[inner]).max() < 2.4 * 0.33**2 / 6.0 * 12.0 * thick * w0 / a**4
+    assert np.abs(exact).max() > 8e-3

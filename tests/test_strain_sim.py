@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cut_scenes
+import field_bench as bench
 import numpy as np
 import pytest
 
@@ -13,9 +17,9 @@ from sim.render import RenderOptions, render
 from sim.scene import UPRIGHT, Scene
 from sim.surface import flat
 from sim.texture import speckle
-from tests.field_bench import SIZE, grid, pair, rig
 from tests.strain_fields import turned
 
+SIZE, grid, pair, rig = bench.SIZE, bench.grid, bench.pair, bench.rig
 SUBSET = 21
 FALSE_LIMIT = 20e-6  # what the project asks of itself
 
@@ -88,3 +92,21 @@ def test_uncertainty_of_repeated_pictures() -> None:
     told = np.sqrt(np.mean([s.sigma[kept] ** 2 for s in found], axis=(0, 1)))
     # eight pictures of some 60 independent windows: 5 % at two sigma
     np.testing.assert_allclose(told / scatter, 1.0, atol=0.12)
+
+
+@pytest.mark.fault(37)
+def test_lips_of_an_open_crack_have_no_false_strain() -> None:
+    """Two halves part by 120 um along a drawn line: on both lips the strain is zero within what is told."""
+    line = np.array([(0.0, 107.3), (263.0, 118.1)])
+    marked = bench.grid(step_px=5.0, margin_px=36.0).with_cracks([line])
+    reference = ReferencePair(bench.pair(), *cut_scenes.reference())
+    now = cut_scenes.parted(cut_scenes.below(line))
+    field = reference.motion(*now, marked, MeasureOptions(subset_px=SUBSET, patch="stretch"))
+    found = surface_strain(field, StrainOptions(window=7), subset_px=SUBSET)
+    beside = np.abs(field.y_px - np.interp(field.x_px, line[:, 0], line[:, 1])) < 15.0
+    assert found.valid[beside].mean() > 0.9
+    share = (found.strain / found.sigma)[found.valid]
+    assert np.abs(share).max() < 6.0
+    assert np.abs(found.strain[found.valid & beside]).max() < 2e-3
+    blind = surface_strain(replace(field, cuts=None), StrainOptions(window=7), subset_px=SUBSET)
+    assert np.abs(blind.strain[blind.valid & beside]).max() > 2e-2
