@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from core.errors import MeasurementError, StateError
+from core.field.cuts import Cuts
 from core.field.result import Field
 from server.cli import demo, main
 from server.demo import pictures
@@ -247,6 +248,19 @@ def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
 
 def test_free_ports_are_free() -> None:
     assert not answers(free_port())
+
+
+def test_no_triangle_of_a_picture_reaches_over_a_crack() -> None:
+    field = field_of(lambda x, y: 0.0 * x)
+    y = float(field.y_px[2, 0]) + 1.5
+    line = [(float(field.x_px[0, 0]), y), (float(field.x_px[0, 3]), y)]
+    rows, cols = field.shape
+    whole = {frozenset(t) for t in pictures.triangles(field).tolist()}
+    assert len(whole) == 2 * (rows - 1) * (cols - 1)
+    cut = {frozenset(t) for t in pictures.triangles(dataclasses.replace(field, cuts=Cuts([line]))).tolist()}
+    gone = {k for t in whole - cut for k in t}
+    # between rows 2 and 3 as far as the line goes; its end touches the next triangle's side in column 3
+    assert gone == {2 * cols + c for c in range(5)} | {3 * cols + c for c in range(4)}
 
 
 @pytest.mark.slow

@@ -230,6 +230,20 @@ def test_unrelated_images_give_no_field() -> None:
     assert error.value.code == "not_seeded"
 
 
+@pytest.mark.parametrize("noise", [2.0, 8.0, 20.0])
+def test_images_that_are_noisier_than_the_reference_are_told(noise: float) -> None:
+    first, second = take("block")
+    now = take("block", 1.0, seed=3, noise=noise)
+    dense = grid(step_px=6.0)
+    field = measure_motion(pair(), first, second, *now, dense, replace(OPTIONS, patch="stretch"))
+    error = (field.uvw_mm - truth(dense, scene("block"), scene("block", 1.0)).uvw_mm)[field.valid]
+    told = np.sqrt((field.sigma_mm[field.valid][:, 3:] ** 2).mean(axis=0))
+    assert field.valid.mean() > 0.97
+    ratio = told / error.std(axis=0)
+    assert (ratio > 0.8).all()
+    assert (ratio < 1.25).all()
+
+
 def test_a_noise_model_that_takes_all_texture_for_noise_is_named() -> None:
     first, second = take("block")
     loud = NoiseModel(coefficients=(100.0**2, 0.0, 0.0))

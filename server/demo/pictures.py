@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.cuts import crosses
 from core.field.result import Field
 from server.demo.compare import MotionComparison
 from sim.plate import CircularPlate
@@ -17,6 +18,7 @@ from sim.plate import CircularPlate
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.patches import Rectangle
+from matplotlib.tri import Triangulation
 
 Float = NDArray[np.float64]
 
@@ -31,18 +33,6 @@ def upright_mm(xyz_mm: Float) -> tuple[Float, Float]:
     """Turn X_sys, Y_sys (along the grid's lines, at 45 degrees) to the directions right and down in the images."""
     half = np.sqrt(0.5)
     return half * (xyz_mm[..., 0] - xyz_mm[..., 1]), half * (xyz_mm[..., 0] + xyz_mm[..., 1])
-
-
-def _places(values: Float, valid: NDArray[np.bool_], *, axis: int) -> Float:
-    """One place for every column (axis 0) or row (axis 1): contours need places where points failed, too."""
-    lines = np.moveaxis(np.where(valid, values, np.nan), axis, -1)
-    known = np.isfinite(lines).any(axis=-1)
-    k = np.arange(len(lines))
-    medians = np.array([np.nanmedian(line) for line in lines[known]])
-    slope, offset = np.polyfit(k[known], medians, 1)
-    places: Float = np.asarray(slope * k + offset)
-    places[known] = medians
-    return places
 
 
 def _save(figure: Any, path: Path) -> None:
@@ -204,6 +194,17 @@ def steel(
     }
 
 
+def triangles(result: Field) -> NDArray[np.intp]:
+    """Return (m, 3) triangles of neighbouring valid points, none over a cut: what may be interpolated."""
+    rows, cols = result.shape
+    place = np.arange(rows * cols).reshape(rows, cols)
+    a, b, c, d = place[:-1, :-1].ravel(), place[:-1, 1:].ravel(), place[1:, :-1].ravel(), place[1:, 1:].ravel()
+    three = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+    xy = np.stack([result.x_px.ravel(), result.y_px.ravel()], axis=-1)
+    parted = crosses(xy[three], xy[np.roll(three, 1, axis=1)], result.cuts).any(axis=1)
+    return np.asarray(three[result.valid.ravel()[three].all(axis=1) & ~parted], dtype=np.intp)
+
+
 def panel(
     out: Path, image: NDArray[Any], roi_px: Sequence[float], fields: Sequence[Field],
     comparisons: Sequence[MotionComparison], loads_kn: Sequence[float], crack_px: Float,
@@ -214,10 +215,10 @@ def panel(
         figure, axes = plt.subplots(2, 2, figsize=(9.4, 6.8), layout="constrained")
         for axis, result, load, letter in zip(axes.flat, fields, loads_kn, "abcd", strict=False):
             x, y = upright_mm(result.xyz_mm)
-            px, py = _places(x, result.valid, axis=0), _places(y, result.valid, axis=1)
             w = -result.uvw_mm[..., 2]  # type: ignore[index]
-            drawn = axis.contourf(px, py, np.ma.masked_invalid(w), levels=14, cmap=_HEIGHT)
-            axis.contour(px, py, np.ma.masked_invalid(w), levels=14, colors="black", linewidths=0.3)
+            surface = Triangulation(np.nan_to_num(x).ravel(), np.nan_to_num(y).ravel(), triangles(result))
+            drawn = axis.tricontourf(surface, np.nan_to_num(w).ravel(), levels=14, cmap=_HEIGHT)
+            axis.tricontour(surface, np.nan_to_num(w).ravel(), levels=14, colors="black", linewidths=0.3)
             axis.invert_yaxis()
             axis.set_aspect("equal")
             axis.set_title(f"({letter}) {load:g} kN")

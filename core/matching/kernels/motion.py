@@ -20,6 +20,7 @@ from core.matching.kernels.noise import (
     joint_weights,
     noise_from_residuals,
     share_correction,
+    unlike_noise,
 )
 from core.matching.kernels.point import (
     LOW_TEXTURE,
@@ -214,11 +215,13 @@ def make_motion(degree: int) -> Any:
             worst = min(worst, levels[k, ZNCC])
         variance = noise_from_residuals(levels, 3, count, float(n))
         out[at + 4] = math.sqrt(variance)
+        above = unlike_noise(levels, 3, count, float(n))
         if known_noise:
             variance = variances[0]
         covariance = out[at + 5 : at + 30]
         covariance_of_last(normal, n, 5, work, covariance)
-        factor_on = share_correction(gradients, variance, p, slope[0], slope[1]) * (1.0 if known_noise else variance)
+        factor_on = share_correction(gradients, variance, p, slope[0], slope[1])
+        factor_on *= 1.0 if known_noise else variance + above
         for i in range(25):
             covariance[i] *= factor_on
         # px: along and across camera 2's epipolar line, and both ways in camera 1 at t

@@ -12,6 +12,7 @@ from core.matching.kernels.naming import inner
 # two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
 VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
 ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
+UNLIKE = 1.5  # small differences of the views raise residuals by less, and do not pull the solution as noise does
 MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
 
 # an image's levels; the misfit is the residuals' sum of squares, then the noise of its interpolated grey levels over
@@ -87,6 +88,22 @@ def noise_from_residuals(levels, images, n, unknowns):
             total += one
             count += 1
     return max(total, 0.0) / max(count, 1) / freedom
+
+
+@inner
+def unlike_noise(levels, images, n, unknowns):
+    """Variance by which the noisiest image exceeds what the quietest comparison tells of all; zero where all are alike.
+
+    The weights take all images' noise for equal. Where one has clearly more (less light, blur, a surface that changed),
+    the unknowns that depend on it scatter with the mean of its variance and the reference's, which is what its own
+    comparison tells; so the covariance is that of the noisiest comparison.
+    """
+    freedom = max(n - 2.0 - unknowns / images, 1.0)
+    smallest, largest = np.inf, 0.0
+    for k in range(images):
+        one = _one_variance(levels, k)
+        smallest, largest = min(smallest, one), max(largest, one)
+    return max(largest - UNLIKE * smallest, 0.0) / freedom
 
 
 @inner
