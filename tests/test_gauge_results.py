@@ -154,6 +154,8 @@ def test_csv_holds_the_same_numbers_as_json(results: Path, tmp_path: Path, capsy
     assert len(strain) == 1
     assert float(strain[0]["value"]) == document["steps"][2]["extensometers"][0]["values"]["strain"]["value"]
     assert (strain[0]["label"], strain[0]["load_n"], strain[0]["units"]) == ("step, 2", "200.0", "1")
+    of_shape = [r for r in rows if r["gauge"] == "axial" and r["quantity"] == "strain" and r["step"] == "0"]
+    assert [(r["value"], r["missing"]) for r in of_shape] == [("", "no value")]  # a shape has no strain
     line = [r for r in rows if r["kind"] == "line" and r["quantity"] == "w_mm" and r["step"] == "1"]
     values = document["steps"][1]["lines"][0]["values"]["w_mm"]["value"]
     assert [float(r["value"]) if r["value"] else None for r in line] == values

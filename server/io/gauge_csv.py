@@ -11,6 +11,7 @@ from typing import Any
 COLUMNS = ("step", "label", "load_n", "gauge", "kind", "x_px", "y_px", "distance_px", "quantity", "value", "sigma",
            "units", "missing")  # fmt: skip
 _OF_AREA = ("mean", "sd", "min", "max", "rms", "count")
+NO_VALUE = "no value"
 
 
 def gauges_csv(document: dict[str, Any]) -> bytes:
@@ -31,6 +32,8 @@ def gauges_csv(document: dict[str, Any]) -> bytes:
     for step in document["steps"]:
         head = {"step": step["n"], "label": step["label"], "load_n": _cell(step["load_n"])}
         for row in rows(step):
+            if row.get("value") is None:  # the place is there, but this variable has nothing there
+                row["missing"] = row.get("missing") or NO_VALUE
             writer.writerow({**head, **{k: _cell(v) for k, v in row.items()}})
     return text.getvalue().encode()
 
