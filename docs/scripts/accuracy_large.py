@@ -79,7 +79,7 @@ def large_motion(figures: Path) -> Section:
 
 
 def _draw(path: Path, pictures: list[tuple[str, NDArray[np.uint8], Float, Float]]) -> None:
-    figure, axes = plt.subplots(2, 3, figsize=(11, 7.2), layout="constrained")
+    figure, axes = plt.subplots(2, 3, figsize=(9, 5.9), layout="constrained")
     shown = None
     for axis, (name, image, there, error) in zip(axes.flat, pictures, strict=True):
         axis.imshow(image, cmap="gray", vmin=0, vmax=255)
@@ -87,5 +87,5 @@ def _draw(path: Path, pictures: list[tuple[str, NDArray[np.uint8], Float, Float]
         axis.set(title=name, xticks=[], yticks=[], xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
     assert shown is not None
     figure.colorbar(shown, ax=axes, label="error of u, v, w together, um", shrink=0.7)
-    figure.savefig(path, dpi=80)
+    figure.savefig(path, dpi=64)
     plt.close(figure)
