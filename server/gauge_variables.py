@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import InputError
 from core.field.result import Field
-from core.gauge.shared_pixels import SharedPixels
+from core.field.shared_pixels import SharedPixels
 from server.errors import NotFoundError
 from server.io.netcdf import COVARIANCE_NAMES, field_variable
 from server.results import Variable, read_variable

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from core.errors import InputError, MeasurementError, StateError
 from core.field.result import Field
+from core.field.shared_pixels import SharedPixels
 from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
@@ -20,7 +21,6 @@ from core.gauge.locate import places_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
-from core.gauge.shared_pixels import SharedPixels
 from server.gauge_request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
 from server.gauge_variables import Variables, component_of
 from server.io.files import sha256_of

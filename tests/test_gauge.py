@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from core.errors import InputError, MeasurementError, RegionError
 from core.field.cuts import Cuts
 from core.field.result import Field
+from core.field.shared_pixels import SharedPixels
 from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import Extensometer, extensometer
@@ -21,7 +22,6 @@ from core.gauge.locate import places_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import rigid_motion, without_rigid_motion
 from core.gauge.sampling import sample
-from core.gauge.shared_pixels import SharedPixels
 
 SHARED = SharedPixels(SUBSET)
 TURN = Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix()

@@ -9,8 +9,8 @@ import pytest
 from scipy.ndimage import correlate, uniform_filter
 
 from core.field.patch import asked_for
+from core.field.shared_pixels import SharedPixels
 from core.strain import StrainOptions, surface_strain
-from core.strain.overlap import neighbour_correlation
 from tests.strain_fields import make_field, plane, turned
 
 SUBSET, STEP, SHAPE = 21, 8, (17, 19)
@@ -94,7 +94,7 @@ def test_correlation_of_curved_patches():
         expected = 0.0
         if max(dx, dy) < SUBSET:
             expected = all_lags[middle[0] + dy, middle[1] + dx] / all_lags[middle[0], middle[1]]
-        told = neighbour_correlation(np.array([float(dx)]), np.array([-float(dy)]), SUBSET, curved=True)[0]
+        told = SharedPixels(SUBSET, curved=True).correlation(np.array([float(dx)]), np.array([-float(dy)]))[0]
         assert told == pytest.approx(expected, abs=0.01)
 
 

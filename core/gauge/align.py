@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import MeasurementError, RegionError
 from core.field.result import Field
+from core.field.shared_pixels import SharedPixels, roots_of
 from core.gauge.sampling import sample
-from core.gauge.shared_pixels import SharedPixels, roots_of
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import RegionError
 from core.field.region import PointGrid
 from core.field.result import Field
-from core.gauge.shared_pixels import SharedPixels, steps_px
+from core.field.shared_pixels import SharedPixels, steps_px
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
 from core.field.result import Field
+from core.field.shared_pixels import SharedPixels
 from core.gauge.reading import MISSING, Reading
 from core.gauge.sampling import Samples, sample
-from core.gauge.shared_pixels import SharedPixels
 
 Float = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
 from core.field.result import Field
-from core.gauge.shared_pixels import steps_px
+from core.field.shared_pixels import steps_px
 
 Float = NDArray[np.float64]
 

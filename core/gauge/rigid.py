@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from core.errors import InputError, MeasurementError
 from core.field.result import Field
-from core.gauge.shared_pixels import SharedPixels, roots_of
+from core.field.shared_pixels import SharedPixels, roots_of
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

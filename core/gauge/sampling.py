@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import RegionError
 from core.field.cuts import crosses
 from core.field.result import Field
-from core.gauge.shared_pixels import SharedPixels, roots_of, steps_px
+from core.field.shared_pixels import SharedPixels, roots_of, steps_px
 from core.status import PointStatus
 
 Float = NDArray[np.float64]

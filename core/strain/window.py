@@ -14,9 +14,9 @@ import numpy as np
 from scipy import ndimage
 
 from core.field.cuts import Cuts, crosses
+from core.field.shared_pixels import SharedPixels
 from core.lens import Bool, Float
 from core.strain.options import StrainOptions
-from core.strain.overlap import neighbour_correlation
 from core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
@@ -98,7 +98,7 @@ def window_slopes(
     offsets, _ = _offsets(half)
     step = _steps(xy_px)
     apart = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
-    rho = neighbour_correlation(apart[..., 1] * step[0], apart[..., 0] * step[1], subset_px, curved=curved)
+    rho = SharedPixels(subset_px, curved).correlation(apart[..., 1] * step[0], apart[..., 0] * step[1])
     whole = ndimage.minimum_filter(valid, size=options.window, mode="constant", cval=False)
     crossed = _crossed(valid, xy_px, cuts, half)
     whole &= ~crossed.any(axis=-1) if crossed is not None else True

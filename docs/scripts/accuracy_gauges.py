@@ -13,11 +13,11 @@ from core.camera import RigidTransform
 from core.field.images import MeasureImage
 from core.field.region import PointGrid
 from core.field.result import Field
+from core.field.shared_pixels import SharedPixels
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
 from core.gauge.reading import Reading
 from core.gauge.rigid import rigid_motion
-from core.gauge.shared_pixels import SharedPixels
 from core.measure import MeasureOptions, ReferencePair
 from docs.scripts.paper_rig import load_rig, plane_scene, turn
 from docs.scripts.table import Row, Section
