@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from core.field.result import Field
+from core.field.smooth import smooth_terms
 
 Level = Literal["ok", "warning", "failed"]
 
@@ -67,11 +68,8 @@ def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
     offset = field.epipolar_px[valid]
     if len(offset) < _FEWEST:
         return None
-    columns = [np.ones(len(offset))]
-    if len(offset) >= _FEWEST_FOR_SURFACE:
-        x, y = ((a[valid] - a[valid].mean()) / max(float(np.ptp(a[valid])), 1.0) for a in (field.x_px, field.y_px))
-        columns += [x, y, x * x, x * y, y * y]
-    design = np.column_stack(columns)
+    terms = smooth_terms(np.column_stack([field.x_px[valid], field.y_px[valid]]))
+    design = terms if len(offset) >= _FEWEST_FOR_SURFACE else terms[:, :1]
     smooth = design @ np.linalg.lstsq(design, offset, rcond=1e-9)[0]
     left = float(np.sum((offset - smooth) ** 2)) / max(len(offset) - design.shape[1], 1)
     # what noise alone lets a surface of so many terms explain is taken out

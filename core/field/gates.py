@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from core.field.fitter import PointFits
 from core.field.kernels import N_QUANTITIES, compare_with_neighbours, sorting_network
 from core.field.sight import Sight
+from core.field.smooth import smooth_terms
 from core.field.starts import depth_per_px
 from core.lens import Bool, Float
 from core.status import PointStatus
@@ -97,7 +98,7 @@ def apply_gates(
     """
     before = int(points.ok.sum())
     few = before < _FEW
-    terms = _smooth_terms(xy_px)
+    terms = smooth_terms(xy_px)
     if not few:
         _gate_correlation(points, terms, texture, options)
     for _ in range(2):
@@ -230,12 +231,6 @@ def _connected(ok: Bool, shape: tuple[int, int], sight: Sight) -> NDArray[np.int
     a, b = np.concatenate(ends, axis=1)
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
-
-
-def _smooth_terms(xy: Float) -> Float:
-    """Quadratic surface (n, 6) over the points, scaled to unit size."""
-    x, y = ((a - a.mean()) / max(float(np.ptp(a)), 1.0) for a in np.ascontiguousarray(xy.T))
-    return np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
 
 
 def _at_points(terms: Float, ok: NDArray[np.intp]) -> Float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from core.field.smooth import smooth_terms
 from core.field.starts import position_now
 from core.lens import Float
 from core.stereo import StereoPair
@@ -37,7 +38,7 @@ def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], 
     """
     if len(sample) < _LINEAR_FROM:
         return G
-    terms = _terms(xy_px, len(sample) >= _QUADRATIC_FROM)
+    terms = smooth_terms(xy_px)[:, : 6 if len(sample) >= _QUADRATIC_FROM else 3]
     design, change = terms[sample], G_now - G[sample]
     weight = np.ones(len(sample))
     for _ in range(_ROUNDS):
@@ -65,9 +66,3 @@ def _images(pair: StereoPair, w: Float, G: Float) -> Float:
                 for camera, p in ((pair.cam1, here), (pair.cam2, there))
             ]
         )
-
-
-def _terms(xy_px: Float, quadratic: bool) -> Float:
-    x, y = ((a - a.mean()) / max(float(np.ptp(a)), 1.0) for a in np.ascontiguousarray(xy_px.T))
-    columns = [np.ones(len(x)), x, y]
-    return np.column_stack([*columns, x * x, x * y, y * y] if quadratic else columns)
