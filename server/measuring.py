@@ -134,6 +134,7 @@ def _read_pair(paths: tuple[str, str], task: StepTask, options: MeasureOptions) 
     one, two = (_seen(read_image(path), path, task, model) for path, model in zip(paths, models, strict=True))
     for image in (one, two):
         image.prepared(options.interpolation)
+        image.contrast()
     return one, two
 
 
