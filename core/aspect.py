@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from core.camera import Camera
 from core.errors import CalibrationInputError
@@ -148,6 +147,8 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
 def _refine(views: Sequence[GridView], dz: Float, first: float) -> tuple[float, float, tuple[float, float]]:
     """Fit all eleven parameters over the translated images."""
     target, size = views[0].target, views[0].image_size_px
+    from scipy.optimize import least_squares  # slow to load, and not every start needs it
+
     points = _plane_points(target)
     xy = np.stack([v.xy_px for v in views])
     sigma = np.maximum(np.stack([v.sigma_px for v in views]), _SIGMA_FLOOR_PX)
@@ -186,6 +187,8 @@ def _refine(views: Sequence[GridView], dz: Float, first: float) -> tuple[float, 
 
 def _refine_moved(views: Sequence[GridView], first: float) -> tuple[float, float]:
     """Fit one aspect ratio and one Seidel term over all views, each seen along the grid's normal."""
+    from scipy.optimize import least_squares  # slow to load, and not every start needs it
+
     size = views[0].image_size_px
     middle = 0.5 * (np.array(size) - 1.0)
     corner2 = 0.25 * float(size[0] ** 2 + size[1] ** 2)

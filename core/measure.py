@@ -5,6 +5,7 @@ The functions that measure; their stages lie in ``core.field``, the point-level 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,14 +13,16 @@ import numpy as np
 
 from core.errors import InputError
 from core.field.images import MeasureImage
+from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.run import Image, Run, Seeds
 from core.field.settings import MeasureOptions
+from core.field.updating import Earlier, Updating
 from core.progress import CancelToken, Progress
 from core.stereo import StereoPair
 
-__all__ = ["MeasureOptions", "ReferencePair", "measure_motion", "measure_shape"]
+__all__ = ["Earlier", "MeasureOptions", "ReferencePair", "Updating", "measure_motion", "measure_shape"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,35 @@ class ReferencePair:
     ) -> Field:
         """Measure the displacement to a later pair; see :func:`measure_motion`."""
         return measure_motion(self.pair, self.image1, self.image2, image1, image2, grid, options, **more)
+
+    def sequence(
+        self,
+        shape: Field,
+        grid: PointGrid,
+        options: MeasureOptions | None = None,
+        *,
+        reference_update: ReferenceUpdate = DEFAULT_REFERENCE_UPDATE,
+        images_of: Callable[[int], tuple[MeasureImage, MeasureImage]],
+        field_of: Callable[[int], Field],
+        first: int = 0,
+    ) -> Updating:
+        """Return what measures the steps of a sequence in order, with later references where they are needed.
+
+        Parameters
+        ----------
+        shape, grid, options
+            The reference's shape, as for :meth:`motion`.
+        reference_update
+            ``never``, ``auto`` or ``always``, see :mod:`core.field.updating`.
+        images_of, field_of
+            Images and field of an earlier step, by its number.
+        first
+            Number of the reference.
+        """
+        return Updating(
+            self.pair, (self.image1, self.image2), shape, grid, options or MeasureOptions(), mode=reference_update,
+            images_of=images_of, field_of=field_of, first=first,
+        )  # fmt: skip
 
 
 def measure_shape(

@@ -8,7 +8,7 @@ weighs a subset's pixels and says how far a match scatters, without a guess from
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -107,6 +107,19 @@ class NoiseModel:
             variances_sd=tuple(v * factors[0] for v in self.variances_sd),
             misfit=self.misfit, drift=self.drift, shift_px=self.shift_px, excess=self.excess,
         )  # fmt: skip
+
+    def times(self, factor: float) -> NoiseModel:
+        """Return the model of images whose noise has ``factor`` times this variance at the same grey levels."""
+        if not 0.0 < factor < np.inf:
+            raise InputError(f"a noise variance times {factor:g} is none.", code="option_out_of_range")
+        c, s = self.coefficients, self.coefficients_sd
+        return replace(
+            self,
+            coefficients=(c[0] * factor, c[1] * factor, c[2] * factor),
+            coefficients_sd=(s[0] * factor, s[1] * factor, s[2] * factor),
+            variances=tuple(v * factor for v in self.variances),
+            variances_sd=tuple(v * factor for v in self.variances_sd),
+        )
 
 
 def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = None) -> NoiseModel:

@@ -24,11 +24,11 @@ class PointStatus(IntEnum):
 STATUS_MEANINGS: dict[PointStatus, str] = {
     PointStatus.OK: "measured, and every check passed",
     PointStatus.NOT_SEEDED: "no start value reached this point",
-    PointStatus.MASKED: "outside the region or in the mask",
+    PointStatus.MASKED: "outside the region, in a hole or in the mask, or it sees too little of its subset",
     PointStatus.OUTSIDE_IMAGE: "the patch leaves one of the images or a lens model's domain",
     PointStatus.LOW_TEXTURE: "too little grey-level gradient for a match",
     PointStatus.NOT_CONVERGED: "the iteration did not settle",
-    PointStatus.LOW_CORRELATION: "a comparison's correlation is below its limit",
+    PointStatus.LOW_CORRELATION: "a correlation is below its limit, or the residuals show too much scatter",
     PointStatus.EPIPOLAR_MISMATCH: "camera 2 sees the point off the epipolar line",
     PointStatus.NEIGHBOUR_MISMATCH: "disagrees with its neighbours beyond the expected scatter",
     PointStatus.SINGULAR: "the normal equations cannot be solved",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from core.calibration.inputs import NominalCamera
 from core.calibration.model import Observations, linearise
@@ -41,6 +40,8 @@ def fit_single(
     CalibrationError
         Code ``calibration_not_converged`` if no start leads to a finite minimum.
     """
+    from scipy.optimize import least_squares  # slow to load, and not every start needs it
+
     root_weight = np.sqrt(obs.weight)[..., None]
     prior_weight = 0.05 / centre_sigma_px
     centre = np.array(nominal.centre_px)

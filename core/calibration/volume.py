@@ -79,11 +79,15 @@ class CalibratedVolume:
             return out
         for first in range(0, n, _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
-            J = point_derivatives(self.pair, points_mm[part])[..., _TEN]
+            J = self.slopes(points_mm[part])
             if displaced_mm is not None:
-                J = np.concatenate([J, point_derivatives(self.pair, displaced_mm[part])[..., _TEN] - J], axis=1)
+                J = np.concatenate([J, self.slopes(displaced_mm[part]) - J], axis=1)
             out[part] = J @ self.covariance @ np.swapaxes(J, 1, 2)
         return out
+
+    def slopes(self, points_mm: Float) -> Float:
+        """Derivatives (n, 3, 20) of points (n, 3) over the parameters of ``covariance``."""
+        return np.asarray(point_derivatives(self.pair, points_mm)[..., _TEN])
 
 
 def calibrated_volume(

@@ -54,6 +54,11 @@ class GateOptions:
         Added to it, as a distance in the images: curvature between neighbouring points must fit in.
     least_cluster
         Groups of fewer connected points are not trusted.
+    largest_sigma_px
+        Scatter of a point's place in camera 1, px, as its residuals show it, beyond which a point whose residuals are
+        not noise is refused: five times as much is half a pixel.
+    largest_depth_sigma_px
+        The same of what its depth is told by, in camera 2: it counts several times in depth.
     """
 
     epipolar_sigmas: float = 5.0
@@ -64,6 +69,8 @@ class GateOptions:
     neighbour_sigmas: float = 6.0
     neighbour_floor_px: float = 0.05
     least_cluster: int = 4
+    largest_sigma_px: float = 0.1
+    largest_depth_sigma_px: float = 0.05
 
 
 def apply_gates(

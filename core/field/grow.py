@@ -7,11 +7,12 @@ neighbours. Nothing is ever filled in: what does not match stays empty.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.fitter import Fitter, PointFits
+from core.field.fitter import PointFits
 from core.field.sight import Sight
 from core.field.starts import move_matrix, move_w
 from core.lens import Bool, Float
@@ -27,8 +28,26 @@ ATTEMPTS = 4
 """How often a point is started, each time from another neighbour."""
 
 
+class FitsPoints(Protocol):
+    """What growth needs of a matcher; :class:`core.field.fitter.Fitter` is one."""
+
+    @property
+    def comparisons(self) -> int:
+        """1 for a shape, 3 for a motion."""
+
+    @property
+    def terms(self) -> int:
+        """Numbers in a point's ``w``."""
+
+    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
+        """Refine points from start values."""
+
+    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
+        """Return (n,) whether a fit has left the place it was started at."""
+
+
 def fit_in_batches(
-    fitter: Fitter,
+    fitter: FitsPoints,
     points: PointFits,
     index: NDArray[np.intp],
     xy_px: Float,
@@ -88,7 +107,7 @@ class Attempts:
 
 
 def grow(
-    fitter: Fitter,
+    fitter: FitsPoints,
     points: PointFits,
     *,
     attempts: Attempts,

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import ImageError
 from core.field.features import Box, Features, Picture, detect_all
 from core.lens import Float
+from core.matching.blur import Blur
 from core.matching.image import ImageData, prepare
 from core.matching.options import Interpolation
 from core.noise import NoiseModel
@@ -46,9 +47,9 @@ class MeasureImage:
     ) -> None:
         self.name = name
         self.noise = noise
-        self._prepared: dict[tuple[Interpolation, NoiseModel | None], ImageData] = {}
+        self._prepared: dict[tuple[Interpolation, NoiseModel | None, Blur | None], ImageData] = {}
         self._features: dict[tuple[Box, int], Features] = {}
-        self._variance: list[tuple[int, Float, Float]] = []  # of one set of points at most
+        self._variance: list[tuple[int, Blur | None, Float, Float]] = []  # of one set of points at most
         self._contrast: dict[tuple[float, float, float, float] | None, tuple[float, float, float]] = {}
         if isinstance(image, MeasureImage):
             self.noise = image.noise if noise is None else noise
@@ -56,10 +57,11 @@ class MeasureImage:
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
             self._contrast = image._contrast
         elif isinstance(image, ImageData):
-            self.pixels = image.pixels
+            self.pixels = image.pixels if image.unblurred is None else np.ascontiguousarray(image.unblurred)
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
-            self.noise = image.noise  # prepared with a model by hand, it keeps it where none is asked for
-            self._prepared[kind, image.noise] = image
+            if image.blur is None:
+                self.noise = image.noise  # prepared with a model by hand, it keeps it where none is asked for
+                self._prepared[kind, image.noise, None] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
 
@@ -68,24 +70,34 @@ class MeasureImage:
         """Rows and columns."""
         return int(self.pixels.shape[0]), int(self.pixels.shape[1])
 
-    def prepared(self, interpolation: Interpolation, noise: NoiseModel | None = None) -> ImageData:
-        """Return the image with its spline coefficients and the camera's noise, computed on the first call."""
+    def prepared(
+        self, interpolation: Interpolation, noise: NoiseModel | None = None, blur: Blur | None = None
+    ) -> ImageData:
+        """Return the image, blurred where asked for, with its spline coefficients and the camera's noise; made once."""
         noise = self.noise if noise is None else noise
-        key = interpolation, noise
+        key = interpolation, noise, blur
         if key not in self._prepared:
-            self._prepared[key] = prepare(self.pixels, interpolation, noise)
+            self._prepared[key] = prepare(self.pixels, interpolation, noise, blur)
         return self._prepared[key]
 
-    def subset_variance(self, xy_px: Float, subset_px: int) -> Float:
+    def subset_variance(self, xy_px: Float, subset_px: int, blurred: ImageData | None = None) -> Float:
         """Return the grey-level variance (n,) in the square of ``subset_px`` about the pixels nearest to points (n, 2).
 
         Kept for the last points that were asked for: those of a sequence are the same in every step.
+
+        Parameters
+        ----------
+        xy_px, subset_px
+            Points and width.
+        blurred
+            The image as it is compared; as it was taken, if left out.
         """
-        for known_px, known_xy, known in self._variance:
-            if known_px == subset_px and np.array_equal(known_xy, xy_px):
+        image, blur = (self.pixels, None) if blurred is None else (blurred.raw, blurred.blur)
+        for known_px, known_blur, known_xy, known in self._variance:
+            if (known_px, known_blur) == (subset_px, blur) and np.array_equal(known_xy, xy_px):
                 return known
         rows, cols = self.shape
-        mean = float(self.pixels.mean())
+        mean = float(image.mean())
         at = np.clip(np.rint(xy_px[:, ::-1]).astype(int), 0, np.array(self.shape) - 1)
         out = np.empty(len(at))
         half, size = subset_px // 2, (subset_px, subset_px)
@@ -95,13 +107,13 @@ class MeasureImage:
             if len(here) == 0:
                 continue
             top = max(first - half, 0)
-            pixels = self.pixels[top : first + band + half].astype(np.float64)
+            pixels = image[top : first + band + half].astype(np.float64)
             pixels -= mean
             about = cv2.boxFilter(pixels, -1, size)
             square = cv2.boxFilter(pixels * pixels, -1, size)
             r, c = at[here, 0] - top, at[here, 1]
             out[here] = np.maximum(np.asarray(square)[r, c] - np.asarray(about)[r, c] ** 2, 0.0)
-        self._variance[:] = [(subset_px, np.array(xy_px), out)]
+        self._variance[:] = [(subset_px, blur, np.array(xy_px), out)]
         return out
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:

@@ -9,10 +9,34 @@ from numpy.typing import NDArray
 
 from core.field.cuts import Cuts
 from core.field.patch import PatchChoice
+from core.field.smoothing import Smoothing
 from core.field.starts import Starts
 from core.status import PointStatus
 
 Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """What a step was matched against, where that was not the first reference alone.
+
+    Attributes
+    ----------
+    step
+        Number of the step whose images the step was matched against.
+    steps
+        (r, c) int32, the same for each point: it may be an older one for a point that was found again. Of a point
+        without numbers, the newest reference that shows it.
+    noise_px2, pattern_px2
+        (r, c, 2, 2) covariance, px^2, of where camera 1 sees the points in this step, as far as the noise of this
+        step's images does not cancel it if later steps are matched against them: by the cameras' noise, and by changes
+        of the surface's pattern.
+    """
+
+    step: int
+    steps: NDArray[np.int32]
+    noise_px2: Float
+    pattern_px2: Float
 
 
 @dataclass(frozen=True)
@@ -55,6 +79,10 @@ class Field:
         the cameras; None unless the patches were curved.
     patch
         What patch the field was measured with, and why; None in a field from an older file.
+    references
+        What the step was matched against; None where that is the first reference, for all points.
+    smoothing
+        How the displacement was smoothed; None: it is as measured.
     cuts
         Cracks and borders of holes over which nothing reaches; None where there are none.
     starts
@@ -80,6 +108,8 @@ class Field:
     stretch: Float | None = None
     curvature_per_mm: Float | None = None
     patch: PatchChoice | None = None
+    references: References | None = None
+    smoothing: Smoothing | None = None
     cuts: Cuts | None = None
     starts: Starts | None = None
 

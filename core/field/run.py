@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,16 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.errors import SeedError
 from core.field.assemble import assemble
+from core.field.edges import clear_of_edges, refuse_near_edges
 from core.field.features import Box
 from core.field.fitter import Fitter, PointFits
 from core.field.gates import apply_gates
 from core.field.grow import Attempts, fit_in_batches, grow
 from core.field.images import MeasureImage, different, features_of, refuse_stale, same_size
+from core.field.observed import SigmaLimits, judge
 from core.field.patch import UsedPatch, asked_for
 from core.field.patch_choice import advise, choose_patch
 from core.field.plane_error import plane_error
 from core.field.predict import predict
 from core.field.region import PointGrid, check_region
+from core.field.repeats import repeats
 from core.field.result import Field
 from core.field.scatter import ScatteredMotion, ScatteredShape, scattered_motion, scattered_shape, stretched_motion
 from core.field.seeds import (
@@ -92,16 +96,19 @@ class Run:
             self.cur2.refuse_blank()
             different(self.cur1, self.cur2)
             refuse_stale(self.ref1, self.ref2, self.cur1, self.cur2)
+        self.blur = self.options.blur
+        if self.blur is not None:
+            self.fits_image = clear_of_edges(self.fits_image, grid, self.ref1.shape, self.options.subset_px, self.blur)
         self.xy_px = grid.xy_px.reshape(-1, 2)
         self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
         self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
         kind, (noise1, noise2) = self.options.interpolation, self.options.noise
         self.fitter = Fitter(
             pair=pair,
-            ref1=self.ref1.prepared(kind, noise1),
-            ref2=self.ref2.prepared(kind, noise2),
-            cur1=None if self.cur1 is None else self.cur1.prepared(kind, noise1),
-            cur2=None if self.cur2 is None else self.cur2.prepared(kind, noise2),
+            ref1=self.ref1.prepared(kind, noise1, self.blur),
+            ref2=self.ref2.prepared(kind, noise2, self.blur),
+            cur1=None if self.cur1 is None else self.cur1.prepared(kind, noise1, self.blur),
+            cur2=None if self.cur2 is None else self.cur2.prepared(kind, noise2, self.blur),
             options=self.options.match_options(),
             least_zncc=self.options.least_zncc,
             sight=self.sight,
@@ -114,9 +121,18 @@ class Run:
         self.hoped_for = self.usable  # where new seeds are worth their time
         self.checked = False  # whether every point that stands went through the gates
         self.attempts = Attempts.on(grid.shape, self.sight)
-        self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px)
+        compared = None if self.blur is None else self.fitter.ref1
+        self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px, compared)
         if self.sight is not None:
-            self.texture = self.sight.correct_variance(self.texture, self.ref1.pixels)
+            pixels = self.ref1.pixels if compared is None else compared.pixels
+            self.texture = self.sight.correct_variance(self.texture, pixels)
+
+    @cached_property
+    def repeating(self) -> Bool:
+        """(n,) where the texture repeats itself, so that no start may be put there."""
+        out = np.zeros(len(self.xy_px), bool)
+        out[self.usable] = repeats(self.ref1.pixels, self.xy_px[self.usable], subset_px=self.options.subset_px)
+        return out
 
     # seeds
 
@@ -134,7 +150,7 @@ class Run:
         self.usable = self.usable & shape.valid.ravel()
         if not self.usable.any():
             return
-        self._keep_patch(previous)
+        self.keep_patch(previous)
         self.points.status[~self.usable & self.fits_image.ravel()] = shape.status.ravel()[
             ~self.usable & self.fits_image.ravel()
         ]
@@ -162,20 +178,27 @@ class Run:
                     self.fitter, self.points, index, self.xy_px, w[index], G[index], far_px=_SAMPLE_FAR_PX,
                     cancel=self.cancel,
                 )  # fmt: skip
-                self._gate()
+                self.check()
                 return
         self.progress("seeds", 0, 1)
         if seeds is not None:
             self._user_motion(as_seeds(seeds))
-        elif not (self.known_w is not None and self._sample_holds(self.known_w, no_motion(self.pair, self.xy_px))):
+        elif not (self.known_w is not None and self._stayed()):
             self.points.status[self.usable] = PointStatus.NOT_SEEDED
             if self._match_seeds() == 0:
                 self._searched_motion()
         self.progress("seeds", 1, 1)
 
-    def _sample_holds(self, w: Float, G: Float) -> bool:
+    def _stayed(self) -> bool:
+        """Try whether the surface is about where it was: not on a texture that looks alike a period further on."""
+        assert self.known_w is not None
+        return self._sample_holds(self.known_w, no_motion(self.pair, self.xy_px), once_only=True)
+
+    def _sample_holds(self, w: Float, G: Float, *, once_only: bool = False) -> bool:
         """Fit a spread sample from given starts; True (and the sample stands as seeds) if nearly all of it matches."""
         usable = self.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+        if once_only:
+            usable &= ~self.repeating
         if usable.sum() < 1:
             return False
         index = spread(self.xy_px, usable, np.zeros(len(usable)))[0]
@@ -188,6 +211,8 @@ class Run:
 
     def _match_seeds(self) -> int:
         """Seeds from feature matches; how many stand. Large images are reduced, less and less until seeds are found."""
+        if not (self.usable & ~self.repeating).any():
+            return 0
         reach = self.options.subset_px + self.grid.step_px
         box1 = box_around(self.xy_px[self.usable], reach, self.ref1.shape)
         box2 = seen_by_camera2(self.pair, box1, self.ref2.shape)
@@ -217,7 +242,14 @@ class Run:
 
         def put_seeds(motion: ScatteredMotion | None) -> int:
             return seeds_from_matches(
-                self.fitter, self.points, self.xy_px, self.usable, shape, motion, shape_now, self.known_w
+                self.fitter,
+                self.points,
+                self.xy_px,
+                self.usable & ~self.repeating,
+                shape,
+                motion,
+                shape_now,
+                self.known_w,
             )
 
         found = put_seeds(motion)
@@ -227,7 +259,7 @@ class Run:
         return found
 
     def _swept_shape(self) -> None:
-        for i in swept_places(self.xy_px, self._rather_whole(self.usable)):
+        for i in swept_places(self.xy_px, self._rather_whole(self.usable & ~self.repeating)):
             raise_if_cancelled(self.cancel)
             found = sweep_shape(self.fitter, self.ref1.pixels, self.ref2.pixels, self.xy_px[i])
             if found.ok[0]:
@@ -236,7 +268,7 @@ class Run:
     def _searched_motion(self) -> None:
         if self.known_w is None:
             return
-        known = self.usable & np.isfinite(self.known_w).all(axis=1)
+        known = self.usable & np.isfinite(self.known_w).all(axis=1) & ~self.repeating
         for i in swept_places(self.xy_px, self._rather_whole(known))[:6]:
             raise_if_cancelled(self.cancel)
             found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
@@ -274,7 +306,7 @@ class Run:
             raise SeedError("a seed for a motion needs the shape that was measured before it.")
         usable = self.usable & np.isfinite(self.known_w).all(axis=1)
         index = self._nearest(seeds, usable)
-        for i in index:
+        for i in index[~self.repeating[index]]:
             raise_if_cancelled(self.cancel)
             found = search_motion(self.fitter, self.xy_px[i], self.known_w[i])
             if found.ok[0]:
@@ -287,10 +319,17 @@ class Run:
 
     def finish(self, automatic: bool, shape: Field | None) -> Field:
         """Grow, check, grow into the gaps, check again, and hand over."""
+        self.fill_field(automatic, shape)
+        return assemble(
+            self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape, patch=self.patch
+        )
+
+    def fill_field(self, automatic: bool, shape: Field | None) -> None:
+        """Grow, check, grow into the gaps, and check again."""
         if not self.points.ok.any() and (shape is None or shape.valid.any()):
             remedy = (
                 "Check that both cameras see the same textured surface and that the calibration belongs to these "
-                "images, or give a seed point."
+                "images, or give a seed point. A texture that repeats itself gives no start."
             )
             stated = self.fitter.ref1.noise_variance
             if stated is not None:
@@ -307,12 +346,21 @@ class Run:
         if automatic and self._unreached() > _LEFT_OVER and self._match_seeds() > 0:
             self._forget_attempts()
             self._grow()
-            self._gate()
-        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
-        self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
-        return assemble(
-            self.points, pair=self.pair, grid=self.grid, fits_image=self.fits_image, shape=shape, patch=self.patch
+            self.check()
+        judged = judge(
+            self.fitter,
+            self.points,
+            xy_px=self.xy_px,
+            texture=self.texture,
+            limits=self.sigma_limits,
+            cancel=self.cancel,
         )
+        if judged.refused:
+            self.check()  # points that stand alone now have nothing to confirm them
+        mark_outside(self.fitter, self.points, self.xy_px, self.usable)
+        if self.blur is not None:
+            refuse_near_edges(self.fitter, self.points, self.xy_px, self.blur)
+        self.progress("done", int(self.points.ok.sum()), int(self.usable.sum()))
 
     def _settle_patch(self) -> None:
         """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
@@ -335,9 +383,9 @@ class Run:
         for _ in range(3):
             if self._grow() == 0 and self.checked:
                 break
-            self._gate()
+            self.check()
 
-    def _keep_patch(self, previous: Field | None) -> None:
+    def keep_patch(self, previous: Field | None) -> None:
         """Where a sequence went over to curved patches by itself, it stays with them."""
         choice = None if previous is None or not previous.has_motion else previous.patch
         if self.options.patch == "auto" and choice is not None and choice.patch == "curved":
@@ -375,7 +423,14 @@ class Run:
         self.checked = self.checked and added == 0
         return added
 
-    def _gate(self) -> None:
+    @property
+    def sigma_limits(self) -> SigmaLimits:
+        """How far a point may scatter whose residuals are not noise."""
+        gates = self.options.gates
+        return SigmaLimits(motion_px=gates.largest_sigma_px, depth_px=gates.largest_depth_sigma_px)
+
+    def check(self) -> None:
+        """Have every point that stands checked; those that fail are refused."""
         apply_gates(
             self.points, pair=self.pair, shape=self.grid.shape, xy_px=self.xy_px, rays=self.rays, texture=self.texture,
             options=self.options.gates, sight=self.sight,

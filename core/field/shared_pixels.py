@@ -8,18 +8,19 @@ negative at the corners, and its errors correlate over less than its subset.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import oaconvolve
 
 from core.errors import InputError
 from core.field.result import Field
+from core.field.smoothing import Smoothing, weight_products, weight_square
 
 Float = NDArray[np.float64]
 
 _P2_WEIGHT = -2.5  # (2 n + 1) P_n(0) of n = 2, beside 1 of n = 0
+_AT_ONCE = 256
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -33,10 +34,14 @@ class SharedPixels:
         Width of the square subset.
     curved
         True for patches of the second order.
+    smoothing
+        What the displacements were smoothed with; None: they are as measured. The correlation is then that of smoothed
+        displacements, in whole windows; that of positions is ``places``'.
     """
 
     subset_px: float
     curved: bool = False
+    smoothing: Smoothing | None = None
 
     def __post_init__(self) -> None:
         """Refuse a subset without width, ``invalid_input``."""
@@ -48,10 +53,64 @@ class SharedPixels:
     @staticmethod
     def of(field: Field, subset_px: float) -> SharedPixels:
         """Return the correlation that fits a field's patches; plane where the field does not say."""
-        return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "curved")
+        return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "curved", field.smoothing)
+
+    @property
+    def places(self) -> SharedPixels:
+        """That of the points' positions, which are never smoothed."""
+        return self if self.smoothing is None else replace(self, smoothing=None)
+
+    @property
+    def reach_px(self) -> float:
+        """How far apart two points' errors may still go together."""
+        more = 0.0 if self.smoothing is None else (self.smoothing.window - 1) * self.smoothing.step_px
+        return self.subset_px + more
 
     def correlation(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
-        """Return the correlation coefficient of two subsets whose centres lie ``dx_px, dy_px`` apart, any shape."""
+        """Return the correlation coefficient of two points that lie ``dx_px, dy_px`` apart, any shape."""
+        if self.smoothing is None:
+            return self._of_subsets(dx_px, dy_px)
+        of = self.smoothing
+        products = weight_products(of.window, of.order)
+        return self._smoothed(products, dx_px, dy_px) / self._smoothed(products, 0.0, 0.0)
+
+    def correlation_with_place(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
+        """Return by how much the covariance of a position and a displacement falls off over their points' distance."""
+        if self.smoothing is None:
+            return self._of_subsets(dx_px, dy_px)
+        of = self.smoothing
+        weights = weight_square(of.window, of.order)
+        return self._smoothed(weights, dx_px, dy_px) / self._smoothed(weights, 0.0, 0.0)
+
+    def factors(self, dx_px: ArrayLike, dy_px: ArrayLike, n: int) -> Float:
+        """Return what each element of a covariance of X Y Z (U V W) falls off by over a distance, (..., n, n)."""
+        own = self.places.correlation(dx_px, dy_px)
+        out = np.empty((*own.shape, n, n))
+        out[...] = own[..., None, None]
+        if n > 3 and self.smoothing is not None:
+            mixed = self.correlation_with_place(dx_px, dy_px)[..., None, None]
+            out[..., :3, 3:], out[..., 3:, :3] = mixed, mixed
+            out[..., 3:, 3:] = self.correlation(dx_px, dy_px)[..., None, None]
+        return out
+
+    def _smoothed(self, weights: Float, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
+        """Sum (...) of weights, about the middle of a square of steps, times the subsets' correlation from there."""
+        assert self.smoothing is not None
+        dx, dy = np.broadcast_arrays(np.asarray(dx_px, dtype=np.float64), np.asarray(dy_px, dtype=np.float64))
+        # even both ways, and the same distances again and again
+        distance = np.round(np.abs(dx), 6) + 1j * np.round(np.abs(dy), 6)
+        each, back = np.unique(distance, return_inverse=True)
+        lag = (np.arange(len(weights)) - len(weights) // 2) * self.smoothing.step_px
+        out = np.empty(len(each))
+        for first in range(0, len(each), _AT_ONCE):
+            some = each[first : first + _AT_ONCE, None, None]
+            out[first : first + _AT_ONCE] = np.einsum(
+                "kij,ij->k", self._of_subsets(some.real + lag[None, None, :], some.imag + lag[None, :, None]), weights
+            )
+        return np.asarray(out[back.reshape(dx.shape)])
+
+    def _of_subsets(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
+        """Correlation of two subsets' values."""
         a, b = (np.minimum(np.abs(np.asarray(d, dtype=np.float64)) / self.subset_px, 1.0) for d in (dx_px, dy_px))
         if not self.curved:
             return np.asarray((1.0 - a) * (1.0 - b))
@@ -76,10 +135,12 @@ class SharedPixels:
         values
             (r, c, ...) zero at points that take no part.
         """
+        from scipy.signal import oaconvolve  # slow to load, and not every start needs it
+
         step_x, step_y = steps_px(field)
         rows, cols = field.shape
-        reach_x = min(int(np.ceil(self.subset_px / step_x)), cols - 1) if cols > 1 else 0
-        reach_y = min(int(np.ceil(self.subset_px / step_y)), rows - 1) if rows > 1 else 0
+        reach_x = min(int(np.ceil(self.reach_px / step_x)), cols - 1) if cols > 1 else 0
+        reach_y = min(int(np.ceil(self.reach_px / step_y)), rows - 1) if rows > 1 else 0
         kernel = self.correlation(
             np.arange(-reach_x, reach_x + 1)[None, :] * step_x, np.arange(-reach_y, reach_y + 1)[:, None] * step_y
         )

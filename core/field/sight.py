@@ -8,7 +8,7 @@ neighbours only if they see each other.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -21,7 +21,7 @@ from core.field.cut_kernels import find_near, look, part, parted_neighbours, var
 from core.field.kernels import REACH
 from core.field.region import PointGrid
 from core.lens import Bool, Float
-from core.matching.fit import VisiblePixels
+from core.matching.arguments import VisiblePixels
 from core.threads import run_ranges
 
 MARGIN_PX = 2.0
@@ -118,12 +118,51 @@ class Sight:
 
 def sight_of(grid: PointGrid, subset_px: int) -> Sight | None:
     """Return what the points of a grid see, None where nothing is in the way. Kept as long as the grid lives."""
-    if not grid.cuts and grid.white is None:
-        return None
-    kept = _known.setdefault(grid, {})
+    kept = _known.get(grid, {})
     if subset_px not in kept:
-        kept[subset_px] = _find(grid, subset_px)
-    return kept[subset_px]
+        if not grid.cuts and grid.white is None:
+            return None
+        keep_sight(grid, subset_px, _find(grid, subset_px))
+    return _known[grid][subset_px]
+
+
+def keep_sight(grid: PointGrid, subset_px: int, sight: Sight) -> None:
+    """Keep what the points of a grid see, as long as the grid lives."""
+    _known.setdefault(grid, {})[subset_px] = sight
+
+
+def patches_seen(
+    grid: PointGrid, points: NDArray[np.intp], width: int, margin_px: float, at_once: int
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.uint8]]]:
+    """Yield points that do not see all of a square of ``width`` px about them, and what they see of it.
+
+    Parameters
+    ----------
+    grid
+        Cuts and mask.
+    points
+        Which of its points to look at.
+    width, margin_px
+        Of the square, odd, and how near to a cut or to black no pixel counts.
+    at_once
+        Points a yield, at most.
+    """
+    pieces, white = _obstacles(grid)
+    clear, black_sums = _clear_of(white, margin_px)
+    xy = np.ascontiguousarray(grid.xy_px.reshape(-1, 2)[points])
+    near = np.zeros(len(xy), bool)
+    run_ranges(
+        lambda first, last: find_near(first, last, xy, width, margin_px, pieces, black_sums, near),
+        len(xy), 16 * _AT_ONCE,
+    )  # fmt: skip
+    index = np.flatnonzero(near)
+    for start in range(0, len(index), at_once):
+        some = index[start : start + at_once]
+        places = np.ascontiguousarray(xy[some])
+        patches, counts = np.empty((len(some), width, width), np.uint8), np.empty(len(some), np.int32)
+        run_ranges(partial(_over, look, (places, width, margin_px, pieces, white, clear, patches, counts)), len(some),
+                   _AT_ONCE)  # fmt: skip
+        yield points[some], patches
 
 
 def _over(kernel: Callable[..., None], rest: tuple[Any, ...], first: int, last: int) -> None:
@@ -136,14 +175,19 @@ def _obstacles(grid: PointGrid) -> tuple[Float, NDArray[np.uint8]]:
     return pieces, white
 
 
+def _clear_of(white: NDArray[np.uint8], margin_px: float) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """Return what of a mask's white may count, and the integral image of its black."""
+    if not white.size:
+        return white, np.zeros((1, 1), np.int32)
+    # as far as a cut is kept clear of, the mask's black is too
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(margin_px) - 1, 2 * int(margin_px) - 1))
+    clear = np.ascontiguousarray(cv2.erode(white, disc, borderType=cv2.BORDER_REPLICATE), np.uint8)
+    return clear, np.asarray(cv2.integral(1 - white), np.int32)
+
+
 def _find(grid: PointGrid, subset: int) -> Sight:
     pieces, white = _obstacles(grid)
-    clear, black_sums = white, np.zeros((1, 1), np.int32)
-    if white.size:
-        # as far as a cut is kept clear of, the mask's black is too
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(MARGIN_PX) - 1, 2 * int(MARGIN_PX) - 1))
-        clear = np.ascontiguousarray(cv2.erode(white, disc, borderType=cv2.BORDER_REPLICATE))
-        black_sums = np.asarray(cv2.integral(1 - white), np.int32)
+    clear, black_sums = _clear_of(white, MARGIN_PX)
     xy = np.ascontiguousarray(grid.xy_px.reshape(-1, 2))
     n = len(xy)
     near = np.zeros(n, bool)

@@ -33,20 +33,38 @@ def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) 
     distance, nearest = cKDTree(xy_px[standing]).query(xy_px[open_])
     near = np.asarray(distance) < _REACH_SUBSETS * subset
     open_, parent = open_[near], standing[np.asarray(nearest)[near]]
-    outside = np.zeros(len(open_), bool)
-    half = subset // 2
-    centre = fitter.pair.cam1.rays_cam(xy_px[parent]).xyz_mm
-    for corner in ((-half, -half), (half, -half), (-half, half), (half, half)):
-        ray = fitter.pair.cam1.rays_cam(xy_px[open_] + corner).xyz_mm
-        offset = ray[:, :2] - centre[:, :2]
-        w = move_w(points.w[parent], offset)[:, :1]
-        G = None if fitter.cur1 is None else move_matrix(points.G[parent], offset)
-        outside |= _outside(fitter, ray / w, None if G is None else G[:, :, 0] / w)
+    outside = leaves_an_image(fitter, xy_px[open_], xy_px[parent], points.take(parent))
     points.status[open_[outside]] = PointStatus.OUTSIDE_IMAGE
 
 
-def _outside(fitter: Fitter, before: Float, now: Float | None) -> Bool:
-    """Return (n,) whether a point (n, 3) of camera 1's frame leaves an image at t0 or at t."""
+def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: PointFits, margin_px: float = 0.0) -> Bool:
+    """Return (n,) whether subsets about places (n, 2), on patches that stand at other places, leave an image.
+
+    Parameters
+    ----------
+    fitter
+        The matcher with its images.
+    xy_px, from_px
+        (n, 2) the subsets' centres and the patches' own places.
+    patches
+        (n) fits that stand.
+    margin_px
+        How far inside the images they are to stay.
+    """
+    outside = np.zeros(len(xy_px), bool)
+    half = fitter.options.subset_px // 2
+    centre = fitter.pair.cam1.rays_cam(from_px).xyz_mm
+    for corner in ((-half, -half), (half, -half), (-half, half), (half, half)):
+        ray = fitter.pair.cam1.rays_cam(xy_px + corner).xyz_mm
+        offset = ray[:, :2] - centre[:, :2]
+        w = move_w(patches.w, offset)[:, :1]
+        G = None if fitter.cur1 is None else move_matrix(patches.G, offset)
+        outside |= _outside(fitter, ray / w, None if G is None else G[:, :, 0] / w, margin_px)
+    return outside
+
+
+def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float) -> Bool:
+    """Return (n,) whether a point (n, 3) of camera 1's frame leaves an image, or its inner part, at t0 or at t."""
     pose, lens1, lens2 = fitter.pair.cam2_from_cam1, fitter.pair.cam1.lens, fitter.pair.cam2.lens
     views = [(pose.apply(before), lens2, fitter.ref2.shape)]
     if now is not None:
@@ -55,6 +73,7 @@ def _outside(fitter: Fitter, before: Float, now: Float | None) -> Bool:
     for p, lens, (rows, cols) in views:
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = lens.image_from_normalised(p[:, :2] / p[:, 2:]).xy
-            inside = (p[:, 2] > 0) & (xy[:, 0] >= 0) & (xy[:, 1] >= 0) & (xy[:, 0] <= cols - 1) & (xy[:, 1] <= rows - 1)
+            last = np.array([cols, rows]) - 1 - margin_px
+            inside = (p[:, 2] > 0) & ((xy >= margin_px) & (xy <= last)).all(axis=1)
         out |= ~inside
     return out

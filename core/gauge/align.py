@@ -104,7 +104,7 @@ def align_plane(
     gain[used] = np.linalg.solve(H, (A * weight[:, None]).T).T[:, :, None] * R[2]
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
     each = gain @ roots
-    three = np.einsum("rcij,rckj->ik", each, shared.summed(field, each))
+    three = np.einsum("rcij,rckj->ik", each, shared.places.summed(field, each))
     full = np.zeros((6, 6))
     place = np.ix_([0, 1, 5], [0, 1, 5])
     full[place] = 0.5 * (three + three.T)

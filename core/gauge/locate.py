@@ -8,10 +8,12 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import RegionError
 from core.field.result import Field
 from core.field.shared_pixels import steps_px
+from core.gauge.sampling import sample
 
 Float = NDArray[np.float64]
 
 _ROUNDS = 20
+_REFINED = 5  # each round takes the bend of a cell out of the next digits
 _ON_THE_EDGE = 1e-9
 _SAME = 1e-6  # of a cell: two cells that meet there
 
@@ -43,7 +45,7 @@ def places_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
     row, col = np.nonzero(whole)
     corners = np.stack([xy[row, col], xy[row, col + 1], xy[row + 1, col], xy[row + 1, col + 1]], axis=1)
     low, high = corners.min(axis=1), corners.max(axis=1)
-    out = np.empty_like(wanted)
+    out, slopes = np.empty_like(wanted), np.empty((len(wanted), 2, 2))
     for k, place in enumerate(wanted):
         near = np.flatnonzero(((low <= place) & (place <= high)).all(axis=1))
         t = _inside(corners[near], place)
@@ -67,7 +69,25 @@ def places_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
                 remedy="Give the place in pixels, or a frame in which the surface does not fold over.",
             )
         out[k] = px[0]
-    return out
+        slopes[k] = _slope(corners[near[held][:1]], t[held][:1])[0] / steps
+    return _refined(field, wanted, out, slopes)
+
+
+def _refined(field: Field, wanted: Float, xy_px: Float, slopes: Float) -> Float:
+    """Places (m, 2) at which :func:`sample` gives the X and Y that are wanted, from those of straight cells."""
+    first, last = np.array([v[[0, -1], [0, -1]] for v in (field.x_px, field.y_px)]).T
+    for _ in range(_REFINED):
+        off = wanted - sample(field, xy_px).of(field.xyz_mm)[:, :2]
+        step = np.linalg.solve(slopes, off[..., None])[..., 0]
+        xy_px = np.clip(np.where(np.isfinite(step), xy_px + step, xy_px), first, last)
+    return xy_px
+
+
+def _slope(corners: Float, t: Float) -> Float:
+    """d(X, Y) / d(across, down) (n, 2, 2) of bilinear cells."""
+    a, b, c, d = (corners[:, k] for k in range(4))
+    u, v = t[:, :1], t[:, 1:]
+    return np.stack([(1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)], axis=-1)
 
 
 def _inside(corners: Float, place: Float) -> Float:

@@ -1,8 +1,10 @@
 """The rigid motion of a field, and the field without it.
 
 A point X that moved by U is seen at X + U = c + d + R (X - c) + r. R and d make the sum of r^T W r least, W the inverse
-of r's covariance; c is the centre of the points used. The parameters' covariance comes from the points' own and from
-what overlapping subsets share. It holds the noise only: where the body deforms, the fit is the weighted mean motion.
+of r's covariance; c is the centre of the points used. Where the body deforms, what is left is more than noise; then
+W's covariance is the noise's and a variance alike in all directions, as large as makes up for what is left. Else a body
+that only stretches would be turned until its contraction looks like a tilt, since depth is the noisiest direction. The
+parameters' covariance comes from the points' own and from what overlapping subsets share. It holds the noise only.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ Bool = NDArray[np.bool_]
 
 _FEWEST = 3
 _ROUNDS = 50
+_OUTER_ROUNDS = 30
+_EXTRA_SETTLED = 1e-3
 _CONVERGED = 1e-11
 _TUKEY = 4.685  # 95 % efficiency on normal errors
 _MAD = 1.4826
@@ -106,25 +110,30 @@ def rigid_motion(
     centre = x.mean(axis=0)
     arm = x - centre
     R, d = _unweighted(arm, moved - centre)
-    weight = np.ones(len(x))
-    H, A, W = np.eye(6), np.empty(0), np.empty(0)
-    r = np.empty(0)
-    for _ in range(_ROUNDS):
-        turned = arm @ R.T
-        r = moved - centre - d - turned
-        M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)  # r's noise is (I - R) dX + dU
-        W = np.linalg.inv(M @ cov @ M.T)
-        distance2 = np.einsum("na,nab,nb->n", r, W, r)
-        weight = _biweight(distance2) if robust else weight
-        A = np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
-        WA = weight[:, None, None] * (W @ A)
-        H = np.einsum("nai,naj->ij", A, WA)
-        change = np.linalg.solve(H, np.einsum("nai,na->i", WA, r))
-        R, d = Rotation.from_rotvec(change[:3]).as_matrix() @ R, d + change[3:]
-        if np.abs(change).max() < _CONVERGED * max(1.0, float(np.abs(arm).max())):
+    noise, r = _residuals(arm, moved - centre, cov, R, d)
+    weight: Float = np.ones(len(x))
+    extra = _deformation(r, noise, weight)
+    A: Float = np.empty(0)
+    W: Float = np.empty(0)
+    H = np.eye(6)
+    for _ in range(_OUTER_ROUNDS):
+        for _ in range(_ROUNDS):
+            noise, r = _residuals(arm, moved - centre, cov, R, d)
+            W = np.asarray(np.linalg.inv(noise + extra * np.eye(3)), dtype=np.float64)
+            weight = _biweight(np.einsum("na,nab,nb->n", r, W, r)) if robust else weight
+            A = np.concatenate([-skew(arm @ R.T), np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
+            WA = weight[:, None, None] * (W @ A)
+            H = np.einsum("nai,naj->ij", A, WA)
+            change = np.linalg.solve(H, np.einsum("nai,na->i", WA, r))
+            R, d = Rotation.from_rotvec(change[:3]).as_matrix() @ R, d + change[3:]
+            if np.abs(change).max() < _CONVERGED * max(1.0, float(np.abs(arm).max())):
+                break
+        before, extra = extra, _deformation(r, noise, weight)
+        if abs(extra - before) <= _EXTRA_SETTLED * before:
             break
     kept = weight > 0.0
     _check_spread(x[kept])
+    distance2 = np.einsum("na,nab,nb->n", r, np.linalg.inv(noise), r)
     gain = np.zeros((*field.shape, 6, 3))
     gain[used] = np.linalg.solve(H, np.swapaxes(weight[:, None, None] * (W @ A), 1, 2))
     small = _fit_covariance(field, shared, gain, R)
@@ -137,6 +146,27 @@ def rigid_motion(
         residual_rms_mm=float(np.sqrt(np.mean(np.sum(r[kept] ** 2, axis=1)))),
         noise_ratio=float(np.sqrt(np.mean(distance2[kept]) / 3.0)), gain=gain,
     )  # fmt: skip
+
+
+def _residuals(arm: Float, moved: Float, cov: Float, R: Float, d: Float) -> tuple[Float, Float]:
+    """Covariance (n, 3, 3) of the noise of what the motion leaves, and what it leaves (n, 3)."""
+    M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)  # r's noise is (I - R) dX + dU
+    return M @ cov @ M.T, moved - d - arm @ R.T
+
+
+def _deformation(r: Float, noise: Float, weight: Float) -> float:
+    """Variance, alike in all directions, that with the noise makes up what is left; zero where noise explains it."""
+    from scipy.optimize import brentq  # slow to load, and not every start needs it
+
+    spread, axes = np.linalg.eigh(noise)
+    q = np.einsum("nab,na->nb", axes, r) ** 2 * weight[:, None]
+    share = 3.0 * float(weight.sum())
+
+    def over(extra: float) -> float:
+        return float((q / (spread + extra)).sum()) - share
+
+    most = float(q.sum()) / share
+    return float(brentq(over, 0.0, most)) if most > 0.0 and over(0.0) > 0.0 else 0.0
 
 
 def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPixels) -> Field:

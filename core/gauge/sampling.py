@@ -1,4 +1,9 @@
-"""Values between the points of the grid: inside one cell, never over a missing point or a cut."""
+"""Values between the points of the grid, never over a missing point or a cut.
+
+Between four points along a line a cubic goes through the inner two with the slopes that their neighbours give (Keys,
+1981); quadratics are told exactly. Where one of the 4 x 4 points about a place is missing, its cell's corners serve
+alone: what lies between them is then off by up to an eighth of the curvature times the squared step.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,8 @@ Float = NDArray[np.float64]
 
 _ON_A_POINT = 1e-9
 _CUT = "cut"
+_ABOUT = np.arange(-1, 3)  # nodes that a place takes along each axis, from the lower corner of its cell
+_AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +37,10 @@ class Samples:
     xy_px
         (m, 2) the places in camera 1's reference image.
     index
-        (m, 4) flat indices of the corners of each place's cell.
+        (m, 16) flat indices of the points about each place.
     weight
-        (m, 4) their weights, sum 1; NaN where the place is missing.
+        (m, 16) their weights, sum 1, most of them zero where the cell's corners serve alone; NaN where the place is
+        missing.
     missing
         m texts: empty, or why the place has no value: the status of a point that it needs, or ``cut``.
     """
@@ -72,20 +80,33 @@ class Samples:
         """
         a, b = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
         n = self.field.covariance.shape[-1]
-        own = self.field.covariance.reshape(-1, n, n)[self.index]
-        roots = roots_of(np.where((self.weight > 0.0)[..., None, None], own, 0.0))
+        used = np.zeros(self.field.status.size, bool)
+        used[self.index[np.nan_to_num(self.weight) != 0.0]] = True
+        roots = np.zeros((used.size, n, n))
+        roots[used] = roots_of(self.field.covariance.reshape(-1, n, n)[used])
         x, y = self.field.x_px.ravel()[self.index], self.field.y_px.ravel()[self.index]
-        r = shared.correlation(x[a][:, :, None] - x[b][:, None, :], y[a][:, :, None] - y[b][:, None, :])
-        w = self.weight[a][:, :, None] * self.weight[b][:, None, :] * r
-        return np.asarray(np.einsum("kij,kiab,kjcb->kac", w, roots[a], roots[b], optimize=True))
+        out = np.empty((len(a), n, n))
+        for k in range(0, len(a), _AT_ONCE):
+            i, j = a[k : k + _AT_ONCE], b[k : k + _AT_ONCE]
+            apart = x[i][:, :, None] - x[j][:, None, :], y[i][:, :, None] - y[j][:, None, :]
+            w = self.weight[i][:, :, None] * self.weight[j][:, None, :]
+            one, two = roots[self.index[i]], roots[self.index[j]]
+            if shared.smoothing is None:
+                w *= shared.correlation(*apart)
+                second = (w @ two.reshape(len(j), -1, n * n)).reshape(len(j), -1, n, n)
+                out[k : k + _AT_ONCE] = np.einsum("kiab,kicb->kac", one, second, optimize=True)
+            else:  # positions and displacements fall off over other distances
+                each = np.einsum("kiab,kjcb->kijac", one, two, optimize=True)
+                out[k : k + _AT_ONCE] = np.einsum("kij,kijac,kijac->kac", w, shared.factors(*apart, n), each)
+        return out
 
 
 def sample(field: Field, xy_px: ArrayLike) -> Samples:
     """Lay places into the grid's cells.
 
-    A place takes its values from the four corners of its cell, bilinearly; from three if the fourth failed or lies
-    beyond a cut and the place lies inside their triangle; from two or one where it lies on the grid's lines. Else it is
-    missing.
+    A place takes its values from the 4 x 4 points about it, by cubics. Where one of them failed, lies beyond a cut or
+    the grid's edge, the four corners of its cell serve, bilinearly; three if the fourth failed or lies beyond a cut and
+    the place lies inside their triangle; two or one where it lies on the grid's lines. Else it is missing.
 
     Parameters
     ----------
@@ -123,6 +144,7 @@ def sample(field: Field, xy_px: ArrayLike) -> Samples:
     t = f - low
     ox, oy = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])  # of the corners
     index = np.where(oy, high[:, 1:], low[:, 1:]) * cols + np.where(ox, high[:, :1], low[:, :1])
+    wide, wide_weight = _by_cubics(field, xy, low, t)
     across, down = np.where(ox, t[:, :1], 1.0 - t[:, :1]), np.where(oy, t[:, 1:], 1.0 - t[:, 1:])
     weight = across * down
     status = field.status.ravel()[index]
@@ -143,4 +165,30 @@ def sample(field: Field, xy_px: ArrayLike) -> Samples:
         k = int(np.argmax(np.where(bad[i], weight[i], -1.0)))
         missing[i] = PointStatus(int(status[i, k])).name.lower() if failed[i, k] else _CUT
         weight[i] = np.nan
-    return Samples(field, xy, index.astype(np.int64), weight, tuple(missing))
+    whole = np.isfinite(wide_weight[:, 0])
+    wide[~whole, :4], wide_weight[~whole] = index[~whole], 0.0
+    wide_weight[~whole, :4] = weight[~whole]
+    return Samples(field, xy, wide, wide_weight, tuple(missing))
+
+
+def _by_cubics(field: Field, xy_px: Float, low: NDArray[np.int64], t: Float) -> tuple[NDArray[np.int64], Float]:
+    """Return (m, 16) flat indices of the points about places and their weights, NaN where one of them is not there.
+
+    ``low`` (m, 2) column and row of the cell's first corner, ``t`` (m, 2) how far in the cell the place lies.
+    """
+    rows, cols = field.shape
+    at = low[:, None, :] + _ABOUT[:, None]  # (m, 4, 2)
+    u = t[:, None, :]
+    each = np.concatenate([
+        u * (-0.5 + u * (1.0 - 0.5 * u)), 1.0 + u * u * (1.5 * u - 2.5), u * (0.5 + u * (2.0 - 1.5 * u)),
+        u * u * (0.5 * u - 0.5),
+    ], axis=1)  # fmt: skip
+    weight = (each[:, :, None, 1] * each[:, None, :, 0]).reshape(-1, 16)
+    row, col = np.broadcast_arrays(at[:, :, None, 1], at[:, None, :, 0])
+    there = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+    index = (np.clip(row, 0, rows - 1) * cols + np.clip(col, 0, cols - 1)).reshape(-1, 16)
+    good = there.reshape(-1, 16) & np.isin(field.status.ravel()[index], (PointStatus.OK, PointStatus.EXTRAPOLATED))
+    points = np.stack([field.x_px.ravel()[index], field.y_px.ravel()[index]], axis=-1)
+    good &= ~crosses(xy_px[:, None, :], points, field.cuts)
+    lost = ((weight != 0.0) & ~good).any(axis=1)
+    return index.astype(np.int64), np.where(lost[:, None], np.nan, weight)

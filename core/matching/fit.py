@@ -2,46 +2,42 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.camera import Camera
 from core.errors import ImageError, InputError
 from core.lens import Float
-from core.matching.image import PAD, ImageData, prepare
+from core.matching.arguments import (
+    FEWEST_AT_ONCE,
+    POINTS_AT_ONCE,
+    Int,
+    VisiblePixels,
+    assumed_variance,
+    degree_of,
+    flat,
+    lens_of,
+    one_a_thread,
+    own,
+    points_of,
+    reference_of,
+    setting_of,
+    starts_of,
+    visible_of,
+)
+from core.matching.image import ImageData, prepare
 from core.matching.kernels.drivers import motion_points, motion_space, shape_points, shape_space
 from core.matching.kernels.motion import n_motion_out
 from core.matching.kernels.shape import n_shape_out
-from core.matching.options import SPLINE_ORDER, MatchOptions
+from core.matching.options import MatchOptions
+from core.status import PointStatus
 from core.stereo import StereoPair
 from core.threads import run_ranges
 
-Int = NDArray[np.int32]
 Status = NDArray[np.int8]
-
-POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to call it
-FEWEST_AT_ONCE = 16
-
-
-@dataclass(frozen=True, eq=False)
-class VisiblePixels:
-    """Which pixels of a subset count, for the points that do not see all of theirs.
-
-    Attributes
-    ----------
-    patches
-        (k, subset, subset) uint8 in camera 1's reference image, zero where a pixel does not count.
-    of_point
-        (N,) int32 which patch is a point's; -1 where all pixels count.
-    """
-
-    patches: NDArray[np.uint8]
-    of_point: Int
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +59,8 @@ class ShapeFit:
         (N, 2, 2) of (w0, epipolar offset).
     iterations, status
         (N,).
+    variance
+        (N,) of the noise that the covariance holds where no model states it.
     """
 
     w: Float
@@ -73,6 +71,7 @@ class ShapeFit:
     covariance: Float
     iterations: Int
     status: Status
+    variance: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ class MotionFit:
 
     Attributes
     ----------
-    w, epipolar_px, epipolar_sigma_px, noise, iterations, status
+    w, epipolar_px, epipolar_sigma_px, noise, iterations, status, variance
         As in :class:`ShapeFit`.
     G
         (N, 3, 3): camera 1 at t sees the patch at ``G (1, X, Y)`` (scale fixed by ``w``); for curved patches (N, 3, 6),
@@ -101,6 +100,10 @@ class MotionFit:
     covariance: Float
     iterations: Int
     status: Status
+    variance: Float
+
+
+_Fit = TypeVar("_Fit", ShapeFit, MotionFit)
 
 
 def no_motion(pair: StereoPair, xy_px: ArrayLike) -> Float:
@@ -151,29 +154,37 @@ def fit_shape(
     """
     options = options or MatchOptions()
     images = [prepare(image, options.interpolation) for image in (ref1, ref2)]
-    xy, n = _points(xy_px)
-    degree, terms = _patch(options)
-    w = _starts("start", start, (n,), terms)
+    _check_blur(images)
+    xy, n = points_of(xy_px)
+    degree, terms = degree_of(options)
+    w = starts_of("start", start, (n,), terms)
     out = np.full((n, n_shape_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     results = (out, status, iterations)
     pose = pair.cam2_from_cam1
-    setting = _setting(options, images)
+    setting = setting_of(options, images)
     fixed = (
-        _reference(images[0]), _visible(visible, n, options.subset_px), _flat(images[1]), _lens(pair.cam1),
-        _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, setting,
+        reference_of(images[0]), visible_of(visible, n, options.subset_px), flat(images[1]), lens_of(pair.cam1),
+        lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), xy, w, setting,
     )  # fmt: skip
-    kernel, space = shape_points[degree], _one_a_thread(shape_space[degree], options.subset_px)
+    kernel, space = shape_points[degree], one_a_thread(shape_space[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
     failed = status != 0
     out[failed, : terms + 1] = np.nan
     out[failed, terms + 3 :] = np.nan
     covariance = out[:, [terms + 3, terms + 4, terms + 4, terms + 5]].reshape(n, 2, 2)
-    return ShapeFit(
+    fit = ShapeFit(
         w=out[:, :terms], epipolar_px=out[:, terms], epipolar_sigma_px=np.sqrt(out[:, terms + 5]),
         zncc=out[:, terms + 1 : terms + 2], noise=out[:, terms + 2], covariance=covariance, iterations=iterations,
-        status=status,
+        status=status, variance=out[:, terms + 2] ** 2,
     )  # fmt: skip
+    if images[0].blur is None:
+        return fit
+
+    def sharp(before: list[ImageData], once: MatchOptions) -> ShapeFit:
+        return fit_shape(pair, before[0], before[1], xy, fit.w, once, visible)
+
+    return _with_blurred_noise(fit, images, xy, options, sharp)
 
 
 def fit_motion(
@@ -220,6 +231,7 @@ def fit_motion(
     """
     options = options or MatchOptions()
     images = [prepare(image, options.interpolation) for image in (ref1, ref2, cur1, cur2)]
+    _check_blur(images)
     for i, j, camera in ((0, 2, 1), (1, 3, 2)):
         if images[i].shape != images[j].shape:
             raise ImageError(
@@ -227,109 +239,71 @@ def fit_motion(
                 code="image_size_mismatch",
                 remedy="Give images of one size per camera.",
             )
-    xy, n = _points(xy_px)
-    degree, terms = _patch(options)
-    w = _starts("start_w", start_w, (n,), terms)
-    G = _starts("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
+    xy, n = points_of(xy_px)
+    degree, terms = degree_of(options)
+    w = starts_of("start_w", start_w, (n,), terms)
+    G = starts_of("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
     out = np.full((n, n_motion_out(terms)), np.nan)
     status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
     results = (out, status, iterations)
     pose = pair.cam2_from_cam1
-    setting = (*_setting(options, images), options.patch == "rigid")
+    setting = (*setting_of(options, images), options.patch == "rigid")
     fixed = (
-        _reference(images[0]), _visible(visible, n, options.subset_px), _flat(images[1]), _flat(images[2]),
-        _flat(images[3]), _lens(pair.cam1), _lens(pair.cam2), _own(pose.rotation), _own(pose.translation_mm), xy, w, G,
+        reference_of(images[0]), visible_of(visible, n, options.subset_px), flat(images[1]), flat(images[2]),
+        flat(images[3]), lens_of(pair.cam1), lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), xy, w, G,
         setting,
     )  # fmt: skip
-    kernel, space = motion_points[degree], _one_a_thread(motion_space[degree], options.subset_px)
+    kernel, space = motion_points[degree], one_a_thread(motion_space[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan
-    out[failed, at + 5 :] = np.nan
-    covariance = out[:, at + 5 :].reshape(n, 5, 5)
-    return MotionFit(
+    out[failed, at + 5 : at + 30] = np.nan
+    covariance = out[:, at + 5 : at + 30].reshape(n, 5, 5)
+    fit = MotionFit(
         w=out[:, :terms], G=out[:, terms:at].reshape(n, 3, terms), epipolar_px=out[:, at],
         epipolar_sigma_px=np.sqrt(covariance[:, 4, 4]), zncc=out[:, at + 1 : at + 4], noise=out[:, at + 4],
-        covariance=covariance, iterations=iterations, status=status,
+        covariance=covariance, iterations=iterations, status=status, variance=out[:, at + 30],
     )  # fmt: skip
+    if images[0].blur is None:
+        return fit
+
+    def sharp(before: list[ImageData], once: MatchOptions) -> MotionFit:
+        one, two, one_now, two_now = before
+        return fit_motion(pair, one, two, one_now, two_now, xy, fit.w, fit.G, once, visible)
+
+    return _with_blurred_noise(fit, images, xy, options, sharp)
 
 
-def _one_a_thread(make: Callable[[int], Any], subset: int) -> Callable[[], Any]:
-    """Return what gives each thread its own work space, once: one for each range would cost as much as ten points."""
-    own = threading.local()
-
-    def space() -> Any:
-        if not hasattr(own, "space"):
-            own.space = make(subset)
-        return own.space
-
-    return space
+def _check_blur(images: list[ImageData]) -> None:
+    if any(image.blur != images[0].blur for image in images):
+        raise InputError("the images were not blurred alike.", code="blur_mismatch",
+                         remedy="Prepare all images with the same blur.")  # fmt: skip
 
 
-def _points(xy_px: ArrayLike) -> tuple[Float, int]:
-    xy = np.array(xy_px, dtype=np.float64, order="C")
-    if xy.ndim != 2 or xy.shape[1] != 2:
-        raise InputError(f"xy_px has shape {xy.shape}, it must be (N, 2).", code="shape_mismatch")
-    return xy, xy.shape[0]
+def _with_blurred_noise(
+    fit: _Fit,
+    images: list[ImageData],
+    xy: Float,
+    options: MatchOptions,
+    sharp: Callable[[list[ImageData], MatchOptions], _Fit],
+) -> _Fit:
+    """Give a fit of blurred images the covariance and the noise that such images have.
 
-
-def _patch(options: MatchOptions) -> tuple[int, int]:
-    """Degree of the patch and number of its monomials."""
-    return (2, 6) if options.patch == "curved" else (1, 3)
-
-
-def _starts(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) -> Float:
-    """Start values with ``terms`` columns; a plane's serve a curved patch, the rest is zero."""
-    given = np.asarray(values, dtype=np.float64)
-    columns = given.shape[-1] if given.ndim else 0
-    if given.shape[:-1] != shape or columns not in (3, terms):
-        raise InputError(f"{name} has shape {given.shape}, it must be {(*shape, terms)}.", code="shape_mismatch")
-    array = np.zeros((*shape, terms))
-    array[..., :columns] = given
-    return array
-
-
-def _setting(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...]:
-    """Options and what is known of the noise: the images' variances, or all one where any is unknown."""
-    given = [image.noise_variance for image in images]
-    variances = [v for v in given if v is not None and v > 0.0]
-    known = len(variances) == len(images)
-    return (
-        options.subset_px, SPLINE_ORDER[options.interpolation], options.max_iterations, options.tolerance_px,
-        options.max_sigma_px, options.max_step_px, (images[0].slope_noise, images[0].slope_share),
-        tuple(variances) if known else (1.0,) * len(images), known,
-    )  # fmt: skip
-
-
-def _visible(visible: VisiblePixels | None, n: int, subset: int) -> tuple[NDArray[np.uint8], Int]:
-    if visible is None or not (visible.of_point >= 0).any():
-        return np.zeros((0, subset, subset), np.uint8), np.full(n, -1, np.int32)
-    patches, of_point = np.ascontiguousarray(visible.patches, np.uint8), np.array(visible.of_point, np.int32)
-    if patches.ndim != 3 or patches.shape[1:] != (subset, subset) or of_point.shape != (n,):
-        raise InputError(
-            f"visible has patches of shape {patches.shape} for {of_point.shape} points, it must be "
-            f"(k, {subset}, {subset}) for ({n},).",
-            code="shape_mismatch",
-        )
-    if of_point.max() >= len(patches):
-        raise InputError(f"visible names patch {of_point.max()} of {len(patches)}.", code="shape_mismatch")
-    return patches, of_point
-
-
-def _reference(image: ImageData) -> tuple[Any, ...]:
-    weights = np.empty((0, 0), np.float32) if image.weights is None else image.weights
-    return (image.pixels, *image.gradients, weights)
-
-
-def _flat(image: ImageData) -> tuple[Any, ...]:
-    rows, cols = image.shape
-    return image.coefficients.ravel(), rows, cols, cols + 2 * PAD
-
-
-def _lens(camera: Camera) -> Float:
-    return _own(camera.lens.kernel_parameters())
-
-
-def _own(array: Float) -> Float:
-    # the kernels are compiled for writable contiguous arrays; a read-only one would compile them again
-    return np.array(array, dtype=np.float64)
+    One step from the result on the images before the blur tells their noise, and that a subset which showed noise alone
+    shows nothing.
+    """
+    blur, spread = images[0].blur, images[0].spread(options.subset_px, degree_of(options)[0])
+    assert blur is not None
+    assert spread is not None
+    rows, cols = spread.shape
+    col, row = (np.clip(np.rint(a), 0, last - 1).astype(int) for a, last in zip(xy.T, (cols, rows), strict=True))
+    factor = spread[row, col].astype(np.float64)
+    before = [image.sharp for image in images]
+    told = sharp([image for image in before if image is not None], replace(options, max_iterations=1))
+    if not all(image.noise_variance for image in images):
+        factor *= blur.gain * told.variance / assumed_variance(images[0])
+    unseen = (fit.status == PointStatus.OK) & ~np.isfinite(told.variance)
+    status, noise = np.where(unseen, told.status, fit.status), np.sqrt(blur.gain) * told.noise
+    covariance = fit.covariance * factor[:, None, None]
+    return replace(fit, status=status, noise=noise, covariance=covariance,
+                   epipolar_sigma_px=np.sqrt(covariance[:, -1, -1]))  # fmt: skip

@@ -6,7 +6,7 @@ pixel centres), so the spline passes through every pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import ImageError, InputError
+from core.matching.blur import Blur, fitted_share, spread_of
 from core.matching.filters import correlate, derivative, in_bands, prefilter
 from core.matching.options import SPLINE_ORDER, Interpolation
 from core.matching.slopes import SlopeFilter, slope_filter
@@ -43,13 +44,20 @@ class ImageData:
     order
         3 or 5.
     noise
-        The camera's noise model, or None where it is not known.
+        The noise model of ``raw``, or None where it is not known.
+    blur
+        What ``raw`` was blurred with; None: nothing.
+    unblurred
+        (rows, cols) grey levels before the blur; None without one.
     """
 
     coefficients: Float32
     raw: NDArray[Any]
     order: int
     noise: NoiseModel | None = None
+    blur: Blur | None = None
+    unblurred: NDArray[Any] | None = None
+    _spreads: dict[tuple[int, int], Float32] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -89,7 +97,7 @@ class ImageData:
     @cached_property
     def slopes(self) -> SlopeFilter | None:
         """The derivative that is best under this image's noise; None where the image shows nothing."""
-        return slope_filter(self.raw, self.order, self.noise_variance)
+        return slope_filter(self.raw, self.order, self.noise_variance, blur=self.blur, unblurred=self.unblurred)
 
     @property
     def slope_noise(self) -> float:
@@ -112,9 +120,33 @@ class ImageData:
         correlate(self.raw, slope, _ONE, gy)
         return gx, gy
 
+    @cached_property
+    def sharp(self) -> ImageData | None:
+        """The image before its blur, prepared alike; None without one. Its residuals tell the noise."""
+        if self.unblurred is None:
+            return None
+        return prepare(self.unblurred, "cubic" if self.order == 3 else "quintic")
+
+    def spread(self, subset_px: int, degree: int = 1) -> Float32 | None:
+        """Return (rows, cols) how much more blurred noise weighs than white noise in subsets about each pixel.
+
+        None without a blur; ``degree`` is 1 for plane and 2 for curved patches.
+        """
+        if self.blur is None:
+            return None
+        key = subset_px, degree
+        if key not in self._spreads:
+            found = spread_of(self.blur, self.gradients, subset_px)
+            share = fitted_share(self.blur, self.pixels, self.gradients, subset_px, degree, found)
+            self._spreads[key] = found * np.float32(share)
+        return self._spreads[key]
+
 
 def prepare(
-    image: ArrayLike | ImageData, interpolation: Interpolation = "quintic", noise: NoiseModel | None = None
+    image: ArrayLike | ImageData,
+    interpolation: Interpolation = "quintic",
+    noise: NoiseModel | None = None,
+    blur: Blur | None = None,
 ) -> ImageData:
     """Find the spline coefficients of an image.
 
@@ -126,6 +158,8 @@ def prepare(
         ``cubic`` or ``quintic``.
     noise
         The camera's noise model; pixels then count by their noise, and it says how far a match scatters.
+    blur
+        A Gaussian that the image is blurred with before anything else; None: nothing.
 
     Raises
     ------
@@ -154,6 +188,10 @@ def prepare(
         raise ImageError(f"an image of type {pixels.dtype} has no grey levels.")
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         raise ImageError("the image holds NaN or infinite grey levels.")
+    if blur is not None:
+        blurred = blur.apply(pixels)
+        left = None if noise is None else noise.times(blur.gain)
+        return ImageData(_coefficients(blurred, order), blurred, order, left, blur, pixels)
     return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order, noise)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from core.matching.blur import Blur
 from core.matching.filters import derivative, in_bands
 
 Float = NDArray[np.float64]
@@ -49,7 +50,7 @@ class SlopeFilter:
     along_x, along_y
         (7, 7) taps.
     gain
-        Variance of the filtered gradient per variance of white noise, mean of both directions.
+        Variance of the filtered gradient per variance of the pixels' noise, mean of both directions.
     share
         Share of noise in the filtered gradient's squares over the image's texture.
     noise_variance
@@ -76,7 +77,14 @@ def _correlate(image: NDArray[Any], taps: Float32, out: Float32) -> None:
     )
 
 
-def slope_filter(image: NDArray[Any], order: int, noise_variance: float | None = None) -> SlopeFilter | None:
+def slope_filter(
+    image: NDArray[Any],
+    order: int,
+    noise_variance: float | None = None,
+    *,
+    blur: Blur | None = None,
+    unblurred: NDArray[Any] | None = None,
+) -> SlopeFilter | None:
     """Make the filter for an image; None if it shows nothing.
 
     Parameters
@@ -88,6 +96,9 @@ def slope_filter(image: NDArray[Any], order: int, noise_variance: float | None =
     noise_variance
         Of a pixel, grey levels squared; from the spectrum's floor when left out. Texture that is sharp enough to reach
         the floor raises it: the gradients then lose a little, and the covariance stays on the safe side.
+    blur, unblurred
+        What the image was blurred with, and the image before: its noise is no longer white, and its spectrum shows no
+        floor.
 
     Notes
     -----
@@ -98,7 +109,13 @@ def slope_filter(image: NDArray[Any], order: int, noise_variance: float | None =
     spectra, window = _spectra(image)
     if spectra is None:
         return None
-    noise = _floor(spectra) if noise_variance is None else noise_variance
+    if noise_variance is not None:
+        noise = noise_variance
+    elif blur is None or unblurred is None:
+        noise = _floor(spectra)
+    else:
+        before = _spectra(unblurred)[0]
+        noise = 0.0 if before is None else blur.gain * _floor(before)
     side = 2 * REACH + 1
     W = np.maximum(_lags(np.abs(fft.rfft2(window)) ** 2 / (window**2).sum()), 0.01)
     spectrum = spectra.mean(axis=0)
@@ -106,13 +123,17 @@ def slope_filter(image: NDArray[Any], order: int, noise_variance: float | None =
     if not S[0, 0] > 0.0:
         return None
     noise = min(noise, _MOST_NOISE * float(S[0, 0]))
-    E = _lags(np.maximum(spectrum - noise, 0.0) * _interpolation_error(len(spectrum), order)) / W
-    S[0, 0] -= noise
+    colour = np.ones_like(spectrum) if blur is None else blur.spectrum(len(spectrum))
+    E = _lags(np.maximum(spectrum - noise * colour, 0.0) * _interpolation_error(len(spectrum), order)) / W
+    C = _lags(colour)
+    N = noise * C
+    least = _LEAST_NOISE * float(S[0, 0] - noise)
+    S -= N
     lag = np.arange(-REACH, REACH + 1)
     y, x = (v.ravel() for v in np.meshgrid(lag, lag, indexing="ij"))
     apart = y[:, None] - y, x[:, None] - x
-    R = S[apart]
-    R[np.diag_indices(side**2)] += noise + _LEAST_NOISE * S[0, 0]
+    R = S[apart] + N[apart]
+    R[np.diag_indices(side**2)] += least
     slope = derivative(5)
     far = min(len(slope) // 2, len(S) // 2 - 1 - REACH)
     tap = np.arange(-far, far + 1)
@@ -124,7 +145,7 @@ def slope_filter(image: NDArray[Any], order: int, noise_variance: float | None =
     if not (power > 0.0).all():
         return None
     taps *= np.einsum("ik,ik->k", taps, wanted) / power
-    gain = float((taps**2).sum()) / 2.0
+    gain = float(np.einsum("ik,ij,jk->", taps, C[apart], taps)) / 2.0
     power = float(np.einsum("ik,ij,jk->", taps, R, taps)) / 2.0
     along_x, along_y = taps.T.reshape(2, side, side)
     return SlopeFilter(along_x, along_y, gain, gain * noise / power, noise)

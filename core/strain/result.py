@@ -46,7 +46,8 @@ class StrainField:
     subset_px
         Width of the subset that the displacements were measured with.
     gauge_px
-        Width of the virtual gauge, (window - 1) step + subset.
+        Width of the virtual gauge, (window - 1) step + subset; of displacements that were smoothed over a window of w
+        points (w - 1) step more.
     gauge_mm
         The same on the surface, median of the field; NaN where nothing was computed.
     status

@@ -7,12 +7,14 @@ from scipy import ndimage
 
 from core.errors import InputError
 from core.field.result import Field
+from core.field.shared_pixels import SharedPixels
 from core.lens import Bool, Float
 from core.matching.geometry import tangent_frames
+from core.strain.arcs import missed_slope
 from core.strain.options import StrainOptions
 from core.strain.result import StrainField, StrainStatus
 from core.strain.tensors import strain_covariance, strain_of, strain_of_stretch
-from core.strain.window import window_slopes
+from core.strain.window import Slopes, window_slopes
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
@@ -45,7 +47,8 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     Notes
     -----
     A fit over a window takes chords for arcs. Where the surface keeps its shape this cancels; where it bends from flat
-    to a radius R, planes over a window of half width h tell up to h^2 / (10 R^2) too little.
+    to a radius R, planes over a window of half width h would tell h^2 / (10 R^2) too little (a quarter more with 9
+    points in place of a continuum). The windows' curvature says how much it is, and it is taken out.
     """
     options = StrainOptions() if options is None else options
     if field.uvw_mm is None:
@@ -54,17 +57,10 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
             code="strain_needs_motion",
             remedy="Give the field of a later step.",
         )
-    curved = field.patch is not None and field.patch.patch == "curved"
-    values = np.concatenate([field.xyz_mm, field.uvw_mm], axis=-1)
-    xy_px = np.stack([field.x_px, field.y_px], axis=-1)
-    slopes = window_slopes(values, field.valid, xy_px, field.cuts, options, subset_px=subset_px, curved=curved)
-    status = slopes.status
-    good = status == StrainStatus.OK
-    slope = slopes.slope[good]
-    frame = _frames(slope[:, :3], field.normal_sys[good])
-    tangents = np.swapaxes(frame, -1, -2) @ slope[:, :3]
-    area, per_mm = np.abs(np.linalg.det(tangents)), np.linalg.inv(tangents)
-    gradient = slope[:, 3:] @ per_mm
+    shared = SharedPixels.of(field, subset_px)
+    slopes, frame, per_mm, gradient = surface_slopes(field, options, shared)
+    status, good = slopes.status, slopes.status == StrainStatus.OK
+    area = 1.0 / np.abs(np.linalg.det(per_mm))
     found = strain_of(frame, gradient, options.tensor)
     spread = np.swapaxes(per_mm, -1, -2) @ slopes.spread[good] @ per_mm
     around = _mean_around(field.covariance, field.valid, options.window)[good]
@@ -73,7 +69,8 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     strain[good] = found
     covariance[good] = strain_covariance(frame, gradient, options.tensor, around, spread, found)
     step_px = _step(field)
-    gauge_px = (options.window - 1) * step_px + subset_px
+    # of smoothed displacements it begins with what went into one of them
+    gauge_px = (options.window - 1) * step_px + shared.reach_px
     return StrainField(
         options=options,
         step_px=step_px,
@@ -85,6 +82,38 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
         covariance=covariance,
         patch=_patch_strain(field, options),
     )
+
+
+def surface_slopes(field: Field, options: StrainOptions, shared: SharedPixels) -> tuple[Slopes, Float, Float, Float]:
+    """Return the windows' fits, and of the n points that have a strain frame, steps per mm in it, and gradient.
+
+    Parameters
+    ----------
+    field
+        A displacement.
+    options
+        Window, order, limits.
+    shared
+        How the points' errors go together.
+
+    Returns
+    -------
+    tuple
+        :class:`core.strain.window.Slopes`; (n, 3, 2) unit tangents; (n, 2, 2) steps of column and row (first index) per
+        mm along them; (n, 3, 2) the displacement's derivatives along them.
+    """
+    assert field.uvw_mm is not None
+    values = np.concatenate([field.xyz_mm, field.uvw_mm], axis=-1)
+    xy_px = np.stack([field.x_px, field.y_px], axis=-1)
+    slopes = window_slopes(values, field.valid, xy_px, field.cuts, options, shared=shared)
+    good = slopes.status == StrainStatus.OK
+    slope, second, moments = slopes.slope[good], slopes.second[good], slopes.moments[good]
+    before = missed_slope(slope[:, :3], second[:, :3], moments)
+    now = missed_slope(slope[:, :3] + slope[:, 3:], second[:, 3:], moments)
+    slope = slope - np.concatenate([before, now - before], axis=1)
+    frame = _frames(slope[:, :3], field.normal_sys[good])
+    per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
+    return slopes, frame, per_mm, slope[:, 3:] @ per_mm
 
 
 def _frames(tangents: Float, towards: Float) -> Float:

@@ -85,15 +85,7 @@ def strain_covariance(
     An error of the positions makes the tangents off by d_j = sum c_kj (dX, dU)_k, six numbers for each of j = 1, 2.
     The strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
     """
-    moved = frame + gradient
-    if tensor == "infinitesimal":
-        of_motion = frame
-        # E^T dP with P's own basis off by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
-        of_place = frame - frame @ _transposed(_transposed(frame) @ moved)
-    else:
-        of_motion = moved
-        of_place = moved - frame @ (_transposed(moved) @ moved)
-    A = _transposed(np.concatenate([of_place, of_motion], axis=-2))  # (n, 2, 6)
+    A = _pulls(frame, gradient, tensor)
     Q = A @ points @ _transposed(A)
     q11, q22, q12 = Q[..., 0, 0], Q[..., 1, 1], Q[..., 0, 1]
     k11, k22, k12 = spread[..., 0, 0], spread[..., 1, 1], spread[..., 0, 1]
@@ -108,6 +100,35 @@ def strain_covariance(
         J = _hencky_slope(strain)
         out = J @ out @ _transposed(J)
     return out
+
+
+def strain_slopes(frame: Float, gradient: Float, tensor: StrainTensor, per_mm: Float, strain: Float) -> Float:
+    """Return (n, 3, 2, 6) what exx, eyy, exy gain for errors of the slopes of X Y Z U V W over column and row.
+
+    Parameters
+    ----------
+    frame, gradient, tensor, strain
+        As in :func:`strain_covariance`.
+    per_mm
+        (n, 2, 2) steps of column and row (first index) per mm along the frame's axes (second).
+    """
+    A = _pulls(frame, gradient, tensor)
+    along = A[:, :, None, None, :] * np.swapaxes(per_mm, -1, -2)[:, None, :, :, None]  # (n, i, j, a, 6)
+    out = np.stack([along[:, 0, 0], along[:, 1, 1], 0.5 * (along[:, 0, 1] + along[:, 1, 0])], axis=1)
+    return np.einsum("nij,njab->niab", _hencky_slope(strain), out) if tensor == "hencky" else out
+
+
+def _pulls(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
+    """A (n, 2, 6): the strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i)."""
+    moved = frame + gradient
+    if tensor == "infinitesimal":
+        of_motion = frame
+        # E^T dP with P's own basis off by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
+        of_place = frame - frame @ _transposed(_transposed(frame) @ moved)
+    else:
+        of_motion = moved
+        of_place = moved - frame @ (_transposed(moved) @ moved)
+    return _transposed(np.concatenate([of_place, of_motion], axis=-2))
 
 
 def _hencky_slope(hencky: Float) -> Float:

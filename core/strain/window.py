@@ -8,14 +8,15 @@ the surface's shape.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
 
-from core.field.cuts import Cuts, crosses
+from core.field.cuts import Cuts
 from core.field.shared_pixels import SharedPixels
+from core.field.window import fit_terms, points_seen, steps_of, ways_cut, window_offsets
 from core.lens import Bool, Float
+from core.strain.arcs import reduced_moments, second_weights, third_moments, whole_second_derivatives
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
 
@@ -34,37 +35,21 @@ class Slopes:
         (r, c, 6, 2) of X Y Z U V W over column and row, mm a step.
     spread
         (r, c, 2, 2) sum of c_k rho_kl c_l^T: what the slopes' covariance is in units of a point's.
+    second
+        (r, c, 6, 3) second derivatives of X Y Z and of X + U, Y + V, Z + W: over column twice, both, row twice.
+    moments
+        (r, c, 2, 4) :func:`core.strain.arcs.third_moments` of the weights.
+    reduced
+        Of windows that edges, holes or cuts have reduced, in batches: rows (m,), columns (m,), and weights (m, 2, n) of
+        the points of ``window_offsets`` in the slopes.
     """
 
     status: np.ndarray
     slope: Float
     spread: Float
-
-
-@lru_cache(maxsize=8)
-def _offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next towards the centre."""
-    side = np.arange(-half, half + 1)
-    row, col = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
-    ring = np.maximum(np.abs(row), np.abs(col))
-    order = np.argsort(ring, kind="stable")
-    row, col, ring = row[order], col[order], ring[order]
-    number = {(int(r), int(c)): k for k, (r, c) in enumerate(zip(row, col, strict=True))}
-    share = np.maximum(ring - 1, 0) / np.maximum(ring, 1)
-    # truncated: of two cells as near the line, the one nearer to the axes
-    before_row = np.trunc(row * share + 0.5 * np.sign(row) - 1e-9 * np.sign(row)).astype(int)
-    before_col = np.trunc(col * share + 0.5 * np.sign(col) - 1e-9 * np.sign(col)).astype(int)
-    before = np.array([number[int(r), int(c)] for r, c in zip(before_row, before_col, strict=True)])
-    return np.stack([row, col], axis=1), before
-
-
-def _design(offsets: np.ndarray, half: int, order: int) -> Float:
-    """(n, 3 or 6) terms of the fit, offsets as shares of the half width."""
-    y, x = (offsets / half).T
-    terms = [np.ones_like(x), x, y]
-    if order == 2:
-        terms += [x * x, x * y, y * y]
-    return np.stack(terms, axis=1)
+    second: Float
+    moments: Float
+    reduced: list[tuple[np.ndarray, np.ndarray, Float]]
 
 
 def window_slopes(
@@ -73,9 +58,7 @@ def window_slopes(
     xy_px: Float,
     cuts: Cuts | None,
     options: StrainOptions,
-    *,
-    subset_px: int,
-    curved: bool,
+    shared: SharedPixels,
 ) -> Slopes:
     """Fit the window about each valid point.
 
@@ -91,23 +74,28 @@ def window_slopes(
         What no window reaches over.
     options
         Window, order, limits.
-    subset_px, curved
-        What the points were measured with: tells how their errors go together.
+    shared
+        How the points' errors go together.
     """
     half = options.window // 2
-    offsets, _ = _offsets(half)
-    step = _steps(xy_px)
+    offsets, _ = window_offsets(half)
+    step = steps_of(xy_px)
     apart = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
-    rho = SharedPixels(subset_px, curved).correlation(apart[..., 1] * step[0], apart[..., 0] * step[1])
+    rho = shared.correlation(apart[..., 1] * step[0], apart[..., 0] * step[1])
     whole = ndimage.minimum_filter(valid, size=options.window, mode="constant", cval=False)
-    crossed = _crossed(valid, xy_px, cuts, half)
+    crossed = ways_cut(valid, xy_px, cuts, half)
     whole &= ~crossed.any(axis=-1) if crossed is not None else True
     status = np.where(valid, StrainStatus.OK, StrainStatus.NO_POINT).astype(np.int8)
     slope = _whole_slopes(values, half)
     spread = np.zeros((*valid.shape, 2, 2))
-    c = _plane_weights(half)
+    c = plane_weights(half)
     spread[...] = c @ rho @ c.T
+    places = np.concatenate([values[..., :3], values[..., :3] + values[..., 3:]], axis=-1)
+    second = whole_second_derivatives(places, half)
+    moments = np.empty((*valid.shape, 2, 4))
+    moments[...] = third_moments(c, half)
     rows, cols = np.nonzero(valid & ~whole)
+    reduced = []
     there = np.pad(valid, half)
     padded = np.pad(np.where(valid[..., None], values, 0.0), ((half, half), (half, half), (0, 0))).reshape(-1, 6)
     width = there.shape[1]
@@ -115,29 +103,25 @@ def window_slopes(
     for first in range(0, len(rows), _AT_ONCE):
         r, k = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
         here = (r + half) * width + k + half
-        seen = _seen(there, here, None if crossed is None else crossed[r, k], half)
+        seen = points_seen(there, here, None if crossed is None else crossed[r, k], half)
         found, weights = _weights(seen, half, options)
         # from the centre's values on, so that no digits are lost
         data = padded.take(here[:, None] + reach, axis=0) - values[r, k][:, None, :]
         status[r, k] = found
+        reduced.append((r, k, weights))
+        moments[r, k] = reduced_moments(weights, seen, half, options.order)
+        there_now = np.concatenate([data[..., :3], data[..., :3] + data[..., 3:]], axis=-1)
+        second[r, k] = np.einsum("man,mnb->mba", second_weights(seen, half), there_now)
         slope[r, k] = np.einsum("man,mnb->mba", weights, data)
         # one large product instead of many small ones
-        shared = (weights.reshape(-1, len(rho)) @ rho).reshape(weights.shape)
-        spread[r, k] = np.einsum("man,mbn->mab", shared, weights)
-    return Slopes(status, slope, spread)
+        together = (weights.reshape(-1, len(rho)) @ rho).reshape(weights.shape)
+        spread[r, k] = np.einsum("man,mbn->mab", together, weights)
+    return Slopes(status, slope, spread, second, moments, reduced)
 
 
-def _steps(xy_px: Float) -> tuple[float, float]:
-    """Distances of neighbouring columns and rows in px; a single one has no window, and takes the other's."""
-    rows, cols = xy_px.shape[:2]
-    x = float(xy_px[0, 1, 0] - xy_px[0, 0, 0]) if cols > 1 else 0.0
-    y = float(xy_px[1, 0, 1] - xy_px[0, 0, 1]) if rows > 1 else 0.0
-    return x or y, y or x
-
-
-def _plane_weights(half: int) -> Float:
+def plane_weights(half: int) -> Float:
     """(2, n) weights of a whole window's points in its slopes over column and row."""
-    offsets, _ = _offsets(half)
+    offsets, _ = window_offsets(half)
     return np.asarray(offsets[:, ::-1].T / float((offsets[:, 0] ** 2).sum()))
 
 
@@ -152,50 +136,10 @@ def _whole_slopes(values: Float, half: int) -> Float:
     return np.stack(out, axis=-1)
 
 
-def _crossed(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | None:
-    """(r, c, n) True where the way from a point to one of its window meets a cut; None where there is no cut."""
-    if not cuts:
-        return None
-    offsets, _ = _offsets(half)
-    step = _steps(xy_px)
-    out = np.zeros((*valid.shape, len(offsets)), bool)
-    reach = half * np.array(step)
-    near = np.zeros(valid.shape, bool)
-    for x0, y0, x1, y1 in cuts.pieces_px:
-        low, high = np.array([min(x0, x1), min(y0, y1)]) - reach, np.array([max(x0, x1), max(y0, y1)]) + reach
-        near |= ((xy_px >= low) & (xy_px <= high)).all(axis=-1)
-    rows, cols = np.nonzero(near & valid)
-    here = xy_px[rows, cols]
-    if len(here):
-        ways = offsets[:, ::-1] * np.array(step)
-        out[rows, cols] = crosses(here[:, None, :], here[:, None, :] + ways, cuts)
-    return out
-
-
-def _seen(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
-    """(m, n) which points of the windows can be reached from their centres over valid points alone.
-
-    ``there`` is the padded grid, ``here`` (m,) the centres' flat places in it. The way goes from cell to cell. Over a
-    corner it goes where one of the two cells beside it is valid: an empty line of cells, however it slants, is not
-    passed.
-    """
-    offsets, before = _offsets(half)
-    flat, width = there.ravel(), there.shape[1]
-    dr, dc = offsets.T
-    valid = flat.take(here[:, None] + offsets @ np.array([width, 1]))
-    seen = np.ascontiguousarray((valid if crossed is None else valid & ~crossed).T)
-    for k in range(1, len(offsets)):
-        b = before[k]
-        seen[k] &= seen[b]
-        if dr[k] != dr[b] and dc[k] != dc[b]:
-            seen[k] &= flat[here + dr[k] * width + dc[b]] | flat[here + dr[b] * width + dc[k]]
-    return np.asarray(seen.T)
-
-
 def _weights(seen: Bool, half: int, options: StrainOptions) -> tuple[np.ndarray, Float]:
     """Status (m,) and weights (m, 2, n) of the points in the slopes; zero where there are none."""
-    offsets, _ = _offsets(half)
-    A = _design(offsets, half, options.order)
+    offsets, _ = window_offsets(half)
+    A = fit_terms(offsets, half, options.order)
     n, terms = A.shape
     count = seen.sum(axis=1)
     normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)

@@ -27,13 +27,13 @@ def _stamp() -> int:
     return int.from_bytes(digest[:7], "big")
 
 
-_plane_shape, _shape_space = make_shape(1)
-_plane_motion, _motion_space = make_motion(1)
-_curved_shape, _curved_shape_space = make_shape(2)
-_curved_motion, _curved_motion_space = make_motion(2)
+_plane_shape, _shape_space, _observed_plane_shape, _observed_shape_space = make_shape(1)
+_plane_motion, _motion_space, _observed_plane_motion, _observed_motion_space = make_motion(1)
+_curved_shape, _curved_shape_space, _observed_curved_shape, _observed_curved_shape_space = make_shape(2)
+_curved_motion, _curved_motion_space, _observed_curved_motion, _observed_curved_motion_space = make_motion(2)
 
 
-def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
+def _wrappers(stamp: int) -> tuple[dict[int, Any], ...]:
     @entry
     def run_plane_shape(
         first, last, reference, visible, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
@@ -86,11 +86,74 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], dict[int, Any]]:
                 start_g[i], setting, space, out[i],
             )  # fmt: skip
 
-    return {1: run_plane_shape, 2: run_curved_shape}, {1: run_plane_motion, 2: run_curved_motion}
+    @entry
+    def observe_plane_shape(
+        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
+        space, out, status,
+    ):  # fmt: skip
+        if stamp < 0:
+            return
+        patches, which = visible
+        for i in range(first, last):
+            status[i] = _observed_plane_shape(
+                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
+                setting, rigid, space, out[i],
+            )  # fmt: skip
+
+    @entry
+    def observe_plane_motion(
+        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
+        space, out, status,
+    ):  # fmt: skip
+        if stamp < 0:
+            return
+        patches, which = visible
+        for i in range(first, last):
+            status[i] = _observed_plane_motion(
+                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
+                setting, rigid, space, out[i],
+            )  # fmt: skip
+
+    @entry
+    def observe_curved_shape(
+        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
+        space, out, status,
+    ):  # fmt: skip
+        if stamp < 0:
+            return
+        patches, which = visible
+        for i in range(first, last):
+            status[i] = _observed_curved_shape(
+                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
+                setting, rigid, space, out[i],
+            )  # fmt: skip
+
+    @entry
+    def observe_curved_motion(
+        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
+        space, out, status,
+    ):  # fmt: skip
+        if stamp < 0:
+            return
+        patches, which = visible
+        for i in range(first, last):
+            status[i] = _observed_curved_motion(
+                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
+                setting, rigid, space, out[i],
+            )  # fmt: skip
+
+    return (
+        {1: run_plane_shape, 2: run_curved_shape},
+        {1: run_plane_motion, 2: run_curved_motion},
+        {1: observe_plane_shape, 2: observe_curved_shape},
+        {1: observe_plane_motion, 2: observe_curved_motion},
+    )
 
 
-shape_points, motion_points = _wrappers(_stamp())
-"""The compiled fits, by the patch's degree: 1 plane, 2 curved."""
+shape_points, motion_points, observe_shape, observe_motion = _wrappers(_stamp())
+"""The compiled fits and observed covariances, by the patch's degree: 1 plane, 2 curved."""
 shape_space = {1: _shape_space, 2: _curved_shape_space}
 motion_space = {1: _motion_space, 2: _curved_motion_space}
+observed_shape_space = {1: _observed_shape_space, 2: _observed_curved_shape_space}
+observed_motion_space = {1: _observed_motion_space, 2: _observed_curved_motion_space}
 """What makes their work space for a subset's width; one call at a time may use it."""

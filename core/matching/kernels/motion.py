@@ -22,6 +22,7 @@ from core.matching.kernels.noise import (
     share_correction,
     unlike_noise,
 )
+from core.matching.kernels.observed import make_observed
 from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
@@ -43,14 +44,18 @@ from core.matching.kernels.warp import lens_jacobian
 
 
 def n_motion_out(terms: int) -> int:
-    """Numbers a point: ``terms`` of w, 3 x ``terms`` of G, e, zncc (3), noise, covariance (25) of (w0, G0, e)."""
-    return 4 * terms + 30
+    """Numbers a point: ``terms`` of w, 3 x ``terms`` of G, e, zncc (3), noise, covariance (25) of (w0, G0, e).
+
+    Last the variance that the covariance holds where the noise is not known.
+    """
+    return 4 * terms + 31
 
 
 def make_motion(degree: int) -> Any:
     """Compile the fit for plane (degree 1, stretch or rigid) or curved (2) patches."""
+    parts = make_point(degree, 3)
     (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
-     texture, few) = make_point(degree, 3)  # fmt: skip
+     texture, few) = parts  # fmt: skip
     unknowns = 4 * few + 1
 
     @kernel(f"{degree}")
@@ -216,6 +221,7 @@ def make_motion(degree: int) -> Any:
         variance = noise_from_residuals(levels, 3, count, float(n))
         out[at + 4] = math.sqrt(variance)
         above = unlike_noise(levels, 3, count, float(n))
+        out[at + 30] = variance + above
         if known_noise:
             variance = variances[0]
         covariance = out[at + 5 : at + 30]
@@ -230,4 +236,4 @@ def make_motion(degree: int) -> Any:
         share = slope[0] * variance * p / weakest
         return texture_status(status, share, sigma, max_sigma, worst), iterations
 
-    return motion_point, work_space
+    return motion_point, work_space, *make_observed(degree, 3, parts, freeze, work_space)

@@ -105,9 +105,25 @@ def texture_status(status, share, sigma_px, max_sigma_px, zncc):
 
 
 @cache
+def make_sum_pixels(degree: int) -> Any:
+    """Compile the loop over an image's pixels for both interpolants."""
+    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+
+    @kernel(f"{degree}")
+    def sum_pixels(coefficients, order, base, stride, warp, ref, blocks, sums):
+        """See :mod:`core.matching.kernels.loops`."""
+        if order == 3:
+            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, np.int64(blocks), sums)
+        else:
+            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, np.int64(blocks), sums)
+
+    return sum_pixels
+
+
+@cache
 def make_compare(degree: int) -> Any:
     """Compile the comparison of one image with the reference; shape and motion use the same."""
-    cubic, quintic = compare_cubic[degree], compare_quintic[degree]
+    sum_pixels = make_sum_pixels(degree)
     n_columns = 2 * len(monomials(degree))
     made_for = f"{degree}"
 
@@ -126,10 +142,7 @@ def make_compare(degree: int) -> Any:
             return False
         warp[20] = levels[GAIN]
         warp[21] = levels[SHIFT]
-        if order == 3:
-            cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
-        else:
-            quintic(coefficients, np.int64(base), np.int64(stride), warp, ref, blocks, sums)
+        sum_pixels(coefficients, order, base, stride, warp, ref, blocks, sums)
         # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
         gain, shift = float(warp[20]), float(warp[21])
         mean = sums[0] / p

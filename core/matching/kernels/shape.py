@@ -18,6 +18,7 @@ from core.matching.kernels.noise import (
     noise_from_residuals,
     share_correction,
 )
+from core.matching.kernels.observed import make_observed
 from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
@@ -44,12 +45,13 @@ def n_shape_out(terms: int) -> int:
 
 def make_shape(degree: int) -> Any:
     """Compile the fit for plane (degree 1) or curved (2) patches."""
+    parts = make_point(degree, 1)
     (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
-     texture, few) = make_point(degree, 1)  # fmt: skip
+     texture, few) = parts  # fmt: skip
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @kernel(f"{degree}")
-    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations):
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, _chain, _rigid):
         """Set up and factor the normal equations; status."""
         weights, block, columns, _, _, normal = equations
         joint_weights(levels, variances, 1, weights)
@@ -62,7 +64,9 @@ def make_shape(degree: int) -> Any:
     def shape_point(reference, patches, which, image2, lens1, lens2, R, t, xy, start, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
-        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, _, _, work) = space
+        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work) = (
+            space
+        )
         gram, columns, normal = of_reference[7], equations[2], equations[5]
         inside, xc, yc, p, offset, f2, white, count = set_up_reference(
             reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
@@ -100,7 +104,9 @@ def make_shape(degree: int) -> Any:
             if levels[0, CONTRAST] == 0.0:
                 return LOW_TEXTURE, iterations
             if moved > REFREEZE_PX:
-                result = freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations)
+                result = freeze(
+                    R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, rotation, False
+                )
                 if result != OK:
                     return result, iterations
                 moved = 0.0
@@ -140,4 +146,4 @@ def make_shape(degree: int) -> Any:
         share = slope[0] * variance * p / weakest
         return texture_status(status, share, sigma, max_sigma, levels[0, ZNCC]), iterations
 
-    return shape_point, work_space
+    return shape_point, work_space, *make_observed(degree, 1, parts, freeze, work_space)

@@ -1,0 +1,176 @@
+"""What a plan may be expected to leave uncertain: before anything moves, from nominal values alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from core.calibration.adjust import covariance_of
+from core.calibration.inputs import (
+    CAMERAS,
+    CalibrationOptions,
+    CalibrationView,
+    NominalCamera,
+    TargetLike,
+    extent_mm,
+    inner_nodes_mm,
+)
+from core.calibration.model import N_CAMERA, camera_at, camera_of, collect
+from core.calibration.prepare import EXPECTED_NOISE_PX
+from core.calibration.result import COVARIANCE_NAMES, TEN_OF_BOTH
+from core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
+from core.camera import TEN_PARAMETER_NAMES
+from core.errors import CalibrationInputError
+from core.lens import Float
+from core.stereo import StereoPair
+
+LineModel = Literal["straight", "parabola", "local"]
+_PER_LINE = {"straight": 2, "parabola": 3}
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a plan may be expected to leave.
+
+    Attributes
+    ----------
+    parameters, sigma
+        Nominal value and expected standard deviation by name, as in :data:`COVARIANCE_NAMES`.
+    volume
+        What the covariance does to points of the target's volume.
+    points_mm, sigma_mm
+        (9, 3) the middle of the volume, then its corners, and the standard deviation of X, Y, Z there.
+    seen
+        Of each camera, the share of the inner intersections that the nominal camera sees at the worst position.
+    reasons
+        Why :func:`core.calibration.calibrate` would refuse such views; empty where it would not.
+    """
+
+    parameters: dict[str, float]
+    sigma: dict[str, float]
+    volume: VolumeUncertainty
+    points_mm: Float
+    sigma_mm: Float
+    seen: tuple[float, float]
+    reasons: tuple[str, ...]
+
+
+def correlation_of_lines(target: TargetLike, line_model: LineModel | None) -> float:
+    """Observed coordinates per independent one, where intersections come from whole lines (1 where they do not)."""
+    per_line = _PER_LINE.get(line_model or "")
+    if per_line is None:
+        return 1.0
+    n_a, n_b = (n - 2 for n in target.lines)
+    return max(float(2.0 * n_a * n_b / (per_line * (n_a + n_b))), 1.0)
+
+
+def expect(
+    positions_mm: Sequence[float],
+    target: TargetLike,
+    nominals: tuple[NominalCamera, NominalCamera],
+    options: CalibrationOptions | None = None,
+    *,
+    noise_px: float = EXPECTED_NOISE_PX,
+    roll_deg: float = 0.0,
+    line_model: LineModel | None = None,
+) -> Expectation:
+    """Predict what fitted positions will leave uncertain.
+
+    The nominal cameras look at the target's centre; the adjustment's own derivatives and priors at the places where
+    they would see the intersections give the covariance.
+
+    Parameters
+    ----------
+    positions_mm
+        dZ of the fitted positions, the same for both cameras.
+    target, nominals, options
+        As :func:`core.calibration.calibrate` takes them; held-out positions do not matter.
+    noise_px
+        Standard deviation with which an intersection's coordinate is found.
+    roll_deg
+        Turn of the grid in the image (alpha of Eq. 1).
+    line_model
+        How lines are fitted; whole lines give fewer independent coordinates.
+
+    Raises
+    ------
+    CalibrationInputError
+        ``calibration_unseen`` where a camera sees too few intersections.
+    CalibrationError
+        ``calibration_singular`` where the positions determine nothing.
+    """
+    options = options or CalibrationOptions()
+    nodes = inner_nodes_mm(target)
+    on_plane = np.concatenate([nodes, np.zeros((*nodes.shape[:2], 1))], axis=-1)
+    correlation = correlation_of_lines(target, line_model)
+    parameters = np.zeros((2, N_CAMERA))
+    observations, seen = [], []
+    for c, (name, nominal) in enumerate(zip(CAMERAS, nominals, strict=True)):
+        cx, cy = nominal.centre_px
+        parameters[c, :10] = (
+            nominal.phd_px, cx, cy, 0.0, np.radians(roll_deg), 0.0, np.radians(nominal.angle_deg), 0.0, 0.0,
+            nominal.standoff_mm,
+        )  # fmt: skip
+        width, height = nominal.image_size_px
+        views, shares = [], []
+        for dz in positions_mm:
+            image = camera_at(parameters[c], nominal.aspect, float(dz)).project(on_plane)
+            inside = image.valid & (image.xy >= -0.5).all(axis=-1) & (image.xy <= [width - 0.5, height - 0.5]).all(-1)
+            shares.append(float(inside.mean()))
+            views.append(
+                CalibrationView(name, float(dz), np.where(inside[..., None], image.xy, np.nan), correlation=correlation)
+            )
+        seen.append(min(shares))
+        if min(shares) < 0.25:
+            raise CalibrationInputError(
+                f"By its nominal values {name} sees {100 * min(shares):.0f} % of the grid's inner intersections at "
+                f"{positions_mm[int(np.argmin(shares))]:+g} mm.",
+                code="calibration_unseen",
+                remedy="Check phd_px, standoff_mm and image_size_px of the rig file, or use a target that fits.",
+                camera=name,
+            )
+        observations.append(collect(views))
+    estimated = options.estimate_nodes is not False and target.node_tolerance_mm > 0.0
+    covariance = covariance_of(
+        parameters, nodes.reshape(-1, 2), observations, nominals, options, noise_px=np.full(2, noise_px),
+        node_sigma_mm=target.node_tolerance_mm / float(np.sqrt(3.0)) if estimated else 0.0,
+    )  # fmt: skip
+    pair = StereoPair(*(camera_of(parameters[c], nominals[c].aspect) for c in range(2)))
+    volume = volume_uncertainty(pair, covariance, target)
+    points = np.concatenate([np.zeros((1, 3)), _corners(volume.points_mm)])
+    G = point_derivatives(pair, points)
+    spread = np.diagonal(G @ covariance @ np.swapaxes(G, 1, 2), axis1=1, axis2=2)
+    values = parameters[:, : len(TEN_PARAMETER_NAMES)].ravel()
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))[TEN_OF_BOTH]
+    return Expectation(
+        parameters=dict(zip(COVARIANCE_NAMES, values.tolist(), strict=True)),
+        sigma=dict(zip(COVARIANCE_NAMES, sigma.tolist(), strict=True)),
+        volume=volume,
+        points_mm=points,
+        sigma_mm=np.sqrt(np.maximum(spread, 0.0)),
+        seen=(seen[0], seen[1]),
+        reasons=_reasons(volume, target, options),
+    )
+
+
+def _corners(points_mm: Float) -> Float:
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    return np.array([[x, y, z] for z in (low[2], high[2]) for y in (low[1], high[1]) for x in (low[0], high[0])])
+
+
+def _reasons(volume: VolumeUncertainty, target: TargetLike, options: CalibrationOptions) -> tuple[str, ...]:
+    limits = (
+        (volume.relative_shape, options.max_shape_uncertainty,
+         f"Shape would be uncertain by {1e3 * volume.shape_rms_mm:.3g} um rms; allowed are "
+         f"{1e3 * options.max_shape_uncertainty * extent_mm(target):.3g} um."),
+        (volume.centre_px, options.max_centre_sigma_px,
+         f"An image centre would be uncertain by {volume.centre_px:.3g} px; allowed are "
+         f"{options.max_centre_sigma_px:g} px."),
+        (volume.standoff_relative, options.max_standoff_sigma,
+         f"A standoff would be uncertain by {100 * volume.standoff_relative:.3g} %; allowed are "
+         f"{100 * options.max_standoff_sigma:g} %."),
+    )  # fmt: skip
+    return tuple(text for value, limit, text in limits if not value <= limit)

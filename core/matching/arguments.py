@@ -1,0 +1,136 @@
+"""What the compiled kernels are called with: checked, contiguous, and of the types that they were compiled for."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.camera import Camera
+from core.errors import InputError
+from core.lens import Float
+from core.matching.image import PAD, ImageData
+from core.matching.options import SPLINE_ORDER, MatchOptions
+
+Int = NDArray[np.int32]
+
+POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to call it
+FEWEST_AT_ONCE = 16
+_TINY = 1e-6  # grey levels squared
+
+
+@dataclass(frozen=True, eq=False)
+class VisiblePixels:
+    """Which pixels of a subset count, for the points that do not see all of theirs.
+
+    Attributes
+    ----------
+    patches
+        (k, subset, subset) uint8 in camera 1's reference image, zero where a pixel does not count.
+    of_point
+        (N,) int32 which patch is a point's; -1 where all pixels count.
+    """
+
+    patches: NDArray[np.uint8]
+    of_point: Int
+
+
+def one_a_thread(make: Callable[[int], Any], subset: int) -> Callable[[], Any]:
+    """Return what gives each thread its own work space, once: one for each range would cost as much as ten points."""
+    local = threading.local()
+
+    def space() -> Any:
+        if not hasattr(local, "space"):
+            local.space = make(subset)
+        return local.space
+
+    return space
+
+
+def points_of(xy_px: ArrayLike) -> tuple[Float, int]:
+    """Return the points as (N, 2) doubles, and N."""
+    xy = np.array(xy_px, dtype=np.float64, order="C")
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise InputError(f"xy_px has shape {xy.shape}, it must be (N, 2).", code="shape_mismatch")
+    return xy, xy.shape[0]
+
+
+def degree_of(options: MatchOptions) -> tuple[int, int]:
+    """Degree of the patch and number of its monomials."""
+    return (2, 6) if options.patch == "curved" else (1, 3)
+
+
+def starts_of(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) -> Float:
+    """Start values with ``terms`` columns; a plane's serve a curved patch, the rest is zero."""
+    given = np.asarray(values, dtype=np.float64)
+    columns = given.shape[-1] if given.ndim else 0
+    if given.shape[:-1] != shape or columns not in (3, terms):
+        raise InputError(f"{name} has shape {given.shape}, it must be {(*shape, terms)}.", code="shape_mismatch")
+    array = np.zeros((*shape, terms))
+    array[..., :columns] = given
+    return array
+
+
+def setting_of(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...]:
+    """Options and what is known of the noise: the images' variances, or all one where any is unknown."""
+    given = [image.noise_variance for image in images]
+    variances = [v for v in given if v is not None and v > 0.0]
+    known = len(variances) == len(images)
+    max_sigma_px, spread = options.max_sigma_px, images[0].spread(options.subset_px, degree_of(options)[0])
+    if spread is not None:  # the kernels take noise for white
+        max_sigma_px /= float(np.sqrt(np.median(spread[::4, ::4])))
+        variances = variances if known else [assumed_variance(images[0])] * len(images)
+        known = True
+    return (
+        options.subset_px, SPLINE_ORDER[options.interpolation], options.max_iterations, options.tolerance_px,
+        max_sigma_px, options.max_step_px, (images[0].slope_noise, images[0].slope_share),
+        tuple(variances) if known else (1.0,) * len(images), known,
+    )  # fmt: skip
+
+
+def assumed_variance(blurred: ImageData) -> float:
+    """Return the noise of a blurred image's pixels, from its spectrum before the blur; without noise a little."""
+    return max(blurred.slopes.noise_variance if blurred.slopes else 0.0, _TINY)
+
+
+def visible_of(visible: VisiblePixels | None, n: int, subset: int) -> tuple[NDArray[np.uint8], Int]:
+    """Return the patches (k, subset, subset) of points that do not see all of theirs, and which is a point's."""
+    if visible is None or not (visible.of_point >= 0).any():
+        return np.zeros((0, subset, subset), np.uint8), np.full(n, -1, np.int32)
+    patches, of_point = np.ascontiguousarray(visible.patches, np.uint8), np.array(visible.of_point, np.int32)
+    if patches.ndim != 3 or patches.shape[1:] != (subset, subset) or of_point.shape != (n,):
+        raise InputError(
+            f"visible has patches of shape {patches.shape} for {of_point.shape} points, it must be "
+            f"(k, {subset}, {subset}) for ({n},).",
+            code="shape_mismatch",
+        )
+    if of_point.max() >= len(patches):
+        raise InputError(f"visible names patch {of_point.max()} of {len(patches)}.", code="shape_mismatch")
+    return patches, of_point
+
+
+def reference_of(image: ImageData) -> tuple[Any, ...]:
+    """Return the reference's pixels, gradients and weights; empty where all pixels weigh alike."""
+    weights = np.empty((0, 0), np.float32) if image.weights is None else image.weights
+    return (image.pixels, *image.gradients, weights)
+
+
+def flat(image: ImageData) -> tuple[Any, ...]:
+    """Return the padded coefficients as one row, the image's rows and columns, and the padded row's length."""
+    rows, cols = image.shape
+    return image.coefficients.ravel(), rows, cols, cols + 2 * PAD
+
+
+def lens_of(camera: Camera) -> Float:
+    """Return the lens as the kernels know it."""
+    return own(camera.lens.kernel_parameters())
+
+
+def own(array: Float) -> Float:
+    """Return a copy in doubles."""
+    # the kernels are compiled for writable contiguous arrays; a read-only one would compile them again
+    return np.array(array, dtype=np.float64)

@@ -1,0 +1,198 @@
+"""The covariance of a fitted point as its residuals show it, whatever they are made of.
+
+The fit's own covariance takes the residuals for white noise. A texture that changed, paint that flaked, something in
+front of a corner of the subset, a view that differs leave residuals that hang together over some pixels and pull the
+solution by more. So the subset is cut into blocks about as wide as a speckle; each block's pull on the unknowns is
+summed, and the scatter of these sums is the scatter of the solution (a sandwich covariance with clustered errors,
+Liang and Zeger 1986). Whatever the blocks hold in common over the three comparisons stays in: residuals that camera 2
+shows at t0 and at t alike do not become scatter of the displacement.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from core.matching.kernels.linear import solve
+from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
+from core.matching.kernels.naming import kernel
+from core.matching.kernels.noise import CONTRAST, GAIN, SHIFT, ZNCC, noise_from_residuals, share_correction
+from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR, epipolar_shift, make_sum_pixels
+from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
+from core.matching.kernels.vectors import LANES
+from core.matching.kernels.warp import lens_jacobian, set_up_warp
+
+BLOCK_PX = 5.5  # about a good speckle; in smaller blocks less of what hangs together is seen
+FEWEST_BLOCKS, MOST_BLOCKS = 3, 7  # across the subset
+
+
+def blocks_across(subset_px: int) -> int:
+    """Return into how many blocks a subset is cut each way."""
+    return int(min(max(round(subset_px / BLOCK_PX), FEWEST_BLOCKS), MOST_BLOCKS))
+
+
+def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space: Any) -> tuple[Any, Any]:
+    """Compile the observed covariance for the fit that ``parts`` and ``freeze`` belong to.
+
+    Parameters
+    ----------
+    degree, images
+        Of the patch, and how many comparisons: 1 (shape) or 3 (motion).
+    parts
+        What :func:`core.matching.kernels.point.make_point` returned.
+    freeze
+        The fit's set-up of the normal equations.
+    make_space
+        The fit's own work space for a subset's width.
+    """
+    set_up_reference, _, compare, image_matrices, *_, gradients_of, few = parts
+    n_columns = 2 * few
+    last = 5 if images == 3 else 2
+    unknowns = (4 if images == 3 else 1) * few + 1
+    sum_pixels = make_sum_pixels(degree)
+
+    def work_space(subset: int) -> tuple[Any, ...]:
+        """The fit's space and, besides, one block's pixels, the blocks' sums, and what they do to the unknowns."""
+        across = blocks_across(subset)
+        widest = -(-subset // across) + 1
+        width = (widest * widest + LANES - 1) // LANES * LANES + LANES
+        own = (
+            np.zeros((N_ROWS, width), np.float32),
+            np.empty((images, across * across, n_columns)),
+            np.empty((last, images, n_columns)),
+            np.empty(last),
+            np.empty(3 + n_columns),
+        )
+        return make_space(subset), own
+
+    @kernel(f"{degree}_{images}")
+    def cut_out(ref, subset, top, bottom, left, right, part):
+        """Copy a block's pixels; returns their number over eight, rounded up, and their squared gradients' sum."""
+        n, texture = 0, 0.0
+        for r in range(top, bottom):
+            for c in range(left, right):
+                i = r * subset + c
+                for row in range(N_ROWS):
+                    part[row, n] = ref[row, i]
+                texture += ref[WEIGHT, i] * (ref[GX, i] * ref[GX, i] + ref[GY, i] * ref[GY, i])
+                n += 1
+        blocks = (n + LANES - 1) // LANES
+        for i in range(n, min(blocks * LANES + LANES, part.shape[1])):
+            for row in range(N_ROWS):
+                part[row, i] = 0.0
+        return blocks, texture
+
+    @kernel(f"{degree}_{images}")
+    def sum_blocks(coefficients, subset, order, ref, base, stride, warp, correlation, part, sums, scores):
+        """One image's residuals times the columns, summed in each block; returns how many even blocks that is worth."""
+        across = int(math.sqrt(scores.shape[0]) + 0.5)
+        total, squares = 0.0, 0.0
+        for a in range(across):
+            for b in range(across):
+                blocks, texture = cut_out(
+                    ref, subset, a * subset // across, (a + 1) * subset // across, b * subset // across,
+                    (b + 1) * subset // across, part,
+                )  # fmt: skip
+                total += texture
+                squares += texture * texture
+                sum_pixels(coefficients, order, base, stride, warp, part, blocks, sums)
+                for i in range(n_columns):
+                    scores[a * across + b, i] = correlation * sums[3 + i]
+        return total * total / squares
+
+    @kernel(f"{degree}_{images}", inline="always")
+    def observed_point(
+        reference, patches, which, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid, space, out
+    ):
+        """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status."""
+        subset, order, _, _, _, _, slope, variances, known_noise = setting
+        fit_space, (part, scores, pull, z, sums) = space
+        (ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain,
+         _) = fit_space  # fmt: skip
+        inside, xc, yc, p, offset, f2, _, count = set_up_reference(
+            reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
+        )
+        if not inside:
+            return OUTSIDE_IMAGE
+        if not (f2 > 0.0 and p > 0.0):
+            return LOW_TEXTURE
+        gradients, _ = gradients_of(of_reference[7])
+        nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
+        if not along > 0.0:
+            return SINGULAR
+        slopes = lens_jacobian(lens1, xc, yc)
+        shown = (image2, image1t, image2t)
+        known = (np.int64((subset * subset + LANES - 1) // LANES), p, offset, f2)
+        warp = warp_space[0]
+        if images == 3:
+            for j in range(few):
+                for i in range(3):
+                    G[i, j] = g[i, j]
+        image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
+        worth = 0.0
+        for k in range(images):
+            lens = lens1 if k == 1 else lens2
+            levels[k, GAIN], levels[k, SHIFT] = 1.0, 0.0
+            if not compare(shown[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
+                return OUTSIDE_IMAGE
+            if levels[k, CONTRAST] == 0.0 or not levels[k, ZNCC] > 0.0:
+                return LOW_TEXTURE
+            # residuals that hold nothing of the reference itself: its mean and its contrast are taken out
+            correlation = levels[k, ZNCC]
+            warp[20] = levels[k, GAIN] / correlation
+            warp[21] = (levels[k, SHIFT] + offset) / correlation - offset
+            coefficients, rows, cols, stride = shown[k]
+            base = set_up_warp(
+                lens, M[k], of_reference[2], rows, cols, stride, 1 if order == 3 else 2, warp_space[1], warp
+            )
+            worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, correlation, part, sums, scores[k])
+        n = unknowns
+        if images == 3 and few == 3 and rigid:
+            n = N_RIGID
+            if not nearest_rotation(xc, yc, w, G, rotation):
+                return SINGULAR
+            rigid_chain(xc, yc, w, rotation, G, chain)
+        result = freeze(
+            R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid
+        )
+        if result != OK:
+            return result
+        weights, _, columns, _, _, normal = equations
+        unit = vectors[0]
+        for i in range(last):
+            for c in range(n):
+                unit[c] = 0.0
+            unit[n - last + i] = 1.0
+            solve(normal, unit, n)
+            for o in range(images):
+                for r in range(n_columns):
+                    s = 0.0
+                    for k in range(images):
+                        along_k = 0.0
+                        for c in range(n):
+                            along_k += columns[k, r, c] * unit[c]
+                        s += weights[k, o] * along_k
+                    pull[i, o, r] = s
+        for i in range(last * last):
+            out[i] = 0.0
+        for b in range(scores.shape[1]):
+            for i in range(last):
+                s = 0.0
+                for o in range(images):
+                    for r in range(n_columns):
+                        s += pull[i, o, r] * scores[o, b, r]
+                z[i] = s
+            for i in range(last):
+                for j in range(last):
+                    out[last * i + j] += z[i] * z[j]
+        # the fit took the mean and slopes of the residuals' pull away from the blocks
+        factor_on = 1.0 / max(1.0 - few / worth, 0.2)
+        variance = variances[0] if known_noise else noise_from_residuals(levels, images, count, float(n))
+        factor_on *= share_correction(gradients, variance, p, slope[0], slope[1])
+        for i in range(last * last):
+            out[i] *= factor_on
+        return OK
+
+    return observed_point, work_space

@@ -1,0 +1,91 @@
+"""Chords for arcs: what a window's fit misses of a surface that bends, and what takes its place.
+
+Along a surface whose metric is even, the third derivatives of the position have tangential parts that follow from the
+second fundamental form b alone: from d_s d_s (x_s . x_s) = 0 comes x_sss . x_s = -b_ss^2, and so on. A fit of planes
+or quadratics takes them for slope, by the third moments of its weights. With b from quadratics over the window they are
+taken out again. On a surface that keeps its shape they are the same before and after, and cancel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from core.field.window import fit_terms, window_offsets
+from core.lens import Bool, Float
+
+_FIRM = 1e-6
+_FACTORS = np.array([1.0 / 6.0, 0.5, 0.5, 1.0 / 6.0])  # of s^3, s^2 t, s t^2, t^3 in a Taylor series
+
+
+def third_moments(weights: Float, half: int) -> Float:
+    """Return (..., 2, 4) sums of slope weights (..., 2, n) times s^3/6, s^2 t/2, s t^2/2, t^3/6; s column, t row."""
+    t, s = window_offsets(half)[0].T.astype(np.float64)
+    return np.asarray(weights @ _thirds(s, t))
+
+
+def reduced_moments(weights: Float, seen: Bool, half: int, order: int) -> Float:
+    """Return the same (m, 2, 4) of windows that edges, holes or cuts have reduced.
+
+    Planes tell the slope in the middle of the points that a window sees, quadratics that in the window's middle; the
+    moments are about that place, where what the second order does to the slope is none.
+    """
+    t, s = np.broadcast_to(window_offsets(half)[0].T.astype(np.float64)[:, None, :], (2, *seen.shape))
+    if order == 1:
+        count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
+        t, s = (a - (a * seen).sum(axis=1, keepdims=True) / count for a in (t, s))
+    return np.asarray(weights @ _thirds(s, t))
+
+
+def _thirds(s: Float, t: Float) -> Float:
+    """(..., n, 4) terms of a Taylor series."""
+    return np.asarray(np.stack([s**3, s * s * t, s * t * t, t**3], axis=-1) * _FACTORS)
+
+
+def whole_second_derivatives(values: Float, half: int) -> Float:
+    """Return second derivatives (r, c, 3, 3) of X Y Z over column twice, column and row, row twice; whole windows."""
+    side = np.arange(-half, half + 1, dtype=np.float64)
+    bent = side**2 - (side**2).mean()
+    twice, line, ones = 2.0 * bent / (bent**2).sum(), side / (side**2).sum(), np.full(len(side), 1.0 / len(side))
+
+    def over(along: Float, across: Float) -> Float:
+        part = ndimage.correlate1d(values, along, axis=1, mode="constant", cval=np.nan)
+        return np.asarray(ndimage.correlate1d(part, across, axis=0, mode="constant", cval=np.nan))
+
+    return np.stack([over(twice, ones), over(line, line), over(ones, twice)], axis=-1)
+
+
+def second_weights(seen: Bool, half: int) -> Float:
+    """Return weights (m, 3, n) of the points that windows see in these derivatives; zero where they carry none."""
+    A = fit_terms(window_offsets(half)[0], half, 2)
+    n, terms = A.shape
+    normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)
+    firm = np.linalg.eigvalsh(normal)[:, 0] > _FIRM * n
+    inverse = np.linalg.inv(np.where(firm[:, None, None], normal, np.eye(terms)))[:, 3:]
+    weights = inverse.reshape(-1, terms) @ A.T * np.tile([2.0, 1.0, 2.0], len(seen))[:, None] / half**2
+    return np.where(seen[:, None, :] & firm[:, None, None], weights.reshape(-1, 3, n), 0.0)
+
+
+def missed_slope(slope: Float, second: Float, moments: Float) -> Float:
+    """Return (n, 3, 2) what the fits took for slope.
+
+    Parameters
+    ----------
+    slope
+        (n, 3, 2) tangents x_s, x_t in their columns, a step each.
+    second
+        (n, 3, 3) x_ss, x_st, x_tt in their columns.
+    moments
+        (n, 2, 4) of :func:`third_moments`.
+    """
+    normal = np.cross(slope[..., 0], slope[..., 1])
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    ss, st, tt = np.moveaxis(np.einsum("na,nab->nb", normal, second), -1, 0)
+    # the third derivatives along x_s and x_t: (n, 4, 2)
+    along = -np.stack([
+        np.stack([ss * ss, ss * st], -1), np.stack([ss * st, st * st], -1),
+        np.stack([st * st, tt * st], -1), np.stack([tt * st, tt * tt], -1),
+    ], axis=1)  # fmt: skip
+    metric = np.swapaxes(slope, -1, -2) @ slope
+    third = np.linalg.solve(metric[:, None], along[..., None])[..., 0] @ np.swapaxes(slope, -1, -2)  # (n, 4, 3)
+    return np.swapaxes(moments @ third, -1, -2)

@@ -1,0 +1,70 @@
+"""How far the mean of a strain over an area is known.
+
+Neighbouring strains share the points of their windows, and these the pixels of their subsets. The mean is one weighted
+sum over the points: each point's weight is what all windows of the area that hold it give it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.field.result import Field
+from core.field.shared_pixels import SharedPixels, roots_of
+from core.field.window import window_offsets
+from core.lens import Bool, Float
+from core.strain.options import StrainOptions
+from core.strain.result import StrainStatus
+from core.strain.surface import surface_slopes
+from core.strain.tensors import strain_of, strain_slopes
+from core.strain.window import plane_weights
+
+
+def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> Float:
+    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN where no strain is in it.
+
+    Parameters
+    ----------
+    field
+        The displacement that the strain was computed from.
+    options
+        How it was computed.
+    inside
+        (r, c) the area.
+    subset_px
+        Width of the subset that the field was measured with.
+
+    Notes
+    -----
+    Errors dX_k, dU_k of the points make the slopes of a window off by ``d_a = sum_k c_ak (dX, dU)_k``, and its strain
+    by ``sum_a D_a . d_a``. The mean's error is ``sum_k v_k . (dX, dU)_k`` with v the sum of D over the windows that
+    hold point k, times their weights c; its variance is ``sum_kl v_k S_k rho_kl S_l v_l``, S the roots of the points'
+    covariances.
+    """
+    from scipy.signal import oaconvolve  # slow to load, and not every start needs it
+
+    shared = SharedPixels.of(field, subset_px)
+    slopes, frame, per_mm, gradient = surface_slopes(field, options, shared)
+    good = slopes.status == StrainStatus.OK
+    used = good & inside
+    n = int(used.sum())
+    if n == 0:
+        return np.full(3, np.nan)
+    strain = strain_of(frame, gradient, options.tensor)
+    D = np.zeros((*field.shape, 3, 2, 6))
+    D[used] = strain_slopes(frame, gradient, options.tensor, per_mm, strain)[used[good]] / n
+    half = options.window // 2
+    v = np.zeros((field.shape[0] + 2 * half, field.shape[1] + 2 * half, 3, 6))
+    offsets, _ = window_offsets(half)
+    for rows, cols, weights in slopes.reduced:
+        given = np.einsum("miab,mak->mkib", D[rows, cols], weights)
+        at = rows[:, None] + half + offsets[:, 0], cols[:, None] + half + offsets[:, 1]
+        np.add.at(v, at, given)
+        D[rows, cols] = 0.0
+    for a, along in enumerate(plane_weights(half)):
+        kernel = np.zeros((options.window, options.window))
+        kernel[offsets[:, 0] + half, offsets[:, 1] + half] = along
+        v += oaconvolve(D[..., a, :], kernel[:, :, None, None], mode="full", axes=(0, 1))
+    v = v[half : half + field.shape[0], half : half + field.shape[1]]
+    roots = roots_of(np.where(field.valid[..., None, None], field.covariance, 0.0))
+    each = np.where(field.valid[..., None, None], v, 0.0) @ roots
+    return np.asarray(np.sqrt(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)))
