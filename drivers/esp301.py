@@ -17,16 +17,22 @@ from pathlib import Path
 
 from core.errors import StageError
 from drivers.motion import SerialStage
-from drivers.serial_line import SerialLine
+from drivers.refusals import motor_off
+from drivers.serial_line import FlowControl, SerialLine
 from drivers.stage import AxisIdentity, AxisOptions, AxisState, AxisStatus, ControllerMessage, StageIdentity
 
 # SN codes of the length units; an axis in counts, steps or angles cannot carry a camera by millimetres
 _MM_PER_UNIT = {2: 1.0, 3: 1e-3, 4: 25.4, 5: 25.4e-3, 6: 25.4e-6}
 _UNIT_NAMES = {2: "mm", 3: "um", 4: "in", 5: "milli-in", 6: "micro-in"}
+_ODD_UNITS = {
+    0: "encoder counts", 1: "motor steps", 7: "degrees", 8: "gradians", 9: "radians", 10: "milliradians",
+    11: "microradians",
+}  # fmt: skip
 _QUEUE_LENGTH = 10
 
 # The part of an axis error behind the axis number -> code of the stage protocol
 _AXIS_CODES = {
+    1: "out_of_range",
     2: "motion_fault",
     3: "motion_fault",
     4: "motion_fault",
@@ -35,6 +41,8 @@ _AXIS_CODES = {
     7: "out_of_limits",
     8: "motion_fault",
     9: "motion_fault",
+    10: "out_of_range",
+    11: "out_of_range",
     13: "motor_off",
     20: "motion_fault",
 }
@@ -49,8 +57,8 @@ class ESP301Stage(SerialStage):
         Any URL that pyserial opens; the ESP301's USB port runs at 921600 baud, RS-232 (and the ESP300) at 19200.
     options
         Axis number -> how it is used; only the axes named here are touched.
-    baudrate
-        For true serial ports.
+    baudrate, flow_control
+        For true serial ports; the controller's own is hardware flow control (RTS and CTS).
     home_mode
         Parameter of OR: 0 count zero, 1 home and index, 2 home switch, 3 and 4 positive and negative limit.
     record
@@ -65,6 +73,7 @@ class ESP301Stage(SerialStage):
         options: Mapping[int, AxisOptions],
         *,
         baudrate: int = 921600,
+        flow_control: FlowControl = "hardware",
         home_mode: int = 1,
         record: Path | None = None,
         timeout_s: float = 0.5,
@@ -73,7 +82,7 @@ class ESP301Stage(SerialStage):
             url,
             terminator=b"\r",
             baudrate=baudrate,
-            rtscts=True,
+            flow_control=flow_control,
             timeout_s=timeout_s,
             resync=("VE?", _is_version),
             record=record,
@@ -81,26 +90,31 @@ class ESP301Stage(SerialStage):
         super().__init__(line, options)
         self._home_mode = home_mode
         self._mm_per_unit: dict[int, float] = {}
+        self._unit: dict[int, int] = {}
+        self._most: dict[int, tuple[float | None, float | None]] = {}
         # axis -> how often the line had been lost when the axis was homed: one loss more, and it may have lost its zero
         self._homed_at: dict[int, int] = {}
 
     def _connect(self) -> StageIdentity:
         version = self._line.query("VE?", _version)
-        self._homed_at = {axis: self._line.losses for axis, option in self._options.items() if option.assume_homed}
         axes = []
         for axis in self.axes:
             model = self._line.query(f"{axis}ID?", _text)
             unit = self._line.query(f"{axis}SN?", _integer)
             if unit not in _MM_PER_UNIT:
                 raise StageError(
-                    f"Axis {axis} of {self._line.url} ({model}) counts in unit {unit}, which is no length.",
-                    code="stage_refused",
+                    f"Axis {axis} of {self._line.url} ({model}) counts in {_ODD_UNITS.get(unit, f'unit {unit}')}, "
+                    "which is no length.",
+                    code="unit_not_length",
                     remedy="Choose an axis with a linear stage, or set its units (SN) to millimetres.",
                     axis=axis,
                 )
-            self._mm_per_unit[axis] = _MM_PER_UNIT[unit]
+            self._unit[axis] = unit
+            scale = self._mm_per_unit[axis] = _MM_PER_UNIT[unit]
+            self._most[axis] = (self._ask_greatest(axis, "VU?", scale), self._ask_greatest(axis, "AU?", scale))
             name, _, serial = (part.strip() for part in model.partition(","))
             axes.append(AxisIdentity(axis, name, serial, _UNIT_NAMES[unit]))
+        self._homed_at = {axis: self._line.losses for axis, option in self._options.items() if option.assume_homed}
         model, _, firmware = version.partition("Version")
         return StageIdentity("esp301", model.strip(), firmware.strip(), self._line.url, tuple(axes))
 
@@ -153,12 +167,11 @@ class ESP301Stage(SerialStage):
 
     def _start_homing(self, axis: int) -> None:
         if not self._line.query(f"{axis}MO?", _flag):
-            raise StageError(
-                f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis
-            )
+            raise motor_off(axis)
         self._keep(self._drain_errors())
         self._homed_at.pop(axis, None)
-        self._line.command(f"{axis}OR{self._home_mode}")
+        mode = self._options[axis].home_mode
+        self._line.command(f"{axis}OR{self._home_mode if mode is None else mode}")
         self._raise_refusal((axis,), "search for home")
 
     def _finish_homing(self, axis: int) -> None:
@@ -169,6 +182,32 @@ class ESP301Stage(SerialStage):
 
     def _stop_text(self, axis: int | None) -> str:
         return "ST" if axis is None else f"{axis}ST"
+
+    def _abort_text(self) -> str:
+        return "AB"
+
+    def _distrust(self, axis: int) -> None:
+        self._homed_at.pop(axis, None)
+
+    def _check_unit(self, axis: int) -> None:
+        unit = self._line.query(f"{axis}SN?", _integer)
+        if unit != self._unit[axis]:
+            now = _UNIT_NAMES.get(unit, _ODD_UNITS.get(unit, f"unit {unit}"))
+            raise StageError(
+                f"Axis {axis} counts in {now}; when it was opened it counted in {_UNIT_NAMES[self._unit[axis]]}.",
+                code="units_changed",
+                remedy=f"Set its unit back (SN{self._unit[axis]}), or reconnect the rig.",
+                axis=axis,
+            )
+
+    def _greatest(self, axis: int) -> tuple[float | None, float | None]:
+        return self._most[axis]
+
+    def _ask_greatest(self, axis: int, word: str, scale: float) -> float | None:
+        try:
+            return self._ask(axis, word) * scale
+        except StageError:  # a firmware that does not know the question
+            return None
 
     def _drain_errors(self, _axis: int | None = None) -> list[ControllerMessage]:
         found: list[ControllerMessage] = []

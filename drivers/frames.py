@@ -14,6 +14,7 @@ from core.errors import CameraError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 TriggerMode = Literal["free", "software", "hardware"]
+FeatureValue = bool | int | float | str
 
 
 class FrameStatus(StrEnum):
@@ -43,6 +44,8 @@ class Frame:
         Anything but ``OK`` is counted and thrown away by the reader.
     trigger
         Number of the trigger that made this frame, where the device or driver knows it; pairs are made by it.
+    exposed_ns
+        Start of the exposure brought to the host's monotonic clock (`drivers.clocks`), set by the reader.
     """
 
     pixels: Pixels
@@ -52,6 +55,7 @@ class Frame:
     host_ns: int
     status: FrameStatus = FrameStatus.OK
     trigger: int | None = None
+    exposed_ns: int | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or self.pixels.dtype not in (np.uint8, np.uint16):
@@ -71,22 +75,100 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """Settings as asked for; ``None`` leaves what the device has. `FrameGrabber.configure` returns what it took."""
+    """Settings as asked for; ``None`` leaves what the device has. `FrameGrabber.configure` returns what it took.
+
+    Parameters
+    ----------
+    exposure_ms, gain_db, frame_rate_hz
+        Read back, they are the device's own, which may round them; ``None`` where the device has no such setting.
+    bit_depth
+        Significant bits; the driver takes the plainest pixel format that carries them. ``pixel_format`` names one.
+    trigger
+        What starts an exposure: nothing, a call, a pulse on the camera's line.
+    region_px
+        x0, y0, width, height on the sensor.
+    pixel_format
+        The device's own name: ``Mono12Packed`` (GenICam), ``Y12 `` (V4L2).
+    features
+        Anything else by the device's own name (GenICam feature, V4L2 control), set in this order.
+    """
 
     exposure_ms: float | None = None
     gain_db: float | None = None
     frame_rate_hz: float | None = None
     bit_depth: int | None = None
     trigger: TriggerMode | None = None
-    region_px: tuple[int, int, int, int] | None = None  # x0, y0, width, height
+    region_px: tuple[int, int, int, int] | None = None
+    pixel_format: str | None = None
+    features: Mapping[str, FeatureValue] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """How a driver reaches its camera and uses it: what is set once, when it is opened.
+
+    Parameters
+    ----------
+    device
+        The driver's name of the device, as `discover` lists it: an Aravis id or IP address, ``/dev/video0``, or a
+        stable link below ``/dev/v4l``.
+    buffers
+        Frames that may be under way between device and reader.
+    packet_size_bytes
+        GigE Vision packets; ``None`` asks the network for the largest that passes.
+    ptp
+        Switch the camera's IEEE 1588 clock on; opening fails with ``ptp_unsupported`` where it has none.
+    trigger_source, trigger_edge
+        Line of the hardware trigger.
+    trigger_features
+        Trigger mode -> features that bring the device there, for devices that have no standard way (V4L2).
+    """
+
+    device: str
+    buffers: int = 16
+    packet_size_bytes: int | None = None
+    ptp: bool = False
+    trigger_source: str = "Line1"
+    trigger_edge: Literal["rising", "falling"] = "rising"
+    trigger_features: Mapping[TriggerMode, Mapping[str, FeatureValue]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundDevice:
+    """A device that discovery saw.
+
+    Parameters
+    ----------
+    kind
+        What it may be used as; a serial port may hold anything.
+    driver
+        Driver to name in the rig file; empty for a serial port.
+    device
+        What to write as ``device`` (cameras) or ``url`` (stages) in the rig file.
+    problem
+        Why it cannot be used as it is, with what to do about it; ``None`` when nothing is known to be wrong.
+    """
+
+    kind: Literal["camera", "serial"]
+    driver: str
+    device: str
+    model: str = ""
+    serial: str = ""
+    address: str = ""
+    problem: str | None = None
+    extra: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class CameraDescription:
     """Who the camera is and what it can do.
 
-    Ranges are (lowest, highest) as the device reports them. ``latency_s`` is what a frame may take beyond its period
-    before it arrives, for the watchdog: zero but for cameras that render.
+    Ranges are (lowest, highest) as the device reports them; ``None`` where the device has no such setting.
+    ``latency_s`` is what a frame may take beyond its period before it arrives, for the watchdog: zero but for cameras
+    that render. ``clock`` names the clock of ``Frame.device_ns``: those of two cameras may be compared when both name
+    the same one (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
+    ``counter_range`` is where ``Frame.sequence`` starts again and ends before it wraps. ``feature_names`` are what
+    ``CameraSettings.features`` may name.
     """
 
     model: str
@@ -94,12 +176,16 @@ class CameraDescription:
     image_size_px: tuple[int, int]  # width, height
     bit_depths: tuple[int, ...]
     trigger_modes: tuple[TriggerMode, ...]
-    exposure_range_ms: tuple[float, float]
-    gain_range_db: tuple[float, float]
-    frame_rate_range_hz: tuple[float, float]
+    exposure_range_ms: tuple[float, float] | None
+    gain_range_db: tuple[float, float] | None
+    frame_rate_range_hz: tuple[float, float] | None
     driver: str
     firmware: str = ""
     latency_s: float = 0.0
+    clock: str = ""
+    counter_range: tuple[int, int] = (0, 2**16 - 1)
+    pixel_formats: tuple[str, ...] = ()
+    feature_names: tuple[str, ...] = ()
     extra: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -135,12 +221,14 @@ class FrameGrabber(Protocol):
         """Connect. Raises `CameraError` (``camera_lost``, ``camera_busy``) when it cannot."""
 
     def describe(self) -> CameraDescription:
-        """Say who the camera is and what it can do."""
+        """Say who the camera is and what it can do; ranges may depend on what was configured."""
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Set what is not ``None`` and return every setting as read back from the device.
 
-        A value outside the device's range is refused with code ``out_of_range`` before anything is changed.
+        A value outside the device's range is refused with code ``out_of_range`` before anything is changed; a setting
+        or feature that the device does not have with ``unknown_feature``; what cannot be changed while armed with
+        ``armed``.
         """
 
     def arm(self) -> None:
@@ -157,6 +245,9 @@ class FrameGrabber(Protocol):
 
         Raises `CameraError` with code ``camera_lost`` when the device says that it is gone.
         """
+
+    def statistics(self) -> dict[str, int | float]:
+        """Return the driver's own counts since `open` (buffers, packets, resends ...), never waiting for the device."""
 
     def close(self) -> None:
         """Release the device; safe to call twice."""

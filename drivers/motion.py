@@ -1,6 +1,6 @@
 """What all serial stage drivers have in common: checks before a byte goes out, one-sided arrival, waiting, stopping.
 
-A driver adds only its controller's words, as the methods that begin with an underscore at the end of `SerialStage`.
+A driver adds only its controller's words, see `drivers.words`.
 
 A stop takes no lock. It sets a number of its own on the axes it concerns, and then writes. A motion notes these numbers
 when it is asked for, and looks at them again after each command that starts movement: whichever of the two was first on
@@ -13,13 +13,26 @@ import itertools
 import math
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 
 from core.errors import StageError
+from drivers.refusals import (
+    check_dynamic,
+    check_number,
+    check_target,
+    configuration_state,
+    detour,
+    motion_fault,
+    motor_off,
+    not_homed,
+    not_in_configuration,
+    tighten,
+)
 from drivers.serial_line import SerialLine
 from drivers.stage import (
+    AxisDynamics,
     AxisLimits,
     AxisOptions,
     AxisState,
@@ -28,6 +41,7 @@ from drivers.stage import (
     MoveResult,
     StageIdentity,
 )
+from drivers.words import ControllerWords
 
 _POLL_S = 0.02
 # An axis that says it moves and stays where it is for this long has jammed
@@ -40,7 +54,7 @@ _MESSAGES = 100
 _REST_S = 3.0
 
 
-class SerialStage(ABC):
+class SerialStage(ControllerWords):
     """Base of the stage drivers; see `drivers.stage.Stage` for what callers may expect."""
 
     def __init__(self, line: SerialLine, options: Mapping[int, AxisOptions]) -> None:
@@ -62,14 +76,15 @@ class SerialStage(ABC):
         return tuple(sorted(self._options))
 
     def open(self) -> None:
-        """Connect, identify, read limits, set and read back velocities. Moves nothing."""
+        """Connect, identify, read limits, set and read back velocities; stop what moves already."""
         with self._motion_lock:
             self._line.open()
             try:
                 self._identity = self._connect()
                 for axis in self.axes:
-                    self._limits[axis] = self._tighten(axis, *self._read_travel_mm(axis))
+                    self._limits[axis] = tighten(axis, self._options[axis].soft_limits_mm, *self._read_travel_mm(axis))
                     self._velocity_mm_s[axis], self._acceleration_mm_s2[axis] = self._set_dynamics(axis)
+                self._stop_left_over()
             except BaseException:
                 self._line.close()
                 raise
@@ -108,9 +123,9 @@ class SerialStage(ABC):
         self._check_axis(axis)
         return self._read_status(axis)
 
-    def errors(self) -> tuple[ControllerMessage, ...]:
+    def errors(self, *, ask: bool = True) -> tuple[ControllerMessage, ...]:
         """Empty the controller's error queue."""
-        if not self._moving:  # a motion reads the queue itself, and must find there what went wrong with it
+        if ask and not self._moving:  # a motion reads the queue itself, and must find there what went wrong with it
             self._keep(self._drain_errors())
         found, self._messages = self._messages, []
         return tuple(found)
@@ -119,10 +134,73 @@ class SerialStage(ABC):
         """Stop one axis or all, at once; takes no lock."""
         if axis is not None:
             self._check_axis(axis)
-        number = next(self._stop_numbers)
-        for stopped in self._options if axis is None else (axis,):
-            self._stops[stopped] = number
+        self._mark_stopped(self.axes if axis is None else (axis,))
         self._line.urgent(self._stop_text(axis))
+
+    def abort(self) -> None:
+        """Stop all axes as in an emergency, then see to it that their motors are off."""
+        self._mark_stopped(self.axes)
+        self._line.urgent(self._abort_text())
+        rest = time.monotonic() + _REST_S
+        for axis in self.axes:
+            while (status := self._read_status(axis)).moving and time.monotonic() < rest:
+                time.sleep(_POLL_S)
+            if status.motor_on:
+                self._switch_motor(axis, on=False)
+
+    def _mark_stopped(self, axes: tuple[int, ...]) -> None:
+        number = next(self._stop_numbers)
+        for axis in axes:
+            self._stops[axis] = number
+
+    def _stop_left_over(self) -> None:
+        """Stop what an earlier program left moving when it died; nobody waits for it any more."""
+        moving = [axis for axis in self.axes if self._read_status(axis).moving]
+        for axis in moving:
+            self._line.urgent(self._stop_text(axis))
+            self._distrust(axis)
+            self._keep([ControllerMessage("opened_moving", "was moving when the stage was opened: stopped", axis)])
+        rest = time.monotonic() + _REST_S
+        while any(self._read_status(axis).moving for axis in moving) and time.monotonic() < rest:
+            time.sleep(_POLL_S)
+
+    def dynamics(self, axis: int) -> AxisDynamics:
+        """Velocity and acceleration as last read back."""
+        self._check_axis(axis)
+        if axis not in self._velocity_mm_s:
+            self.identify()
+        return AxisDynamics(axis, self._velocity_mm_s[axis], self._acceleration_mm_s2[axis], *self._greatest(axis))
+
+    def set_dynamics(
+        self, axis: int, *, velocity_mm_s: float | None = None, acceleration_mm_s2: float | None = None
+    ) -> AxisDynamics:
+        """Set velocity, acceleration or both, and return what the controller took; homing keeps them."""
+        known = self.dynamics(axis)
+        for what, value, most in (
+            ("velocity", velocity_mm_s, known.max_velocity_mm_s),
+            ("acceleration", acceleration_mm_s2, known.max_acceleration_mm_s2),
+        ):
+            if value is not None:
+                check_dynamic(axis, what, value, most)
+        with self._motion_lock:
+            self._check_settable(axis)
+            before = self._options[axis]
+            self._options[axis] = replace(
+                before,
+                velocity_mm_s=before.velocity_mm_s if velocity_mm_s is None else velocity_mm_s,
+                acceleration_mm_s2=before.acceleration_mm_s2 if acceleration_mm_s2 is None else acceleration_mm_s2,
+            )
+            try:
+                self._velocity_mm_s[axis], self._acceleration_mm_s2[axis] = self._set_dynamics(axis)
+            except BaseException:
+                self._options[axis] = before
+                raise
+        return self.dynamics(axis)
+
+    def leave_configuration(self, axis: int) -> None:
+        """Leave the configuration state; only the SMC100 family has one."""
+        self._check_axis(axis)
+        raise not_in_configuration(axis)
 
     def enable(self, axis: int) -> None:
         """Switch the motor on."""
@@ -156,7 +234,7 @@ class SerialStage(ABC):
     def move_by(self, axis: int, distance_mm: float) -> MoveResult:
         """As `move_to`, from the position read back at the start."""
         self._check_axis(axis)
-        self._check_number(axis, distance_mm)
+        check_number(axis, distance_mm)
         noted = self._note_stops((axis,))
         with self._motion_lock:
             return self._move({axis: self._read_position_mm(axis) + distance_mm}, noted)[axis]
@@ -176,7 +254,11 @@ class SerialStage(ABC):
         goals = {axis: self._check_target(axis, target) for axis, target in targets_mm.items()}
         self._check_not_stopped(noted, write=False)
         here = {axis: self._check_ready(axis).position_mm for axis in axes}
-        detours = {axis: mm for axis in axes if (mm := self._detour(axis, here[axis], goals[axis])) is not None}
+        detours = {
+            axis: mm
+            for axis in axes
+            if (mm := detour(axis, self._options[axis], self.limits(axis), here[axis], goals[axis])) is not None
+        }
         self._keep(self._drain_errors())  # what is found afterwards was caused by this motion
         with self._stopped_on_error(axes):
             if detours:
@@ -188,7 +270,7 @@ class SerialStage(ABC):
             for axis, goal in goals.items():
                 there = self._read_position_mm(axis)
                 if abs(there - goal) > self._options[axis].tolerance_mm:
-                    raise self._fault(axis, f"stands at {there:.5f} mm instead of {goal:.5f} mm")
+                    raise motion_fault(axis, f"stands at {there:.5f} mm instead of {goal:.5f} mm")
                 results[axis] = MoveResult(axis, goal, there, time.monotonic() - start)
         return results
 
@@ -213,10 +295,12 @@ class SerialStage(ABC):
                 self._check_not_stopped(noted)
                 status = self._read_status(axis)
                 if status.state is AxisState.FAULT or (watch_jam and status.state is AxisState.MOTOR_OFF):
-                    raise self._fault(axis, status.detail or "switched its motor off")
+                    self._check_not_stopped(noted)  # an abort since the last look switched it off
+                    raise motion_fault(axis, status.detail or "switched its motor off")
                 if not status.moving:
                     if watch_jam and status.state is not AxisState.READY:
-                        raise self._fault(axis, f"ended in the state {status.state} {status.detail}".rstrip())
+                        self._check_not_stopped(noted)
+                        raise motion_fault(axis, f"ended in the state {status.state} {status.detail}".rstrip())
                     waiting.discard(axis)
                     continue
                 now = time.monotonic()
@@ -226,15 +310,17 @@ class SerialStage(ABC):
                 if abs(status.position_mm - mm) > step:
                     last[axis] = (status.position_mm, now)
                 elif watch_jam and now - since > _JAM_S:
-                    raise self._fault(axis, f"has stood at {status.position_mm:.5f} mm for {now - since:.1f} s")
+                    raise motion_fault(axis, f"has stood at {status.position_mm:.5f} mm for {now - since:.1f} s")
                 if now > deadline:
-                    raise self._fault(axis, f"did not come to rest in time, it is at {status.position_mm:.5f} mm")
+                    raise motion_fault(axis, f"did not come to rest in time, it is at {status.position_mm:.5f} mm")
             if waiting:
                 time.sleep(_POLL_S)
+        # A stop that came between the last question and its answer brought the axes to rest, not their goal
+        self._check_not_stopped(noted)
         # Once every axis rests, what went wrong on the way stands in the error queue
         bad = self._new_errors(axes)
         if bad:
-            raise self._fault(bad[0].axis or axes[0], "; ".join(f"{message.text} ({message.code})" for message in bad))
+            raise motion_fault(bad[0].axis or axes[0], "; ".join(f"{message.text} ({message.code})" for message in bad))
 
     def _check_axis(self, axis: int) -> None:
         if axis not in self._options:
@@ -245,78 +331,21 @@ class SerialStage(ABC):
                 axis=axis,
             )
 
-    def _check_number(self, axis: int, value: object) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise StageError(
-                f"Axis {axis} cannot move to {value!r}: not a finite number.",
-                code="out_of_limits",
-                remedy="Give a target in millimetres inside the limits.",
-                axis=axis,
-            )
-        return float(value)
-
     def _check_target(self, axis: int, target: object) -> float:
-        goal = self._check_number(axis, target)
-        limits = self.limits(axis)
-        if not limits.low_mm <= goal <= limits.high_mm:
-            raise StageError(
-                f"Axis {axis} cannot move to {goal:g} mm: outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
-                code="out_of_limits",
-                remedy="Give a target inside the limits, or widen the soft limits in the rig file.",
-                axis=axis,
-                target_mm=goal,
-                low_mm=limits.low_mm,
-                high_mm=limits.high_mm,
-            )
-        return goal
+        return check_target(axis, target, self.limits(axis))
 
     def _check_ready(self, axis: int) -> AxisStatus:
         status = self._read_status(axis)
+        if status.state is AxisState.CONFIGURATION:
+            raise configuration_state(axis)
         if not status.homed:
-            raise StageError(
-                f"Axis {axis} was not homed, its position {status.position_mm:g} mm means nothing.",
-                code="not_homed",
-                remedy="Home the axis first.",
-                axis=axis,
-            )
+            raise not_homed(axis)
         if status.state is AxisState.MOTOR_OFF:
-            raise StageError(
-                f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis
-            )
+            raise motor_off(axis)
         if status.state is not AxisState.READY:
-            raise self._fault(axis, f"is not ready to move: {status.state} {status.detail}".rstrip())
+            raise motion_fault(axis, f"is not ready to move: {status.state} {status.detail}".rstrip())
+        self._check_unit(axis)
         return status
-
-    def _detour(self, axis: int, here_mm: float, goal_mm: float) -> float | None:
-        """Where to go first so that the last stretch takes up the backlash; ``None`` when the way there does it."""
-        option = self._options[axis]
-        sign = 1.0 if option.approach_from == "below" else -1.0
-        if option.backlash_mm == 0 or sign * (goal_mm - here_mm) >= option.backlash_mm:
-            return None
-        turn = goal_mm - sign * option.backlash_mm
-        limits = self.limits(axis)
-        if not limits.low_mm <= turn <= limits.high_mm:
-            raise StageError(
-                f"Axis {axis} cannot arrive at {goal_mm:g} mm from {option.approach_from}: it would have to turn at "
-                f"{turn:g} mm, outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
-                code="out_of_limits",
-                remedy=f"Stay at least the backlash ({option.backlash_mm:g} mm) inside the limit.",
-                axis=axis,
-                target_mm=goal_mm,
-            )
-        return turn
-
-    def _tighten(self, axis: int, low_mm: float, high_mm: float) -> AxisLimits:
-        soft = self._options[axis].soft_limits_mm
-        low, high = (low_mm, high_mm) if soft is None else (max(low_mm, soft[0]), min(high_mm, soft[1]))
-        if not low < high:
-            raise StageError(
-                f"The soft limits {soft} mm of axis {axis} leave nothing of its travel {low_mm:g} to {high_mm:g} mm.",
-                code="out_of_limits",
-                remedy="Correct soft_limits_mm in the rig file.",
-                axis=axis,
-            )
-        return AxisLimits(low, high, low_mm, high_mm)
 
     def _note_stops(self, axes: tuple[int, ...]) -> dict[int, int]:
         return {axis: self._stops.get(axis, 0) for axis in axes}
@@ -377,59 +406,3 @@ class SerialStage(ABC):
             remedy="Correct what the controller names, then try again.",
             axis=axis,
         )
-
-    def _fault(self, axis: int, what: str) -> StageError:
-        return StageError(
-            f"Axis {axis} {what}.",
-            code="motion_fault",
-            remedy="Check the stage for an obstacle or a limit switch, enable and home it, then move again.",
-            axis=axis,
-        )
-
-    @abstractmethod
-    def _connect(self) -> StageIdentity:
-        """Find out who answers; called with the line open."""
-
-    @abstractmethod
-    def _read_travel_mm(self, axis: int) -> tuple[float, float]:
-        """Read the controller's own software limits."""
-
-    @abstractmethod
-    def _set_dynamics(self, axis: int) -> tuple[float, float]:
-        """Set velocity and acceleration where the options give them; return both as read back."""
-
-    @abstractmethod
-    def _read_position_mm(self, axis: int) -> float:
-        """Read where the axis is."""
-
-    @abstractmethod
-    def _read_status(self, axis: int) -> AxisStatus:
-        """Read what the axis does."""
-
-    @abstractmethod
-    def _switch_motor(self, axis: int, *, on: bool) -> None:
-        """Switch the motor, and check that it is."""
-
-    @abstractmethod
-    def _start_homing(self, axis: int) -> None:
-        """Write the homing command, once, and raise what the controller has against it."""
-
-    @abstractmethod
-    def _finish_homing(self, axis: int) -> None:
-        """Check that homing ended well; called when the axis rests."""
-
-    @abstractmethod
-    def _send_move(self, axis: int, position_mm: float) -> None:
-        """Write the motion command, once."""
-
-    @abstractmethod
-    def _stop_text(self, axis: int | None) -> str:
-        """Give the stop command for one axis or all."""
-
-    @abstractmethod
-    def _drain_errors(self, axis: int | None = None) -> list[ControllerMessage]:
-        """Read and clear the controller's errors (of one axis where it keeps them apart)."""
-
-    @abstractmethod
-    def _code_of(self, message: ControllerMessage) -> str | None:
-        """Map a controller's error to one of the codes of `Stage`, if one fits."""

@@ -110,7 +110,9 @@ class _Pairing:
         self._counts[name] = self._counts.get(name, 0) + 1
 
     def _time_ns(self, frame: Frame) -> int:
-        return frame.device_ns if self._common_clock else frame.host_ns
+        if self._common_clock:
+            return frame.device_ns
+        return frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
 
     def _pair(self, frames: Mapping[Cam, Frame], number: int) -> Pair:
         one, two = frames["cam1"], frames["cam2"]
@@ -135,7 +137,8 @@ class NumberPairing(_Pairing):
     max_skew_ms
         Above it a pair is made and counted, but not accepted.
     common_clock
-        Whether the device times of both cameras may be compared; else skew is that of the arrival at the host.
+        Whether the device times of both cameras may be compared; else skew is that of the exposures brought to the
+        host's clock, or of the arrival at the host where that was not done.
     origin
         Frame number, in each camera, of the first trigger; its trigger number in pairing by trigger (cam1's counts).
     depth

@@ -2,7 +2,8 @@
 
 What happened to every frame number since `CameraReader.start` is in the counters: ``delivered + overrun + dropped +
 incomplete`` is how far the camera's counter went. Repeats and late frames come on top, since their numbers are already
-counted. The watchdog is ours: a camera that is silent for three frame periods is lost, whatever its library thinks.
+counted. The watchdog is ours: a camera that is silent for three frame periods (0.4 s at least) is lost, whatever its
+library thinks.
 """
 
 from __future__ import annotations
@@ -16,12 +17,15 @@ from dataclasses import replace
 import numpy as np
 
 from core.errors import CameraError
+from drivers.clocks import DeviceClock
 from drivers.frames import Frame, FrameCounters, FrameGrabber, FrameStatus
 from drivers.sequence import Arrival, SequenceReader
 
 # How long the thread waits in the grabber before it looks at the watchdog again
 _SLICE_S = 0.02
 _WATCHDOG_PERIODS = 3.0
+# A busy host stops for longer than three periods of a fast camera, which is no fault of the camera's
+_LEAST_PATIENCE_S = 0.4
 
 
 class CameraReader:
@@ -45,6 +49,8 @@ class CameraReader:
     compare_pixels
         Also refuse a frame whose pixels equal the last frame's: a stale buffer under a new number. Not for cameras
         that can deliver the same picture twice, such as noise-free simulated ones.
+    pass_incomplete
+        Hand incomplete frames on too, with their status, so that pairing can say what became of their triggers.
     on_fault
         Called once, from the reader's thread, when the camera is lost.
     """
@@ -59,15 +65,19 @@ class CameraReader:
         buffer_frames: int = 8,
         sequence: SequenceReader | None = None,
         compare_pixels: bool = False,
+        pass_incomplete: bool = False,
         on_fault: Callable[[CameraError], None] | None = None,
     ) -> None:
         self._grabber = grabber
         self._name = name
-        self._patience_s = _WATCHDOG_PERIODS * period_s + grabber.describe().latency_s
+        latency_s = grabber.describe().latency_s
+        self._patience_s = max(_WATCHDOG_PERIODS * period_s, _LEAST_PATIENCE_S) + latency_s
         self._expects_frames = expects_frames
         self._sequence = sequence if sequence is not None else SequenceReader()
         self._compare_pixels = compare_pixels
+        self._pass_incomplete = pass_incomplete
         self._on_fault = on_fault
+        self._clock = DeviceClock()
         self._buffer: deque[Frame] = deque()
         self._room = buffer_frames
         self._changed = threading.Condition()
@@ -119,7 +129,7 @@ class CameraReader:
         return self._grabber.trigger()
 
     def take(self, timeout_s: float) -> Frame | None:
-        """Return the oldest good frame, its sequence number unwrapped; ``None`` when none came in time.
+        """Return the oldest frame that waits, its sequence number unwrapped; ``None`` when none came in time.
 
         Raises
         ------
@@ -148,7 +158,7 @@ class CameraReader:
                     self._sort(frame)
                 elif self._overdue():
                     raise CameraError(
-                        f"{self._name} has been silent for {self._patience_s:.2f} s (three frame periods).",
+                        f"{self._name} has been silent for {self._patience_s:.2f} s: three frame periods, or 0.4 s.",
                         code="camera_lost",
                         remedy="Check its cable and power, then reconnect.",
                         camera=self._name,
@@ -176,6 +186,7 @@ class CameraReader:
         reading = self._sequence.read(frame.sequence)
         last, count = self._last, self._counters
         delivered: Frame | None = None
+        spoiled: Frame | None = None
         stale = last is not None and reading.arrival is Arrival.NEXT and self._is_stale(frame, last)
         if reading.arrival is Arrival.LATE:
             count = replace(count, out_of_order=count.out_of_order + 1)
@@ -188,18 +199,22 @@ class CameraReader:
                 count = replace(count, duplicates=count.duplicates + 1, dropped=count.dropped + 1)
             elif frame.status is not FrameStatus.OK:
                 count = replace(count, incomplete=count.incomplete + 1)
+                if self._pass_incomplete:
+                    spoiled = replace(frame, sequence=reading.number)
             else:
                 count = replace(count, delivered=count.delivered + 1)
-                delivered = replace(frame, sequence=reading.number)
+                exposed_ns = self._clock.on_host(frame.device_ns, frame.host_ns)
+                delivered = replace(frame, sequence=reading.number, exposed_ns=exposed_ns)
                 self._last = frame
         with self._changed:
             if reading.arrival is Arrival.NEXT:
                 self._waiting = max(0, self._waiting - 1 - reading.missing)
             if delivered is not None:
-                if len(self._buffer) >= self._room:
-                    self._buffer.popleft()
+                if len(self._buffer) >= self._room and self._buffer.popleft().status is FrameStatus.OK:
                     count = replace(count, delivered=count.delivered - 1, overrun=count.overrun + 1)
                 self._buffer.append(delivered)
+            elif spoiled is not None and len(self._buffer) < self._room:
+                self._buffer.append(spoiled)
             self._counters = count
             self._changed.notify_all()
 

@@ -12,13 +12,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import Literal, TypeVar
 
 import serial
 
 from core.errors import StageError
+from drivers.transcript import Transcript
 
 T = TypeVar("T")
+FlowControl = Literal["hardware", "software", "none"]
 
 # Longest time the flush listens to a line that never falls silent
 _FLUSH_LIMIT_S = 1.0
@@ -35,8 +37,10 @@ class SerialLine:
         What `serial.serial_for_url` takes.
     terminator
         Ends every command.
-    baudrate, rtscts, xonxoff
-        For true serial ports; sockets ignore them.
+    baudrate
+        For true serial ports, also those behind ``rfc2217://``; sockets and ptys ignore it.
+    flow_control
+        ``hardware`` (RTS and CTS), ``software`` (XON and XOFF) or ``none``; likewise.
     timeout_s
         How long a query waits for a reply that makes sense.
     quiet_s
@@ -45,7 +49,7 @@ class SerialLine:
         For controllers whose replies do not say which question they answer: a harmless query and a test for its reply.
         It is asked after a flush, and all that comes before its reply is a late answer to something older.
     record
-        File that gets a transcript of the wire, for users who report trouble.
+        File that gets a transcript of the wire, see `drivers.transcript`.
 
     Attributes
     ----------
@@ -59,8 +63,7 @@ class SerialLine:
         *,
         terminator: bytes,
         baudrate: int,
-        rtscts: bool = False,
-        xonxoff: bool = False,
+        flow_control: FlowControl = "none",
         timeout_s: float = 0.5,
         quiet_s: float = 0.03,
         resync: tuple[str, Callable[[str], bool]] | None = None,
@@ -69,13 +72,12 @@ class SerialLine:
         self.url = url
         self._terminator = terminator
         self._baudrate = baudrate
-        self._rtscts = rtscts
-        self._xonxoff = xonxoff
+        self._flow_control = flow_control
         self._timeout_s = timeout_s
         self._quiet_s = quiet_s
         self._resync = resync
         self._record_path = record
-        self._record: TextIO | None = None
+        self._record: Transcript | None = None
         self._port: serial.Serial | None = None
         self._lock = threading.RLock()
         self._pending = bytearray()
@@ -96,13 +98,14 @@ class SerialLine:
                 port = serial.serial_for_url(
                     self.url,
                     baudrate=self._baudrate,
-                    rtscts=self._rtscts,
-                    xonxoff=self._xonxoff,
+                    rtscts=self._flow_control == "hardware",
+                    xonxoff=self._flow_control == "software",
                     timeout=self._quiet_s,
-                    write_timeout=1.0,
+                    # the one kind of URL whose port knows no such limit; its socket has one of five seconds
+                    write_timeout=None if self.url.lower().startswith("rfc2217:") else 1.0,
                     exclusive=True,
                 )
-            except (serial.SerialException, OSError, ValueError) as error:
+            except (serial.SerialException, OSError, ValueError, NotImplementedError) as error:
                 text = str(error)
                 if "exclusively lock" in text or "busy" in text.lower():
                     raise StageError(
@@ -117,8 +120,11 @@ class SerialLine:
             if isinstance(connection, socket.socket):
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._record_path is not None:
-                self._record = self._record_path.open("a", encoding="ascii", buffering=1)
-                self._note("# open", self.url.encode())
+                try:
+                    self._record = Transcript(self._record_path, f"{self.url} at {self._baudrate} baud")
+                except StageError:
+                    port.close()
+                    raise
             self._pending.clear()
             self._dirty = True
             self._port = port
@@ -127,7 +133,11 @@ class SerialLine:
         """Close the line; safe to call twice, and from any thread."""
         port, self._port = self._port, None
         if port is not None:
+            connection = getattr(port, "_socket", None)
             port.close()
+            # pyserial shuts the connection down first, and leaves it open where the other side was quicker
+            if isinstance(connection, socket.socket):
+                connection.close()
         record, self._record = self._record, None
         if record is not None:
             record.close()
@@ -258,11 +268,13 @@ class SerialLine:
     def _note(self, mark: str, data: bytes) -> None:
         record = self._record
         if record is not None:
-            record.write(f"{time.monotonic():.6f} {mark} {data!r}\n")
+            record.note(mark, data)
 
     def _lost(self, cause: str, **context: str) -> StageError:
         self._dirty = True
         self.losses += 1
+        if self._record is not None:
+            self._record.remark(cause)
         return StageError(
             cause,
             code="stage_lost",

@@ -24,7 +24,8 @@ from pathlib import Path
 
 from core.errors import StageError
 from drivers.motion import SerialStage
-from drivers.serial_line import SerialLine
+from drivers.refusals import configuration_state, motion_fault, motor_off, not_homed, not_in_configuration
+from drivers.serial_line import FlowControl, SerialLine
 from drivers.stage import AxisIdentity, AxisOptions, AxisState, AxisStatus, ControllerMessage, StageIdentity
 
 _STATES = {
@@ -47,7 +48,17 @@ _POSITIONER_ERRORS = (
     "DC voltage too low",
     "80 W output power exceeded",
 )
-_CODES = {"G": "out_of_limits", "H": "not_homed", "J": "motor_off", "N": "out_of_limits"}
+_CODES = {
+    "C": "out_of_range",
+    "G": "out_of_limits",
+    "H": "not_homed",
+    "I": "configuration_state",
+    "J": "motor_off",
+    "N": "out_of_limits",
+}
+# moved by the keypad (SMC100) or by a stream of targets (CONEX-CC)
+_FOREIGN_MOTION = (0x46, 0x47)
+_READY_TO_TRACK = (0x36, 0x37, 0x38)
 _CONFIGURATION_S = 12.0  # leaving CONFIGURATION takes the controller up to 10 s, in which it is silent
 
 
@@ -60,13 +71,15 @@ class SMC100Stage(SerialStage):
         Any URL that pyserial opens. The SMC100 runs at 57600 baud, the CONEX-CC at 921600.
     options
         Address -> how the axis is used.
-    baudrate
-        For true serial ports.
+    baudrate, flow_control
+        For true serial ports; the controllers' own is software flow control (XON and XOFF).
     record
         File for a transcript of the wire.
     timeout_s
         How long a reply may take.
     """
+
+    _driver = "smc100"
 
     def __init__(
         self,
@@ -74,10 +87,18 @@ class SMC100Stage(SerialStage):
         options: Mapping[int, AxisOptions],
         *,
         baudrate: int = 57600,
+        flow_control: FlowControl = "software",
         record: Path | None = None,
         timeout_s: float = 0.5,
     ) -> None:
-        line = SerialLine(url, terminator=b"\r\n", baudrate=baudrate, xonxoff=True, timeout_s=timeout_s, record=record)
+        line = SerialLine(
+            url,
+            terminator=b"\r\n",
+            baudrate=baudrate,
+            flow_control=flow_control,
+            timeout_s=timeout_s,
+            record=record,
+        )
         super().__init__(line, options)
         self._known_errors: dict[int, int] = {}
 
@@ -85,6 +106,8 @@ class SMC100Stage(SerialStage):
         """Leave CONFIGURATION state (PW0), which writes the controller's flash memory; never done unasked."""
         self._check_axis(axis)
         with self._motion_lock:
+            if self._read_status(axis).state is not AxisState.CONFIGURATION:
+                raise not_in_configuration(axis)
             self._line.command(f"{axis}PW0")
             time.sleep(0.1)
             self._read_word(axis, timeout_s=_CONFIGURATION_S)
@@ -104,7 +127,7 @@ class SMC100Stage(SerialStage):
         axes = tuple(AxisIdentity(axis, self._text(axis, "ID", "?"), versions[axis]) for axis in self.axes)
         first = versions[self.axes[0]]
         model, _, firmware = first.rpartition(" ")
-        return StageIdentity("smc100", model or first, firmware, self._line.url, axes)
+        return StageIdentity(self._driver, model or first, firmware, self._line.url, axes)
 
     def _read_travel_mm(self, axis: int) -> tuple[float, float]:
         return self._number(axis, "SL", "?"), self._number(axis, "SR", "?")
@@ -132,11 +155,15 @@ class SMC100Stage(SerialStage):
         detail = "; ".join(message.text for message in fresh)
         if fresh and state is not AxisState.NOT_HOMED:
             state = AxisState.FAULT
-        if number not in _STATES:
-            detail = f"jogging, tracking or unknown state {number:02X}"
+        if number in _FOREIGN_MOTION:
+            detail = "it is moved by a keypad, or follows targets (TK1); stop it first"
+        elif number in _READY_TO_TRACK:
+            detail = "it waits for targets to follow (TK1); leave that by TK0"
+        elif number not in _STATES:
+            detail = f"unknown state {number:02X}"
         elif state is AxisState.CONFIGURATION:
             detail = "it was left in its configuration state (PW1); leave it by PW0"
-        moving = number in (0x1E, 0x1F, 0x28)
+        moving = number in (0x1E, 0x1F, 0x28, *_FOREIGN_MOTION)
         homed = _STATES.get(number) not in (AxisState.NOT_HOMED, AxisState.CONFIGURATION, AxisState.HOMING)
         motor_on = _STATES.get(number) in (AxisState.READY, AxisState.MOVING, AxisState.HOMING)
         return AxisStatus(axis, state, self._read_position_mm(axis), motor_on, homed, moving, detail)
@@ -167,10 +194,10 @@ class SMC100Stage(SerialStage):
 
     def _start_homing(self, axis: int) -> None:
         status = self._read_status(axis)
+        if status.state is AxisState.CONFIGURATION:
+            raise configuration_state(axis)
         if status.state is AxisState.MOTOR_OFF:
-            raise StageError(
-                f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis
-            )
+            raise motor_off(axis)
         self._keep(self._drain_errors(axis))
         self._line.command(f"{axis}PA0" if status.homed else f"{axis}OR")
         self._raise_refusal((axis,), "search for home")
@@ -178,7 +205,7 @@ class SMC100Stage(SerialStage):
     def _finish_homing(self, axis: int) -> None:
         status = self._read_status(axis)
         if not status.homed:
-            raise self._fault(axis, f"did not find home ({status.detail or status.state})")
+            raise motion_fault(axis, f"did not find home ({status.detail or status.state})")
         self._velocity_mm_s[axis], self._acceleration_mm_s2[axis] = self._set_dynamics(axis)
 
     def _send_move(self, axis: int, position_mm: float) -> None:
@@ -186,6 +213,16 @@ class SMC100Stage(SerialStage):
 
     def _stop_text(self, axis: int | None) -> str:
         return "ST" if axis is None else f"{axis}ST"
+
+    def _abort_text(self) -> str:
+        return "ST"  # it knows no harder one; the motors follow when all is at rest
+
+    def _check_settable(self, axis: int) -> None:
+        status = self._read_status(axis)
+        if status.state is AxisState.CONFIGURATION:
+            raise configuration_state(axis)
+        if not status.homed:
+            raise not_homed(axis)
 
     def _drain_errors(self, axis: int | None = None) -> list[ControllerMessage]:
         found: list[ControllerMessage] = []
@@ -199,6 +236,27 @@ class SMC100Stage(SerialStage):
 
     def _code_of(self, message: ControllerMessage) -> str | None:
         return _CODES.get(message.code)
+
+
+class ConexCCStage(SMC100Stage):
+    """Driver for the CONEX-CC: the SMC100's words over USB at 921600 baud, whose version says ``CONEX-CC``.
+
+    Parameters are those of `SMC100Stage`.
+    """
+
+    _driver = "conex-cc"
+
+    def __init__(
+        self,
+        url: str,
+        options: Mapping[int, AxisOptions],
+        *,
+        baudrate: int = 921600,
+        flow_control: FlowControl = "software",
+        record: Path | None = None,
+        timeout_s: float = 0.5,
+    ) -> None:
+        super().__init__(url, options, baudrate=baudrate, flow_control=flow_control, record=record, timeout_s=timeout_s)
 
 
 def _answer(axis: int, word: str, line: str) -> str:

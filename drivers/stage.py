@@ -46,6 +46,9 @@ class AxisOptions:
     assume_homed
         Trust the controller's position although this driver did not home it. The ESP301 cannot say whether it was
         homed, so the user must.
+    home_mode
+        ESP301: how home is searched (parameter of OR); ``None`` for the driver's usual one. The SMC100 family keeps
+        its home search type (HT) in its configuration.
     """
 
     soft_limits_mm: tuple[float, float] | None = None
@@ -56,6 +59,7 @@ class AxisOptions:
     settle_ms: float = 0.0
     tolerance_mm: float = 0.002
     assume_homed: bool = False
+    home_mode: int | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,17 @@ class AxisLimits:
     high_mm: float
     controller_low_mm: float
     controller_high_mm: float
+
+
+@dataclass(frozen=True)
+class AxisDynamics:
+    """How fast an axis moves, as read back from the controller; ``None`` where it does not tell its greatest."""
+
+    axis: int
+    velocity_mm_s: float
+    acceleration_mm_s2: float
+    max_velocity_mm_s: float | None = None
+    max_acceleration_mm_s2: float | None = None
 
 
 @dataclass(frozen=True)
@@ -129,7 +144,9 @@ class Stage(Protocol):
     byte went out), ``not_homed``, ``motor_off``, ``motion_fault`` (limit switch, stall, following error, position not
     reached: the axis was stopped), ``stage_stopped`` (somebody called `stop` during or before the motion),
     ``stage_lost`` (silence or garbage: the position is unknown), ``stage_refused`` (the controller's own error),
-    ``invalid_axis``.
+    ``out_of_range`` (a velocity or acceleration that the controller cannot do), ``configuration_state`` (an SMC100
+    that a program left in its configuration state), ``unit_not_length``, ``units_changed`` (an ESP301's axis that
+    counts in something else than when it was opened), ``invalid_axis``.
     """
 
     @property
@@ -137,7 +154,10 @@ class Stage(Protocol):
         """Axis numbers, as the controller counts them."""
 
     def open(self) -> None:
-        """Connect, identify, read units and limits, set and read back velocities. Moves nothing."""
+        """Connect, identify, read units and limits, set and read back velocities.
+
+        Moves nothing; what moves already, since an earlier program died, is stopped.
+        """
 
     def close(self) -> None:
         """Release the line; an axis that this driver is moving is stopped first. Safe to call twice."""
@@ -166,6 +186,20 @@ class Stage(Protocol):
     def stop(self, axis: int | None = None) -> None:
         """Stop one axis or all, at once: never waits for a lock, never queued; motions waiting their turn are void."""
 
+    def abort(self) -> None:
+        """Stop all axes as in an emergency and switch their motors off; the stop goes out at once, as with `stop`."""
+
+    def dynamics(self, axis: int) -> AxisDynamics:
+        """Velocity and acceleration as last read back."""
+
+    def set_dynamics(
+        self, axis: int, *, velocity_mm_s: float | None = None, acceleration_mm_s2: float | None = None
+    ) -> AxisDynamics:
+        """Set what is given, and return what the controller took."""
+
+    def leave_configuration(self, axis: int) -> None:
+        """Leave an SMC100's configuration state, which writes its flash memory; never done unasked."""
+
     def position(self, axis: int) -> float:
         """Read the position in mm; works while another thread waits in a move."""
 
@@ -175,5 +209,8 @@ class Stage(Protocol):
     def limits(self, axis: int) -> AxisLimits:
         """Where the axis may go."""
 
-    def errors(self) -> tuple[ControllerMessage, ...]:
-        """Empty the controller's error queue and return it, together with what earlier calls took from it unread."""
+    def errors(self, *, ask: bool = True) -> tuple[ControllerMessage, ...]:
+        """Empty the controller's error queue and return it, together with what earlier calls took from it unread.
+
+        With ``ask=False`` only the latter: nothing goes over the line.
+        """

@@ -1,0 +1,81 @@
+"""The Aravis library, loaded when it is first needed, and its errors as ours.
+
+PyGObject has no types and is in the extra ``[aravis]`` only: nothing else in the project imports it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import CameraError
+
+_INSTALL = (
+    "Install what reaches it: apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc "
+    "python3-dev, then pip install 'stereorig[aravis]'."
+)
+
+
+@functools.cache
+def aravis() -> Any:
+    """Return the namespace of Aravis 0.8.
+
+    Raises
+    ------
+    CameraError
+        ``driver_missing`` when PyGObject or Aravis is not installed.
+    """
+    return _namespace("Aravis", "0.8")
+
+
+@functools.cache
+def glib_error() -> type[Exception]:
+    """Return the class of the errors that Aravis raises."""
+    error: type[Exception] = _namespace("GLib", "2.0").Error
+    return error
+
+
+def _namespace(name: str, version: str) -> Any:
+    try:
+        gi = importlib.import_module("gi")
+        gi.require_version(name, version)
+        return importlib.import_module(f"gi.repository.{name}")
+    except (ImportError, ValueError) as error:  # ValueError: PyGObject is there, the library is not
+        raise CameraError(
+            f"The Aravis library cannot be used: {error}.", code="driver_missing", remedy=_INSTALL
+        ) from error
+
+
+def buffer_bytes(buffer: Any) -> NDArray[np.uint8]:
+    """Return the bytes that came into a buffer, not copied: they are good until the buffer is given back."""
+    size = ctypes.c_size_t()
+    address = _data_of()(_pointer(buffer), ctypes.byref(size))
+    if not address or not size.value:
+        return np.empty(0, np.uint8)
+    memory = (ctypes.c_uint8 * size.value).from_address(address)
+    return np.ctypeslib.as_array(memory)
+
+
+@functools.cache
+def _data_of() -> Any:
+    # PyGObject's own get_data() copies every frame into a bytes object first
+    aravis()
+    repository = _namespace("GIRepository", "2.0").Repository.get_default()
+    library = ctypes.CDLL(repository.get_shared_library("Aravis").split(",")[0])
+    function = library.arv_buffer_get_data
+    function.argtypes = [ctypes.c_void_p, ctypes.POINTER(ctypes.c_size_t)]
+    function.restype = ctypes.c_void_p
+    return function
+
+
+def _pointer(gobject: Any) -> int:
+    capsule = ctypes.pythonapi.PyCapsule_GetPointer
+    capsule.argtypes = [ctypes.py_object, ctypes.c_char_p]
+    capsule.restype = ctypes.c_void_p
+    pointer: int = capsule(gobject.__gpointer__, None)
+    return pointer
