@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
 import queue
 import threading
 import time
@@ -14,6 +16,8 @@ import numpy as np
 
 from core.errors import CameraError
 from drivers.frames import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
+
+_NICE = 5
 
 CameraName = Literal["cam1", "cam2"]
 
@@ -36,28 +40,6 @@ class Pulse:
 
     number: int
     at_ns: int
-
-
-class TriggerLine:
-    """One line to all cameras of a rig: the first camera's software trigger makes the pulse, the others join it.
-
-    So the exposures of a pair begin at the same instant, however late the second call comes.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._newest = Pulse(0, 0)
-        self._last_of: dict[str, int] = {}
-
-    def fire(self, cam: str) -> Pulse:
-        """Join the newest pulse if this camera has not seen it yet, else make one."""
-        with self._lock:
-            now = time.monotonic_ns()
-            pulse = self._newest
-            if self._last_of.get(cam, 0) >= pulse.number or now - pulse.at_ns > _SAME_PULSE_S * 1e9:
-                pulse = self._newest = Pulse(pulse.number + 1, now)
-            self._last_of[cam] = pulse.number
-            return pulse
 
 
 @dataclass
@@ -89,6 +71,63 @@ class GrabberFaults:
     busy: bool = False
     gone: bool = False
     skew_ms: float = 0.0
+
+
+class TriggerLine:
+    """One line to all cameras of a rig: the first camera's software trigger makes the pulse, the others join it.
+
+    So the exposures of a pair begin at the same instant, however late the second call comes.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest = Pulse(0, 0)
+        self._last_of: dict[str, int] = {}
+        self._holders: dict[str, object] = {}
+        self._faults: dict[str, GrabberFaults] = {}
+        self._waiting: dict[str, queue.SimpleQueue[Pulse | None]] = {}
+
+    def listen(self, cam: str, orders: queue.SimpleQueue[Pulse | None] | None) -> None:
+        """Send the pulses of the line to a camera in hardware trigger mode; ``None`` ends that."""
+        with self._lock:
+            if orders is None:
+                self._waiting.pop(cam, None)
+            else:
+                self._waiting[cam] = orders
+
+    def pulse(self, *, missed_by: str | None = None) -> Pulse:
+        """Send a pulse down the line, as a pulse generator does; a camera that is not ready misses it."""
+        with self._lock:
+            pulse = self._newest = Pulse(self._newest.number + 1, time.monotonic_ns())
+            for cam, orders in self._waiting.items():
+                if cam != missed_by:
+                    orders.put(pulse)
+            return pulse
+
+    def faults_of(self, cam: str) -> GrabberFaults:
+        """What is wrong with a camera: it stays wrong when a new grabber is made for it."""
+        return self._faults.setdefault(cam, GrabberFaults())
+
+    def hold(self, cam: str, holder: object) -> bool:
+        """Take a camera for one grabber; False when another has it."""
+        with self._lock:
+            return self._holders.setdefault(cam, holder) is holder
+
+    def let_go(self, cam: str, holder: object) -> None:
+        """Give it back; harmless when another has it."""
+        with self._lock:
+            if self._holders.get(cam) is holder:
+                del self._holders[cam]
+
+    def fire(self, cam: str) -> Pulse:
+        """Join the newest pulse if this camera has not seen it yet, else make one."""
+        with self._lock:
+            now = time.monotonic_ns()
+            pulse = self._newest
+            if self._last_of.get(cam, 0) >= pulse.number or now - pulse.at_ns > _SAME_PULSE_S * 1e9:
+                pulse = self._newest = Pulse(pulse.number + 1, now)
+            self._last_of[cam] = pulse.number
+            return pulse
 
 
 _lines: weakref.WeakKeyDictionary[Any, TriggerLine] = weakref.WeakKeyDictionary()
@@ -138,10 +177,10 @@ class SimFrameGrabber:
             known = world.rig.camera(cam)  # type: ignore[attr-defined]  # a bare Exposer must be described by the caller
             image_size_px = image_size_px or known.size_px
             bit_depth = bit_depth or known.sensor.bit_depth
-        self.faults = GrabberFaults()
         self._world = world
         self._cam: CameraName = cam
         self._line = line if line is not None else _line_of(world)
+        self.faults = self._line.faults_of(cam)
         self._rng = np.random.default_rng([seed, int(cam[-1])])
         self._sequence_bits = sequence_bits
         self._counter = itertools.count(first_sequence)
@@ -150,12 +189,14 @@ class SimFrameGrabber:
             serial=f"SIM-{cam}",
             image_size_px=image_size_px,
             bit_depths=(bit_depth,),
-            trigger_modes=("free", "software"),
+            trigger_modes=("free", "software", "hardware"),
             exposure_range_ms=(0.01, 1000.0),
             gain_range_db=(0.0, 24.0),
             frame_rate_range_hz=(0.1, 100.0),
             driver="sim",
             latency_s=latency_s,
+            clock="sim",
+            counter_range=(0, 2**sequence_bits - 1),
         )
         self._settings = CameraSettings(
             exposure_ms=10.0,
@@ -166,6 +207,7 @@ class SimFrameGrabber:
             region_px=(0, 0, *image_size_px),
         )
         self._open = False
+        self._exposed = 0
         self._orders: queue.SimpleQueue[Pulse | None] = queue.SimpleQueue()
         self._frames: queue.Queue[Frame | CameraError] = queue.Queue(_RING)
         self._thread: threading.Thread | None = None
@@ -173,14 +215,14 @@ class SimFrameGrabber:
 
     def open(self) -> None:
         """Connect."""
-        if self.faults.busy:
+        self._check_there()
+        if self.faults.busy or not self._line.hold(self._cam, self):
             raise CameraError(
                 f"Another program holds {self._cam}.",
                 code="camera_busy",
                 remedy="Close the other program, then reconnect.",
                 camera=self._cam,
             )
-        self._check_there()
         self._open = True
 
     def describe(self) -> CameraDescription:
@@ -192,20 +234,31 @@ class SimFrameGrabber:
         """Set what is not ``None``; refuse all of it when one value cannot be had."""
         self._check_open()
         here = self._description
-        for name, value, (low, high) in (
+        for name, value, allowed in (
             ("exposure_ms", settings.exposure_ms, here.exposure_range_ms),
             ("gain_db", settings.gain_db, here.gain_range_db),
             ("frame_rate_hz", settings.frame_rate_hz, here.frame_rate_range_hz),
         ):
+            low, high = allowed or (-np.inf, np.inf)
             if value is not None and not low <= value <= high:  # NaN is in no range
                 raise self._out_of_range(name, value, f"{low:g} to {high:g}")
+        if settings.features or settings.pixel_format is not None:
+            names = [*(settings.features or ())] or [f"pixel_format {settings.pixel_format}"]
+            raise CameraError(
+                f"{self._cam} has no {', '.join(names)}.",
+                code="unknown_feature",
+                remedy="A simulated camera has exposure, gain, frame rate, trigger and region only.",
+                camera=self._cam,
+            )
         if settings.bit_depth is not None and settings.bit_depth not in here.bit_depths:
             raise self._out_of_range("bit_depth", settings.bit_depth, f"{here.bit_depths}")
         if settings.trigger is not None and settings.trigger not in here.trigger_modes:
             raise self._out_of_range("trigger", settings.trigger, f"{here.trigger_modes}")
-        whole = (0, 0, *here.image_size_px)
-        if settings.region_px is not None and tuple(settings.region_px) != whole:
-            raise self._out_of_range("region_px", settings.region_px, f"{whole}")
+        if settings.region_px is not None:
+            columns, rows = here.image_size_px
+            x0, y0, width, height = settings.region_px
+            if min(x0, y0) < 0 or min(width, height) < 1 or x0 + width > columns or y0 + height > rows:
+                raise self._out_of_range("region_px", settings.region_px, f"inside {columns} x {rows} px")
         given = {name: value for name, value in vars(settings).items() if value is not None}
         self._settings = replace(self._settings, **given)
         return self._settings
@@ -220,11 +273,14 @@ class SimFrameGrabber:
         self._frames = queue.Queue(_RING)
         self._thread = threading.Thread(target=self._run, name=f"simulated {self._cam}", daemon=True)
         self._thread.start()
+        if self._settings.trigger == "hardware":
+            self._line.listen(self._cam, self._orders)
 
     def disarm(self) -> None:
         """Stop delivering; an exposure in progress is finished and thrown away."""
         thread, self._thread = self._thread, None
         if thread is not None:
+            self._line.listen(self._cam, None)
             self._ending.set()
             self._orders.put(None)
             thread.join()
@@ -266,21 +322,29 @@ class SimFrameGrabber:
                 raise item
             return item
 
+    def statistics(self) -> dict[str, int | float]:
+        """Frames exposed since the camera was made."""
+        return {"exposed": self._exposed}
+
     def close(self) -> None:
         """Release the camera."""
         self._open = False
+        self._line.let_go(self._cam, self)
         self.disarm()
 
     def _run(self) -> None:
         ending, orders, frames = self._ending, self._orders, self._frames
         number = itertools.count(1)
         due = time.monotonic()
+        # a camera draws its own pictures; ours must not take the processor from those who handle them
+        with contextlib.suppress(OSError, AttributeError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while not ending.is_set():
-            if self._settings.trigger == "software":
+            if self._settings.trigger != "free":
                 order = orders.get()
                 if order is None:
                     return
-                pulse, trigger = order, order.number
+                pulse, trigger = order, order.number if self._settings.trigger == "software" else None
             else:
                 due = max(due + 1.0 / (self._settings.frame_rate_hz or 10.0), time.monotonic())
                 if ending.wait(max(0.0, due - time.monotonic())):
@@ -293,6 +357,7 @@ class SimFrameGrabber:
         self, pulse: Pulse, trigger: int | None, ending: threading.Event, frames: queue.Queue[Frame | CameraError]
     ) -> None:
         sequence = next(self._counter) % 2**self._sequence_bits
+        self._exposed += 1
         if self.faults.drop > 0:
             self.faults.drop -= 1
             return
@@ -310,6 +375,9 @@ class SimFrameGrabber:
             return
         if ending.is_set() or self.faults.silent:
             return
+        if self._settings.region_px is not None:
+            x0, y0, width, height = self._settings.region_px
+            pixels = pixels[y0 : y0 + height, x0 : x0 + width]
         status = FrameStatus.OK
         if self.faults.incomplete > 0:
             self.faults.incomplete -= 1

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from sim.surface import PLATE, Surface
 
@@ -76,6 +75,8 @@ class CircularPlate:
 
     def centre_deflection_mm(self, pressure_kpa: float) -> float:
         """w0 at a pressure; negative pressures push the other way."""
+        from scipy.optimize import brentq  # slow to load, and not every start needs it
+
         linear = pressure_kpa * 1e-3 * self.radius_mm**4 / (64.0 * self.bending_stiffness_nmm)
         if not self.large_deflection or linear == 0.0:
             return linear
@@ -87,6 +88,34 @@ class CircularPlate:
         """w(r), towards the cameras, zero beyond the clamping."""
         q = np.minimum((np.asarray(r_mm, dtype=np.float64) / self.radius_mm) ** 2, 1.0)
         return np.asarray(self.centre_deflection_mm(pressure_kpa) * (1.0 - q) ** 2)
+
+    def bending_strain(self, r_mm: ArrayLike, pressure_kpa: float) -> tuple[Float, Float]:
+        """Radial and hoop strain of the face by linear bending, -(t/2) w'' and -(t/2) w'/r; 0 beyond the clamping."""
+        q = (np.asarray(r_mm, dtype=np.float64) / self.radius_mm) ** 2
+        scale = np.where(q < 1.0, 2.0 * self.thickness_mm * self._slope_per_mm(pressure_kpa), 0.0)
+        return np.asarray(scale * (1.0 - 3.0 * q)), np.asarray(scale * (1.0 - q))
+
+    def face_strain(self, r_mm: ArrayLike, pressure_kpa: float) -> tuple[Float, Float]:
+        """Green-Lagrange strain of the face, radial and hoop: with the face's u(r) and w(r),
+
+        E_r = u' + (u'^2 + w'^2) / 2,  E_t = u/r + (u/r)^2 / 2.
+
+        u holds bending, and the mid-plane's motion where the deflection is large. The slope's part is no stretch of
+        the material in linear theory, which leaves the mid-plane where it is; the surface that it describes has it.
+        """
+        q = (np.asarray(r_mm, dtype=np.float64) / self.radius_mm) ** 2
+        u_r, u_t = self.bending_strain(r_mm, pressure_kpa)
+        if self.large_deflection:
+            c1, c3, c5, c7 = self.membrane_coefficients
+            scale = np.where(q < 1.0, (self.centre_deflection_mm(pressure_kpa) / self.radius_mm) ** 2, 0.0)
+            u_r = u_r + scale * (c1 + q * (3.0 * c3 + q * (5.0 * c5 + q * 7.0 * c7)))
+            u_t = u_t + scale * (c1 + q * (c3 + q * (c5 + q * c7)))
+        slope = -4.0 * self._slope_per_mm(pressure_kpa) * np.asarray(r_mm) * np.maximum(1.0 - q, 0.0)
+        return np.asarray(u_r + 0.5 * (u_r**2 + slope**2)), np.asarray(u_t + 0.5 * u_t**2)
+
+    def _slope_per_mm(self, pressure_kpa: float) -> float:
+        """w0 / a^2, to which all of the plate's curvatures are in proportion."""
+        return self.centre_deflection_mm(pressure_kpa) / self.radius_mm**2
 
     def surface(self, pressure_kpa: float) -> Surface:
         """Return the face of the plate at a pressure; (s, t) are measured from its centre on the flat plate."""

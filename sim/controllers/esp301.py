@@ -7,6 +7,7 @@ CR LF. The list of error texts is the manual's (appendix A).
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections import deque
@@ -43,6 +44,10 @@ _AXIS_TEXTS = {
     20: "HOMING ABORTED",
     30: "COMMAND NOT ALLOWED DURING HOMING",
 }
+# SN codes -> mm; counts and steps go by the resolution, angles are shown as if a degree were a millimetre
+_MM_PER_UNIT = {2: 1.0, 3: 1e-3, 4: 25.4, 5: 25.4e-3, 6: 25.4e-6}
+_UNITS = range(12)
+_DECIMALS = {2: 4, 3: 1, 4: 6, 5: 3, 6: 0}
 _TROUBLE_CODES: dict[Trouble, int] = {"following_error": 3, "positive_limit": 4, "negative_limit": 5}
 
 
@@ -61,11 +66,28 @@ class _Axis:
     low_mm: float
     high_mm: float
     max_velocity_mm_s: float
+    max_acceleration_mm_s2: float
     power: bool = False
     homing: bool = False
     unit: int = 2
     deceleration_mm_s2: float = 40.0
     home_mode: int = 1
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Length of the unit that this axis shows and takes."""
+        return _MM_PER_UNIT.get(self.unit, 1.0 if self.unit > 1 else self.motor.resolution_mm)
+
+    def show(self, mm: float) -> str:
+        """Write a length, a velocity or an acceleration in the axis' unit."""
+        return f"{mm / self.mm_per_unit:.{_DECIMALS.get(self.unit, 0 if self.unit < 2 else 4)}f}"
+
+    def take(self, text: str) -> float:
+        """Read a length, a velocity or an acceleration that was given in the axis' unit, in mm."""
+        value = float(text)
+        if not math.isfinite(value):
+            raise ValueError("not a finite number")
+        return value * self.mm_per_unit
 
 
 class SimESP301(WireController):
@@ -112,6 +134,7 @@ class SimESP301(WireController):
                 travel_mm[0],
                 travel_mm[1],
                 max_velocity_mm_s=4 * velocity_mm_s,
+                max_acceleration_mm_s2=10 * acceleration_mm_s2,
             )
             for number in range(1, axes + 1)
         }
@@ -119,9 +142,9 @@ class SimESP301(WireController):
         self._words: dict[str, Callable[[int, _Axis, str], str | None]] = {
             "PA": self._pa,
             "PR": self._pr,
-            "TP": lambda _n, axis, _p: f"{axis.motor.encoder_mm:.4f}",
-            "DP": lambda _n, axis, _p: f"{axis.motor.goal_mm:.4f}",
-            "TV": lambda _n, axis, _p: f"{axis.motor.velocity_now_mm_s:.4f}",
+            "TP": lambda _n, axis, _p: axis.show(axis.motor.encoder_mm),
+            "DP": lambda _n, axis, _p: axis.show(axis.motor.goal_mm),
+            "TV": lambda _n, axis, _p: axis.show(axis.motor.velocity_now_mm_s),
             "MD": lambda _n, axis, _p: "0" if axis.motor.moving else "1",
             "MO": self._mo,
             "MF": self._mf,
@@ -130,7 +153,8 @@ class SimESP301(WireController):
             "DH": self._dh,
             "ST": self._st,
             "VA": self._va,
-            "VU": lambda _n, axis, p: f"{axis.max_velocity_mm_s:.4f}" if p == "?" else None,
+            "VU": self._vu,
+            "AU": self._au,
             "AC": self._ac,
             "AG": self._ag,
             "SL": self._sl,
@@ -228,16 +252,16 @@ class SimESP301(WireController):
 
     def _pa(self, number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
-            return f"{axis.motor.goal_mm:.4f}"
+            return axis.show(axis.motor.goal_mm)
         if not parameter:
             raise _Refusal(38)
-        self._start(number, axis, float(parameter))
+        self._start(number, axis, axis.take(parameter))
         return None
 
     def _pr(self, number: int, axis: _Axis, parameter: str) -> str | None:
         if not parameter:
             raise _Refusal(38)
-        self._start(number, axis, axis.motor.goal_mm + float(parameter))
+        self._start(number, axis, axis.motor.goal_mm + axis.take(parameter))
         return None
 
     def _mo(self, _number: int, axis: _Axis, parameter: str) -> str | None:
@@ -276,7 +300,7 @@ class SimESP301(WireController):
         return None
 
     def _dh(self, _number: int, axis: _Axis, parameter: str) -> str | None:
-        axis.motor.define_position(float(parameter) if parameter else 0.0)
+        axis.motor.define_position(axis.take(parameter) if parameter else 0.0)
         return None
 
     def _st(self, number: int, axis: _Axis, _parameter: str) -> str | None:
@@ -288,8 +312,8 @@ class SimESP301(WireController):
 
     def _va(self, number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
-            return f"{axis.motor.velocity_mm_s:.4f}"
-        value = float(parameter)
+            return axis.show(axis.motor.velocity_mm_s)
+        value = axis.take(parameter)
         if not 0 < value <= axis.max_velocity_mm_s:
             raise _Refusal(10, number)
         axis.motor.velocity_mm_s = value
@@ -297,37 +321,56 @@ class SimESP301(WireController):
 
     def _ac(self, number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
-            return f"{axis.motor.acceleration_mm_s2:.4f}"
-        value = float(parameter)
-        if not value > 0:
+            return axis.show(axis.motor.acceleration_mm_s2)
+        value = axis.take(parameter)
+        if not 0 < value <= axis.max_acceleration_mm_s2:
             raise _Refusal(11, number)
         axis.motor.acceleration_mm_s2 = value
         return None
 
     def _ag(self, number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
-            return f"{axis.deceleration_mm_s2:.4f}"
-        value = float(parameter)
-        if not value > 0:
+            return axis.show(axis.deceleration_mm_s2)
+        value = axis.take(parameter)
+        if not 0 < value <= axis.max_acceleration_mm_s2:
             raise _Refusal(11, number)
         axis.deceleration_mm_s2 = value
         return None
 
     def _sl(self, _number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
-            return f"{axis.low_mm:.4f}"
-        axis.low_mm = float(parameter)
+            return axis.show(axis.low_mm)
+        axis.low_mm = axis.take(parameter)
         return None
 
     def _sr(self, _number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
-            return f"{axis.high_mm:.4f}"
-        axis.high_mm = float(parameter)
+            return axis.show(axis.high_mm)
+        axis.high_mm = axis.take(parameter)
         return None
 
     def _sn(self, number: int, axis: _Axis, parameter: str) -> str | None:
         if parameter == "?":
             return str(axis.unit)
-        if int(parameter) != 2:
-            raise _Refusal(1, number)  # this one knows millimetres only
+        if int(parameter) not in _UNITS:
+            raise _Refusal(1, number)
+        axis.unit = int(parameter)  # as with the real one, the stage stays where it is and its numbers change
+        return None
+
+    def _vu(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return axis.show(axis.max_velocity_mm_s)
+        value = axis.take(parameter)
+        if not value > 0:
+            raise _Refusal(1, number)
+        axis.max_velocity_mm_s = value
+        return None
+
+    def _au(self, number: int, axis: _Axis, parameter: str) -> str | None:
+        if parameter == "?":
+            return axis.show(axis.max_acceleration_mm_s2)
+        value = axis.take(parameter)
+        if not value > 0:
+            raise _Refusal(1, number)
+        axis.max_acceleration_mm_s2 = value
         return None

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from core.errors import StageError
 from sim.controllers.esp301 import SimESP301
-from sim.controllers.smc100 import SimSMC100
+from sim.controllers.smc100 import Model, SimSMC100
 
 
 def make_controller(
@@ -24,9 +24,9 @@ def make_controller(
     Parameters
     ----------
     driver
-        ``esp301`` or ``smc100``; a wrong one raises `StageError` with code ``unknown_driver``.
+        ``esp301``, ``smc100`` or ``conex-cc``; a wrong one raises `StageError` with code ``unknown_driver``.
     axes
-        Axis numbers; addresses for the SMC100.
+        Axis numbers; addresses for the SMC100 and the CONEX-CC.
     travel_mm, velocity_mm_s, acceleration_mm_s2, time_scale, start_mm
         As in `SimESP301`; velocities up to four times ``velocity_mm_s`` can be set.
     """
@@ -39,8 +39,10 @@ def make_controller(
             time_scale=time_scale,
             start_mm=start_mm,
         )
-    if driver == "smc100":
+    models: dict[str, Model] = {"smc100": "SMC100CC", "conex-cc": "CONEX-CC"}
+    if driver in models:
         return SimSMC100(
+            model=models[driver],
             addresses=tuple(axes),
             travel_mm=travel_mm,
             velocity_mm_s=velocity_mm_s,
@@ -49,7 +51,7 @@ def make_controller(
             start_mm=start_mm,
         )
     raise StageError(
-        f"There is no simulated controller for the driver {driver!r}, only for esp301 and smc100.",
+        f"There is no simulated controller for the driver {driver!r}, only for esp301, smc100 and conex-cc.",
         code="unknown_driver",
         remedy="Correct [stage] driver in the rig file.",
     )

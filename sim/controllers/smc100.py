@@ -1,19 +1,21 @@
-"""A simulated chain of SMC100CC controllers: one axis an address, its states, its error letters and fault bits.
+"""A simulated chain of SMC100CC, SMC100PP or CONEX-CC controllers: one axis an address, states, letters, fault bits.
 
 State numbers, letters and texts are the manual's. Only the first command on a line is carried out, as with the real
-one.
+one. In CONFIGURATION state limits and the largest velocity and acceleration are those of the flash memory, which
+leaving that state writes; elsewhere velocity, acceleration and limits are working values.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from sim.controllers.axis import SimAxis, SimClock, Trouble
 from sim.controllers.wire import WireController
 
-_COMMAND = re.compile(r"(\d*)([A-Z]{2})(\?|[A-Z@]$|[-+.\dEe]*)")
+_COMMAND = re.compile(r"(\d*)(FRM|FRS|QIL|[A-Z]{2})(\?|[A-Z@]$|[-+.\dEe]*)")
 
 _TEXTS = {
     "@": "No error.",
@@ -22,6 +24,7 @@ _TEXTS = {
     "C": "Parameter missing or out of range.",
     "D": "Command not allowed.",
     "E": "Home sequence already started.",
+    "F": "ESP stage name unknown.",
     "G": "Displacement out of limits.",
     "H": "Command not allowed in NOT REFERENCED state.",
     "I": "Command not allowed in CONFIGURATION state.",
@@ -29,6 +32,12 @@ _TEXTS = {
     "K": "Command not allowed in READY state.",
     "L": "Command not allowed in HOMING state.",
     "M": "Command not allowed in MOVING state.",
+    "N": "Current position out of software limit.",
+    "S": "Communication Time Out.",
+    "U": "Error during EEPROM access.",
+    "V": "Error during command execution.",
+    "W": "Command not allowed for PP version.",
+    "X": "Command not allowed for CC version.",
 }
 _BITS: dict[Trouble, int] = {"negative_limit": 0x0001, "positive_limit": 0x0002, "following_error": 0x0020}
 
@@ -38,6 +47,26 @@ _HOMING = 0x1E
 _MOVING = 0x28
 _READY = (0x32, 0x33, 0x34)
 _DISABLE = (0x3C, 0x3D)
+
+Model = Literal["SMC100CC", "SMC100PP", "CONEX-CC"]
+_VERSIONS: dict[Model, str] = {"SMC100CC": "1.2.0", "SMC100PP": "1.2.0", "CONEX-CC": "2.0.1"}
+# configuration that this one only keeps: word -> (default, lowest, highest), as in the SMC100PP's manual
+_KEPT = {
+    "BA": (0.0, 0.0, 1e12),
+    "BH": (0.0, 0.0, 1e12),
+    "FRM": (100.0, 1.0, 2000.0),
+    "FRS": (0.02, 1e-6, 1e12),
+    "HT": (2.0, 0.0, 4.0),
+    "JR": (0.04, 1e-3, 1e12),
+    "OH": (4.0, 1e-6, 1e12),
+    "OT": (27.5, 1.0, 1e3),
+    "QIL": (0.4, 0.05, 3.0),
+    "SA": (2.0, 2.0, 31.0),
+    "VB": (0.0, 0.0, 1e12),
+    "ZX": (3.0, 1.0, 3.0),
+}
+_STEPPERS_ONLY = ("FRM", "FRS", "VB")
+_COMPENSATIONS = {"BA": "BH", "BH": "BA"}
 
 
 class _Refusal(Exception):
@@ -50,6 +79,11 @@ class _Unit:
     low_mm: float
     high_mm: float
     max_velocity_mm_s: float
+    max_acceleration_mm_s2: float
+    stored_low_mm: float
+    stored_high_mm: float
+    kept: dict[str, float] = field(default_factory=lambda: {word: value for word, (value, _, _) in _KEPT.items()})
+    flash_writes: int = 0
     state: int = 0x0A
     errors: int = 0
     letter: str = "@"
@@ -77,6 +111,8 @@ class SimSMC100(WireController):
         How many times faster than real the axes run; the speeds that they report stay those of the stage.
     start_mm
         Where the axes stand at power-on, from home.
+    model
+        What each controller says it is.
     """
 
     terminator = b"\r\n"
@@ -90,8 +126,10 @@ class SimSMC100(WireController):
         acceleration_mm_s2: float = 40.0,
         time_scale: float = 1.0,
         start_mm: float = 0.0,
+        model: Model = "SMC100CC",
     ) -> None:
         super().__init__()
+        self.model: Model = model
         if not addresses or not all(1 <= address <= 31 for address in addresses):
             raise ValueError(f"addresses lie between 1 and 31, got {addresses}")
         self.clock = SimClock(time_scale)
@@ -106,6 +144,9 @@ class SimSMC100(WireController):
                 travel_mm[0],
                 travel_mm[1],
                 max_velocity_mm_s=4 * velocity_mm_s,
+                max_acceleration_mm_s2=10 * acceleration_mm_s2,
+                stored_low_mm=travel_mm[0],
+                stored_high_mm=travel_mm[1],
             )
             for address in addresses
         }
@@ -128,12 +169,16 @@ class SimSMC100(WireController):
             "PW": self._pw,
             "RS": self._rs,
             "ID": lambda _u, _p: "SIM-TRA25CC",
-            "VE": lambda _u, _p: " SMC100CC 1.2.0",
+            "VE": lambda _u, _p: f" {self.model} {_VERSIONS[self.model]}",
         }
 
     def axis(self, number: int) -> SimAxis:
         """Give access to an axis and its faults."""
         return self._units[number].motor
+
+    def flash_writes(self, number: int) -> int:
+        """Count how often a controller has written its flash memory, which bears about a hundred times."""
+        return self._units[number].flash_writes
 
     def cut_power(self) -> bytes:
         """Lose the motor supply and get it back: all references are gone, and the chain sends a NUL byte."""
@@ -160,11 +205,15 @@ class SimSMC100(WireController):
         if unit_or_none is None:
             return b""
         unit = unit_or_none
-        if word not in self._words:
-            unit.letter = "A"
-            return b""
+        if word == "ZT":
+            return self._configuration(int(number), unit)
         try:
-            reply = self._words[word](unit, parameter)
+            if word in _KEPT:
+                reply = self._keep(unit, word, parameter)
+            elif word in self._words:
+                reply = self._words[word](unit, parameter)
+            else:
+                raise _Refusal("A")
         except _Refusal as refusal:
             unit.letter = str(refusal)
             return b""
@@ -246,11 +295,45 @@ class SimSMC100(WireController):
             unit.state = 0x0B
         return None
 
+    def _configuration(self, address: int, unit: _Unit) -> bytes:
+        """List the whole configuration, as it would have to be sent to another controller."""
+        values = {
+            "AC": unit.max_acceleration_mm_s2,
+            "SL": unit.stored_low_mm,
+            "SR": unit.stored_high_mm,
+            "VA": unit.max_velocity_mm_s,
+            **{word: value for word, value in unit.kept.items() if self._knows(word)},
+        }
+        lines = ["PW1", "IDSIM-TRA25CC", *(f"{word}{values[word]:g}" for word in sorted(values)), "PW0"]
+        return "".join(f"{address}{line}\r\n" for line in lines).encode("ascii")
+
+    def _knows(self, word: str) -> bool:
+        return self.model == "SMC100PP" or word not in _STEPPERS_ONLY
+
+    def _keep(self, unit: _Unit, word: str, parameter: str) -> str | None:
+        if not self._knows(word):
+            raise _Refusal("X")
+        if parameter == "?":
+            return f"{unit.kept[word]:g}"
+        if unit.state != _CONFIGURATION:
+            raise _Refusal(unit.group())
+        value, (_, low, high) = float(parameter), _KEPT[word]
+        other = _COMPENSATIONS.get(word)
+        # zero is no value that a compensation can be set to: the other one switches it off
+        if not low <= value <= high or (other is not None and value == 0):
+            raise _Refusal("C")
+        unit.kept[word] = value
+        if other is not None:
+            unit.kept[other] = 0.0
+        return None
+
     def _va(self, unit: _Unit, parameter: str) -> str | None:
         if parameter == "?":
             return f"{unit.motor.velocity_mm_s:.4f}"
         self._check_settable(unit)
         value = float(parameter)
+        if unit.state == _CONFIGURATION and 1e-6 < value < 1e12:
+            unit.max_velocity_mm_s = value
         if not 0 < value <= unit.max_velocity_mm_s:
             raise _Refusal("C")
         unit.motor.velocity_mm_s = value
@@ -261,7 +344,9 @@ class SimSMC100(WireController):
             return f"{unit.motor.acceleration_mm_s2:.4f}"
         self._check_settable(unit)
         value = float(parameter)
-        if not value > 0:
+        if unit.state == _CONFIGURATION and 1e-6 < value < 1e12:
+            unit.max_acceleration_mm_s2 = value
+        if not 0 < value <= unit.max_acceleration_mm_s2:
             raise _Refusal("C")
         unit.motor.acceleration_mm_s2 = value
         return None
@@ -270,14 +355,24 @@ class SimSMC100(WireController):
         if parameter == "?":
             return f"{unit.low_mm:.4f}"
         self._check_settable(unit)
-        unit.low_mm = float(parameter)
+        value = float(parameter)
+        if not -1e12 < value <= 0:
+            raise _Refusal("C")
+        unit.low_mm = value
+        if unit.state == _CONFIGURATION:
+            unit.stored_low_mm = value
         return None
 
     def _sr(self, unit: _Unit, parameter: str) -> str | None:
         if parameter == "?":
             return f"{unit.high_mm:.4f}"
         self._check_settable(unit)
-        unit.high_mm = float(parameter)
+        value = float(parameter)
+        if not 0 <= value < 1e12:
+            raise _Refusal("C")
+        unit.high_mm = value
+        if unit.state == _CONFIGURATION:
+            unit.stored_high_mm = value
         return None
 
     def _pw(self, unit: _Unit, parameter: str) -> str | None:
@@ -287,6 +382,7 @@ class SimSMC100(WireController):
             unit.state = _CONFIGURATION
         elif parameter == "0" and unit.state == _CONFIGURATION:
             unit.state = 0x0C
+            unit.flash_writes += 1
         else:
             raise _Refusal(unit.group())
         return None
@@ -294,6 +390,7 @@ class SimSMC100(WireController):
     def _rs(self, unit: _Unit, _parameter: str) -> str | None:
         unit.motor.cut()
         unit.state, unit.errors, unit.letter = 0x0A, 0, "@"
+        unit.low_mm, unit.high_mm = unit.stored_low_mm, unit.stored_high_mm
         return None
 
     @staticmethod

@@ -57,6 +57,9 @@ class LineFaults:
         return stray + reply
 
 
+_MOST_RECEIVED = 200_000
+
+
 @dataclass(frozen=True)
 class Received:
     """One command line as it came in, and when by the host's monotonic clock."""
@@ -81,6 +84,8 @@ class WireController(ABC):
             return b""
         text = line.decode("ascii", errors="replace").strip("\r\n")
         with self._lock:
+            if len(self.received) >= _MOST_RECEIVED:  # one that stands in a service is asked for weeks
+                del self.received[: _MOST_RECEIVED // 2]
             self.received.append(Received(time.monotonic(), text))
             reply = self.line_faults.apply(self._execute(text))
         if reply and self.line_faults.delay_s > 0:
