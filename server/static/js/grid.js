@@ -1,0 +1,293 @@
+// The grid of points: values between them, never over a missing point or a cut. The rule is that of the gauges:
+// four corners bilinearly; three where the fourth is missing or lies beyond a cut and the place lies in their triangle.
+
+const NEAR = 1e-6;
+
+/** Whether the straight lines a-b and c-d meet. */
+function meet(ax, ay, bx, by, cx, cy, dx, dy) {
+  const side = (px, py, qx, qy, rx, ry) => (qx - px) * (ry - py) - (qy - py) * (rx - px);
+  const s1 = side(ax, ay, bx, by, cx, cy);
+  const s2 = side(ax, ay, bx, by, dx, dy);
+  const s3 = side(cx, cy, dx, dy, ax, ay);
+  const s4 = side(cx, cy, dx, dy, bx, by);
+  if (s1 === 0 && s2 === 0 && s3 === 0 && s4 === 0) {
+    const over = (a, b, c, d) => Math.max(Math.min(a, b), Math.min(c, d)) <= Math.min(Math.max(a, b), Math.max(c, d));
+    return over(ax, bx, cx, dx) && over(ay, by, cy, dy);
+  }
+  return s1 * s2 <= 0 && s3 * s4 <= 0;
+}
+
+export class Grid {
+  /**
+   * @param {object} of
+   * @param {number} of.rows
+   * @param {number} of.cols
+   * @param {Float64Array} of.x columns of the points in camera 1's reference image, row by row
+   * @param {Float64Array} of.y their rows
+   * @param {Int8Array} of.status
+   * @param {number[][]} [of.cuts] pieces [x0, y0, x1, y1] of the cuts
+   */
+  constructor({ rows, cols, x, y, status, cuts = [] }) {
+    Object.assign(this, { rows, cols, x, y, status, cuts });
+    this.x0 = x[0];
+    this.y0 = y[0];
+    this.dx = cols > 1 ? x[1] - x[0] : rows > 1 ? y[cols] - y[0] : 1;
+    this.dy = rows > 1 ? y[cols] - y[0] : this.dx;
+    this.valid = new Uint8Array(status.length);
+    for (let i = 0; i < status.length; i += 1) this.valid[i] = status[i] === 0 || status[i] === 10 ? 1 : 0; // ok, extrapolated
+    this.cutCells = this.#cutCells();
+  }
+
+  /** Cell number -> the pieces of cuts that touch it. */
+  #cutCells() {
+    const cells = new Map();
+    for (const piece of this.cuts) {
+      const [x0, y0, x1, y1] = piece;
+      const column = (x) => Math.floor((x - this.x0) / this.dx);
+      const row = (y) => Math.floor((y - this.y0) / this.dy);
+      for (let r = Math.max(row(Math.min(y0, y1) - NEAR), 0); r <= Math.min(row(Math.max(y0, y1) + NEAR), this.rows - 2); r += 1) {
+        for (let c = Math.max(column(Math.min(x0, x1) - NEAR), 0); c <= Math.min(column(Math.max(x0, x1) + NEAR), this.cols - 2); c += 1) {
+          const cell = r * this.cols + c;
+          if (!cells.has(cell)) cells.set(cell, []);
+          cells.get(cell).push(piece);
+        }
+      }
+    }
+    return cells;
+  }
+
+  /** Nearest point of the grid to a place in the reference image. */
+  nearest(x, y) {
+    const c = Math.min(Math.max(Math.round((x - this.x0) / this.dx), 0), this.cols - 1);
+    const r = Math.min(Math.max(Math.round((y - this.y0) / this.dy), 0), this.rows - 1);
+    return r * this.cols + c;
+  }
+
+  /** Nearest point where the points lie at `places`; -1 where none has a place. */
+  nearestOf(places, x, y) {
+    let best = -1;
+    let least = Infinity;
+    for (let i = 0; i < this.x.length; i += 1) {
+      const d = (places[2 * i] - x) ** 2 + (places[2 * i + 1] - y) ** 2;
+      if (d < least) { least = d; best = i; }
+    }
+    return best;
+  }
+
+  corners(cell) {
+    return [cell, cell + 1, cell + this.cols, cell + this.cols + 1];
+  }
+
+  /** Which of a cell's corners (bits) have a value. */
+  good(values, cell) {
+    const below = cell + this.cols;
+    let bits = 0;
+    if (this.valid[cell] && Number.isFinite(values[cell])) bits |= 1;
+    if (this.valid[cell + 1] && Number.isFinite(values[cell + 1])) bits |= 2;
+    if (this.valid[below] && Number.isFinite(values[below])) bits |= 4;
+    if (this.valid[below + 1] && Number.isFinite(values[below + 1])) bits |= 8;
+    return bits;
+  }
+
+  /** Value in a cell at shares s, t of its width and height; NaN where it has none. */
+  inside(values, cell, s, t, bits = this.good(values, cell)) {
+    const pieces = this.cutCells.get(cell);
+    const corners = this.corners(cell);
+    const weight = [(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t];
+    let needed = 0;
+    for (let k = 0; k < 4; k += 1) if (weight[k] > 0) needed |= 1 << k;
+    let bad = needed & ~bits;
+    if (pieces) {
+      const px = this.x[cell] + s * this.dx;
+      const py = this.y[cell] + t * this.dy;
+      for (let k = 0; k < 4; k += 1) {
+        if (needed & (1 << k) && pieces.some((p) => meet(px, py, this.x[corners[k]], this.y[corners[k]], ...p))) bad |= 1 << k;
+      }
+    }
+    if (!bad) {
+      let sum = 0;
+      for (let k = 0; k < 4; k += 1) if (weight[k] > 0) sum += weight[k] * values[corners[k]];
+      return sum;
+    }
+    if (needed !== 15 || bad & (bad - 1)) return NaN;
+    const o = 3 - Math.log2(bad);
+    const a = o & 1 ? 1 - s : s;
+    const b = o & 2 ? 1 - t : t;
+    if (a + b > 1 + NEAR) return NaN;
+    return (1 - a - b) * values[corners[o]] + a * values[corners[o ^ 1]] + b * values[corners[o ^ 2]];
+  }
+
+  /** Value at a place of the reference image; NaN where it has none. */
+  at(values, x, y) {
+    const fx = (x - this.x0) / this.dx;
+    const fy = (y - this.y0) / this.dy;
+    if (!(fx >= -NEAR && fy >= -NEAR && fx <= this.cols - 1 + NEAR && fy <= this.rows - 1 + NEAR)) return NaN;
+    if (this.cols < 2 || this.rows < 2) return this.valid[this.nearest(x, y)] ? values[this.nearest(x, y)] : NaN;
+    const c = Math.min(Math.max(Math.floor(fx), 0), this.cols - 2);
+    const r = Math.min(Math.max(Math.floor(fy), 0), this.rows - 2);
+    return this.inside(values, r * this.cols + c, Math.min(Math.max(fx - c, 0), 1), Math.min(Math.max(fy - r, 0), 1));
+  }
+
+  /**
+   * Values over the pixels of an image.
+   * @param {ArrayLike<number>} values of the points
+   * @param {number} width of the image, px
+   * @param {number} height of the image, px
+   * @param {?Float64Array} places where the points lie in it (x, y, x, y ...); null: the reference image
+   * @param {boolean} steps each pixel takes its nearest point's value, failed or not (for a status)
+   * @returns {{x: number, y: number, width: number, height: number, values: Float32Array}} a part of the image
+   */
+  raster(values, width, height, places = null, steps = false) {
+    let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
+    for (let i = 0; i < this.x.length; i += 1) {
+      const x = places ? places[2 * i] : this.x[i];
+      const y = places ? places[2 * i + 1] : this.y[i];
+      if (x < left) left = x;
+      if (x > right) right = x;
+      if (y < top) top = y;
+      if (y > bottom) bottom = y;
+    }
+    const margin = steps ? Math.ceil(Math.max(Math.abs(this.dx), Math.abs(this.dy)) / 2) : 1;
+    left = Math.max(Math.floor(left) - margin, 0);
+    top = Math.max(Math.floor(top) - margin, 0);
+    right = Math.min(Math.ceil(right) + margin, width - 1);
+    bottom = Math.min(Math.ceil(bottom) + margin, height - 1);
+    if (!(right >= left && bottom >= top)) return { x: 0, y: 0, width: 0, height: 0, values: new Float32Array(0) };
+    const out = { x: left, y: top, width: right - left + 1, height: bottom - top + 1, values: null };
+    out.values = new Float32Array(out.width * out.height).fill(NaN);
+    if (steps && !places) this.#nearestEach(values, out);
+    else this.#cells(values, out, places);
+    return out;
+  }
+
+  #nearestEach(values, out) {
+    const half = [Math.abs(this.dx) / 2, Math.abs(this.dy) / 2];
+    for (let y = 0; y < out.height; y += 1) {
+      const fy = out.y + y;
+      if (fy < this.y0 - half[1] || fy > this.y0 + (this.rows - 1) * this.dy + half[1]) continue;
+      for (let x = 0; x < out.width; x += 1) {
+        const fx = out.x + x;
+        if (fx < this.x0 - half[0] || fx > this.x0 + (this.cols - 1) * this.dx + half[0]) continue;
+        out.values[y * out.width + x] = values[this.nearest(fx, fy)];
+      }
+    }
+  }
+
+  #cells(values, out, places) {
+    const used = new Uint8Array(this.x.length);
+    for (let r = 0; r < this.rows - 1; r += 1) {
+      for (let c = 0; c < this.cols - 1; c += 1) {
+        const cell = r * this.cols + c;
+        const bits = this.good(values, cell);
+        if (bits === 0) continue;
+        const lone = bits !== 15 && ![14, 13, 11, 7].includes(bits);
+        if (lone) continue;
+        for (const corner of this.corners(cell)) used[corner] = 1;
+        if (!places) this.#rectangle(values, out, cell, bits);
+        else if (bits === 15) {
+          this.#triangle(values, out, places, cell, 0, bits);
+          this.#triangle(values, out, places, cell, 3, bits);
+        } else this.#triangle(values, out, places, cell, 3 - Math.log2(15 & ~bits), bits);
+      }
+    }
+    // a point without neighbours shows itself alone
+    for (let i = 0; i < used.length; i += 1) {
+      if (used[i] || !this.valid[i] || !Number.isFinite(values[i])) continue;
+      const x = Math.round(places ? places[2 * i] : this.x[i]) - out.x;
+      const y = Math.round(places ? places[2 * i + 1] : this.y[i]) - out.y;
+      for (let v = Math.max(y - 1, 0); v <= Math.min(y + 1, out.height - 1); v += 1) {
+        for (let u = Math.max(x - 1, 0); u <= Math.min(x + 1, out.width - 1); u += 1) out.values[v * out.width + u] = values[i];
+      }
+    }
+  }
+
+  #rectangle(values, out, cell, bits) {
+    const x0 = this.x[cell];
+    const y0 = this.y[cell];
+    const from = [Math.max(Math.ceil(x0 - NEAR), out.x), Math.max(Math.ceil(y0 - NEAR), out.y)];
+    const to = [Math.min(Math.floor(x0 + this.dx + NEAR), out.x + out.width - 1), Math.min(Math.floor(y0 + this.dy + NEAR), out.y + out.height - 1)];
+    if (bits === 15 && !this.cutCells.has(cell)) {
+      const [v0, v1, v2, v3] = this.corners(cell).map((i) => values[i]);
+      for (let y = from[1]; y <= to[1]; y += 1) {
+        const t = (y - y0) / this.dy;
+        const left = v0 + (v2 - v0) * t;
+        const slope = (v1 + (v3 - v1) * t - left) / this.dx;
+        let at = (y - out.y) * out.width + from[0] - out.x;
+        for (let x = from[0]; x <= to[0]; x += 1, at += 1) out.values[at] = left + slope * (x - x0);
+      }
+      return;
+    }
+    for (let y = from[1]; y <= to[1]; y += 1) {
+      for (let x = from[0]; x <= to[0]; x += 1) {
+        const value = this.inside(values, cell, Math.min(Math.max((x - x0) / this.dx, 0), 1), Math.min(Math.max((y - y0) / this.dy, 0), 1), bits);
+        if (!Number.isNaN(value)) out.values[(y - out.y) * out.width + x - out.x] = value;
+      }
+    }
+  }
+
+  /** The half of a cell at its corner `o`, where its corners lie at `places`. */
+  #triangle(values, out, places, cell, o, bits) {
+    const corner = (k) => cell + (k & 1) + (k & 2 ? this.cols : 0);
+    const [io, ia, ib, id] = [corner(o), corner(o ^ 1), corner(o ^ 2), corner(o ^ 3)];
+    const px = places[2 * io];
+    const py = places[2 * io + 1];
+    const ax = places[2 * ia];
+    const ay = places[2 * ia + 1];
+    const bx = places[2 * ib];
+    const by = places[2 * ib + 1];
+    const ux = ax - px;
+    const uy = ay - py;
+    const vx = bx - px;
+    const vy = by - py;
+    const area = ux * vy - uy * vx;
+    if (!Number.isFinite(area) || Math.abs(area) < 1e-9) return;
+    const from = [Math.max(Math.ceil(Math.min(px, ax, bx) - NEAR), out.x), Math.max(Math.ceil(Math.min(py, ay, by) - NEAR), out.y)];
+    const to = [Math.min(Math.floor(Math.max(px, ax, bx) + NEAR), out.x + out.width - 1), Math.min(Math.floor(Math.max(py, ay, by) + NEAR), out.y + out.height - 1)];
+    const plain = !this.cutCells.has(cell);
+    const vo = values[io];
+    const va = values[ia];
+    const vb = values[ib];
+    const twist = bits === 15 ? vo - va - vb + values[id] : 0;
+    const da = vy / area;
+    const db = -uy / area;
+    for (let y = from[1]; y <= to[1]; y += 1) {
+      let a = ((from[0] - px) * vy - (y - py) * vx) / area - da;
+      let b = (ux * (y - py) - uy * (from[0] - px)) / area - db;
+      for (let x = from[0]; x <= to[0]; x += 1) {
+        a += da;
+        b += db;
+        if (a < -NEAR || b < -NEAR || a + b > 1 + NEAR) continue;
+        if (plain) {
+          out.values[(y - out.y) * out.width + x - out.x] = vo + a * (va - vo) + b * (vb - vo) + a * b * twist;
+          continue;
+        }
+        const clip = (share) => Math.min(Math.max(share, 0), 1);
+        const value = this.inside(values, cell, clip(o & 1 ? 1 - a : a), clip(o & 2 ? 1 - b : b), bits);
+        if (!Number.isNaN(value)) out.values[(y - out.y) * out.width + x - out.x] = value;
+      }
+    }
+  }
+
+  /** Whether another grid has the same points. */
+  same(other) {
+    return this.rows === other.rows && this.cols === other.cols && ["x0", "y0", "dx", "dy"].every((name) => Math.abs(this[name] - other[name]) < 1e-3);
+  }
+}
+
+/** Least, largest, mean, sd and number of the values of measured points, and how many there could be. */
+export function statistics(grid, values) {
+  let [count, sum, squares, min, max, within] = [0, 0, 0, Infinity, -Infinity, 0];
+  for (let i = 0; i < values.length; i += 1) {
+    if (grid.status[i] !== 2) within += 1;
+    const v = values[i];
+    if (!grid.valid[i] || !Number.isFinite(v)) continue;
+    count += 1;
+    sum += v;
+    squares += v * v;
+    if (v < min) min = v;
+    if (v > max) max = v;
+  }
+  if (!count) return { count, within, min: null, max: null, mean: null, sd: null, rms: null };
+  const mean = sum / count;
+  return { count, within, min, max, mean, sd: Math.sqrt(Math.max(squares / count - mean * mean, 0)), rms: Math.sqrt(squares / count) };
+}
