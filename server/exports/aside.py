@@ -1,0 +1,110 @@
+"""Exports beside the service: a process of their own, begun with the first and ended when none was asked for lately.
+
+Drawing and compressing hold Python's interpreter for tenths of a second; in the service's process they would delay its
+answers, in the measuring worker an analysis.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from server.errors import QueueFullError
+from server.exports.request import ExportRequest
+from server.worker import ComputeWorker, TaskFuture
+
+FOLDER = ".exports"
+_MOST_WAITING = 4
+_REST_AFTER_S = 60.0
+
+
+def export_task(folder: str, files: list[str], request: ExportRequest, out: str) -> str:
+    """Export an analysis' result files as one file; return its path. Runs in the process aside."""
+    # matplotlib and SciPy are loaded here alone
+    from server.exports.run import export_packed
+    from server.exports.source import source_of
+
+    made = export_packed(source_of(Path(folder), [Path(f) for f in files]), request, Path(out))
+    return str(made)
+
+
+class ExportProcess:
+    """Runs exports one after the other, in a process that lives while it is wanted.
+
+    Parameters
+    ----------
+    data
+        The data folder: what is being made lies under it, on the disk whose room is watched.
+    """
+
+    def __init__(self, data: Path) -> None:
+        self._folder = data / FOLDER
+        shutil.rmtree(self._folder, ignore_errors=True)  # what a kill left
+        self._lock = threading.Lock()
+        self._worker: ComputeWorker | None = None
+        self._waiting = 0
+        self._rest: threading.Timer | None = None
+        self._closed = False
+
+    def new_folder(self) -> Path:
+        """Make a folder for one export; who asked removes it."""
+        self._folder.mkdir(exist_ok=True)
+        return Path(tempfile.mkdtemp(dir=self._folder))
+
+    def submit(self, folder: Path, files: list[Path], request: ExportRequest, out: Path) -> TaskFuture:
+        """Begin an export, see :func:`export_task`; raises as :meth:`run`."""
+        return self.run(export_task, str(folder), [str(f) for f in files], request, str(out))
+
+    def run(self, task: Callable[..., Any], *args: Any) -> TaskFuture:
+        """Begin a task in the process aside; everything must pickle.
+
+        Raises
+        ------
+        QueueFullError
+            ``exports_waiting`` if four are on their way.
+        """
+        with self._lock:
+            if self._closed or self._waiting >= _MOST_WAITING:
+                raise QueueFullError(f"{self._waiting} exports are being made.", code="exports_waiting")
+            if self._rest is not None:
+                self._rest.cancel()
+                self._rest = None
+            if self._worker is None:
+                self._worker = ComputeWorker(threads=1)
+            future = self._worker.submit(task, *args)
+            self._waiting += 1
+        future.add_done_callback(self._done)
+        return future
+
+    def _done(self, _future: Future[Any]) -> None:
+        with self._lock:
+            self._waiting -= 1
+            if self._waiting == 0 and not self._closed:
+                self._rest = threading.Timer(_REST_AFTER_S, self._end)
+                self._rest.daemon = True
+                self._rest.start()
+
+    def _end(self) -> None:
+        with self._lock:
+            if self._waiting:
+                return
+            worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.shutdown()
+
+    def close(self) -> None:
+        """End the process; exports on their way fail."""
+        with self._lock:
+            self._closed = True
+            worker, self._worker = self._worker, None
+            rest, self._rest = self._rest, None
+        if rest is not None:
+            rest.cancel()
+        if worker is not None:
+            worker.shutdown()
+        shutil.rmtree(self._folder, ignore_errors=True)

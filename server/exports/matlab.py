@@ -1,0 +1,76 @@
+"""Steps as a MATLAB file (version 5): a struct a step, double arrays, names that MATLAB takes."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from core.errors import InputError
+from server.exports.steps import Source, StepResult, provenance
+from server.io.files import written_aside
+
+_LONGEST = 63  # namelengthmax
+_KEYWORDS = frozenset({
+    "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function", "global", "if",
+    "otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while",
+})  # fmt: skip
+_MOST_BYTES = (1 << 31) - (1 << 20)  # of one variable in this version of the format
+
+
+def matlab_name(name: str) -> str:
+    """Return a name as MATLAB takes it for a variable or field: letters, digits, underscores, a letter first."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    if not name or not name[0].isalpha() or name in _KEYWORDS:
+        name = f"v_{name}"
+    return name[:_LONGEST]
+
+
+def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
+    """Write ``step_<nnnn>``, a struct for each step, and one ``about_<nnnn>`` that says what it holds.
+
+    A step's struct has ``n``, ``load_n`` (NaN where not known), ``label`` and each variable as a double array: rows
+    and columns of the grid, NaN where a point has no number. ``about_<nnnn>`` has ``units`` and ``meaning`` by
+    variable, and the provenance; settings are JSON text, for ``jsondecode``. Steps are written one after the other.
+
+    Raises
+    ------
+    InputError
+        ``export_too_large`` for a step beyond the 2 GB that this version of the format holds in one variable.
+    """
+    with written_aside(path) as aside, aside.open("wb") as out:
+        for step in steps:
+            size = sum(8 * v.values.size for v in step.variables.values())
+            if size > _MOST_BYTES:
+                raise InputError(f"Step {step.n} comes to {size >> 20} MiB; a MATLAB file of version 5 holds 2 GB.",
+                                 code="export_too_large", remedy="Choose variables, or the format h5.")  # fmt: skip
+            names = {name: matlab_name(name) for name in step.variables}
+            held: dict[str, Any] = {
+                "n": float(step.n), "load_n": np.nan if step.load_n is None else step.load_n, "label": step.label,
+            }  # fmt: skip
+            held |= {names[name]: v.values.astype(np.float64) for name, v in step.variables.items()}
+            about = {matlab_name(k): _plain(v) for k, v in provenance(step, source).items()}
+            about["units"] = {names[name]: v.units for name, v in step.variables.items()}
+            about["meaning"] = {names[name]: v.long_name for name, v in step.variables.items()}
+            about["states"] = {
+                names[name]: "; ".join(f"{k} = {text}" for k, text in v.flags.items())
+                for name, v in step.variables.items() if v.flags is not None
+            }  # fmt: skip
+            about["parts"] = {names[name]: " ".join(v.parts) for name, v in step.variables.items() if v.parts}
+            content = {f"step_{step.n:04d}": held, f"about_{step.n:04d}": about}
+            # on an open file, each call adds to what is there
+            save: Any = scipy.io.savemat  # its stubs know names of files alone
+            save(out, content, long_field_names=True, do_compression=True)
+
+
+def _plain(value: Any) -> Any:
+    if value is None:
+        return ""
+    if isinstance(value, bool | int | float):
+        return float(value)
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)

@@ -1,0 +1,69 @@
+"""What can be asked for as an export; apart from the making, which takes seconds to load."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from core.errors import InputError
+from server.io.look import Look
+
+ExportFormat = Literal["nc", "csv", "vtu", "mat", "h5", "png", "svg", "gif", "mp4"]
+FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
+MEDIA_TYPES: dict[ExportFormat, str] = {
+    "nc": "application/x-netcdf", "csv": "text/csv; charset=utf-8", "vtu": "application/zip",
+    "mat": "application/x-matlab-data", "h5": "application/x-hdf5", "png": "image/png", "svg": "image/svg+xml",
+    "gif": "image/gif", "mp4": "video/mp4",
+}  # fmt: skip
+_HIGHEST = 9999
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What to export.
+
+    Attributes
+    ----------
+    format
+        One of :data:`FORMATS`.
+    steps
+        Numbers; None: all that are finished.
+    variables
+        Names in the result files; None: all, of pictures and films the displacement ``w_mm`` or the shape ``z_mm``.
+    look
+        Of pictures and films.
+    over_image
+        Draw over camera 1's reference image.
+    fps
+        Steps a second in a film.
+    """
+
+    format: ExportFormat
+    steps: Sequence[int] | None = None
+    variables: Sequence[str] | None = None
+    look: Look = field(default_factory=Look)
+    over_image: bool = False
+    fps: float = 2.0
+
+
+def steps_in(text: str) -> list[int]:
+    """Return the step numbers in a text such as ``0,3-7``.
+
+    Raises
+    ------
+    InputError
+        ``step_invalid``.
+    """
+    numbers: set[int] = set()
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        try:
+            low, high = int(first), int(last or first)
+        except ValueError:
+            low, high = 0, -1
+        if not 0 <= low <= high <= _HIGHEST:
+            raise InputError(f"{part!r} is neither a step's number nor a range of them.", code="step_invalid",
+                             remedy="Give a number, or numbers and ranges such as 0,3-7.")  # fmt: skip
+        numbers.update(range(low, high + 1))
+    return sorted(numbers)

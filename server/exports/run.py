@@ -1,0 +1,150 @@
+"""An export from the wish to the files, one step in memory at a time."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+from core.errors import InputError
+from server.exports.matlab import write_mat
+from server.exports.pictures import check_fps, frames, image_of, picture_of, write_figure, write_gif, write_mp4
+from server.exports.request import ExportRequest
+from server.exports.stacked import write_stacked
+from server.exports.steps import (
+    Source,
+    chosen,
+    columns_of,
+    each,
+    number_of,
+    provenance,
+    read_step,
+    require_known,
+    variables_of,
+)
+from server.exports.table import write_table
+from server.exports.vtu import NEEDS, write_pvd, write_vtu
+from server.io.files import written_aside
+from server.io.images import read_mask
+
+_PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")
+
+
+def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
+    """Write an export's files into a folder, one after the other; yields each as it is finished.
+
+    Raises
+    ------
+    InputError
+        ``look_invalid``, ``steps_mixed``, ``export_too_large``, ``mask_unusable``.
+    NotFoundError
+        ``no_results``, ``step_missing``, ``field_missing``, ``image_missing``.
+    FileFormatError
+        A result file that cannot be read.
+    StorageError
+        ``storage_full``, ``storage_failed``.
+    """
+    files = chosen(source, request.steps)
+    if request.format in ("gif", "mp4"):
+        check_fps(request.fps)
+    if request.format == "nc":
+        yield from _as_stored(source, files, request, out)
+    elif request.format == "csv":
+        for step in each(source, request.steps, request.variables):
+            path = _path(out, source, step.n, "csv")
+            write_table(path, step, source)
+            yield path
+    elif request.format == "vtu":
+        yield from _as_vtu(source, files, request, out)
+    elif request.format == "mat":
+        path = out / f"{source.name}.mat"
+        write_mat(path, each(source, request.steps, request.variables), source)
+        yield path
+    elif request.format == "h5":
+        path = out / f"{source.name}.h5"
+        write_stacked(path, source, request.steps, request.variables)
+        yield path
+    else:
+        yield from _drawn(source, files, request, out)
+
+
+def export_packed(source: Source, request: ExportRequest, folder: Path) -> Path:
+    """Write an export into a folder as one file: its only one, or a ZIP of several; return its path."""
+    made = export(source, request, folder)
+    first = next(made)
+    second = next(made, None)
+    if second is None:
+        return first
+    packed = folder / f"{source.name}_{request.format}.zip"
+    with zipfile.ZipFile(packed, "w", compression=zipfile.ZIP_DEFLATED, compresslevel=4) as archive:
+        for path in itertools.chain((first, second), made):
+            how = zipfile.ZIP_STORED if path.suffix in _PACKED else None
+            archive.write(path, path.name, compress_type=how)
+            path.unlink()
+    return packed
+
+
+def _path(out: Path, source: Source, n: int, suffix: str) -> Path:
+    return out / f"{source.name}_step_{n:04d}.{suffix}"
+
+
+def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
+    if request.variables is not None:
+        raise InputError("NetCDF files are given as they are stored, with all variables.", code="option_conflict",
+                         remedy="Leave the variables out, or choose h5.")  # fmt: skip
+    for path in files:
+        copy = _path(out, source, number_of(path), "nc")
+        with written_aside(copy) as aside:
+            shutil.copyfile(path, aside)
+        yield copy
+
+
+def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
+    mask = None if source.mask is None else read_mask(source.mask)
+    there = {path: variables_of(path) for path in source.files}
+    moves = any("u_mm" in names for names in there.values())
+    require_known(files, request.variables)
+    written = []
+    for path in files:
+        names = request.variables
+        if names is not None:
+            names = [name for name in (*names, *NEEDS) if name in there[path]]
+        step = read_step(path, names)
+        target = _path(out, source, step.n, "vtu")
+        write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path])
+        written.append((step.n, target.name))
+        yield target
+    series = out / f"{source.name}.pvd"
+    write_pvd(series, written)
+    yield series
+
+
+def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
+    image = image_of(source, request.over_image)
+    names = request.variables
+    if names is None:
+        moves = any("w_mm" in variables_of(path) for path in files)
+        names = ["w_mm" if moves else "z_mm"]
+    for name in names:
+        of_file = "zncc" if name.startswith("zncc_") else name  # comparisons are parts of one variable
+        require_known(files, [of_file])
+        if request.format in ("gif", "mp4"):
+            path = out / f"{source.name}_{name}.{request.format}"
+            drawn = frames(source, request.steps, name, request.look, image)
+            if request.format == "gif":
+                first = read_step(files[0], [])
+                write_gif(path, drawn, request.fps, json.dumps(provenance(first, source), sort_keys=True))
+            else:
+                write_mp4(path, drawn, request.fps)
+            yield path
+            continue
+        for step in each(source, request.steps, [of_file]):
+            if name in columns_of(step) or step.n == number_of(files[-1]):
+                path = out / f"{source.name}_step_{step.n:04d}_{name}.{request.format}"
+                form: Literal["png", "svg"] = "svg" if request.format == "svg" else "png"
+                write_figure(path, picture_of(step, name, source, image), request.look, form)
+                yield path

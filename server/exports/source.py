@@ -1,0 +1,111 @@
+"""Where results lie: an analysis of a data folder, a test's folder, or what ``stereorig measure`` wrote."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from core.errors import InputError
+from server.exports.steps import Source
+from server.io.netcdf_reading import read_attributes
+from server.staleness import stale_results
+
+_RESULT = re.compile(r"step_\d{4,}\.nc")
+
+
+def results_in(folder: Path) -> list[Path]:
+    """Return a folder's result files, by step."""
+    return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))
+
+
+def find_source(folder: Path, analysis: str | None = None) -> Source:
+    """Return the results of a folder, with what lies beside them.
+
+    Parameters
+    ----------
+    folder
+        An analysis' folder, a test's, or one that ``stereorig measure --out`` wrote.
+    analysis
+        Id of one of a test's analyses.
+
+    Raises
+    ------
+    InputError
+        ``results_missing``; ``analysis_ambiguous`` where a test has several and none is named.
+    """
+    if (folder / "analyses").is_dir() or (folder / "steps").is_dir():
+        folder = _of_test(folder, analysis)
+    elif analysis is not None:
+        raise InputError(f"{folder} is not a test's folder; it has no analyses.", code="option_conflict",
+                         remedy="Leave the analysis out, or give the test's folder.")  # fmt: skip
+    files = results_in(folder)
+    if not files:
+        raise InputError(
+            f"There is no step_0000.nc or another step's result in {folder}.", code="results_missing",
+            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
+        )  # fmt: skip
+    return source_of(folder.absolute(), files)
+
+
+def source_of(folder: Path, files: list[Path]) -> Source:
+    """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
+    heads = [read_attributes(path) for path in files]
+    stale = stale_results(files, heads)
+    about: dict[str, Any] = {"stale_reasons": stale} if stale else {}
+    test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
+    document = _json(test / "test.json")
+    reference = int(heads[-1].get("reference_step", heads[0].get("step", 0)))
+    image = test / "steps" / f"{reference:04d}" / "cam1.tif"
+    if document or image.is_file():
+        about |= {
+            "test_id": document.get("id", test.name), "test": document.get("name", ""),
+            "calibration_id": document.get("calibration_id"), "specimen": document.get("specimen", ""),
+        }  # fmt: skip
+        if folder.parent.name == "analyses":
+            about["analysis_id"] = folder.name
+        name = f"{test.name}_{folder.name}" if folder.parent.name == "analyses" else test.name
+        return Source(files, name, str(document.get("name") or test.name), image, about, _mask(folder, heads[0]))
+    said = str(heads[0].get("cam1_file", ""))
+    calibration = _json(folder / "summary.json").get("calibration")
+    if isinstance(calibration, dict) and calibration.get("file"):
+        about["calibration_file"] = str(calibration["file"])
+    return Source(files, folder.name or "results", folder.name, Path(said) if said else None, about,
+                  _mask(folder, heads[0]))  # fmt: skip
+
+
+def _mask(folder: Path, head: dict[str, Any]) -> Path | None:
+    """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
+    named = head["settings"].get("mask") if isinstance(head.get("settings"), dict) else None
+    for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):
+        if path.is_file():
+            return path
+    return None
+
+
+def _of_test(test: Path, analysis: str | None) -> Path:
+    there = sorted(p for p in (test / "analyses").glob("*") if results_in(p)) if (test / "analyses").is_dir() else []
+    if analysis is not None:
+        found = [p for p in there if p.name == analysis]
+        if not found:
+            known = ", ".join(p.name for p in there) or "none with results"
+            raise InputError(f"{test} has no results of an analysis {analysis}; it has {known}.",
+                             code="results_missing", remedy="Name one of these.")  # fmt: skip
+        return found[0]
+    measured = test / "exports" / "measure"
+    if results_in(measured):
+        there.append(measured)
+    if len(there) > 1:
+        names = ", ".join(p.name for p in there)
+        raise InputError(f"{test} has several results: {names}.", code="analysis_ambiguous",
+                         remedy="Name one with --analysis, or give its folder.")  # fmt: skip
+    return there[0] if there else test
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

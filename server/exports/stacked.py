@@ -1,0 +1,104 @@
+"""All steps in one HDF5 file: each variable stacked over the steps, for MATLAB's h5read, h5py and xarray alike."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from server.exports.steps import Source, StepResult, chosen, each, provenance, require_same_grid
+from server.io.files import written_aside
+from server.results import library
+
+_NO_STATE = -1  # of an integer variable in a step that does not have it
+_COMMON = ("x_px", "y_px")
+
+
+def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names: Sequence[str] | None) -> None:
+    """Write one file of all steps, one step in memory at a time.
+
+    Datasets have the axes step, row, col (MATLAB, which counts from the other end, sees col, row, step); ``x_px`` and
+    ``y_px`` are the same in every step and have row, col. ``step``, ``load_n``, ``label`` and ``provenance`` (JSON
+    text) have one entry a step. A variable that a step lacks is NaN there, or -1 if it counts. Units and meanings are
+    attributes. The file is netCDF-4, which is HDF5.
+
+    Raises
+    ------
+    InputError
+        ``steps_mixed`` if the steps lie on different points.
+    """
+    count = len(chosen(source, steps))
+    first: StepResult | None = None
+    with written_aside(path) as aside:
+        with library:
+            data = netCDF4.Dataset(aside, "w", format="NETCDF4")
+        try:
+            for k, step in enumerate(each(source, steps, names)):
+                with library:
+                    if first is None:
+                        _begin(data, step, count)
+                        first = step
+                    require_same_grid(step, first)
+                    _put(data, k, step, source)
+        finally:
+            with library:
+                data.close()
+
+
+def _begin(data: Any, step: StepResult, count: int) -> None:
+    rows, cols = step.shape
+    for name, size in (("step", count), ("row", rows), ("col", cols)):
+        data.createDimension(name, size)
+    _describe(data.createVariable("step", "i4", ("step",)), "1", "number of the step")
+    _describe(data.createVariable("load_n", "f8", ("step",), fill_value=np.nan), "N", "load, where it is known")
+    for name, meaning in (("label", "what the user called the step"), ("provenance", "where it comes from, JSON")):
+        _describe(data.createVariable(name, str, ("step",)), "1", meaning)
+
+
+def _put(data: Any, k: int, step: StepResult, source: Source) -> None:
+    document = provenance(step, source)
+    if k == 0:
+        of_all = {n: v for n, v in document.items() if n not in ("step", "label", "load_n", "kind")}
+        data.setncatts({n: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for n, v in of_all.items()})
+    data.variables["step"][k] = step.n
+    data.variables["load_n"][k] = np.nan if step.load_n is None else step.load_n
+    data.variables["label"][k] = step.label
+    data.variables["provenance"][k] = json.dumps(document, ensure_ascii=False, sort_keys=True)
+    for name, variable in step.variables.items():
+        values = variable.values
+        if name not in data.variables:
+            _declare(data, name, variable, stacked=name not in _COMMON)
+        if name not in _COMMON:
+            held = data.variables[name]
+            part = (slice(None),) * 2 + tuple(slice(0, n) for n in values.shape[2:])
+            held[(k, *part)] = values  # a shape has fewer comparisons than a displacement
+        elif k == 0:
+            data.variables[name][...] = values
+
+
+def _declare(data: Any, name: str, variable: Any, *, stacked: bool) -> None:
+    shape = variable.values.shape
+    dims: list[str] = ["step", "row", "col"] if stacked else ["row", "col"]
+    for _ in shape[2:]:
+        # unlimited, as a shape has three components and one comparison where a displacement has more
+        dims.append(f"{name}_part_{len(dims) - 2}")
+        data.createDimension(dims[-1], None)
+    fill = np.nan if variable.values.dtype.kind == "f" else _NO_STATE
+    chunks = [*([1] if stacked else []), *shape[:2], *shape[2:]]
+    made = data.createVariable(name, variable.values.dtype.str[1:], tuple(dims), fill_value=fill, chunksizes=chunks,
+                               compression="zlib", complevel=1, shuffle=True)  # fmt: skip
+    made.set_auto_mask(False)
+    _describe(made, variable.units, variable.long_name)
+    if variable.flags is not None:
+        made.flag_values = np.array(list(variable.flags), dtype=variable.values.dtype)
+        made.flag_meanings = " ".join(variable.flags.values())
+    if variable.parts:
+        made.parts = " ".join(variable.parts)
+
+
+def _describe(variable: Any, units: str, meaning: str) -> None:
+    variable.setncatts({"units": units, "long_name": meaning})

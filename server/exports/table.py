@@ -1,0 +1,66 @@
+"""A step as a CSV table: one line a point, what it says of itself in comment lines above the header."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.exports.steps import Source, StepResult, columns_of, provenance
+from server.io.files import written_aside
+
+_LINES_AT_ONCE = 2000
+
+
+def write_table(path: Path, step: StepResult, source: Source) -> None:
+    """Write one step as CSV.
+
+    Lines that begin with ``#`` say name by name where the numbers come from and each column's unit and meaning. The
+    header follows, then one line a grid point: ``row, col``, then the variables. A number that is not there is empty;
+    a variable of states is written as its number, with the name in the next column.
+    """
+    columns = columns_of(step)
+    with written_aside(path) as aside, aside.open("w", encoding="utf-8", newline="") as out:
+        for name, value in provenance(step, source).items():
+            out.write(f"# {name}: {_one_line(value)}\n")
+        out.write("# column row, unit 1: row of the grid of points\n# column col, unit 1: column of the grid\n")
+        header = ["row", "col"]
+        for name, variable in columns.items():
+            out.write(f"# column {name}, unit {variable.units}: {_one_line(variable.long_name)}\n")
+            header.append(name)
+            if variable.flags is not None:
+                header.append(f"{name}_name")
+        out.write(",".join(header) + "\n")
+        rows, cols = step.shape
+        texts: list[tuple[Callable[[Any], str], NDArray[Any]]] = [
+            (str, np.repeat(np.arange(rows), cols)), (str, np.tile(np.arange(cols), rows)),
+        ]  # fmt: skip
+        for variable in columns.values():
+            flat = variable.values.ravel()
+            texts.append((_text_of(flat), flat))
+            if variable.flags is not None:
+                texts.append((_name_of(variable.flags), flat))
+        for first in range(0, rows * cols, _LINES_AT_ONCE):
+            block = [[text(v) for v in flat[first : first + _LINES_AT_ONCE].tolist()] for text, flat in texts]
+            out.writelines(",".join(line) + "\n" for line in zip(*block, strict=True))
+
+
+def _text_of(values: NDArray[Any]) -> Callable[[Any], str]:
+    if values.dtype.kind != "f":
+        return str
+    if values.dtype.itemsize <= 4:  # nine digits are all that single precision holds
+        return lambda v: "" if v != v else f"{v:.9g}"
+    return lambda v: "" if v != v else repr(v)
+
+
+def _name_of(flags: dict[int, str]) -> Callable[[Any], str]:
+    return lambda v: flags.get(v, "")
+
+
+def _one_line(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)
+    return " ".join(text.split())

@@ -1,0 +1,143 @@
+"""What follows from the calibration and the measured surface: stereo angle, stand-off, scale, field of view.
+
+All of it is told at the middle of what was measured, on the plane that fits the surface best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.camera import Camera
+from core.field.result import Field
+from core.stereo import StereoPair
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera before the surface.
+
+    Attributes
+    ----------
+    standoff_mm
+        From the pinhole along the optical axis to the surface's plane.
+    distance_mm
+        From the pinhole to the middle of what was measured.
+    scale_mm_per_px
+        Along the rows and down the columns, on the surface, at its middle.
+    field_of_view_mm
+        Width and height of what the image shows of the plane, through the image's middle; None without image size.
+    tilt_rad
+        Angle between the line of sight to the middle and the surface's normal.
+    """
+
+    standoff_mm: float
+    distance_mm: float
+    scale_mm_per_px: tuple[float, float]
+    field_of_view_mm: tuple[float, float] | None
+    tilt_rad: float
+
+    @property
+    def mean_scale_mm_per_px(self) -> float:
+        """Geometric mean of both directions."""
+        return float(np.sqrt(self.scale_mm_per_px[0] * self.scale_mm_per_px[1]))
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Both cameras before the surface.
+
+    Attributes
+    ----------
+    stereo_angle_rad
+        Between the optical axes.
+    sight_angle_rad
+        Between both lines of sight to the middle of what was measured.
+    baseline_mm
+        Between the pinholes.
+    views
+        By camera.
+    middle_mm, normal
+        Of the surface, system frame.
+    """
+
+    stereo_angle_rad: float
+    sight_angle_rad: float
+    baseline_mm: float
+    views: dict[str, View]
+    middle_mm: Float
+    normal: Float
+
+
+def geometry(
+    pair: StereoPair, surface: Field, sizes: tuple[tuple[int, int] | None, tuple[int, int] | None]
+) -> Geometry | None:
+    """Return the geometry of a measurement; None where fewer than four points stand.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    surface
+        Shape of the reference.
+    sizes
+        Width and height of both cameras' images.
+    """
+    points = surface.xyz_mm[surface.valid]
+    if len(points) < 4:
+        return None
+    middle = np.median(points, axis=0)
+    centred = points - points.mean(axis=0)
+    normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+    middle = middle - ((middle - points.mean(axis=0)) @ normal) * normal  # onto the plane
+    sights = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
+    directions = [s / np.linalg.norm(s) for s in sights]
+    views = {}
+    for name, camera, size in zip(("cam1", "cam2"), (pair.cam1, pair.cam2), sizes, strict=True):
+        view = _view(camera, middle, normal, size)
+        if view is None:
+            return None
+        views[name] = view
+    return Geometry(
+        stereo_angle_rad=pair.stereo_angle_rad,
+        sight_angle_rad=float(np.arccos(np.clip(directions[0] @ directions[1], -1.0, 1.0))),
+        baseline_mm=pair.baseline_mm,
+        views=views,
+        middle_mm=middle,
+        normal=normal,
+    )
+
+
+def _view(camera: Camera, middle: Float, normal: Float, size: tuple[int, int] | None) -> View | None:
+    centre = camera.centre_sys_mm
+    axis = camera.cam_from_sys.rotation[2]
+    slant = float(axis @ normal)
+    here = camera.project(middle)
+    if not bool(here.valid) or abs(slant) < 1e-6:
+        return None
+    xy = here.xy
+
+    def on_plane(places: Float) -> Float:
+        return camera.back_project_to_plane(places, point_sys_mm=middle, normal_sys=normal).xyz_mm
+
+    ends = on_plane(xy + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
+    scale = (float(np.linalg.norm(ends[1] - ends[0])), float(np.linalg.norm(ends[3] - ends[2])))
+    seen = None
+    if size is not None:
+        width, height = size
+        x, y = 0.5 * (width - 1), 0.5 * (height - 1)
+        edges = on_plane(np.array([[-0.5, y], [width - 0.5, y], [x, -0.5], [x, height - 0.5]]))
+        spans = float(np.linalg.norm(edges[1] - edges[0])), float(np.linalg.norm(edges[3] - edges[2]))
+        seen = spans if np.isfinite(spans).all() else None
+    sight = (middle - centre) / np.linalg.norm(middle - centre)
+    return View(
+        standoff_mm=float(((middle - centre) @ normal) / slant),
+        distance_mm=float(np.linalg.norm(middle - centre)),
+        scale_mm_per_px=scale,
+        field_of_view_mm=seen,
+        tilt_rad=float(np.arccos(min(abs(float(sight @ normal)), 1.0))),
+    )

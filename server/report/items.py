@@ -1,0 +1,72 @@
+"""What an item of the report's tables is: value, where it comes from, or that nobody stated it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from server.report.source import CAMERAS
+
+CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
+    "from the calibration", "measured here", "as told", "recorded with the images", "settings of the analysis",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Value:
+    """What is known of an item: text, the number behind it in the unit that the text says, where it comes from."""
+
+    text: str
+    number: float | None = None
+    origin: str = ""
+
+
+@dataclass(frozen=True)
+class Item:
+    """An item of the tables.
+
+    Attributes
+    ----------
+    key
+        Its id in the page.
+    label
+        Its name.
+    values
+        One for the rig, or one for each camera; None where it is not stated.
+    remedy
+        How it can be stated.
+    comment
+        How it was found, or what it means.
+    """
+
+    key: str
+    label: str
+    values: tuple[Value | None, ...]
+    remedy: str = ""
+    comment: str = ""
+
+    @property
+    def missing(self) -> list[str]:
+        """What is not stated: the item, or the cameras that lack it."""
+        if all(v is None for v in self.values):
+            return [self.label]
+        return [f"{self.label}, {cam}" for cam, v in zip(CAMERAS, self.values, strict=False) if v is None]
+
+
+def of_text(value: str | None, origin: str) -> Value | None:
+    """A text as a value; None of nothing."""
+    return None if not value else Value(value, None, origin)
+
+
+def of_number(value: float | None, form: str, unit: str, origin: str) -> Value | None:
+    """A number with its unit as a value; None of nothing."""
+    return None if value is None else Value(f"{value:{form}} {unit}".strip(), float(value), origin)
+
+
+def plain(value: float, digits: int = 4) -> str:
+    """A number with so many digits, without an exponent where that reads better."""
+    if value == 0.0 or not np.isfinite(value):
+        return "0" if value == 0.0 else "-"
+    places = int(max(0, digits - 1 - np.floor(np.log10(abs(value)))))
+    return f"{value:.{min(places, 12)}f}" if abs(value) >= 1e-6 else f"{value:.{digits - 1}e}"

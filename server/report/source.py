@@ -1,0 +1,228 @@
+"""What a report is made from: result files, the records that lie about them, the calibration, the facts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError, StereorigError
+from server.errors import NotFoundError
+from server.exports.source import results_in
+from server.facts import TestFacts, parse_facts
+from server.io.calibration_any import LoadedCalibration, load_calibration
+from server.io.files import known_sha256
+from server.io.images import read_image
+from server.io.netcdf_reading import read_attributes
+from server.staleness import stale_results
+from server.store.durable import known_json
+
+CAMERAS = ("cam1", "cam2")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Everything that a report is made from.
+
+    Attributes
+    ----------
+    files
+        Result files by step, ascending.
+    heads
+        Their attributes, as :func:`server.io.netcdf_reading.read_attributes` gives them.
+    test
+        The test's folder, None where the results lie alone; ``test_document`` is its ``test.json``.
+    analysis
+        ``analysis.json`` of the service, or ``summary.json`` of ``stereorig measure``; empty without either.
+    steps
+        ``step.json`` by number, as far as there are any.
+    calibration, calibration_file
+        None where it was not found or is not the one that was measured with.
+    facts
+        What people told.
+    stale
+        What is gone or was replaced since the results were written.
+    doubts
+        What the report's reader must know of what was not found.
+    """
+
+    files: dict[int, Path]
+    heads: dict[int, dict[str, Any]]
+    test: Path | None
+    test_document: dict[str, Any]
+    analysis: dict[str, Any]
+    steps: dict[int, dict[str, Any]]
+    calibration: LoadedCalibration | None
+    calibration_file: Path | None
+    facts: TestFacts
+    stale: list[str]
+    doubts: list[str] = field(default_factory=list)
+
+    @property
+    def reference(self) -> int:
+        """Number of the reference step; of shapes alone, of the first."""
+        shapes = [n for n, head in self.heads.items() if head["kind"] == "shape"]
+        return min(shapes) if shapes else int(self.settings.get("reference", 0))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the analysis, from the files themselves."""
+        found = self.heads[max(self.heads)].get("settings", {})
+        return found if isinstance(found, dict) else {}
+
+    @property
+    def title(self) -> str:
+        """Name of the test; without one, of the folder."""
+        return str(self.test_document.get("name") or self.files[min(self.files)].absolute().parent.name)
+
+    def reference_image(self, cam: str) -> NDArray[Any] | None:
+        """Image of the reference; None where it is gone or not the one that was measured."""
+        n = self.reference
+        head = self.heads.get(n, self.heads[max(self.heads)])
+        inputs = head["inputs_sha256"]
+        sha256 = inputs.get(f"reference_{cam}") or inputs.get(f"step_{cam}") or inputs.get(cam)
+        places = [] if self.test is None else [self.test / "steps" / f"{n:04d}" / f"{cam}.tif"]
+        if n in self.heads and self.heads[n].get(f"{cam}_file"):
+            named = Path(str(self.heads[n][f"{cam}_file"]))
+            places += [named, self.files[n].parent / named.name]
+        for path in places:
+            try:
+                if path.is_file() and (sha256 is None or known_sha256(path) == sha256):
+                    return read_image(path)
+            except (OSError, StereorigError):
+                continue
+        return None
+
+
+def find_source(
+    place: Path,
+    *,
+    test: str | None = None,
+    analysis: str | None = None,
+    calibration: Path | None = None,
+    facts: TestFacts | None = None,
+) -> Source:
+    """Find everything about one measurement.
+
+    Parameters
+    ----------
+    place
+        A data folder, a test's folder, an analysis' folder, or what ``stereorig measure --out`` wrote.
+    test, analysis
+        Which of a data folder's tests, and of a test's analyses; left out: the only test, the newest analysis with
+        results.
+    calibration
+        Its file, where it is not beside the results.
+    facts
+        What people told; left out: what is kept with the test.
+
+    Raises
+    ------
+    InputError
+        ``results_missing``, ``test_unclear``.
+    NotFoundError
+        No such test or analysis.
+    FileFormatError
+        A result file that cannot be read, facts that cannot be.
+    """
+    folder = _results_folder(place, test, analysis)
+    files = {int(path.stem[5:]): path for path in results_in(folder)}
+    if not files:
+        raise InputError(f"There is no step_0000.nc or another step's result in {folder}.", code="results_missing",
+                         remedy="Measure first, or give the folder that stereorig measure --out wrote.")  # fmt: skip
+    folder = folder.absolute()
+    heads = {n: read_attributes(path) for n, path in sorted(files.items())}
+    home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
+    document = {} if home is None else known_json(home / "test.json")
+    made = known_json(folder / "analysis.json") or known_json(folder / "summary.json")
+    doubts: list[str] = []
+    loaded, file = _calibration(calibration, home, made, heads, doubts)
+    told = facts
+    if told is None:
+        told = parse_facts(document.get("facts") or {}, name="the facts of the test")
+    steps = {} if home is None else {n: known_json(home / "steps" / f"{n:04d}" / "step.json") for n in files}
+    return Source(
+        files=dict(sorted(files.items())), heads=heads, test=home, test_document=document, analysis=made,
+        steps={n: step for n, step in steps.items() if step}, calibration=loaded, calibration_file=file, facts=told,
+        stale=stale_results(list(files.values()), heads.values()), doubts=doubts,
+    )  # fmt: skip
+
+
+def _results_folder(place: Path, test: str | None, analysis: str | None) -> Path:
+    if not place.is_dir():
+        raise InputError(f"{place} is no folder.", code="results_missing", remedy="Give a folder with results.")
+    if (place / "tests").is_dir():
+        place = _one_test(place / "tests", test)
+    elif test is not None:
+        raise InputError(f"{place} is no data folder, so it has no test {test}.", code="option_conflict",
+                         remedy="Give the data folder, or leave the test out.")  # fmt: skip
+    if (place / "steps").is_dir():
+        return _one_analysis(place, analysis)
+    if analysis is not None and place.name != analysis:
+        raise InputError(f"{place} is no test's folder, so it has no analysis {analysis}.", code="option_conflict",
+                         remedy="Give the test's folder, or leave the analysis out.")  # fmt: skip
+    return place
+
+
+def _one_test(tests: Path, wanted: str | None) -> Path:
+    there = {path.parent.name: path.parent for path in sorted(tests.glob("*/test.json"))}
+    if wanted is not None:
+        if wanted not in there:
+            raise NotFoundError(f"There is no test {wanted[:40]!r} in {tests.parent}.", what="test")
+        return there[wanted]
+    if len(there) != 1:
+        raise InputError(f"{tests.parent} holds {len(there)} tests.", code="test_unclear",
+                         remedy="Name one with --test, or give the test's own folder.", tests=list(there))  # fmt: skip
+    return next(iter(there.values()))
+
+
+def _one_analysis(test: Path, wanted: str | None) -> Path:
+    there = {path.parent.name: path.parent for path in sorted(test.glob("analyses/*/analysis.json"))}
+    if wanted is not None:
+        if wanted not in there:
+            raise NotFoundError(f"There is no analysis {wanted[:40]!r} in {test}.", what="analysis")
+        return there[wanted]
+    finished = [path for path in there.values() if results_in(path)]
+    # `stereorig measure` puts its results beside the analyses
+    return finished[-1] if finished else test / "exports" / "measure"
+
+
+def _calibration(
+    given: Path | None,
+    test: Path | None,
+    made: Mapping[str, Any],
+    heads: Mapping[int, Mapping[str, Any]],
+    doubts: list[str],
+) -> tuple[LoadedCalibration | None, Path | None]:
+    """Find the calibration that the results were measured with, by its checksum."""
+    inputs = heads[max(heads)]["inputs_sha256"]
+    sha256 = inputs.get("calibration", inputs.get("calibration.json"))
+    places = [] if given is None else [given]
+    if given is None:
+        places += [] if test is None else [test / "calibration.json"]
+        named = made.get("calibration")
+        places += [Path(str(named["file"]))] if isinstance(named, dict) and named.get("file") else []
+    for path in places:
+        if not path.is_file():
+            continue
+        loaded = load_calibration(path)
+        if sha256 is None or loaded.sha256 == sha256:
+            return loaded, path
+        if given is not None:
+            raise InputError(f"{given} is not the calibration that the results were measured with.",
+                             code="calibration_changed", remedy="Give the other one.")  # fmt: skip
+        doubts.append(f"{path.name} is not the calibration that was measured with; nothing is told from it.")
+    if given is not None:
+        load_calibration(given)  # says what is wrong with it
+    return None, None
+
+
+def median(values: Sequence[float] | NDArray[np.float64]) -> float | None:
+    """Median of what is finite; None of nothing."""
+    found = np.asarray(values, dtype=np.float64)
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if found.size else None

@@ -1,0 +1,203 @@
+"""One pass over the result files: the figures of each step, and the few fields that are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.field.result import Field
+from core.strain import StrainField
+from server.io.calibration_volume import rbe_of
+from server.io.netcdf_reading import read_field
+from server.io.strain_netcdf import read_strain
+from server.io.summary import summarise
+from server.report.floor import Floor, FloorKeeper, static_steps, told_sigma
+from server.report.source import Source
+from server.results import library
+from server.straining import summarise_strain
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A step whose field is drawn."""
+
+    n: int
+    why: str
+    field: Field
+    strain: StrainField | None
+
+
+@dataclass(frozen=True)
+class StepFigures:
+    """What the tables say of one step.
+
+    Attributes
+    ----------
+    n, label, load_n, channels
+        As the step's record has them.
+    seconds
+        Since the reference; None where no times are known.
+    summary, strain
+        As :func:`server.io.summary.summarise` and :func:`server.straining.summarise_strain` make them.
+    skew_ms, quality
+        Of the pair of images; None where nobody recorded them.
+    static
+        Whether it counts as static.
+    """
+
+    n: int
+    label: str
+    load_n: float | None
+    channels: dict[str, float]
+    seconds: float | None
+    captured_utc: str | None
+    summary: dict[str, Any]
+    strain: dict[str, Any] | None
+    skew_ms: float | None
+    quality: dict[str, Any] | None
+    static: bool
+
+    @property
+    def largest_mm(self) -> float | None:
+        """Largest component of any point's displacement; None for a shape."""
+        moved = self.summary.get("displacement_mm")
+        if not moved:
+            return None
+        ends = [abs(v) for component in moved.values() if component for v in (component["min"], component["max"])]
+        return max(ends) if ends else None
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Everything that the result files tell.
+
+    Attributes
+    ----------
+    steps
+        Ascending.
+    reference
+        The shape that everything is told from.
+    shown
+        Steps that are drawn: the peak and the last; of shapes, the last.
+    floor
+        By quantity; empty without static steps.
+    static, static_how, static_left_out
+        Which steps the floor is from, how they are known, and which did not fit into memory.
+    told
+        Median of the predicted standard deviations by quantity, of the first displacement or else of the shape.
+    noise_grey
+        Median noise of the reference image from the residuals of the matching.
+    """
+
+    steps: list[StepFigures]
+    reference: Field
+    shown: list[Shown]
+    floor: dict[str, Floor]
+    static: list[int]
+    static_how: str
+    static_left_out: list[int]
+    told: dict[str, float | None]
+    noise_grey: float | None
+
+
+def read_steps(source: Source) -> Measured:
+    """Read every result file once; at most three fields are held at a time, and the static steps' values."""
+    labels = {n: _label(source, n) for n in source.files}
+    static, how = static_steps(source.facts.static_steps, labels, source.reference)
+    rbe = None if source.calibration is None else rbe_of(source.calibration)
+    keeper = FloorKeeper()
+    figures: list[StepFigures] = []
+    reference: Field | None = None
+    peak: Shown | None = None
+    last: Shown | None = None
+    height = -np.inf
+    told: dict[str, float | None] = {}
+    loads = {n: _load(source, n) for n in source.files}
+    by_load = all(load is not None for load in loads.values()) and len(set(loads.values())) > 1
+    for n, path in source.files.items():
+        field, strain = _read(path)
+        if n in static:
+            keeper.add(n, field, strain)
+        step = _figures(source, n, field, strain, rbe, labels[n], static=n in static)
+        figures.append(step)
+        if reference is None:
+            reference = field
+        if not told or ("U" not in told and field.has_motion):
+            told = told_sigma(field, strain)
+        if n == source.reference and field.has_motion is False:
+            reference = field
+        if n == source.reference and len(source.files) > 1:
+            continue
+        last = Shown(n, "the last step", field, strain)
+        size = abs(loads[n] or 0.0) if by_load else step.largest_mm
+        if size is not None and size > height:
+            why = "the step of the highest load" if by_load else "the step of the largest displacement"
+            height, peak = size, Shown(n, why, field, strain)
+    assert reference is not None
+    shown = [s for s in (peak, last) if s is not None]
+    if len(shown) == 2 and shown[0].n == shown[1].n:
+        shown = [Shown(shown[0].n, f"{shown[0].why}, and the last", shown[0].field, shown[0].strain)]
+    grey = reference.noise_grey[reference.valid]
+    grey = grey[np.isfinite(grey)]
+    return Measured(
+        steps=figures, reference=reference, shown=shown, floor=keeper.result(), static=keeper.steps, static_how=how,
+        static_left_out=keeper.left_out, told=told, noise_grey=float(np.median(grey)) if grey.size else None,
+    )  # fmt: skip
+
+
+def _read(path: Path) -> tuple[Field, StrainField | None]:
+    with library:
+        return read_field(path), read_strain(path)
+
+
+def _label(source: Source, n: int) -> str:
+    return str(source.steps.get(n, {}).get("label") or source.heads[n].get("label", ""))
+
+
+def _load(source: Source, n: int) -> float | None:
+    found = source.steps.get(n, {}).get("load_n", source.heads[n].get("load_n"))
+    try:
+        return None if found is None else float(found)
+    except (TypeError, ValueError):
+        return None
+
+
+def _figures(
+    source: Source, n: int, field: Field, strain: StrainField | None, rbe: float | None, label: str, *, static: bool
+) -> StepFigures:
+    record = source.steps.get(n, {})
+    quality = record.get("quality")
+    captured = record.get("captured_utc")
+    return StepFigures(
+        n=n,
+        label=label,
+        load_n=_load(source, n),
+        channels=dict(record.get("channels") or {}),
+        seconds=_seconds(source, n),
+        captured_utc=captured if isinstance(captured, str) else None,
+        summary=summarise(field, rbe_px=rbe, reference=source.reference),
+        strain=None if strain is None else summarise_strain(strain),
+        skew_ms=record.get("skew_ms"),
+        quality=quality if isinstance(quality, dict) else None,
+        static=static,
+    )
+
+
+def _seconds(source: Source, n: int) -> float | None:
+    """Time since the reference, by the host's monotonic clock where both have it, else by the wall clock."""
+    one, two = source.steps.get(source.reference, {}), source.steps.get(n, {})
+    if one.get("source") == "import" or two.get("source") == "import":
+        return None  # when a file was imported says nothing of when it was taken
+    begin, end = one.get("host_monotonic_ns"), two.get("host_monotonic_ns")
+    # the clock begins anew with the machine: only what also agrees with the order of the steps is used
+    if isinstance(begin, int) and isinstance(end, int) and (end - begin) * (n - source.reference) >= 0:
+        return (end - begin) / 1e9
+    try:
+        times = [datetime.fromisoformat(str(step["captured_utc"])) for step in (one, two)]
+    except (KeyError, ValueError):
+        return None
+    return (times[1] - times[0]).total_seconds()

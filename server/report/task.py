@@ -1,0 +1,18 @@
+"""A report as a task of the process beside the service."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+NAME = "report.html"
+
+
+def report_task(results: str, out: str) -> tuple[str, int]:
+    """Make the report of an analysis' folder; return its Content-Security-Policy and how many items are not stated."""
+    # matplotlib is loaded here alone
+    from server.report.build import make_report
+    from server.report.source import find_source
+
+    made = make_report(find_source(Path(results)))
+    (Path(out) / NAME).write_bytes(made.page)
+    return made.policy, len(made.missing)
