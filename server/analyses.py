@@ -1,31 +1,25 @@
-"""An analysis as a job: one task a step in the worker, each step's file announced once it can be read."""
+"""Analyses: what is checked before one is begun, beginning one, and going on with one that was interrupted."""
 
 from __future__ import annotations
 
-import contextlib
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from core.errors import (
-    Cancelled,
     InputError,
-    MeasurementError,
     StateError,
-    StereorigError,
-    StorageError,
 )  # fmt: skip
-from server.compute import run_task
+from server.analysis_run import AnalysisRun, calibration_changed, close
+from server.idempotency import RequestMark
 from server.io.files import sha256_of
 from server.io.images import decode_mask, read_image
-from server.jobs import Job
-from server.noise_sequence import averages_of
-from server.problem import problem_of
+from server.job import Job, Phase
 from server.regions import make_grid
 from server.service import Service
-from server.store.durable import without_nan
-from server.tasks import StepTask, measure_step
-from server.worker import WorkerDiedError
+from server.staleness import stale_inputs
+from server.store.index import analysis_entry
+from server.version import software_version
 
 
 def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:
@@ -36,7 +30,7 @@ def steps_to_measure(service: Service, test_id: str, reference: int, wanted: lis
     StateError
         ``no_steps`` if the reference does not exist.
     InputError
-        ``step_missing`` if a step that was asked for does not exist.
+        ``step_missing`` if a step that was asked for does not exist, or all are and one is gone.
     """
     there = service.tests.step_numbers(test_id)
     if reference not in there:
@@ -45,12 +39,22 @@ def steps_to_measure(service: Service, test_id: str, reference: int, wanted: lis
             code="no_steps",
             remedy="Capture or import the reference first.",
         )
+    everything = wanted is None
     if wanted is None:
         wanted = [n for n in there if n > reference]
     missing = [n for n in wanted if n not in there]
     if missing:
         raise InputError(
             f"Test {test_id} has no step {missing[0]}.", code="step_missing", remedy="Ask for steps that exist."
+        )
+    # an incomplete step keeps its folder and its number; one that was deleted is not missed
+    numbers = {*there, *service.tests.incomplete_steps(test_id), *service.tests.deleted_steps(test_id)}
+    gone = [n for n in range(reference, max(numbers)) if n not in numbers]
+    if gone and everything:
+        raise InputError(
+            f"Step {gone[0]} of test {test_id} is gone; steps up to {max(numbers)} were taken.",
+            code="step_missing",
+            remedy="Restore its folder from a backup, or name the steps to measure.",
         )
     return [reference, *[n for n in dict.fromkeys(wanted) if n != reference]]
 
@@ -63,116 +67,124 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
     }
 
 
+def stale_reasons(service: Service, test_id: str, document: dict[str, Any]) -> list[str]:
+    """Return what is gone or was replaced since an analysis was made; see :func:`server.staleness.stale_inputs`."""
+    test, inputs = service.tests.path(test_id), document.get("inputs", {})
+    return stale_inputs(
+        test,
+        {int(n): hashes for n, hashes in inputs.get("steps", {}).items()},
+        calibration=test / "calibration.json",
+        calibration_sha256=inputs.get("calibration_sha256"),
+        reference=document["steps"][0],
+    )
+
+
+def check_calibration(service: Service, test_id: str, calibration: Path) -> None:
+    """Refuse a calibration other than the one the test was made with.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_changed``.
+    """
+    made_with = service.tests.read(test_id).get("calibration_sha256")
+    if made_with is not None and sha256_of(calibration) != made_with:
+        raise calibration_changed(f"of test {test_id}")
+
+
 def check_region(service: Service, test_id: str, reference: int, settings: dict[str, Any], mask: bytes | None) -> None:
     """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
     image = read_image(service.tests.step(test_id, reference).cam1)
     make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
 
 
-class StepsFailedError(MeasurementError):
-    """Some steps could not be measured; the others were, and are kept."""
-
-    code = "steps_failed"
-    remedy = "Read each step's problem in the summary; the other steps' results stand."
-
-
-def run_analysis(service: Service, job: Job, test_id: str, analysis_id: str) -> dict[str, Any]:
-    """Compute phase of an analysis: a step that fails does not take the others with it.
+def submit(
+    service: Service,
+    test_id: str,
+    prepare: Callable[[Job], dict[str, Any]],
+    request: RequestMark | None,
+    *,
+    follow: bool = False,
+) -> Job:
+    """Queue the measurement of the analysis that ``prepare`` makes or finds.
 
     Raises
     ------
-    StereorigError
-        What went wrong with the reference; or, with the same code, with the first other step that failed.
+    QueueFullError
+        Too many computations wait.
     """
-    document = service.tests.analysis(test_id, analysis_id)
-    steps: list[int] = document["steps"]
-    finished: list[dict[str, Any]] = []
-    failed: dict[int, StereorigError] = {}
-    job.result = {"analysis_id": analysis_id, "test_id": test_id, "steps_finished": [], "steps": finished}
-    for index, n in enumerate(steps):
-        job.check()
-        previous = finished[-1]["n"] if finished else None
-
-        def progress(stage: str, done: int, of: int, *, index: int = index, n: int = n) -> None:
-            # steps are the unit a user thinks in; within a step, the points found so far
-            fraction = min(done / of, 1.0) if of > 0 else 0.0
-            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * len(steps))
-
-        started = time.monotonic()
-        try:
-            task = _task(service, document, n, previous, steps[index + 1] if index + 1 < len(steps) else None)
-            summary = run_task(service.worker, job, measure_step, task, progress=progress)
-        except (Cancelled, StorageError, WorkerDiedError):
-            raise  # not the step's own doing
-        except StereorigError as error:
-            if n == steps[0] and document["kind"] == "displacement":
-                raise
-            failed[n] = error
-            continue
-        finished.append(without_nan({"n": n, **summary, "wall_s": round(time.monotonic() - started, 3)}))
-        job.result["steps_finished"] = [s["n"] for s in finished]
-        service.hub.publish("result", {"test_id": test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
-    job.progress("done", 1000 * len(steps), 1000 * len(steps))
-    if failed:
-        first = min(failed)
-        job.result["steps_failed"] = {str(n): problem_of(error) for n, error in failed.items()}
-        raise StepsFailedError(
-            f"{len(failed)} of {len(steps)} steps failed; step {first}: {failed[first].cause}",
-            code=failed[first].code,
-            remedy=failed[first].remedy,
-            steps_failed=sorted(failed),
-        )
-    return job.result
-
-
-def _task(service: Service, document: dict[str, Any], n: int, previous: int | None, following: int | None) -> StepTask:
-    test_id, displacement = document["test_id"], document["kind"] == "displacement"
-    reference = document["steps"][0] if displacement else n
-    ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
-    checksums = {
-        "calibration.json": document["inputs"]["calibration_sha256"],
-        **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
-        **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
-    }
-    noise = document["settings"].get("noise")
-    if noise:
-        checksums["noise.json"] = noise["sha256"]
-    after = None
-    if following is not None and displacement:
-        with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
-            after = service.tests.step(test_id, following)
-    return StepTask(
-        folder=str(service.tests.analysis_path(test_id, document["id"])),
-        calibration=str(service.tests.calibration_file(test_id)),
-        kind="motion" if n != reference else "shape",
-        n=n,
-        reference=reference,
-        images={"ref1": str(ref.cam1), "ref2": str(ref.cam2), "cur1": str(now.cam1), "cur2": str(now.cam2)},
-        previous=previous,
-        settings=document["settings"],
-        inputs=checksums,
-        noise=str(service.tests.analysis_path(test_id, document["id"]) / "noise.json") if noise else None,
-        averages={
-            str(path): averages_of(step.document)
-            for step in (ref, now, after)
-            if step is not None
-            for path in (step.cam1, step.cam2)
-        },
-        label=now.document["label"],
-        load_n=now.document["load_n"],
-        following=None if after is None else (str(after.cam1), str(after.cam2)),
+    job = service.jobs.submit(
+        "analysis",
+        "an analysis",
+        {"test_id": test_id},
+        [Phase("compute", AnalysisRun(service, test_id))],
+        prepare=prepare,
+        request=request,
+        follows=test_id if follow else None,
+        on_end=lambda job, state: close(service, job, test_id, job.subject["analysis_id"], state),
     )
+    analysis_id = job.subject["analysis_id"]
+    stored = service.tests.analysis(test_id, analysis_id)
+    service.catalog.put_entry("analysis", test_id, analysis_id, analysis_entry({**stored, "job_id": job.id}))
+    return job
 
 
-def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
-    """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
-    found = job.result or {}
-    document = {
-        "analysis_id": analysis_id,
-        "state": state,
-        "job_id": job.id,
-        "problem": job.problem,
-        "steps": found.get("steps", []),
-        "steps_failed": found.get("steps_failed", {}),
-    }
-    service.tests.put_summary(test_id, analysis_id, document)
+def continue_analysis(
+    service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool = False
+) -> Job:
+    """Queue what an analysis has not measured yet, on the same inputs, with the same settings.
+
+    Parameters
+    ----------
+    other_version
+        Go on although another version of the program began it.
+
+    Raises
+    ------
+    StateError
+        ``analysis_running``, ``analysis_finished``, ``analysis_stale`` or ``software_changed``.
+    """
+    with service.continuing:  # two at once would both find nobody at work
+        return _continue(service, test_id, analysis_id, request, other_version=other_version)
+
+
+def _continue(service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool) -> Job:
+    document = service.tests.analysis(test_id, analysis_id)
+    runs = service.tests.analysis_jobs(test_id, analysis_id)
+    if runs and service.jobs.is_active(runs[-1]["job_id"]):
+        raise StateError(
+            f"Analysis {analysis_id} is being worked on.",
+            code="analysis_running",
+            remedy="Follow its job, or cancel it first.",
+            job_id=runs[-1]["job_id"],
+        )
+    summary = service.tests.summary(test_id, analysis_id)
+    if summary is not None and summary["state"] == "succeeded":
+        raise StateError(
+            f"Analysis {analysis_id} is finished: nothing is left to continue.",
+            code="analysis_finished",
+            remedy="Start a new analysis for other steps.",
+        )
+    stale = stale_reasons(service, test_id, document)
+    if stale:
+        raise StateError(
+            f"Analysis {analysis_id} cannot go on: {'; '.join(stale)}.",
+            code="analysis_stale",
+            remedy="Restore the files from a backup, or start a new analysis.",
+            reasons=stale,
+        )
+    begun_by, now = document.get("software"), software_version()
+    if begun_by != now and not other_version:
+        raise StateError(
+            f"Analysis {analysis_id} was begun by version {begun_by}, this is {now}: its steps might not agree.",
+            code="software_changed",
+            remedy="Start a new analysis, or send other_version = true.",
+            begun_by=begun_by,
+            now=now,
+        )
+
+    def prepare(job: Job) -> dict[str, Any]:
+        service.tests.add_analysis_job(test_id, analysis_id, {"job_id": job.id, **request.document()})
+        return {"analysis_id": analysis_id}
+
+    return submit(service, test_id, prepare, request, follow=bool(document.get("follow")))

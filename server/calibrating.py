@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +18,8 @@ from core.errors import CalibrationError
 from core.grid import GridOptions, GridView, detect_grid
 from core.target import GridTarget
 from server.io.calibration_json import calibration_content
-from server.io.files import written_aside
 from server.io.images import GrayImage, read_image
+from server.io.netcdf import written_dataset
 from server.store.durable import write_json
 from server.tasks import FitTask
 from server.version import software_version
@@ -60,7 +59,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
             for view in measured
         ],
         target,
-        _nominals(rig),
+        nominals_of(rig),
         CalibrationOptions(held_out_mm=tuple(plan["held_out_mm"]), axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"]),
         localiser=plan["localiser"],
         grid_options=grid_options,
@@ -78,6 +77,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
         "line_model": found.grids[0].line_model,
         "frames": plan["frames"],
         "views_sha256": {Path(v["file"]).name: v["sha256"] for v in task.views},
+        "cameras": {view["camera"]: view["device"] for view in task.views if "device" in view},
     }
     content = calibration_content(found.result, target, provenance=provenance)
     _judge_drift(content, drift)
@@ -87,7 +87,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
         raise CalibrationError(
             f"The calibration is not usable: {' '.join(content['verdict']['reasons'])}", code="calibration_rejected"
         )
-    write_json(folder / "calibration.json", content)
+    write_json(folder / "calibration.json", content, checksum=True)
     return {
         "verdict": content["verdict"],
         "checks": {k: _three(content["checks"][k]) for k in ("fitted", "held_out")},
@@ -95,7 +95,8 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     }
 
 
-def _nominals(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
+def nominals_of(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
+    """Return the nominal cameras of a plan's rig."""
     one, two = (
         NominalCamera(
             image_size_px=tuple(rig[cam]["image_size_px"]),
@@ -167,7 +168,7 @@ def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, Gri
         }
         for v in result.views
     ]  # fmt: skip
-    with written_aside(path) as aside, netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as data:
+    with written_dataset(path, checksum=True) as data:
         for name, size in zip(("view", "i", "j", "xy"), residuals.shape, strict=True):
             data.createDimension(name, size)
         _put(data, "found_px", found, "place of the intersection in the image")

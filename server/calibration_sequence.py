@@ -15,7 +15,7 @@ import numpy as np
 from core.errors import CalibrationInputError
 from server.compute import run_task
 from server.config import RigConfig
-from server.jobs import Job
+from server.job import Job
 from server.rig.cameras import CAMERAS
 from server.service import Service
 from server.store.index import calibration_entry
@@ -86,8 +86,10 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
     rig = service.rig
     stops = [*plan.stops_mm(), 0.0]
     views: list[dict[str, Any]] = []
+    cameras = rig.identities()
     for index, dz in enumerate(stops):
         job.check()
+        service.require_room()
         job.progress("views", index, len(stops))
         moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)))
         job.check()
@@ -98,6 +100,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
             view = {
                 "index": index,
                 "camera": cam,
+                "device": cameras[cam],
                 "role": role,
                 "dz_mm": rig.dz_of(cam, moved[axis].position_mm),
                 "dz_commanded_mm": dz,

@@ -13,11 +13,13 @@ from types import TracebackType
 
 import numpy as np
 
+from server.priority import end_with_parent
+
 _LONGEST_S = 300.0
 
 
 class CompileAside:
-    """A process that compiles what :func:`core.matching.fit.fit_motion` needs.
+    """A process that compiles what a displacement needs.
 
     Parameters
     ----------
@@ -62,9 +64,11 @@ class CompileAside:
 
 
 def main() -> int:
-    """Fit one point that has no start: compiled code is needed to find that out."""
+    """Fit one point that has no start, and judge it: compiled code is needed to find that out."""
+    end_with_parent()
     from core.camera import Camera
     from core.matching.fit import fit_motion
+    from core.matching.observed import observed_covariance
     from core.matching.options import MatchOptions
     from core.stereo import StereoPair
 
@@ -76,6 +80,9 @@ def main() -> int:
     options = MatchOptions(subset_px=21, patch="curved" if sys.argv[1] == "curved" else "stretch")
     pair, xy, start = StereoPair(camera, camera), [[32.0, 32.0]], [[np.nan] * 3]
     fit_motion(pair, picture, picture, picture, picture, xy, start, None, options)
+    terms = 6 if options.patch == "curved" else 3
+    w, G = np.full((1, terms), np.nan), np.full((1, 3, terms), np.nan)
+    observed_covariance(pair, [picture] * 4, xy, w, G, 0.0, options)
     return 0
 
 

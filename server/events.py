@@ -1,7 +1,7 @@
 """What happens in the service, as a numbered stream that readers can resume.
 
-Events live in a bounded ring. A slow reader loses the oldest ones and can see that it did (numbers jump); it never
-holds up a writer.
+Events live in a bounded ring. A slow reader loses the oldest ones and is told so by an event ``gap``; it never holds up
+a writer. Numbers grow over restarts too, so that a reader which comes back after one is told what it missed.
 """
 
 from __future__ import annotations
@@ -9,14 +9,16 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
+
+_AT_ONCE = 20
 
 
 @dataclass(frozen=True)
 class Event:
-    """One event: number, name (``job``, ``step``, ``result``, ``stage``, ``rig``) and data."""
+    """One event: number, name (``job``, ``step``, ``result``, ``stage``, ``rig``, ``gap`` ...) and data."""
 
     number: int
     name: str
@@ -24,14 +26,27 @@ class Event:
 
 
 class EventHub:
-    """Publish from any thread, follow from the event loop."""
+    """Publish from any thread, follow from the event loop.
 
-    def __init__(self, keep: int = 2000) -> None:
+    Parameters
+    ----------
+    keep
+        How many events a reader may be behind.
+    start
+        The events' numbers begin after it.
+    """
+
+    def __init__(self, keep: int = 2000, *, start: int = 0) -> None:
         self._lock = threading.Lock()
         self._ring: deque[Event] = deque(maxlen=keep)
-        self._number = 0
+        self._number = start
         self._waiters: dict[asyncio.Event, asyncio.AbstractEventLoop] = {}
         self._closed = False
+        self._listeners: list[Callable[[str, dict[str, Any]], None]] = []
+
+    def listen(self, listener: Callable[[str, dict[str, Any]], None]) -> None:
+        """Call ``listener`` with name and data of each event, in the publisher's thread: it must be quick."""
+        self._listeners.append(listener)
 
     def publish(self, name: str, data: dict[str, Any]) -> None:
         """Add an event and wake the readers."""
@@ -40,6 +55,8 @@ class EventHub:
             self._ring.append(Event(self._number, name, data))
             waiters = list(self._waiters.items())
         self._wake(waiters)
+        for listener in self._listeners:
+            listener(name, data)
 
     @staticmethod
     def _wake(waiters: list[tuple[asyncio.Event, asyncio.AbstractEventLoop]]) -> None:
@@ -52,23 +69,47 @@ class EventHub:
         """Number of the newest event."""
         return self._number
 
-    def after(self, number: int) -> list[Event]:
-        """Events still kept that are newer than ``number``."""
+    def after(self, number: int, most: int | None = None) -> list[Event]:
+        """Events still kept that are newer than ``number``, oldest first, at most so many."""
         with self._lock:
-            return [e for e in self._ring if e.number > number]
+            kept = len(self._ring)
+            # their numbers follow one another: the place of each is known
+            first = 0 if kept == 0 else max(number + 1 - self._ring[0].number, 0)
+            last = kept if most is None else min(first + most, kept)
+            return [self._ring[index] for index in range(first, last)]
+
+    def gap(self, number: int) -> Event | None:
+        """Return what tells a reader who saw ``number`` last that events are lost to it; None where none are.
+
+        Its own number is the one from which the reader can go on.
+        """
+        with self._lock:
+            known = self._number - len(self._ring)
+            if known <= number <= self._number:
+                return None
+        return Event(known, "gap", {"after": number, "next": known + 1})
 
     async def follow(self, after: int) -> AsyncIterator[Event]:
-        """Yield events newer than ``after``, then new ones as they come, until the hub is closed."""
+        """Yield events newer than ``after``, then new ones as they come, until the hub is closed.
+
+        Where some are lost to the reader, an event ``gap`` comes first: what it knows is old, and can be asked for.
+        """
         woken = asyncio.Event()
         with self._lock:
             self._waiters[woken] = asyncio.get_running_loop()
         try:
             while not self._closed:
                 woken.clear()
-                for event in self.after(after):
+                lost = self.gap(after)
+                if lost is not None:
+                    after = lost.number
+                    yield lost
+                # few at a time: a reader that is slow must not hold on to all that it has not read
+                events = self.after(after, _AT_ONCE)
+                for event in events:
                     after = event.number
                     yield event
-                if not self._closed:
+                if not events and not self._closed:
                     await woken.wait()
         finally:
             with self._lock:

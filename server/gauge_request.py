@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
-from server.api.models import Number, Pixel, Request, Whole
+from server.api.models import Number, Pixel, Request
+from server.api.models.base import StepNumber, Switch, Whole, any_of, disagreement, given, not_both, one_of
 
 Place = tuple[Pixel, Pixel]
 PlaceMm = tuple[Number, Number]
@@ -22,6 +23,8 @@ class _Named(Request):
 
 class PointGauge(_Named):
     """Values at one place."""
+
+    model_config = ConfigDict(json_schema_extra=one_of("xy_px", "xy_mm"))
 
     xy_px: Place | None = Field(None, description="Where, in camera 1's reference image.", examples=[[210.0, 180.5]])
     xy_mm: PlaceMm | None = Field(
@@ -41,6 +44,15 @@ class PointGauge(_Named):
 
 class ExtensometerGauge(_Named):
     """A virtual extensometer."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {"allOf": [given("a_px"), given("b_px")], "not": given("ends_mm")},
+                {**given("ends_mm"), "not": any_of("a_px", "b_px")},
+            ]
+        }
+    )
 
     a_px: Place | None = Field(None, description="One end.", examples=[[150.0, 200.0]])
     b_px: Place | None = Field(None, description="The other end.", examples=[[350.0, 200.0]])
@@ -73,6 +85,8 @@ class LineGauge(_Named):
 
 
 class _Area(Request):
+    model_config = ConfigDict(json_schema_extra=not_both("rectangle_px", "polygon_px"))
+
     rectangle_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None, description="x0, y0, x1, y1, inclusive.", examples=[[150, 100, 350, 300]]
     )
@@ -85,7 +99,7 @@ class _Area(Request):
         if self.rectangle_px is not None:
             x0, y0, x1, y1 = self.rectangle_px
             if x1 <= x0 or y1 <= y0:
-                raise ValueError("rectangle_px is empty; give the upper left corner first")
+                raise disagreement("rectangle_px is empty; give the upper left corner first")
         return self
 
     def corners(self) -> list[tuple[float, float]] | None:
@@ -103,7 +117,7 @@ class AreaGauge(_Area, _Named):
 class RigidRemoval(_Area):
     """Take the best rigid motion out of every step, fitted over an area or the whole field."""
 
-    robust: bool = Field(False, description="Do not let single points far off the others draw the fit.")
+    robust: Switch = Field(False, description="Do not let single points far off the others draw the fit.")
 
 
 class PlaneAlignment(_Area):
@@ -130,6 +144,19 @@ Alignment = Annotated[PlaneAlignment | ThreeTwoOneAlignment, Field(discriminator
 class GaugeRequest(Request):
     """A set of gauges, read in every step."""
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [
+                {"required": ["points"], "properties": {"points": {"minItems": 1}}},
+                {"required": ["extensometers"], "properties": {"extensometers": {"minItems": 1}}},
+                {"required": ["lines"], "properties": {"lines": {"minItems": 1}}},
+                {"required": ["areas"], "properties": {"areas": {"minItems": 1}}},
+                given("align"),
+                given("remove_rigid"),
+            ]
+        }
+    )
+
     points: list[PointGauge] = Field(default_factory=list, description="Places.", max_length=_MOST)
     extensometers: list[ExtensometerGauge] = Field(
         default_factory=list, description="Virtual extensometers.", max_length=_MOST
@@ -144,8 +171,8 @@ class GaugeRequest(Request):
     )
     align: Alignment | None = Field(None, description="Frame to express everything in; the system frame if left out.")
     remove_rigid: RigidRemoval | None = Field(None, description="Take the rigid motion out first; null leaves it in.")
-    steps: Annotated[list[Annotated[Whole, Field(ge=0, le=9999)]], Field(min_length=1, max_length=10_000)] | None = (
-        Field(None, description="Steps to read; all if left out.")
+    steps: Annotated[list[StepNumber], Field(min_length=1, max_length=10_000)] | None = Field(
+        None, description="Steps to read; all if left out."
     )
 
     @model_validator(mode="after")
@@ -161,7 +188,7 @@ class GaugeRequest(Request):
             for k, gauge in enumerate(gauges):
                 gauge.name = gauge.name or f"{letter}{k + 1}"
                 if gauge.name in seen:
-                    raise ValueError(f"two gauges have the name {gauge.name}")
+                    raise disagreement(f"two gauges have the name {gauge.name}")
                 seen.add(gauge.name)
         if not seen and self.align is None and self.remove_rigid is None:
             raise ValueError("give a point, an extensometer, a line, an area, align or remove_rigid")

@@ -12,18 +12,21 @@ from numpy.typing import NDArray
 from core.errors import InputError
 from core.field.result import Field
 from core.field.shared_pixels import SharedPixels
+from core.strain.mean import mean_strain_sigma
 from server.errors import NotFoundError
-from server.io.netcdf import COVARIANCE_NAMES, field_variable
-from server.results import Variable, read_variable
+from server.io.netcdf_layout import COVARIANCE_NAMES, field_variable
+from server.io.strain_netcdf import read_strain
+from server.results import Variable, library, read_variable
 
 Float = NDArray[np.float64]
+STRAIN_NAMES = ("exx", "eyy", "exy")
 
 
 class Variables:
     """Variables by name: of the field as it is now, else of the file as it was written."""
 
-    def __init__(self, path: Path, field: Field, shared: SharedPixels) -> None:
-        self.path, self.field, self.shared = path, field, shared
+    def __init__(self, path: Path, field: Field, shared: SharedPixels, *, measured: Field) -> None:
+        self.path, self.field, self.shared, self.measured = path, field, shared, measured
         self._read: dict[str, tuple[Variable, Float | None]] = {}
 
     def get(self, name: str) -> tuple[Variable, Float | None]:
@@ -31,6 +34,15 @@ class Variables:
         if name not in self._read:
             self._read[name] = self._find(name)
         return self._read[name]
+
+    def mean_strain_sigma(self, inside: NDArray[np.bool_]) -> Float:
+        """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN without strain."""
+        with library:
+            strain = read_strain(self.path)
+        if strain is None:
+            return np.full(3, np.nan)
+        # the file's strain is that of the field as it was measured, along the file's axes
+        return mean_strain_sigma(self.measured, strain.options, inside, subset_px=strain.subset_px)
 
     def known(self, names: Sequence[str]) -> list[str]:
         """Return those that this step has: a shape has no displacement."""

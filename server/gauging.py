@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,14 @@ from core.gauge.locate import places_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
+from server.gauge_fields import FieldWriter
 from server.gauge_request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
-from server.gauge_variables import Variables, component_of
+from server.gauge_variables import STRAIN_NAMES, Variables, component_of
 from server.io.files import sha256_of
-from server.io.netcdf import COVARIANCE_NAMES, read_attributes, read_field
+from server.io.netcdf_layout import COVARIANCE_NAMES
+from server.io.netcdf_reading import read_attributes, read_field
 from server.results import library, read_variable
+from server.staleness import stale_results
 from server.version import software_version
 
 Float = NDArray[np.float64]
@@ -56,7 +59,7 @@ class _Step:
         }
 
 
-def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
+def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> dict[str, Any]:
     """Read a set of gauges in every step.
 
     Parameters
@@ -65,11 +68,15 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
         Result files of one measurement.
     request
         The gauges.
+    fields
+        Takes each step's field in the frame and without the motion that was asked for.
 
     Returns
     -------
     dict
-        ``software_version``, ``settings`` (the request), ``inputs_sha256``, ``frame``, ``subset_px``, ``alignment`` and
+        ``software_version``, ``settings`` (the request), ``inputs_sha256``, ``stale`` (True where inputs or results
+        are gone or were replaced since, told in ``stale_reasons``), ``frame``, ``subset_px``,
+        ``smoothing_window`` (of the displacements; None: as measured), ``alignment`` and
         ``steps``: for each step ``n, kind, label, load_n``, ``rigid_motion``, and for ``points``, ``extensometers``,
         ``lines``, ``areas`` a list of readings. Numbers come with ``sigma`` and ``units``; what is missing is None,
         with the reason under ``missing``. A step whose rigid motion cannot be told has a ``problem`` and no readings.
@@ -89,7 +96,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
     alignment: Alignment | None = None
     first: Mapping[str, Any] | None = None
     grid: tuple[Float, Float] | None = None
-    hashes, steps = {}, []
+    hashes, steps, heads = {}, [], []
     moved_by: set[str] = set()
     found: set[str] = set()
     placed: _Placed = {}
@@ -108,11 +115,13 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
         if numbers > MOST_NUMBERS:
             raise InputError(f"The lines hold more than {MOST_NUMBERS:,} numbers.", code="gauge_too_large",
                              remedy="Ask for fewer places, variables or steps.")  # fmt: skip
-        steps.append(_read_step(step, alignment, request, placed, found))
+        heads.append(step.attributes)
+        steps.append(_read_step(step, alignment, request, placed, found, fields))
     for name in request.variables or ():
         if name not in found and any("problem" not in s for s in steps):
             read_variable(chosen[-1], name)  # says which there are
     assert first is not None
+    stale = stale_results(chosen, heads)
     frame = str(first["frame"])
     if request.align is not None:
         frame = f"aligned by {request.align.kind}; before: {frame}"
@@ -120,8 +129,11 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest) -> dict[str, Any]:
         "software_version": software_version(),
         "settings": request.model_dump(mode="json"),
         "inputs_sha256": hashes,
+        "stale": bool(stale),
+        "stale_reasons": stale,
         "frame": frame,
         "subset_px": first["settings"]["subset_px"],
+        "smoothing_window": first["settings"].get("smoothing_window"),
         "alignment": None if alignment is None else _alignment_document(alignment),
         "steps": steps,
     }
@@ -168,6 +180,8 @@ def _check_same(step: _Step, first: Mapping[str, Any], grid: tuple[Float, Float]
         "points" if field.shape != grid[0].shape or (field.x_px != grid[0]).any() or (field.y_px != grid[1]).any()
         else "calibration" if any(inputs.get(k) != others.get(k) for k in _CALIBRATION)
         else "subset" if step.attributes["settings"].get("subset_px") != first["settings"].get("subset_px")
+        else "smoothing" if field.has_motion and first["settings"].get("smoothing_window")
+        != step.attributes["settings"].get("smoothing_window")
         else "reference" if len(refs) > 1 or (refs and str(others.get("reference_cam1")) not in refs)
         else ""
     )  # fmt: skip
@@ -201,7 +215,12 @@ def _placed(field: Field, request: GaugeRequest) -> _Placed:
 
 
 def _read_step(
-    step: _Step, alignment: Alignment | None, request: GaugeRequest, placed: _Placed, found: set[str]
+    step: _Step,
+    alignment: Alignment | None,
+    request: GaugeRequest,
+    placed: _Placed,
+    found: set[str],
+    fields: FieldWriter | None,
 ) -> dict[str, Any]:
     field = step.field if alignment is None else aligned(step.field, alignment)
     document = step.head
@@ -215,7 +234,10 @@ def _read_step(
             return document
         field = without_rigid_motion(field, motion, shared=step.shared)
         document["rigid_motion"] = _motion_document(motion)
-    variables = Variables(step.path, field, step.shared)
+    if fields is not None:
+        frame = None if alignment is None else _alignment_document(alignment)
+        fields(step.path, step.sha256, step.attributes, field, frame, document.get("rigid_motion"))
+    variables = Variables(step.path, field, step.shared, measured=step.field)
     names = variables.known(request.variables or COVARIANCE_NAMES)
     found.update(names)
     return {
@@ -237,7 +259,7 @@ def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> d
         if k is not None:
             s = np.sqrt(variance[:, k])
         elif sigma is not None:
-            s = places.of(sigma)  # as if the corners' errors were one: never too small
+            s = places.of(sigma)  # as if the errors of the points about it were one
         else:
             s = np.full(len(own), np.nan)
         out[name] = (places.of(variable.values), s, variable.units)
@@ -280,7 +302,11 @@ def _area(
         variable, sigma = variables.get(n)
         # how far other variables' errors reach is not known here: no uncertainty of their mean
         known = sigma if component_of(n) is not None else None
-        got = area_statistics(field, variable.values, known, inside, shared=variables.shared)
+        of_place = component_of(n) in range(3)
+        shared = variables.shared.places if of_place else variables.shared
+        got = area_statistics(field, variable.values, known, inside, shared=shared)
+        if n in STRAIN_NAMES and got.count:
+            got = replace(got, mean_sigma=variables.mean_strain_sigma(inside)[STRAIN_NAMES.index(n)])
         values[n] = {
             "units": variable.units,
             "count": got.count,

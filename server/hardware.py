@@ -5,6 +5,7 @@ Hardware is never queued: a second caller is told who has it. Stopping needs nei
 
 from __future__ import annotations
 
+import contextvars
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from core.errors import StateError
 from server.errors import BusyError
 
 T = TypeVar("T")
@@ -22,7 +24,9 @@ class HardwareGate:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._acting = threading.RLock()  # what is done to a holder from outside comes before the next one's hold
         self._holder: dict[str, Any] | None = None
+        self._shut = False
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="hardware")
 
     @property
@@ -37,7 +41,9 @@ class HardwareGate:
 
     def claim(self, what: str, **details: Any) -> object:
         """Take the hold, or raise :class:`BusyError` with the holder; returns the token for :meth:`release`."""
-        with self._lock:
+        with self._acting, self._lock:
+            if self._shut:
+                raise StateError("The service is shutting down.", code="shutting_down", remedy="Start it again.")
             if self._holder is None:
                 self._holder = {"what": what, **details, "since": time.monotonic()}
                 return self._holder
@@ -45,6 +51,20 @@ class HardwareGate:
         if holder is None:  # released in between
             return self.claim(what, **details)
         raise BusyError(holder)
+
+    def while_held_by(self, job_id: str, function: Callable[[], None]) -> bool:
+        """Call ``function`` if a job has the hold, and return whether; nobody else gets the hold before it is done."""
+        with self._acting:
+            with self._lock:
+                if self._holder is None or self._holder.get("job_id") != job_id:
+                    return False
+            function()
+            return True
+
+    def shut(self) -> None:
+        """Let nobody take the hold from now on; who has it keeps it."""
+        with self._lock:
+            self._shut = True
 
     def release(self, token: object) -> None:
         """Give the hold back; harmless if it is another's by now."""
@@ -63,11 +83,11 @@ class HardwareGate:
 
     def start(self, function: Callable[[], None]) -> None:
         """Run ``function`` on the owner thread, without waiting."""
-        self._thread.submit(function)
+        self._thread.submit(contextvars.copy_context().run, function)
 
     def call(self, function: Callable[[], T]) -> T:
         """Run ``function`` on the owner thread and wait."""
-        return self._thread.submit(function).result()
+        return self._thread.submit(contextvars.copy_context().run, function).result()
 
     def close(self) -> None:
         """Let the owner thread end after what it is doing."""

@@ -10,111 +10,23 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from core.errors import Cancelled, StateError, StereorigError, StorageError
 from server.errors import NotFoundError, QueueFullError
 from server.events import EventHub
 from server.hardware import HardwareGate
+from server.idempotency import RequestMark
+from server.job import ACTIVE, Job, Phase, State, Waiting
+from server.logs import about
 from server.problem import RESTART, problem_of
 from server.store.catalog import Catalog
 from server.store.durable import without_nan
 from server.store.folder import IdMaker, is_id, now_utc
 
 _log = logging.getLogger("stereorig.jobs")
-
-State = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
-FINAL: tuple[State, ...] = ("succeeded", "failed", "cancelled", "interrupted")
-ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
-
-
-@dataclass(frozen=True)
-class Phase:
-    """One phase of a job: where it runs, and what; what ``run`` returns is merged into the job's result."""
-
-    lane: Literal["hardware", "compute"]
-    run: Callable[[Job], dict[str, Any] | None]
-
-
-@dataclass(eq=False)
-class Job:
-    """One job; ``document`` is what the API shows. Doubles as progress callback and cancel token of its phases."""
-
-    id: str
-    kind: str
-    subject: dict[str, Any]
-    phases: Sequence[Phase]
-    publish: Callable[[Job, str], None]
-    state: State = "queued"
-    created_utc: str = field(default_factory=now_utc)
-    started_utc: str | None = None
-    finished_utc: str | None = None
-    result: dict[str, Any] | None = None
-    problem: dict[str, Any] | None = None
-    stage: str = "waiting"
-    done: int = 0
-    total: int = 0
-    #: called with the final state before that state is shown (writes summaries)
-    on_end: Callable[[Job, State], None] | None = None
-    #: called at once when the job is cancelled, from whatever thread asks (stops the stage)
-    on_cancel: Callable[[Job], None] | None = None
-    saving: threading.Lock = field(default_factory=threading.Lock)
-    ended: bool = False
-    _pace_from: tuple[float, int] | None = None
-    _last_shown: float = 0.0
-    _cancel: threading.Event = field(default_factory=threading.Event)
-
-    @property
-    def cancelled(self) -> bool:
-        """Whether the job should stop (:class:`core.progress.CancelToken`)."""
-        return self._cancel.is_set()
-
-    def check(self) -> None:
-        """Raise :class:`core.errors.Cancelled` if the job should stop."""
-        if self.cancelled:
-            raise Cancelled(f"The {self.kind} was cancelled.")
-
-    def progress(self, stage: str, done: int, total: int) -> None:
-        """Report progress (:class:`core.progress.Progress`)."""
-        now = time.monotonic()
-        changed = stage != self.stage
-        if total != self.total or done < self.done or self._pace_from is None:
-            self._pace_from = (now, done)  # other units from here on
-        self.stage, self.done, self.total = stage, done, total
-        # a kernel may report thousands of times a second; readers need ten
-        if changed or done >= total or now - self._last_shown > 0.1:
-            self._last_shown = now
-            self.publish(self, "progress")
-
-    @property
-    def eta_s(self) -> float | None:
-        """Seconds left in these units, from their own pace; None while there is nothing to go by."""
-        if self.state not in ACTIVE or self._pace_from is None or self.total <= 0:
-            return None
-        since, first = self._pace_from
-        if self.done <= first:
-            return None
-        pace_s = (time.monotonic() - since) / (self.done - first)
-        return round(pace_s * max(self.total - self.done, 0), 2)
-
-    def document(self) -> dict[str, Any]:
-        """Return the job as the API shows and the catalogue keeps it."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "state": self.state,
-            "subject": self.subject,
-            "progress": {"stage": self.stage, "done": self.done, "total": self.total, "eta_s": self.eta_s},
-            "created_utc": self.created_utc,
-            "started_utc": self.started_utc,
-            "finished_utc": self.finished_utc,
-            "result": self.result,
-            "problem": self.problem,
-        }
 
 
 class JobManager:
@@ -136,7 +48,9 @@ class JobManager:
         self.queue_limit = queue_limit
         self._lock = threading.Lock()
         self._active: dict[str, Job] = {}
+        self._unsaved: dict[str, dict[str, Any]] = {}  # how jobs ended that a full disk has no room for
         self._queue: deque[Job] = deque()
+        self._parked: set[Job] = set()  # compute jobs that wait for something to do; they hold no lane
         self._reserved = 0  # jobs that will come to the compute lane after their hardware phase
         self._wake = threading.Condition(self._lock)
         self._closing = False
@@ -161,9 +75,11 @@ class JobManager:
         subject: dict[str, Any],
         phases: Sequence[Phase],
         *,
-        prepare: Callable[[], dict[str, Any]] | None = None,
+        prepare: Callable[[Job], dict[str, Any]] | None = None,
+        request: RequestMark | None = None,
         on_end: Callable[[Job, State], None] | None = None,
         on_cancel: Callable[[Job], None] | None = None,
+        follows: str | None = None,
     ) -> Job:
         """Acknowledge a job and start it.
 
@@ -172,7 +88,12 @@ class JobManager:
         what
             The holder's name as a busy caller will read it.
         prepare
-            Runs once it is certain that the job is accepted, before it starts; what it returns joins the subject.
+            Runs once it is certain that the job is accepted, before it starts; what it returns, ids of what it
+            made, joins the subject.
+        request
+            What asked for the job: written with it, so that a crash leaves both or none.
+        follows
+            Id of a test whose new steps wake the job when it waits.
 
         Raises
         ------
@@ -181,7 +102,16 @@ class JobManager:
         QueueFullError
             Too many computations wait.
         """
-        job = Job(self._ids.new("j"), kind, dict(subject), phases, self._show, on_end=on_end, on_cancel=on_cancel)
+        job = Job(
+            self._ids.new("j"),
+            kind,
+            dict(subject),
+            phases,
+            self._show,
+            on_end=on_end,
+            on_cancel=on_cancel,
+            follows=follows,
+        )
         computes = any(p.lane == "compute" for p in phases)
         if computes:
             self._reserve()
@@ -189,9 +119,10 @@ class JobManager:
         try:
             if phases[0].lane == "hardware":
                 token = self._gate.claim(what, job_id=job.id, kind=kind)
-            if prepare is not None:
-                job.subject |= prepare()
-            self._catalog.put_job(job.id, job.state, job.document())
+            made = prepare(job) if prepare is not None else {}
+            job.subject |= made
+            row = None if request is None else request.made({**made, "job_id": job.id})
+            self._catalog.put_job(job.id, job.state, job.document(), row)
         except BaseException:
             if token is not None:
                 self._gate.release(token)
@@ -222,19 +153,26 @@ class JobManager:
     def document(self, job_id: str) -> dict[str, Any]:
         """Return a job of this or an earlier run."""
         with self._lock:
-            job = self._active.get(job_id)
+            job, ended = self._active.get(job_id), self._unsaved.get(job_id)
         if job is not None:
             return job.document()
+        if ended is not None:
+            return ended
         found = self._catalog.job(job_id) if is_id(job_id, "j") else None
         if found is None:
             raise NotFoundError(f"There is no job {job_id[:40]!r}.", what="job")
         return found
 
-    def documents(self, limit: int) -> list[dict[str, Any]]:
-        """Return jobs, newest first."""
+    def documents(self, limit: int, *, before: str | None = None) -> list[dict[str, Any]]:
+        """Return jobs, newest first; ``before``: only those older than this one."""
         with self._lock:
-            active = {j.id: j.document() for j in self._active.values()}
-        return [active.get(d["id"], d) for d in self._catalog.jobs(limit=limit)]
+            active = self._unsaved | {j.id: j.document() for j in self._active.values()}
+        return [active.get(d["id"], d) for d in self._catalog.jobs(limit=limit, before=before)]
+
+    def is_active(self, job_id: str) -> bool:
+        """Whether a job is not finished."""
+        with self._lock:
+            return job_id in self._active
 
     def active_count(self) -> int:
         """Number of jobs that are not finished."""
@@ -258,10 +196,12 @@ class JobManager:
             job = self._active.get(job_id)
             if job is not None:
                 job._cancel.set()
-                waiting = job in self._queue
-                if waiting:
+                waiting = job in self._queue or job in self._parked
+                if job in self._queue:
                     self._queue.remove(job)
                     self._reserved -= 1
+                elif waiting:
+                    self._parked.remove(job)
                 elif job.state == "running":
                     job.state = "cancelling"
         if job is None:
@@ -272,14 +212,61 @@ class JobManager:
                 remedy="There is nothing to cancel.",
                 state=state,
             )
+        stop_waiting = job.stop_waiting
+        if stop_waiting is not None:
+            stop_waiting()
         if job.on_cancel is not None:
             job.on_cancel(job)
         if waiting:
-            self._end(job, "cancelled", Cancelled(f"The {job.kind} was cancelled before it began."))
+            self._end(job, "cancelled", Cancelled(f"The {job.kind} was cancelled while it waited."))
         else:
             self._save(job)
             self._show(job, "state")
         return job.document()
+
+    def landed(self, test_id: str) -> None:
+        """Wake the jobs that follow a test."""
+        with self._lock:
+            followers = [job for job in self._active.values() if job.follows == test_id]
+        for job in followers:
+            self._rouse(job)
+
+    def finish(self, job_id: str) -> dict[str, Any]:
+        """Let a job that follows a test end once it has done what there is.
+
+        Raises
+        ------
+        StateError
+            ``not_following`` if it follows nothing, or has ended.
+        """
+        with self._lock:
+            job = self._active.get(job_id)
+        if job is None or job.follows is None:
+            raise StateError(
+                f"Job {job_id} follows no test." if job is not None else f"Job {job_id} has ended.",
+                code="not_following",
+                remedy="Only an analysis made with follow = true can be finished, while it runs.",
+            )
+        job.finishing.set()
+        self._rouse(job)
+        return job.document()
+
+    def _rouse(self, job: Job) -> None:
+        with self._wake:
+            job.woken.set()
+            if job in self._parked and not self._closing:
+                self._parked.remove(job)
+                self._queue.append(job)
+                self._reserved += 1
+                self._wake.notify()
+
+    def _park(self, job: Job) -> bool:
+        """Set a job aside until it is woken; False where it was woken or is to end, and should go on."""
+        with self._wake:
+            if job.woken.is_set() or job.cancelled or self._closing:
+                return False
+            self._parked.add(job)
+            return True
 
     def cancel_hardware(self) -> str | None:
         """Cancel the job that holds the hardware, if one does; return its id."""
@@ -306,8 +293,11 @@ class JobManager:
         self._end(job, "interrupted", RESTART)
 
     def _run_hardware(self, job: Job, token: object) -> None:
+        # who sees that it has ended may begin something else at once
+        job.let_go = lambda: self._gate.release(token)
         try:
-            finished = self._run_phase(job, 0)
+            with about(job_id=job.id):
+                finished = self._run_phase(job, 0)
         finally:
             self._gate.release(token)
         if not finished:
@@ -328,8 +318,9 @@ class JobManager:
                 job = self._queue.popleft()
                 self._reserved -= 1
             index = 0 if job.phases[0].lane == "compute" else 1
-            if self._run_phase(job, index):
-                self._end(job, "succeeded", None)
+            with about(job_id=job.id):
+                if self._run_phase(job, index):
+                    self._end(job, "succeeded", None)
 
     def _run_phase(self, job: Job, index: int) -> bool:
         try:
@@ -338,7 +329,16 @@ class JobManager:
                 job.state, job.started_utc = "running", now_utc()
                 self._save(job)
                 self._show(job, "state")
-            result = job.phases[index].run(job)
+            while True:
+                job.woken.clear()
+                try:
+                    result = job.phases[index].run(job)
+                except Waiting:
+                    if self._park(job):
+                        return False
+                    job.check()
+                    continue
+                break
             if result:
                 job.result = {**(job.result or {}), **without_nan(result)}
             job.check()
@@ -364,6 +364,8 @@ class JobManager:
                 _log.exception("closing job %s failed", job.id)
                 state, job.problem = "failed", problem_of(second)
         ended = now_utc()
+        if job.let_go is not None:
+            job.let_go()
         # nobody sees a job's end before it is on disk
         self._save(job, state=state, finished_utc=ended)
         with self._lock:
@@ -380,19 +382,43 @@ class JobManager:
                 document = job.document() | final
                 if final:
                     document["progress"]["eta_s"] = None
+                    with self._lock:
+                        self._unsaved[job.id] = document
                 self._catalog.put_job(job.id, document["state"], document)
+                with self._lock:
+                    self._unsaved.pop(job.id, None)
+                    late = list(self._unsaved.items())
+            for job_id, document in late:  # there is room again
+                self._catalog.put_job(job_id, document["state"], document)
+                with self._lock:
+                    self._unsaved.pop(job_id, None)
         except StorageError:
             _log.exception("the state of job %s could not be written", job.id)
 
     def _show(self, job: Job, what: str) -> None:
-        self._hub.publish("job", {**job.document(), "change": what})
+        document = {**job.document(), "change": what}
+        if what == "progress":
+            del document["result"]  # it may hold thousands of steps, and progress comes ten times a second
+        self._hub.publish("job", document)
+
+    def begin_close(self) -> None:
+        """Accept nothing more; what ends from now on without its result was interrupted."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify_all()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the compute lane runs."""
+        return self._thread.is_alive() or self._closing
 
     def close(self) -> None:
         """Interrupt everything; returns when the compute lane has ended."""
         with self._wake:
             self._closing = True
-            queued = list(self._queue)
+            queued = [*self._queue, *self._parked]
             self._queue.clear()
+            self._parked.clear()
             active = [j for j in self._active.values() if j not in queued]
             self._wake.notify_all()
         for job in queued:

@@ -2,7 +2,8 @@
 
 What the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of points, the
 last two fields) is kept between tasks, and the next step's images are read while a step is fitted; a fresh worker makes
-all of it again from the files, so a step measured anywhere gives the same result.
+all of it again from the files, so a step measured anywhere gives the same result. To the last bit: fields of earlier
+steps are taken from their files in any case, with the starts that lie beside them.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+import weakref
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +27,27 @@ from core.compiling import told_when_compiling
 from core.errors import FileFormatError
 from core.field.extrapolated import mark_extrapolated
 from core.field.images import MeasureImage, check_calibrated_size
+from core.field.reference_update import ReferenceUpdate
 from core.field.region import PointGrid
 from core.field.result import Field
 from core.field.seeds import Seed
-from core.measure import MeasureOptions, ReferencePair
+from core.measure import Earlier, MeasureOptions, ReferencePair, Updating
 from core.noise import NoiseModel
 from core.stereo import StereoPair
 from core.threads import set_threads
 from server.compile_aside import CompileAside
 from server.io.calibration_any import load_calibration
 from server.io.calibration_volume import rbe_of, volume_of
+from server.io.files import sha256_of
 from server.io.images import GrayImage, read_image, read_mask
-from server.io.netcdf import Provenance, read_field, write_field
+from server.io.netcdf import Provenance, write_field
+from server.io.netcdf_reading import read_measured
 from server.io.noise_json import load_noise
+from server.io.starts import read_starts, starts_file, write_starts
 from server.io.summary import summarise
 from server.regions import make_grid
-from server.straining import strain_of_step, strain_options, summarise_strain
+from server.seeding import seeds_of
+from server.straining import smoothed_step, strain_of_step, strain_options, summarise_strain
 from server.tasks import StepTask
 from server.version import software_version
 from server.worker_process import current_task
@@ -58,7 +65,11 @@ class _Context:
     options: MeasureOptions
     volume: CalibratedVolume | None
     rbe_px: float | None
+    frame: str
     fields: dict[int, Field] = field(default_factory=dict)
+    sequence: Updating | None = None
+    task: StepTask | None = None
+    last: tuple[int, _Pair] | None = None
     ahead: tuple[tuple[str, str], Future[_Pair]] | None = None
 
 
@@ -81,36 +92,84 @@ def measure_step(task: StepTask) -> dict[str, Any]:
     channel = current_task()
     began = time.perf_counter()
     context = _context_of(task)
-    seeds = task.settings["seeds"]
+    seeds = seeds_of(task.settings)
     more: dict[str, Any] = {"progress": channel.progress, "cancel": channel}
     if seeds is not None:
-        more["seeds"] = np.asarray(seeds, dtype=np.float64)
+        more["seeds"] = seeds
     if task.kind == "shape":
         _read_ahead(task, context)
         result = context.reference.shape(context.grid, context.options, **more)
     else:
         shape = _field(task, context, task.reference)
-        previous = None if task.previous in (None, task.reference) else _field(task, context, task.previous)
+        earlier = None
+        if task.previous is not None and task.previous != task.reference:
+            earlier = Earlier(task.previous, _field(task, context, task.previous))
         images = _images_now(task, context)
         _read_ahead(task, context)
-        result = context.reference.motion(
-            *images, context.grid, context.options, shape=shape, previous=previous, **more
-        )
+        result = _sequence(context, task, shape).measure(images, earlier, **more)
+        context.last = None if _update(task) == "never" else (task.n, images)
     computed = time.perf_counter()
-    extra = {"label": task.label, "test_step": str(task.n), "reference_step": str(task.reference)}
+    extra = {"label": task.label, "test_step": str(task.n)}
     if task.load_n is not None:
         extra["load_n"] = repr(task.load_n)
+    inputs = dict(task.inputs)
+    if result.references is not None:
+        inputs["matched_cam1"], inputs["matched_cam2"] = task.earlier[result.references.step].sha256
     provenance = Provenance(
-        settings=task.settings, inputs=task.inputs, software_version=software_version(), step=task.n, extra=extra
-    )
-    marked = mark_extrapolated(result, context.volume)
+        settings=task.settings, inputs=inputs, software_version=software_version(), step=task.n,
+        reference=task.reference, extra=extra, frame=context.frame,
+    )  # fmt: skip
+    shown = smoothed_step(result, task.settings.get("smoothing_window"), subset_px=task.settings["subset_px"])
+    marked = mark_extrapolated(shown, context.volume)
     strain = strain_of_step(marked, strain_options(task.settings.get("strain")), subset_px=task.settings["subset_px"])
-    write_field(_result_path(task, task.n), marked, provenance, strain)
-    # the next step needs these two, nobody the others
-    context.fields = {n: f for n, f in context.fields.items() if n == task.reference} | {task.n: result}
-    summary = summarise(marked, rbe_px=context.rbe_px)
+    path = _result_path(task, task.n)
+    if result.starts is not None and task.keeps_starts:
+        write_starts(starts_file(path), result.starts)  # first: where the result is, they are
+    write_field(path, marked, provenance, strain, measured=result, checksum=True)
+    if task.previous not in (None, task.reference):
+        starts_file(_result_path(task, task.previous)).unlink(missing_ok=True)  # nobody starts from there any more
+    # the next step needs the reference's field and this one, and reads this one as any other process would
+    context.fields = {n: f for n, f in context.fields.items() if n == task.reference and n != task.n}
+    summary = summarise(marked, rbe_px=context.rbe_px, reference=task.reference)
     summary["strain"] = None if strain is None else summarise_strain(strain)
     return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
+
+
+def _update(task: StepTask) -> ReferenceUpdate:
+    # analyses of earlier versions have no such setting: theirs was total correlation
+    mode: ReferenceUpdate = task.settings.get("reference_update", "never")
+    return mode
+
+
+def _sequence(context: _Context, task: StepTask, shape: Field) -> Updating:
+    """What measures the analysis' steps; all that it needs of earlier ones it finds in memory or in the files."""
+    context.task = task
+    if context.sequence is None:
+        own = weakref.proxy(context)  # no circle: what is dropped, images above all, is to go at once
+        context.sequence = context.reference.sequence(
+            shape, context.grid, context.options, reference_update=_update(task), first=task.reference,
+            images_of=lambda n: _earlier_images(own, n), field_of=lambda n: _earlier_field(own, n),
+        )  # fmt: skip
+    return context.sequence
+
+
+def _earlier_images(context: _Context, n: int) -> _Pair:
+    """Images of an earlier step: those of the last one are still here, others are read and checked again."""
+    if context.last is not None and context.last[0] == n:
+        return context.last[1]
+    assert context.task is not None
+    step = context.task.earlier[n]
+    for path, recorded in zip(step.images, step.sha256, strict=True):
+        if sha256_of(Path(path)) != recorded:
+            raise FileFormatError(f"{path} does not match the checksum in its step.json.", code="checksum_mismatch",
+                                  remedy="Restore the file, or start the analysis again.")  # fmt: skip
+    return _read_pair(step.images, context.task, context.options)
+
+
+def _earlier_field(context: _Context, n: int) -> Field:
+    """Field of an earlier step as its file has it."""
+    assert context.task is not None
+    return mark_extrapolated(_field(context.task, context, n), context.volume)
 
 
 def _images_now(task: StepTask, context: _Context) -> _Pair:
@@ -133,7 +192,7 @@ def _read_pair(paths: tuple[str, str], task: StepTask, options: MeasureOptions) 
     models = _noise(task)
     one, two = (_seen(read_image(path), path, task, model) for path, model in zip(paths, models, strict=True))
     for image in (one, two):
-        image.prepared(options.interpolation)
+        image.prepared(options.interpolation, None, options.blur)
         image.contrast()
     return one, two
 
@@ -166,15 +225,17 @@ def _make_context(task: StepTask) -> _Context:
     check_calibrated_size("The image of cam1", one.shape, calibration.image_size1_px)
     check_calibrated_size("The image of cam2", two.shape, calibration.image_size2_px)
     options = MeasureOptions(
-        subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"]
-    )
+        subset_px=settings["subset_px"], patch=settings["patch"], interpolation=settings["interpolation"],
+        prefilter_px=settings.get("prefilter_px", 0.0),
+    )  # fmt: skip
     models = _noise(task)
     seen1, seen2 = (
         _seen(image, task.images[which], task, model)
         for image, which, model in zip((one, two), ("ref1", "ref2"), models, strict=True)
     )
     reference = ReferencePair(calibration.pair, seen1, seen2)
-    return _Context(reference, _grid(task, one), options, volume_of(calibration), rbe_of(calibration))
+    return _Context(reference, _grid(task, one), options, volume_of(calibration), rbe_of(calibration),
+                    "target" if calibration.source == "calibration_json" else "camera1")  # fmt: skip
 
 
 def _grid(task: StepTask, image: GrayImage) -> PointGrid:
@@ -199,7 +260,7 @@ def _field(task: StepTask, context: _Context, n: int | None) -> Field:
             raise FileFormatError(
                 f"The result of step {n} is missing.", code="file_missing", remedy="Start the analysis again."
             )
-        context.fields[n] = read_field(path)
+        context.fields[n] = replace(read_measured(path), starts=read_starts(starts_file(path)))
     return context.fields[n]
 
 

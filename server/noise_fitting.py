@@ -36,5 +36,5 @@ def fit_noise(task: NoiseTask) -> dict[str, Any]:
             raise type(error)(f"{cam}: {error.cause}", code=error.code, remedy=error.remedy, camera=cam) from error
         sources[cam] = [{"file": entry["file"], "sha256": entry["sha256"]} for entry in files]
     content = noise_content(models, sources=sources, settings=document["settings"])
-    write_noise(folder / "noise.json", content)
+    write_noise(folder / "noise.json", content, checksum=True)
     return {"noise_id": folder.name, **{cam: {"coefficients": list(m.coefficients)} for cam, m in models.items()}}

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from server.compute import run_task
-from server.jobs import Job
+from server.job import Job
 from server.rig.cameras import CAMERAS
 from server.service import Service
 from server.tasks import NoiseTask, fit_noise
@@ -18,6 +18,7 @@ def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[
     taken = []
     for index in range(frames):
         job.check()
+        service.require_room()
         job.progress("frames", index, frames)
         shot = rig.shoot(1, job.check)
         taken += [service.noise.put_frame(noise_id, index, cam, shot.pixels[cam]) for cam in CAMERAS]

@@ -27,10 +27,11 @@ _TILE_PX = 32
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Figures of one image; grey levels in counts."""
+    """Figures of one image; grey levels in counts, ``mean_share`` of full scale: how it was exposed."""
 
     code: str
     mean_grey: float
+    mean_share: float
     saturated_share: float
     contrast_grey: float
     texture_grey_per_px: float
@@ -41,11 +42,19 @@ class ImageQuality:
         return {
             "code": self.code,
             "mean_grey": round(self.mean_grey, 2),
+            "mean_share": round(self.mean_share, 4),
             "saturated_share": round(self.saturated_share, 5),
             "contrast_grey": round(self.contrast_grey, 2),
             "texture_grey_per_px": round(self.texture_grey_per_px, 3),
             "focus": round(self.focus, 4),
         }
+
+
+def gradients(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return central differences along x and y, in grey levels per px, of all pixels but the outermost."""
+    a = pixels.astype(np.float32)
+    # neighbouring pixels' independent noise does not cancel in them, but is halved
+    return 0.5 * (a[1:-1, 2:] - a[1:-1, :-2]), 0.5 * (a[2:, 1:-1] - a[:-2, 1:-1])
 
 
 def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
@@ -54,9 +63,7 @@ def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
     a = pixels.astype(np.float32)
     mean, contrast = float(a.mean()), float(a.std())
     saturated = float(np.mean(pixels >= full))
-    # central differences: neighbouring pixels' independent noise does not cancel, but is halved
-    gx = 0.5 * (a[1:-1, 2:] - a[1:-1, :-2])
-    gy = 0.5 * (a[2:, 1:-1] - a[:-2, 1:-1])
+    gx, gy = gradients(a)
     g2 = gx * gx + gy * gy
     rows, cols = (max(n // _TILE_PX, 1) for n in g2.shape)
     tiles = g2[: g2.shape[0] // rows * rows, : g2.shape[1] // cols * cols]
@@ -77,7 +84,7 @@ def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
         code = "blurred"
     else:
         code = "ok"
-    return ImageQuality(code, mean, saturated, contrast, texture, focus)
+    return ImageQuality(code, mean, mean / full, saturated, contrast, texture, focus)
 
 
 def pair_quality(cam1: ImageQuality, cam2: ImageQuality) -> dict[str, Any]:

@@ -27,6 +27,7 @@ class Variable:
     values: NDArray[Any]
     units: str
     long_name: str
+    dimensions: tuple[str, ...] = ()
 
 
 def _open(path: Path) -> netCDF4.Dataset:
@@ -62,12 +63,18 @@ def read_variable(path: Path, name: str) -> Variable:
             )
         variable = data.variables[name]
         return Variable(
-            _values(variable), str(getattr(variable, "units", "1")), str(getattr(variable, "long_name", ""))
+            _values(variable),
+            str(getattr(variable, "units", "1")),
+            str(getattr(variable, "long_name", "")),
+            tuple(variable.dimensions),
         )
 
 
 def list_variables(path: Path) -> list[dict[str, Any]]:
-    """Return name, unit, meaning and dimensions of every variable of a result file."""
+    """Return name, unit, meaning and dimensions of every variable of a result file.
+
+    ``flags`` names the values of a status, ``comparisons`` those of the correlation's last axis.
+    """
     with library, _open(path) as data:
         return [
             {
@@ -76,9 +83,42 @@ def list_variables(path: Path) -> list[dict[str, Any]]:
                 "long_name": str(getattr(variable, "long_name", "")),
                 "dimensions": list(variable.dimensions),
                 "shape": list(variable.shape),
+                **_meanings(variable),
             }
             for name, variable in data.variables.items()
         ]
+
+
+def read_cut_pieces(path: Path) -> list[list[float]]:
+    """Return the straight pieces [x0, y0, x1, y1] of a result's cuts, px of camera 1's reference image."""
+    with library, _open(path) as data:
+        if "cut_line" not in data.variables:
+            return []
+        x, y, line = (_values(data.variables[name]) for name in ("cut_x_px", "cut_y_px", "cut_line"))
+    same = line[1:] == line[:-1]
+    return [[float(v) for v in piece] for piece in np.stack([x[:-1], y[:-1], x[1:], y[1:]], axis=1)[same]]
+
+
+def _meanings(variable: Any) -> dict[str, Any]:
+    told = variable.ncattrs()
+    meanings: dict[str, Any] = {}
+    if "flag_values" in told:
+        words = str(variable.flag_meanings).split()
+        meanings["flags"] = {str(int(v)): w for v, w in zip(np.atleast_1d(variable.flag_values), words, strict=True)}
+    if "comparisons" in told:
+        meanings["comparisons"] = str(variable.comparisons).split()
+    return meanings
+
+
+def read_point_positions(path: Path) -> NDArray[np.float64]:
+    """Return (rows, cols, 3) where each point is at the step, mm; NaN where it was not measured."""
+    with library, _open(path) as data:
+        held = data.variables
+        position = np.stack([_values(held[f"{axis}_mm"]) for axis in "xyz"], axis=-1)
+        if "u_mm" in held:
+            position = position + np.stack([_values(held[f"{axis}_mm"]) for axis in "uvw"], axis=-1)
+        measured = np.isin(_values(held["status"]), (PointStatus.OK, PointStatus.EXTRAPOLATED))
+    return np.asarray(np.where(measured[..., None], position, np.nan), dtype=np.float64)
 
 
 def read_residuals(path: Path) -> dict[str, Any]:

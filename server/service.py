@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 import time
 from collections.abc import Callable
@@ -10,11 +11,19 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from core.errors import StateError
+from core.errors import StereorigError, StorageError
+from server.cluster import ClusterExecutor
 from server.config import RigConfig
+from server.devices import DeviceFinder
 from server.events import EventHub
+from server.exports.aside import ExportProcess
 from server.hardware import HardwareGate
-from server.jobs import Job, JobManager
+from server.idempotency import OneEffect, RequestMark
+from server.job import Job
+from server.jobs import JobManager
+from server.logs import log_job_event
+from server.metrics import Metrics
+from server.metrics_state import StateCollector
 from server.rig import Rig
 from server.rig.build import check_config
 from server.store.calibrations import CalibrationStore
@@ -23,10 +32,15 @@ from server.store.folder import DataFolder
 from server.store.index import rebuild
 from server.store.noise import NoiseStore
 from server.store.tests import TestStore
-from server.worker import ComputeWorker
+from server.store.trash import Trash
+from server.streams import Streams
+from server.worker import ComputeWorker, start_worker
 
 _log = logging.getLogger("stereorig.service")
 _OPEN_WAIT_S = 5.0
+# numbers stay below 2^53, which JavaScript can hold, for some centuries
+_EVENTS_A_START = 1_000_000
+_END_MOTION_S = 2.0
 
 
 class Service:
@@ -38,9 +52,15 @@ class Service:
         The rig file.
     data
         The data folder; locked while the service runs.
+    record
+        File that gets a transcript of the stage's wire.
+    worker
+        One that was started already, so that it gets warm meanwhile; the service ends it.
     """
 
-    def __init__(self, config: RigConfig, data: Path) -> None:
+    def __init__(
+        self, config: RigConfig, data: Path, *, record: Path | None = None, worker: ComputeWorker | None = None
+    ) -> None:
         check_config(config)
         self.config = config
         self.folder = DataFolder(data)
@@ -52,22 +72,41 @@ class Service:
         self.calibrations = CalibrationStore(self.folder)
         self.tests = TestStore(self.folder)
         self.noise = NoiseStore(self.folder)
-        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests)
+        self.trash = Trash(self.folder.root)
+        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
         for line in self.differences:
             _log.info("catalogue: %s", line)
-        self.hub = EventHub()
+        self.metrics = Metrics()
+        # the clock alone may step back, and the catalogue alone may be lost
+        self.hub = EventHub(start=_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
+        self.hub.listen(self.metrics.on_event)
+        self.hub.listen(log_job_event)
+        self.streams = Streams(live_view=config.service.live_views, events=config.service.event_streams)
         self.gate = HardwareGate()
         self.jobs = JobManager(
             self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
         )
-        self.worker = ComputeWorker(threads=config.service.kernel_threads, warm_up="server.tasks:warm_up")
-        self.rig = Rig(config, self.gate)
+        self.worker = worker or start_worker(config.service.kernel_threads)
+        self.executor: ComputeWorker | ClusterExecutor = self.worker  # of analyses
+        if config.compute.scheduler is not None:
+            self.executor = ClusterExecutor(
+                config.compute.scheduler,
+                images=config.compute.images,
+                threads=config.compute.threads_per_worker,
+            )
+        self.rig = Rig(config, self.gate, self.hub.publish, record=record)
+        self.finder = DeviceFinder()
+        self.exports = ExportProcess(self.folder.root)
         # stopping must not wait behind forty slow requests
         self.stop_thread = ThreadPoolExecutor(max_workers=2, thread_name_prefix="stop")
+        self.abort_thread = ThreadPoolExecutor(max_workers=4, thread_name_prefix="abort")
         self.started_monotonic = time.monotonic()
         self.closing = False
-        self._key_locks: dict[tuple[str, str], threading.Lock] = {}
-        self._key_guard = threading.Lock()
+        #: held from the look at a thing to its change, where a client says which state it means
+        self.changes = threading.Lock()
+        self.metrics.registry.register(StateCollector(self))
+        self._effects = OneEffect(self.catalog)
+        self.continuing = threading.Lock()
         opened = threading.Event()
         token = self.gate.claim("the opening of the rig")
 
@@ -78,15 +117,35 @@ class Service:
                 self.gate.release(token)
                 opened.set()
 
+        self._end: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._end_thread = threading.Thread(target=self._await_end, name="end", daemon=True)
+        self._end_thread.start()
         self.gate.start(open_rig)
         # so that the first request finds the rig; a device that hangs must not keep the service from starting
         opened.wait(timeout=_OPEN_WAIT_S)
 
+    def require_room(self) -> None:
+        """Refuse with ``storage_full`` when less than the reserve is left on the disk."""
+        self.folder.require_room(self.config.service.free_reserve_mib)
+
+    def not_ready(self) -> list[dict[str, str]]:
+        """Return why nothing can be captured or computed now: code and cause each; empty when all can."""
+        reasons = []
+        if self.closing:
+            reasons.append({"code": "shutting_down", "cause": "The service is ending."})
+        if self.rig.fault is not None:
+            reasons.append({"code": str(self.rig.fault["code"]), "cause": str(self.rig.fault["cause"])})
+        if not self.worker.ready.is_set():
+            reasons.append({"code": "worker_starting", "cause": "The compute worker is starting."})
+        try:
+            self.require_room()
+        except StorageError as error:
+            reasons.append({"code": error.code, "cause": error.cause})
+        return reasons
+
     def stop_job(self, job: Job) -> None:
         """Stop the stage for a job that is being cancelled, if it holds the hardware."""
-        holder = self.gate.holder
-        if holder is not None and holder.get("job_id") == job.id and self.rig.fault is None:
-            self.rig.stop()
+        if self.rig.fault is None and self.gate.while_held_by(job.id, self.rig.stop):
             self.stop_until_released(job.id)
 
     def stop_until_released(self, job_id: str) -> None:
@@ -101,10 +160,40 @@ class Service:
         """
         for _ in range(100):
             time.sleep(0.02)
-            holder = self.gate.holder
-            if holder is None or holder.get("job_id") != job_id or self.closing:
-                return
-            self.rig.stop()
+            try:
+                if self.closing or not self.gate.while_held_by(job_id, self.rig.stop):
+                    return
+            except StereorigError as error:  # the job closes the rig just now, or the line was lost
+                _log.debug("stopping again failed: %s", error)
+
+    def is_alive(self) -> bool:
+        """Whether the threads that everything waits for run."""
+        return self.catalog.alive and self.jobs.alive
+
+    def begin_end(self) -> None:
+        """Have the stage stopped, at once and in the background; a signal handler may call it: it takes no lock."""
+        self._end.put(True)
+
+    def _await_end(self) -> None:
+        if self._end.get():
+            self._end_motion()
+
+    def _end_motion(self) -> None:
+        """Let nobody begin a motion any more, and stop the one that runs until its job has let the hardware go."""
+        self.closing = True
+        self.gate.shut()
+        self.jobs.begin_close()
+        self.jobs.cancel_hardware()
+        deadline = time.monotonic() + _END_MOTION_S
+        try:
+            while self.rig.fault is None:
+                self.rig.stop()
+                holder = self.gate.holder
+                if holder is None or "job_id" not in holder or time.monotonic() > deadline:
+                    return
+                time.sleep(0.02)
+        except Exception:  # noqa: BLE001 - closing the rig tries again
+            _log.exception("the stage could not be stopped at shutdown")
 
     def stop_streams(self) -> None:
         """End live views and event streams, which would otherwise outlast every shutdown."""
@@ -114,47 +203,22 @@ class Service:
     def close(self) -> None:
         """Stop the stage first, then jobs, worker, rig and files."""
         self.stop_streams()
-        if self.rig.fault is None:
-            try:
-                self.rig.stop()
-            except Exception:  # noqa: BLE001 - the rest must still be closed
-                _log.exception("the stage could not be stopped at shutdown")
+        self.begin_end()
+        self._end_thread.join(timeout=_END_MOTION_S + 2.0)
         self.jobs.close()
+        if self.executor is not self.worker:
+            self.executor.shutdown()
         self.worker.shutdown()
+        self.exports.close()
         self.gate.close()
         self.rig.close()
         self.stop_thread.shutdown(wait=False)
+        self.abort_thread.shutdown(wait=False)
         self.catalog.close()
         self.folder.close()
 
     def once(
         self, scope: str, key: str | None, body_sha256: str, make: Callable[[], dict[str, Any]]
     ) -> tuple[dict[str, Any], bool]:
-        """Run ``make`` once per Idempotency-Key; return what it made and whether it was made before.
-
-        ``make`` returns the ids of what it made, from which the answer is built again.
-
-        Raises
-        ------
-        StateError
-            ``idempotency_key_reused`` if the key came with another body before.
-        """
-        if key is None:
-            return make(), False
-        with self._key_guard:
-            lock = self._key_locks.setdefault((scope, key), threading.Lock())
-        with lock:
-            earlier = self.catalog.request(scope, key)
-            if earlier is not None:
-                if earlier[0] != body_sha256:
-                    raise StateError(
-                        "This Idempotency-Key was used with another body.",
-                        code="idempotency_key_reused",
-                        remedy="Use a new key for a new request.",
-                    )
-                return earlier[1], True
-            made = make()
-            self.catalog.put_request(scope, key, body_sha256, made)
-        with self._key_guard:
-            self._key_locks.pop((scope, key), None)
-        return made, False
+        """Run ``make`` once per Idempotency-Key, see :meth:`server.idempotency.OneEffect.once`."""
+        return self._effects.once(RequestMark(scope, key, body_sha256), make)

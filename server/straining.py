@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.result import Field
+from core.field.smoothed import smoothed_displacement
+from core.field.smoothing import Smoothing
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
 
 _NAMES = ("exx", "eyy", "exy")
@@ -26,6 +28,26 @@ def strain_options(settings: Mapping[str, Any] | None) -> StrainOptions | None:
     return None if settings is None else StrainOptions(**settings)
 
 
+def smoothed_step(field: Field, window: int | None, *, subset_px: float) -> Field:
+    """Return a step's field with its displacement smoothed; as it is where that was not asked for, or of a shape."""
+    if not window or not field.has_motion:
+        return field
+    return smoothed_displacement(field, window, subset_px=subset_px)
+
+
+def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_window: int | None) -> str:
+    """Say what a smoothed displacement, and strain from it, can still tell apart."""
+    mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
+    text = (
+        f"displacements are smoothed over {smoothing.window} points: what is told apart is "
+        f"{smoothing.resolution_px:g} px{mm} wide, {smoothing.subset_px:g} px without smoothing"
+    )
+    if gauge_px is None or strain_window is None:
+        return text
+    plain = (strain_window - 1) * smoothing.step_px + smoothing.subset_px
+    return f"{text}; the strain gauge grows from {plain:g} to {gauge_px:g} px"
+
+
 def strain_of_step(field: Field, options: StrainOptions | None, *, subset_px: int) -> StrainField | None:
     """Strain of a step; None where it was not asked for, or the step is the reference."""
     if options is None or not field.has_motion:
@@ -39,10 +61,11 @@ def summarise_strain(strain: StrainField) -> dict[str, Any]:
     Returns
     -------
     dict
-        Options, ``gauge_px``, ``gauge_mm``, ``points`` with strain and ``status`` (counts), and in microstrain of
-        exx, eyy, exy: ``mean_microstrain``, ``sd_microstrain`` over the field, ``noise_floor_microstrain`` (median of
-        the standard deviation that the points' covariances predict); of the patches' own strain ``patch``: its mean,
-        and mean and sd of what it differs by. What cannot be told is None.
+        Options, ``gauge_px``, ``gauge_mm`` (of smoothed displacements with the smoothing's window), ``points`` with
+        strain and ``status`` (counts), and in microstrain of exx, eyy, exy: ``mean_microstrain``, ``sd_microstrain``
+        over the field, ``noise_floor_microstrain`` (median of the standard deviation that the points' covariances
+        predict); of the patches' own strain ``patch``: its mean, and mean and sd of what it differs by. What cannot be
+        told is None.
     """
     valid = strain.valid
     summary: dict[str, Any] = {

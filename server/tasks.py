@@ -11,6 +11,22 @@ from typing import Any, Literal
 
 
 @dataclass(frozen=True)
+class EarlierStep:
+    """Images of a step that was measured.
+
+    Parameters
+    ----------
+    images
+        Paths of camera 1's and camera 2's.
+    sha256
+        Of their files, as recorded.
+    """
+
+    images: tuple[str, str]
+    sha256: tuple[str, str]
+
+
+@dataclass(frozen=True)
 class StepTask:
     """One step of one analysis; plain paths and values, so that any executor can carry it.
 
@@ -40,6 +56,11 @@ class StepTask:
         Path of the noise models, or None.
     averages
         By an image's path: how many frames it is the mean of, and what its grey levels were multiplied by.
+    earlier
+        By number, the steps between the reference and this one that were measured: this one may be matched against
+        them.
+    keeps_starts
+        Whether later steps start from what this one finds.
     """
 
     folder: str
@@ -56,6 +77,8 @@ class StepTask:
     following: tuple[str, str] | None = None
     noise: str | None = None
     averages: dict[str, tuple[int, float]] = field(default_factory=dict)
+    earlier: dict[int, EarlierStep] = field(default_factory=dict)
+    keeps_starts: bool = True
 
 
 @dataclass(frozen=True)

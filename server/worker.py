@@ -16,17 +16,21 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
 from core.compiling import COMPILING
 from core.errors import Cancelled, MeasurementError
+from server.death import MemoryWatch, cause_of_death, resident_mib
+from server.logs import about, ids_now
 from server.worker_process import serve
 
 _log = logging.getLogger("stereorig.worker")
 
 _RESTART_PAUSE_S = 5.0
+_LOOK_S = 0.05
+_MEMORY_S = 0.5
 Progress = Callable[[str, int, int], None]
 
 
@@ -34,7 +38,10 @@ class WorkerDiedError(MeasurementError):
     """The compute process ended while it worked."""
 
     code = "worker_died"
-    remedy = "The worker has been started again: start the analysis again. If it dies again, look for memory limits."
+    remedy = (
+        "The worker has been started again, finished steps are kept: continue the analysis. If it dies again, look for "
+        "memory limits, and report a signal other than SIGKILL with the service's log."
+    )
 
 
 @dataclass(eq=False)
@@ -44,6 +51,8 @@ class _Task:
     function: Callable[..., Any]
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
+    #: what its log lines name
+    ids: dict[str, str] = field(default_factory=ids_now)
 
 
 class TaskFuture(Future[Any]):
@@ -73,7 +82,7 @@ class ComputeWorker(Executor):
         How long a cancelled task may take to stop before its process is ended.
     """
 
-    def __init__(self, *, threads: int | None = None, warm_up: str | None = None, patience_s: float = 0.7) -> None:
+    def __init__(self, *, threads: int | None = None, warm_up: str | None = None, patience_s: float = 0.5) -> None:
         self._threads = threads or len(os.sched_getaffinity(0))
         self._warm_up = warm_up
         self._patience_s = patience_s
@@ -85,11 +94,17 @@ class ComputeWorker(Executor):
         self._process: multiprocessing.process.BaseProcess | None = None
         self._connection: Connection | None = None
         self._restart_at = 0.0
+        self._kills, self._held_mib = MemoryWatch({}), None  # type: tuple[MemoryWatch, float | None]
         self.starts = 0
         self.ready = threading.Event()
         self.compiling = threading.Event()  # since the process began; until it is ready
         self._thread = threading.Thread(target=self._run, name="compute-worker", daemon=True)
         self._thread.start()
+
+    @property
+    def width(self) -> int:
+        """How many tasks run at once."""
+        return 1
 
     @property
     def pid(self) -> int | None:
@@ -126,7 +141,8 @@ class ComputeWorker(Executor):
                     task.future.set_exception(Cancelled("The service is shutting down."))
                 break
             if task.future.set_running_or_notify_cancel():
-                self._work_on(task)
+                with about(**task.ids):
+                    self._work_on(task)
         self._end_process()
         with contextlib.suppress(queue.Empty):
             while True:
@@ -159,6 +175,8 @@ class ComputeWorker(Executor):
         elif message[0] == "compiling":
             self.compiling.set()
             _log.warning("%s", COMPILING)  # a warning reaches the service's terminal
+        elif message[0] == "log":
+            logging.getLogger(message[1].name).handle(message[1])
 
     def _start(self) -> None:
         self._end_process()
@@ -168,7 +186,7 @@ class ComputeWorker(Executor):
         self._cancel = self._context.Event()
         process = self._context.Process(
             target=serve,
-            args=(theirs, self._cancel, self._threads, self._warm_up),
+            args=(theirs, self._cancel, self._threads, self._warm_up, logging.getLogger().getEffectiveLevel()),
             name="stereorig-worker",
             daemon=True,
         )
@@ -177,13 +195,13 @@ class ComputeWorker(Executor):
         self._process, self._connection = process, ours
         self.starts += 1
 
-    def _end_process(self) -> None:
+    def _end_process(self, *, at_once: bool = False) -> None:
         process, self._process = self._process, None
         if self._connection is not None:
             self._connection.close()
             self._connection = None
         if process is not None:
-            process.terminate()
+            process.kill() if at_once else process.terminate()
             process.join(timeout=2.0)
             if process.is_alive():
                 process.kill()
@@ -197,6 +215,8 @@ class ComputeWorker(Executor):
             task.future.set_exception(error)
         else:
             task.future.set_result(result)
+        if self._process is None and not self._closing.is_set():
+            self._start()  # only now: whoever waits for the task does not wait for that
 
     def _exchange(self, task: _Task) -> Any:
         if self._process is None or not self._process.is_alive():
@@ -207,6 +227,7 @@ class ComputeWorker(Executor):
         if not self._wait_ready(task, connection, process):
             return self._died(process)
         self._cancel.clear()
+        self._kills, self._held_mib, look_at = MemoryWatch.now(), None, 0.0
         try:
             connection.send((task.id, task.function, task.args, task.kwargs))
         except (BrokenPipeError, ConnectionResetError):
@@ -217,10 +238,13 @@ class ComputeWorker(Executor):
                 self._cancel.set()
                 stop_at = time.monotonic() + self._patience_s
             if stop_at is not None and time.monotonic() > stop_at:
-                self._start() if not self._closing.is_set() else self._end_process()
+                self._end_process(at_once=True)
                 raise Cancelled("The computation was cancelled.")
+            if time.monotonic() > look_at and process.pid is not None:
+                look_at = time.monotonic() + _MEMORY_S
+                self._held_mib = resident_mib(process.pid) or self._held_mib
             try:
-                if not connection.poll(0.05):
+                if not connection.poll(_LOOK_S):
                     if not process.is_alive() and not connection.poll():
                         return self._died(process)
                     continue
@@ -246,7 +270,7 @@ class ComputeWorker(Executor):
             if task.future.stop_requested.is_set() or self._closing.is_set():
                 raise Cancelled("The computation was cancelled.")
             try:
-                if connection.poll(0.05):
+                if connection.poll(_LOOK_S):
                     self._note(connection.recv())
                 elif not process.is_alive():
                     return False
@@ -257,7 +281,19 @@ class ComputeWorker(Executor):
     def _died(self, process: multiprocessing.process.BaseProcess) -> Any:
         process.join(timeout=2.0)
         code = process.exitcode
-        how = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
-        _log.error("the compute worker ended %s during a task; starting it again", how)
+        out_of_memory = self._kills.killed_since()
+        how = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=self._held_mib)
+        _log.error("the compute worker ended during a task, %s; starting it again", how.rstrip("."))
         self._start()
-        raise WorkerDiedError(f"The compute process ended {how} while it worked.", exit_code=code)
+        raise WorkerDiedError(
+            f"The compute process ended while it worked, {how}",
+            exit_code=code,
+            signal=None if code is None or code >= 0 else -code,
+            out_of_memory=out_of_memory,
+            memory_mib=self._held_mib,
+        )
+
+
+def start_worker(threads: int | None) -> ComputeWorker:
+    """Start the worker of a service; its process loads and warms the kernels while the service goes on starting."""
+    return ComputeWorker(threads=threads, warm_up="server.tasks:warm_up")

@@ -6,6 +6,10 @@ loaded.
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import faulthandler
+import gc
 import importlib
 import logging
 import os
@@ -19,6 +23,8 @@ from typing import Any
 
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import Cancelled
+from server.memory import settle
+from server.priority import end_with_parent, lower_worker
 
 _log = logging.getLogger("stereorig.worker")
 _current: TaskChannel | None = None
@@ -59,10 +65,32 @@ def pin_threads(threads: int) -> None:
     os.environ["NUMBA_NUM_THREADS"] = str(threads)
 
 
-def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | None) -> None:
+class LogHandler(logging.Handler):
+    """Sends log records to the service, which knows whose task it was and how lines are to look."""
+
+    def __init__(self, send: Callable[[tuple[Any, ...]], None]) -> None:
+        super().__init__()
+        self._send = send
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record, its arguments and traceback as text."""
+        travelling = copy.copy(record)
+        travelling.msg, travelling.args = record.getMessage(), None
+        if record.exc_info:
+            travelling.exc_text = logging.Formatter().formatException(record.exc_info)
+            travelling.exc_info = None
+        with contextlib.suppress(OSError):  # the service is gone
+            self._send(("log", travelling))
+
+
+def serve(
+    connection: Connection, cancel: Event, threads: int, warm_up: str | None, log_level: int = logging.WARNING
+) -> None:
     """Run tasks from ``connection`` one after another until it closes."""
     global _current
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to handle
+    faulthandler.enable()  # a fault in compiled code leaves its place on the terminal
+    end_with_parent()
     pin_threads(threads)
     import cv2
 
@@ -73,6 +101,8 @@ def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | No
         with lock:
             connection.send(message)
 
+    logging.getLogger().addHandler(LogHandler(send))
+    logging.getLogger().setLevel(max(log_level, logging.INFO))  # below it, others' libraries tell all they do
     if warm_up is not None:
         module, name = warm_up.split(":")
         try:
@@ -80,6 +110,8 @@ def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | No
                 getattr(importlib.import_module(module), name)(threads)
         except Exception:  # noqa: BLE001 - the first task will say what is wrong to somebody who asked
             _log.exception("warming up failed")
+    settle()
+    lower_worker()  # not before: somebody waits for it to be ready
     send(("ready",))
     while True:
         try:
@@ -94,7 +126,9 @@ def serve(connection: Connection, cancel: Event, threads: int, warm_up: str | No
             _reply_error(send, task_id, error)
         else:
             send(("result", task_id, result))
-        _current = None
+        _current = result = args = kwargs = None
+        # by number, what a task leaves in circles is little to the collector; by size it is images
+        gc.collect()
 
 
 def _reply_error(send: Callable[[tuple[Any, ...]], None], task_id: int, error: BaseException) -> None:

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal
 
 import cv2
-from fastapi import APIRouter, File, Form, Query, UploadFile
+from fastapi import APIRouter, File, Form, Path, Query, UploadFile
 from fastapi.responses import FileResponse, Response
 
 from core.errors import StateError
-from server.api.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
+from server.api.conditional import tagged
+from server.api.dependencies import CalibrationId, Camera, KeyHeader, ServiceDep, mark
 from server.api.models import (
     CalibrationAccepted,
     CalibrationList,
     CalibrationReply,
     CalibrationRequest,
-    CameraName,
     Label,
+    ResidualsReply,
+    ViewList,
 )
+from server.api.models.calibrations import CalibrationFile
+from server.api.paging import PageDep
 from server.api.problems import errors
 from server.calibration_sequence import CalibrationPlan, check_plan, close, fit, plan_document, take_views, targets_of
 from server.errors import NotFoundError
-from server.io.calibration_any import imported_content
+from server.io.calibration_any import imported_content, parse_calibration
+from server.io.calibration_check import check_calibration
 from server.io.images import read_image
-from server.jobs import Job, Phase
+from server.job import Job, Phase
 from server.results import read_residuals
+from server.store.durable import without_nan
 from server.store.index import calibration_entry
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
@@ -54,12 +60,13 @@ def create_calibration(
     request = mark("calibrations", key, body)
 
     def make() -> dict[str, Any]:
+        service.require_room()
         check_plan(plan)
         targets_of(service, plan)
         made: dict[str, Any] = {}
 
-        def prepare() -> dict[str, Any]:
-            document = plan_document(plan, service.config) | request.document()
+        def prepare(job: Job) -> dict[str, Any]:
+            document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
             made["calibration_id"] = service.calibrations.create(
                 document, service.config.target.model_dump(mode="json")
             )
@@ -77,6 +84,7 @@ def create_calibration(
             {},
             [Phase("hardware", hardware), Phase("compute", compute)],
             prepare=prepare,
+            request=request,
             on_end=lambda job, state: close(service, job, made["calibration_id"], state),
             on_cancel=service.stop_job,
         )
@@ -86,16 +94,17 @@ def create_calibration(
     return {"job": service.jobs.document(made["job_id"]), "calibration_id": made["calibration_id"]}
 
 
-@router.get("", summary="Calibrations, oldest first", response_model=CalibrationList)
-def list_calibrations(service: ServiceDep) -> dict[str, Any]:
+@router.get("", summary="Calibrations, oldest first", response_model=CalibrationList, responses=errors(422))
+def list_calibrations(service: ServiceDep, page: PageDep) -> dict[str, Any]:
     """Return every calibration that was begun, with its state and verdict."""
-    return {"calibrations": service.catalog.entries("calibration")}
+    calibrations = page.of(service.catalog.entries("calibration"), lambda c: str(c["id"]))
+    return {"calibrations": calibrations, "next_cursor": page.next_cursor}
 
 
-@router.get("/{calibration_id}", summary="One calibration", response_model=CalibrationReply, responses=errors(404))
-def get_calibration(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
-    """Return plan, views and, once complete, all of calibration.json."""
-    return service.calibrations.read(calibration_id)
+@router.get("/{calibration_id}", summary="One calibration", response_model=CalibrationReply, responses=errors(404, 409))
+def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> dict[str, Any]:
+    """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it."""
+    return tagged(response, service.calibrations.read(calibration_id))
 
 
 @router.post(
@@ -107,17 +116,24 @@ def get_calibration(service: ServiceDep, calibration_id: CalibrationId) -> dict[
 )
 def import_calibration(
     service: ServiceDep,
-    file: Annotated[UploadFile, File(description="calibration.json, DICe XML or OpenCV YAML of a stereo pair.")],
+    file: Annotated[
+        UploadFile,
+        File(description="calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML of a stereo pair."),
+    ],
     label: Annotated[Label, Form(description="Free text.")] = "",
     key: KeyHeader = None,
 ) -> dict[str, Any]:
-    """Store another program's stereo calibration, or one of another data folder, to measure imported steps with."""
+    """Store another program's stereo calibration, or one of another data folder, to measure imported steps with.
+
+    `plan.check` says what both cameras make of points that both see (epipolar residual), and what to doubt.
+    """
     data = file.file.read()
     request = mark("calibrations:import", key, None, data, label.encode())
 
     def make() -> dict[str, Any]:
         content = imported_content(data, name="The file")
-        plan = {"source": "import", "label": label, **request.document()}
+        checked = without_nan(check_calibration(parse_calibration(data, name="The file")))
+        plan = {"source": "import", "label": label, "check": checked, **request.document()}
         calibration_id = service.calibrations.add_imported(plan, content)
         entry = calibration_entry(service.calibrations, calibration_id)
         service.catalog.put_entry("calibration", "", calibration_id, entry)
@@ -128,7 +144,14 @@ def import_calibration(
     return service.calibrations.read(made["calibration_id"])
 
 
-def _complete(service: ServiceDep, calibration_id: str) -> Path:
+def complete(service: ServiceDep, calibration_id: str) -> FilePath:
+    """Return a complete calibration's folder.
+
+    Raises
+    ------
+    StateError
+        ``calibration_not_complete``.
+    """
     path = service.calibrations.path(calibration_id)
     if not (path / "calibration.json").exists():
         state = service.calibrations.read(calibration_id)["state"]
@@ -139,16 +162,27 @@ def _complete(service: ServiceDep, calibration_id: str) -> Path:
     return path
 
 
-@router.get("/{calibration_id}/views", summary="Views that were taken", responses=errors(404))
+@router.get(
+    "/{calibration_id}/views",
+    summary="Views that were taken",
+    response_model=ViewList,
+    response_model_exclude_unset=True,
+    responses=errors(404, 409),
+)
 def list_views(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
     """Return camera, role, read-back dZ and checksum of every view; empty until all are taken."""
     return {"views": service.calibrations.read(calibration_id)["taken"] or []}
 
 
-@router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))
+@router.get(
+    "/{calibration_id}/residuals",
+    summary="Residuals of every view",
+    response_model=ResidualsReply,
+    responses=errors(404, 409),
+)
 def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
     """Return, for each view, where every intersection was found and by how much the model misses it."""
-    path = _complete(service, calibration_id) / "residuals.nc"
+    path = complete(service, calibration_id) / "residuals.nc"
     if not path.is_file():
         raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
     return read_residuals(path)
@@ -158,25 +192,25 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[st
     "/{calibration_id}/file",
     summary="calibration.json as stored",
     response_class=FileResponse,
-    responses=errors(404, 409),
+    responses=errors(404, 409) | {200: {"model": CalibrationFile, "description": "The file"}},
 )
-def get_file(service: ServiceDep, calibration_id: CalibrationId) -> FileResponse:
+def get_calibration_file(service: ServiceDep, calibration_id: CalibrationId) -> FileResponse:
     """Return the file, which `stereorig measure` reads."""
-    return FileResponse(_complete(service, calibration_id) / "calibration.json", media_type="application/json")
+    return FileResponse(complete(service, calibration_id) / "calibration.json", media_type="application/json")
 
 
 @router.get(
     "/{calibration_id}/views/{index}/{cam}",
     summary="One view's image",
     response_class=Response,
-    responses=errors(404, 422) | {200: {"content": {"image/tiff": {}, "image/png": {}}}},
+    responses=errors(404, 409, 422) | {200: {"content": {"image/tiff": {}, "image/png": {}}}},
 )
 def get_view(
     service: ServiceDep,
     calibration_id: CalibrationId,
-    index: int,
-    cam: CameraName,
-    format: Annotated[str, Query(pattern="^(png|tiff)$")] = "tiff",  # noqa: A002
+    index: Annotated[int, Path(ge=0, le=999, description="Number of the view.")],
+    cam: Camera,
+    format: Annotated[Literal["tiff", "png"], Query(description="As stored, or for looking at.")] = "tiff",  # noqa: A002
 ) -> Response:
     """Return the image as stored (TIFF), or as PNG for looking at."""
     path = service.calibrations.view_file(calibration_id, index, cam)

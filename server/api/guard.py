@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from urllib.parse import urlsplit
+import re
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -14,12 +14,14 @@ BODY_LIMIT = 32 * 2**20
 UPLOAD_LIMIT = 1024 * 2**20
 
 
+#: a scheme only where it is an origin; a name or an address, and a port: nothing that two readers may read in two ways
+_PLACE = re.compile(r"(?:[a-z][a-z0-9+.-]*://)?(\[[0-9a-f:.%]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?", re.IGNORECASE)
+
+
 def host_name(value: str) -> str | None:
     """Return the host of a Host header or an origin, without port; None if it is not one."""
-    try:
-        return urlsplit(value if "//" in value else f"//{value}").hostname
-    except ValueError:
-        return None
+    found = _PLACE.fullmatch(value)
+    return None if found is None else found[1].strip("[]").lower()
 
 
 class Guard:
@@ -50,20 +52,47 @@ class Guard:
                 )  # fmt: skip
                 await response(scope, receive, send)
                 return
+        if b"transfer-encoding" in headers and b"content-length" in headers:
+            # two lengths: a proxy in front may believe the other one, and see another request than we do
+            response = problem_response(
+                400, "malformed_request", "A body has one length, and this one is given two.",
+                "Send Content-Length or Transfer-Encoding.", headers={"Connection": "close"},
+            )  # fmt: skip
+            await response(scope, receive, send)
+            return
         limit = UPLOAD_LIMIT if scope["path"].endswith("/steps:import") else BODY_LIMIT
         length = headers.get(b"content-length", "0")
         if not length.isdigit() or int(length) > limit:
             response = problem_response(413, "body_too_large", f"The body is larger than {limit} bytes.", "Send less.")
             await response(scope, receive, send)
             return
-        seen = 0
+        await _counted(self._app, limit, scope, receive, send)
 
-        async def counted() -> Message:
-            nonlocal seen
-            message = await receive()
-            seen += len(message.get("body", b""))
-            if seen > limit:
-                raise TooLargeError(f"The body is larger than {limit} bytes.")
-            return message
 
-        await self._app(scope, counted, send)
+async def _counted(app: ASGIApp, limit: int, scope: Scope, receive: Receive, send: Send) -> None:
+    """Pass on, and cut off a body that does not say beforehand how long it is."""
+    seen, answered, cut_off = 0, False, False
+
+    async def counted() -> Message:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > limit:
+            raise TooLargeError(f"The body is larger than {limit} bytes.")
+        return message
+
+    async def told(message: Message) -> None:
+        nonlocal answered, cut_off
+        if cut_off:
+            return
+        if seen > limit and not answered:
+            # whatever the reader of the body made of it
+            cut_off = True
+            cause = f"The body is larger than {limit} bytes."
+            response = problem_response(413, "body_too_large", cause, "Send less.", headers={"Connection": "close"})
+            await response(scope, receive, send)
+            return
+        answered = True
+        await send(message)
+
+    await app(scope, counted, told)

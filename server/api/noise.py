@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path
 from fastapi.responses import FileResponse
 
+from core.errors import FileFormatError
 from server import noise_sequence
 from server.api.dependencies import KeyHeader, ServiceDep, mark
 from server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
+from server.api.models.noise import NoiseFile
+from server.api.paging import PageDep
 from server.api.problems import errors
-from server.jobs import Job, Phase
+from server.job import Job, Phase
 
 router = APIRouter(prefix="/noise", tags=["noise"])
 NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurement.")]
@@ -30,10 +34,12 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
     request = mark("noise", key, body)
 
     def make() -> dict[str, Any]:
+        service.require_room()
         made: dict[str, Any] = {}
 
-        def prepare() -> dict[str, Any]:
-            plan = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name, **request.document()}
+        def prepare(job: Job) -> dict[str, Any]:
+            facts = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name}
+            plan = {**facts, **request.document(), "job_id": job.id}
             made["noise_id"] = service.noise.create(plan)
             return dict(made)
 
@@ -49,6 +55,7 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
             {},
             [Phase("hardware", hardware), Phase("compute", compute)],
             prepare=prepare,
+            request=request,
             on_end=lambda job, state: noise_sequence.close(service, job, made["noise_id"], state),
         )
         return {**made, "job_id": job.id}
@@ -57,20 +64,29 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
     return {"job": service.jobs.document(made["job_id"]), "noise_id": made["noise_id"]}
 
 
-@router.get("", summary="Noise measurements, oldest first", response_model=NoiseList)
-def list_noise(service: ServiceDep) -> dict[str, Any]:
+@router.get("", summary="Noise measurements, oldest first", response_model=NoiseList, responses=errors(422))
+def list_noise(service: ServiceDep, page: PageDep) -> dict[str, Any]:
     """Return every noise measurement that was begun, with its state."""
-    return {"noise": [_shown(service.noise.read(noise_id)) for noise_id in service.noise.ids()]}
+    found = []
+    for noise_id in page.of(service.noise.ids(), str):
+        with contextlib.suppress(FileFormatError):  # what is damaged says so when it is asked for
+            found.append(_shown(service.noise.read(noise_id)))
+    return {"noise": found, "next_cursor": page.next_cursor}
 
 
-@router.get("/{noise_id}", summary="One noise measurement", response_model=NoiseReply, responses=errors(404))
+@router.get("/{noise_id}", summary="One noise measurement", response_model=NoiseReply, responses=errors(404, 409))
 def get_noise(service: ServiceDep, noise_id: NoiseId) -> dict[str, Any]:
     """Return plan, state and, once complete, both cameras' models."""
     return _shown(service.noise.read(noise_id))
 
 
-@router.get("/{noise_id}/file", summary="noise.json as stored", response_class=FileResponse, responses=errors(404, 409))
-def get_file(service: ServiceDep, noise_id: NoiseId) -> FileResponse:
+@router.get(
+    "/{noise_id}/file",
+    summary="noise.json as stored",
+    response_class=FileResponse,
+    responses=errors(404, 409) | {200: {"model": NoiseFile, "description": "The file"}},
+)
+def get_noise_file(service: ServiceDep, noise_id: NoiseId) -> FileResponse:
     """Return the file, which `stereorig measure --noise` reads."""
     return FileResponse(service.noise.file(noise_id), media_type="application/json")
 

@@ -15,20 +15,34 @@ from fastapi.responses import Response, StreamingResponse
 
 from core.errors import StereorigError
 from drivers.frames import CameraSettings, Frame
-from server.api.dependencies import KeyHeader, ServiceDep, get_service, mark
-from server.api.models import Accepted, CameraName, SceneRequest, SettingsPatch
+from server.api.conditional import IfMatch, etag_of, require_match, tagged
+from server.api.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
+from server.api.models import (
+    Accepted,
+    CameraReply,
+    CameraSet,
+    CamerasReply,
+    CameraStats,
+    RigReply,
+    SceneReply,
+    SceneRequest,
+    SettingsPatch,
+)
 from server.api.problems import errors
-from server.errors import QueueFullError
 from server.io.images import encode_tiff
-from server.jobs import Job, Phase
+from server.job import Job, Phase
 from server.quality import image_quality
 
 router = APIRouter(tags=["rig"])
 _BOUNDARY = "frame"
-MAX_STREAMS = 8
 
 
-@router.get("/rig", summary="The rig: cameras, stage, target, who holds it")
+@router.get(
+    "/rig",
+    summary="The rig: cameras, stage, target, who holds it",
+    response_model=RigReply,
+    response_model_exclude_unset=True,
+)
 def get_rig(service: ServiceDep) -> dict[str, Any]:
     """Return everything a client wants to know before it does anything."""
     return service.rig.describe()
@@ -39,7 +53,7 @@ def get_rig(service: ServiceDep) -> dict[str, Any]:
     summary="Open cameras and stage again",
     response_model=Accepted,
     status_code=202,
-    responses=errors(409, 503),
+    responses=errors(409, 503, 507),
 )
 def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
     """Close and open every device; settings are pushed and read back."""
@@ -50,16 +64,23 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
         return {"rig": service.rig.describe()["name"]}
 
     def make() -> dict[str, Any]:
-        return {
-            "job_id": service.jobs.submit("reconnect", "a reconnection of the rig", {}, [Phase("hardware", run)]).id
-        }
+        job = service.jobs.submit(
+            "reconnect", "a reconnection of the rig", {}, [Phase("hardware", run)], request=request
+        )
+        return {"job_id": job.id}
 
     request = mark("reconnect", key, None)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return {"job": service.jobs.document(made["job_id"])}
 
 
-@router.put("/sim/scene", summary="Choose what a simulated rig sees", responses=errors(409, 422, 503))
+@router.put(
+    "/sim/scene",
+    summary="Choose what a simulated rig sees",
+    response_model=SceneReply,
+    response_model_exclude_unset=True,
+    responses=errors(409, 422, 503),
+)
 def put_scene(service: ServiceDep, body: SceneRequest) -> dict[str, Any]:
     """Put the grid, a plate, a panel ... before the cameras; only on simulated rigs."""
     with service.gate.hold("a change of the scene"):
@@ -68,23 +89,38 @@ def put_scene(service: ServiceDep, body: SceneRequest) -> dict[str, Any]:
     return scene
 
 
-@router.get("/cameras", summary="Both cameras")
+@router.get("/cameras", summary="Both cameras", response_model=CamerasReply, response_model_exclude_unset=True)
 def get_cameras(service: ServiceDep) -> dict[str, Any]:
     """Return nominal data, the devices' own descriptions and their settings."""
     return {"cameras": [service.rig.describe_camera(cam) for cam in ("cam1", "cam2")]}
 
 
-@router.get("/cameras/{cam}", summary="One camera", responses=errors(422))
-def get_camera(service: ServiceDep, cam: CameraName) -> dict[str, Any]:
+@router.get(
+    "/cameras/{cam}",
+    summary="One camera",
+    response_model=CameraReply,
+    response_model_exclude_unset=True,
+    responses=errors(422),
+)
+def get_camera(service: ServiceDep, cam: Camera, response: Response) -> dict[str, Any]:
     """Return nominal data, the device's own description and its settings."""
-    return service.rig.describe_camera(cam)
+    return tagged(response, service.rig.describe_camera(cam))
 
 
-@router.patch("/cameras/{cam}", summary="Change a camera's settings", responses=errors(409, 422, 503))
-def patch_camera(service: ServiceDep, cam: CameraName, body: SettingsPatch) -> dict[str, Any]:
-    """Set what is given; the answer holds every setting as read back from the device."""
+@router.patch(
+    "/cameras/{cam}",
+    summary="Change a camera's settings",
+    response_model=CameraSet,
+    responses=errors(409, 412, 422, 503),
+)
+def patch_camera(
+    service: ServiceDep, cam: Camera, body: SettingsPatch, response: Response, if_match: IfMatch = None
+) -> dict[str, Any]:
+    """Set what is given; the answer holds every setting as read back. If-Match refuses if others changed them."""
     with service.gate.hold(f"new settings of {cam}"):
+        require_match(if_match, etag_of(service.rig.describe_camera(cam)), f"the settings of {cam}", required=False)
         taken = service.rig.configure(cam, CameraSettings(**body.model_dump()))
+        response.headers["ETag"] = etag_of(service.rig.describe_camera(cam))
     return {"name": cam, "settings": asdict(taken)}
 
 
@@ -96,8 +132,8 @@ def patch_camera(service: ServiceDep, cam: CameraName, body: SettingsPatch) -> d
 )
 def get_frame(
     service: ServiceDep,
-    cam: CameraName,
-    format: Annotated[Literal["png", "tiff"], Query()] = "png",  # noqa: A002
+    cam: Camera,
+    format: Annotated[Literal["png", "tiff"], Query(description="File format.")] = "png",  # noqa: A002
 ) -> Response:
     """Return the newest frame, with every grey level as the camera gave it."""
     frame = service.rig.pair.live(cam, max_age_s=0.1)
@@ -115,9 +151,10 @@ def get_frame(
 @router.get(
     "/cameras/{cam}/stats",
     summary="What became of a camera's frames, and the newest one's quality",
+    response_model=CameraStats,
     responses=errors(409, 422, 503),
 )
-def get_stats(service: ServiceDep, cam: CameraName) -> dict[str, Any]:
+def get_stats(service: ServiceDep, cam: Camera) -> dict[str, Any]:
     """Return counters, mean grey level, saturation, texture, focus and histogram."""
     frame = service.rig.pair.live(cam, max_age_s=0.2)
     shift = max(frame.bit_depth - 8, 0)
@@ -125,6 +162,7 @@ def get_stats(service: ServiceDep, cam: CameraName) -> dict[str, Any]:
     return {
         "name": cam,
         "frames": service.rig.pair.units[cam].counters(),
+        "driver": service.rig.pair.units[cam].statistics(),
         "pairs": service.rig.pair.account(),
         "sequence": frame.sequence,
         "quality": image_quality(frame.pixels, frame.bit_depth).as_dict(),
@@ -145,37 +183,42 @@ def _jpeg(frame: Frame) -> bytes:
     responses=errors(409, 422, 503) | {200: {"content": {"multipart/x-mixed-replace": {}}}},
 )
 async def get_stream(
-    request: Request, cam: CameraName, rate_hz: Annotated[float, Query(gt=0.0, le=30.0)] = 10.0
+    request: Request,
+    cam: Camera,
+    rate_hz: Annotated[float, Query(gt=0.0, le=30.0, description="Frames a second at most.")] = 10.0,
 ) -> StreamingResponse:
     """Stream JPEG frames for an `<img>`; a slow reader gets fewer of them, and recording comes first."""
     service = get_service(request)
     pair = service.rig.pair
-    if request.app.state.streams >= MAX_STREAMS:
-        raise QueueFullError(f"{MAX_STREAMS} live views are open already.", code="too_many_streams")
-    request.app.state.streams += 1
+    service.streams.check("live_view")
     # live views have few threads of their own, and can never take those of other requests
     limiter: CapacityLimiter = request.app.state.view_limiter
 
-    def newest() -> tuple[int, bytes]:
-        frame = pair.live(cam, max_age_s=0.9 / rate_hz)
-        return frame.sequence, _jpeg(frame)
+    def newer(last: int | None) -> tuple[int, bytes | None]:
+        frame = pair.live(cam, max_age_s=0.9 / rate_hz, after=last)
+        return frame.sequence, None if frame.sequence == last else _jpeg(frame)
 
     async def parts() -> AsyncIterator[bytes]:
-        last = -1
-        try:
+        last: int | None = None
+        with service.streams.counted("live_view"):
             while not service.closing:
                 began = anyio.current_time()
                 try:
-                    sequence, data = await anyio.to_thread.run_sync(newest, limiter=limiter, abandon_on_cancel=True)
-                except StereorigError:
+                    sequence, data = await anyio.to_thread.run_sync(
+                        newer, last, limiter=limiter, abandon_on_cancel=True
+                    )
+                except StereorigError as error:
+                    if error.code == "camera_busy":  # a capture goes on, and nothing older is there to show
+                        continue
                     return  # the stream ends; GET /rig says why
-                if sequence != last:
+                pause_s = 1.0 / rate_hz
+                if data is None:
+                    pause_s /= 4  # none yet: it is not waited for a whole period, which would halve the rate
+                else:
                     last = sequence
                     head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     yield head.encode() + data + b"\r\n"
-                await anyio.sleep(max(1.0 / rate_hz - (anyio.current_time() - began), 0.0))
-        finally:
-            request.app.state.streams -= 1
+                await anyio.sleep(max(pause_s - (anyio.current_time() - began), 0.0))
 
     return StreamingResponse(
         parts(), media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}", headers={"Cache-Control": "no-store"}

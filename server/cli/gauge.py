@@ -11,14 +11,16 @@ from typing import Any
 from pydantic import ValidationError
 
 from core.errors import InputError
+from server.gauge_fields import FieldWriter
 from server.gauge_request import GaugeRequest
 from server.gauging import read_gauges
 from server.io.files import make_folder, write_bytes
 from server.io.gauge_csv import gauges_csv
+from server.io.gauge_mat import gauges_mat
 from server.io.summary import to_json
 
 _RESULT = re.compile(r"step_\d{4,}\.nc")
-_FORMS = {".csv": gauges_csv, ".json": to_json}
+_FORMS = {".csv": gauges_csv, ".json": to_json, ".mat": gauges_mat}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,17 +45,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="take out the rigid motion of the whole field, or that of a rectangle or polygon")  # fmt: skip
     add("--robust", action="store_true", help="let no outlier draw the rigid motion")
     add("--step", **many, type=int, metavar="N", help="read this step only; repeatable (all)")
-    add("--out", metavar="FILE", type=Path, help="file.csv or file.json for all readings, settings and inputs' hashes")
+    add("--field-out", metavar="DIR", type=Path,
+        help="write whole fields as result files, in the frame and without the motion asked for")  # fmt: skip
+    add(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="file.csv, file.json or file.mat for all readings, settings and inputs' hashes",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Read; print tables; write the file."""
     if args.out is not None and args.out.suffix.lower() not in _FORMS:
-        raise InputError(f"--out {args.out} ends in neither .csv nor .json.", code="output_unusable",
-                         remedy="Give file.csv or file.json.")  # fmt: skip
+        raise InputError(f"--out {args.out} ends in none of .csv, .json and .mat.", code="output_unusable",
+                         remedy="Give file.csv, file.json or file.mat.")  # fmt: skip
     request = _request(args)
-    document = read_gauges(result_files(args.folder), request)
+    files = result_files(args.folder)
+    fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
+    document = read_gauges(files, request, fields)
     print("\n".join(report(document)))
+    if fields is not None:
+        print(f"fields written: {len(fields.written)} files in {args.field_out}")
     if args.out is not None:
         make_folder(args.out.absolute().parent)
         write_bytes(args.out, _FORMS[args.out.suffix.lower()](document))
@@ -162,7 +175,8 @@ def _numbers(option: str, text: str, counts: tuple[int, ...] | None) -> list[flo
 
 def report(document: dict[str, Any]) -> list[str]:
     """Return the readings as tables over the steps, one gauge after the other."""
-    lines = [f"frame: {document['frame']}"]
+    lines = [f"STALE: {reason} since this was measured; measure again" for reason in document["stale_reasons"]]
+    lines.append(f"frame: {document['frame']}")
     alignment = document["alignment"]
     if alignment:
         turns = ", ".join(f"{1e6 * s:.1f}" for s in alignment["sigma_rad"])

@@ -14,10 +14,11 @@ from core.errors import FileFormatError, ImageError, InputError
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The two image files of one step, and what their record says of them (None without a record)."""
+    """The two image files of one step, its number in its test, and what its record says (None without a record)."""
 
     cam1: Path
     cam2: Path
+    number: int | None = None
     sha256_1: str | None = None
     sha256_2: str | None = None
 
@@ -96,23 +97,41 @@ def pairs_of_test_folder(folder: Path) -> list[ImagePair]:
     Raises
     ------
     InputError
-        ``file_missing`` or ``no_steps``.
+        ``file_missing``, ``no_steps``; ``reference_missing`` or ``step_missing`` where a step's folder is gone.
     FileFormatError
         If a ``step.json`` is damaged.
     """
     if not folder.is_dir():
         raise InputError(f"The test folder {folder} does not exist.", code="file_missing", remedy="Check the path.")
+    _check_steps(folder)
     pairs = []
     for mark in sorted(folder.glob("steps/*/step.json")):
         try:
             hashes = _hashes(json.loads(mark.read_text()))
         except (ValueError, OSError) as error:
             raise FileFormatError(f"{mark} cannot be read as a step's record ({error}).") from error
-        pairs.append(ImagePair(mark.parent / "cam1.tif", mark.parent / "cam2.tif", *hashes))
+        number = int(mark.parent.name) if mark.parent.name.isdigit() else None
+        pairs.append(ImagePair(mark.parent / "cam1.tif", mark.parent / "cam2.tif", number, *hashes))
     if not pairs:
         raise InputError(f"{folder} holds no complete step (steps/<nnnn>/ with cam1.tif, cam2.tif and step.json).",
                          code="no_steps", remedy="Give the folder of a test, or --cam1 and --cam2.")  # fmt: skip
     return pairs
+
+
+def _check_steps(folder: Path) -> None:
+    """Refuse a test whose steps do not begin with the reference or have a gap; an incomplete step keeps its folder."""
+    complete = [int(mark.parent.name) for mark in folder.glob("steps/*/step.json") if mark.parent.name.isdigit()]
+    if not complete:
+        return
+    remedy = "Restore it from a backup, or give the images that are left with --cam1 and --cam2."
+    if 0 not in complete:
+        raise InputError(f"The reference, step 0, of {folder} is missing or incomplete.", code="reference_missing",
+                         remedy=remedy)  # fmt: skip
+    known = {int(path.name) for path in folder.glob("steps/*") if path.name.isdigit()}
+    gone = [n for n in range(max(complete)) if n not in known]
+    if gone:
+        raise InputError(f"Step {gone[0]} of {folder} is gone; it has steps up to {max(complete)}.",
+                         code="step_missing", remedy=remedy)  # fmt: skip
 
 
 def _hashes(record: object) -> tuple[str | None, str | None]:

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
 from core.field.images import check_calibrated_size
 from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS
+from core.field.prefilter import check_prefilter
+from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, REFERENCE_UPDATES
+from core.field.smoothing import WIDEST_SMOOTHING
 from core.strain.options import DEFAULT_WINDOW, STRAIN_TENSORS, WIDEST_WINDOW, StrainOptions
 from server.cli.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.region import check_odd, check_region, parse_rectangle
 from server.cli.sequence import CheckedPair, MeasureJob, measure_sequence
 from server.cli.terminal import ProgressLine
+from server.identity import check_same_cameras
 from server.io.calibration_any import LoadedCalibration, load_calibration
 from server.io.images import decode_image, read_file
 from server.io.noise_json import load_noise
+from server.seeding import check_places
+from server.store.durable import read_json
 
 SUBSET_RANGE_PX = (7, 301)
 STEP_RANGE_PX = (1, 1000)
@@ -41,7 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: "
         f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})")  # fmt: skip
     add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
-    add("--seed", action="append", default=[], metavar="X,Y", help="start here in camera 1's first image; repeatable")
+    add("--prefilter", default="0", metavar="SD",
+        help="blur all images with a Gaussian of this sd in px: less bias, more noise (0: none)")  # fmt: skip
+    add("--seed", action="append", default=[], metavar="X,Y[,X2,Y2]",
+        help="start here in camera 1's first image, and there in camera 2's; repeatable")  # fmt: skip
     add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
     add(
         "--strain",
@@ -52,6 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--strain-order", choices=("1", "2"), default="1", help="fit planes (1) or quadratics (2) over the gauge (1)")
     add("--strain-tensor", choices=STRAIN_TENSORS, default="green_lagrange",
         help="which strain is told (green_lagrange)")  # fmt: skip
+    add("--smooth", default="off", metavar="WINDOW|off",
+        help="smooth displacements by a quadratic over WINDOW x WINDOW points (off)")  # fmt: skip
+    add("--reference-update", choices=REFERENCE_UPDATES, default=DEFAULT_REFERENCE_UPDATE,
+        help="never: match every step against the first (total); always: against the step before (incremental); auto: "
+        "against the first, or a later reference where that fails, and says so; displacements are totals in any case "
+        f"({DEFAULT_REFERENCE_UPDATE})")  # fmt: skip
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
@@ -74,6 +90,20 @@ def _strain_options(args: argparse.Namespace) -> StrainOptions | None:
         return None
     window = check_odd("--strain", args.strain, low=3, high=WIDEST_WINDOW, odd=True)
     return StrainOptions(window=window, order=2 if args.strain_order == "2" else 1, tensor=args.strain_tensor)
+
+
+def _smoothing_window(args: argparse.Namespace) -> int | None:
+    return None if args.smooth == "off" else check_odd("--smooth", args.smooth, low=3, high=WIDEST_SMOOTHING, odd=True)
+
+
+def _prefilter_px(args: argparse.Namespace, subset_px: int) -> float:
+    try:
+        prefilter_px = float(args.prefilter)
+    except ValueError as error:
+        raise InputError(f"--prefilter {args.prefilter} is not a number.", code="prefilter_invalid",
+                         remedy="Give a standard deviation in px, or 0 for none.") from error  # fmt: skip
+    check_prefilter(prefilter_px, subset_px)
+    return prefilter_px
 
 
 def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
@@ -99,11 +129,15 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     subset = check_odd("--subset", args.subset, low=SUBSET_RANGE_PX[0], high=SUBSET_RANGE_PX[1], odd=True)
     step = check_odd("--step", args.step, low=STEP_RANGE_PX[0], high=STEP_RANGE_PX[1], odd=False)
     rectangle = None if args.roi is None else parse_rectangle(args.roi)
-    strain = _strain_options(args)
+    strain, prefilter_px = _strain_options(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
     calibration_file = Path(args.calibration) if args.calibration or folder is None else folder / "calibration.json"
     calibration = load_calibration(calibration_file)
+    if folder is not None and not args.calibration:
+        _check_calibration(folder, calibration)
+    for pair in files:
+        _check_cameras(pair, calibration_file)
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
     shapes = _checked_shapes(files[0], calibration)
     if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
@@ -114,12 +148,35 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     noise = None if args.noise is None else load_noise(args.noise)
     region = check_region(rectangle, image_shape=shapes[0], subset_px=subset, step_px=step,
                           mask_path=mask_file, seeds=args.seed, cracks=args.crack, holes=args.hole)  # fmt: skip
+    check_places(calibration.pair, region.seeds or (), (shapes[1][1], shapes[1][0]))
     pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     return MeasureJob(
         calibration=calibration, calibration_file=calibration_file, pairs=pairs, region=region, subset_px=subset,
         step_px=step, patch=args.patch, interpolation=args.interpolation, mask_file=mask_file, out=out,
-        noise=noise, strain=strain,
+        noise=noise, strain=strain, prefilter_px=prefilter_px, smoothing_window=_smoothing_window(args),
+        reference_update=args.reference_update,
     )  # fmt: skip
+
+
+def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
+    """Refuse a test's calibration that is not the one its record names."""
+    try:
+        record = json.loads((folder / "test.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return  # a folder put together by hand has none
+    made_with = record.get("calibration_sha256") if isinstance(record, dict) else None
+    if made_with is not None and made_with != calibration.sha256:
+        raise FileFormatError(
+            f"{folder / 'calibration.json'} is not the calibration that test.json names.", code="calibration_changed",
+            remedy="Restore the file, or name the calibration that is meant with --calibration.",
+        )  # fmt: skip
+
+
+def _check_cameras(pair: ImagePair, calibration_file: Path) -> None:
+    """Refuse a pair that its record says was taken with other cameras than were calibrated."""
+    record = pair.cam1.parent / "step.json"
+    if record.is_file() and calibration_file.suffix == ".json":
+        check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")
 
 
 def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:

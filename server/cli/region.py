@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from core.errors import InputError, RegionError
 from core.field.region import PointGrid
 from core.field.region import check_region as check_points
+from core.field.seeds import Seed
 from server.io.images import read_mask
 
 Rectangle = tuple[float, float, float, float]
@@ -29,34 +30,34 @@ class RegionRequest:
         (X0, Y0, X1, Y1), points lie at X0 + i step and Y0 + j step up to X1, Y1.
     grid
         The points, those on the mask's black not allowed.
-    seeds_px
-        (n, 2) in camera 1's reference image; None = found by the program.
+    seeds
+        Places in camera 1's reference image, and in camera 2's where told; None = found by the program.
     cracks_px, holes_px
         Lines and polygons, as given; the grid knows them.
     """
 
     rectangle_px: Rectangle
     grid: PointGrid
-    seeds_px: NDArray[np.float64] | None
+    seeds: tuple[Seed, ...] | None
     cracks_px: tuple[Line, ...] = ()
     holes_px: tuple[Line, ...] = ()
 
 
-def _numbers(option: str, text: str, count: int) -> list[float]:
+def _numbers(option: str, text: str, count: int, form: str | None = None) -> list[float]:
     parts = text.split(",")
     try:
         numbers = [float(part) for part in parts]
     except ValueError as error:
-        raise _bad(option, text, "is not a list of numbers", count) from error
+        raise _bad(option, text, "is not a list of numbers", count, form) from error
     if len(numbers) != count:
-        raise _bad(option, text, f"has {len(numbers)} numbers", count)
+        raise _bad(option, text, f"has {len(numbers)} numbers", count, form)
     if not all(math.isfinite(v) for v in numbers):
-        raise _bad(option, text, "holds a number that is not finite", count)
+        raise _bad(option, text, "holds a number that is not finite", count, form)
     return numbers
 
 
-def _bad(option: str, text: str, why: str, count: int) -> RegionError:
-    form = "X0,Y0,X1,Y1" if count == 4 else "X,Y"
+def _bad(option: str, text: str, why: str, count: int, form: str | None) -> RegionError:
+    form = form or ("X0,Y0,X1,Y1" if count == 4 else "X,Y")
     return RegionError(f"{option} {text!r} {why}.", remedy=f"Give {option} {form} in pixels of camera 1's image.")
 
 
@@ -144,16 +145,20 @@ def check_region(
     return RegionRequest(rectangle, checked, _seeds(seeds, rectangle, mask), crack_lines, hole_lines)
 
 
-def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> NDArray[np.float64] | None:
+def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> tuple[Seed, ...] | None:
     if not texts:
         return None
     x0, y0, x1, y1 = rectangle
-    seeds = np.array([_numbers("--seed", text, 2) for text in texts])
-    for text, (x, y) in zip(texts, seeds, strict=True):
+    seeds = []
+    for text in texts:
+        # with four numbers, the last two are the place in camera 2
+        count = 4 if text.count(",") == 3 else 2
+        x, y, *other = _numbers("--seed", text, count, "X,Y or X,Y,X2,Y2")
         if not (x0 <= x <= x1 and y0 <= y <= y1):
             cause = f"--seed {text} lies outside the region {x0:g},{y0:g},{x1:g},{y1:g}."
             raise RegionError(cause, code="seed_outside", remedy="Give a seed inside the region, in camera 1's image.")
         if mask is not None and not mask[min(round(y), mask.shape[0] - 1), min(round(x), mask.shape[1] - 1)]:
             raise RegionError(f"--seed {text} lies where the mask is black.",
                               code="seed_outside", remedy="Give a seed where the mask is white.")  # fmt: skip
-    return seeds
+        seeds.append(Seed((x, y), (other[0], other[1]) if other else None))
+    return tuple(seeds)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from core.errors import MeasurementError
 from core.field.extrapolated import mark_extrapolated
 from core.field.images import MeasureImage
 from core.field.patch import PatchSetting
+from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
 from core.field.result import Field
 from core.strain import StrainOptions
 from server.cli.image_lists import ImagePair
@@ -32,11 +33,15 @@ from server.io.calibration_volume import rbe_of, volume_of
 from server.io.files import make_folder, sha256_of, write_bytes
 from server.io.images import read_image
 from server.io.netcdf import Provenance, write_field
+from server.io.netcdf_reading import read_measured
 from server.io.noise_json import LoadedNoise
 from server.io.summary import summarise, to_json
 from server.overlap import ReadAhead, WriteBehind
-from server.straining import strain_of_step, strain_settings, summarise_strain
+from server.straining import smoothed_step, smoothing_note, strain_of_step, strain_settings, summarise_strain
 from server.version import software_version
+
+if TYPE_CHECKING:
+    from core import measure
 
 _LEAST_OF_STATED, _MOST_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
@@ -77,17 +82,23 @@ class MeasureJob:
     out: Path
     noise: LoadedNoise | None = None
     strain: StrainOptions | None = None
+    prefilter_px: float = 0.0
+    reference_update: ReferenceUpdate = DEFAULT_REFERENCE_UPDATE
+    smoothing_window: int | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return what the result depends on besides its inputs."""
-        seeds = self.region.seeds_px
+        seeds = self.region.seeds
         return {
             "roi": list(self.region.rectangle_px), "subset_px": self.subset_px, "step_px": self.step_px,
             "patch": self.patch, "interpolation": self.interpolation,
-            "seeds": None if seeds is None else seeds.tolist(),
+            "seeds": None if seeds is None else [list(seed.xy_px) for seed in seeds],
+            "seeds_cam2": None if seeds is None else [None if s.xy2_px is None else list(s.xy2_px) for s in seeds],
             "cracks": list(self.region.cracks_px), "holes": list(self.region.holes_px),
             "mask": None if self.mask_file is None else str(self.mask_file),
             "noise": None if self.noise is None else self.noise.record(),
+            "prefilter_px": self.prefilter_px, "smoothing_window": self.smoothing_window,
+            "reference_update": self.reference_update,
             "strain": strain_settings(self.strain),
         }  # fmt: skip
 
@@ -164,22 +175,27 @@ class _Runner:
             subset_px=job.subset_px,
             patch=job.patch,
             interpolation=job.interpolation,
+            prefilter_px=job.prefilter_px,
             noise=(None, None) if job.noise is None else job.noise.models,
         )
         self._reference = measure.ReferencePair(job.calibration.pair, *self.read(job.pairs[0]))
         self._volume, self._rbe_px = volume_of(job.calibration), rbe_of(job.calibration)
         self._n = 0
         self._shape: Field | None = None
-        self._last: Field | None = None
+        self._sequence: measure.Updating | None = None
+        self._last: measure.Earlier | None = None
+        self._last_images: tuple[MeasureImage, MeasureImage] | None = None
+        self._matched = 0
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
+        self._told_smoothing = False
         self._done = 0.0
 
     def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
         """Read both images of a step; what will be asked of them is found on this thread."""
         one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.files.cam1, pair.files.cam2))
         for image, noise in zip((one, two), self._options.noise, strict=True):
-            image.prepared(self._options.interpolation, noise)
+            image.prepared(self._options.interpolation, noise, self._options.blur)
             image.contrast()
         return one, two
 
@@ -189,13 +205,10 @@ class _Runner:
         n, region = self._n, self._job.region
         if images is None:
             result = self._shape = self._reference.shape(
-                region.grid, self._options, seeds=region.seeds_px, progress=self._shower(n)
+                region.grid, self._options, seeds=region.seeds, progress=self._shower(n)
             )
         else:
-            result = self._last = self._reference.motion(
-                *images, region.grid, self._options,
-                shape=self._shape, previous=self._last, seeds=region.seeds_px, progress=self._shower(n),
-            )  # fmt: skip
+            result = self._motion(n, images)
         if not result.valid.any():
             files = self._job.pairs[n].files
             raise MeasurementError(
@@ -209,16 +222,50 @@ class _Runner:
         self._written.put(self._write, n, result, started)
         self._n += 1
 
+    def _motion(self, n: int, images: tuple[MeasureImage, MeasureImage]) -> Field:
+        """Measure a step's displacement; keep what the next one may be matched against."""
+        from core.measure import Earlier
+
+        region, update = self._job.region, self._job.reference_update
+        assert self._shape is not None
+        if self._sequence is None:
+            self._sequence = self._reference.sequence(
+                self._shape, region.grid, self._options, reference_update=update, images_of=self._images_of,
+                field_of=self._field_of, first=self._number(0),
+            )  # fmt: skip
+        result = self._sequence.measure(images, self._last, seeds=region.seeds, progress=self._shower(n))
+        self._last = Earlier(self._number(n), result)
+        self._last_images = None if update == "never" else images
+        return result
+
+    def _index(self, number: int) -> int:
+        """Which of the pairs has a number."""
+        return next(k for k in range(len(self._job.pairs)) if self._number(k) == number)
+
+    def _images_of(self, number: int) -> tuple[MeasureImage, MeasureImage]:
+        if self._last is not None and self._last.step == number and self._last_images is not None:
+            return self._last_images
+        return self.read(self._job.pairs[self._index(number)])
+
+    def _field_of(self, number: int) -> Field:
+        """An earlier step's field as its file has it; the last one's may still be on its way to the disk."""
+        if self._last is not None and self._last.step == number:
+            return mark_extrapolated(self._last.field, self._volume)
+        return read_measured(self._job.out / f"step_{number:04d}.nc")
+
     def _write(self, n: int, result: Field, started: float) -> dict[str, Any]:
         """Write the file of a step, say so, return its summary."""
-        pair = self._job.pairs[n]
+        pair, measured = self._job.pairs[n], result
+        result = smoothed_step(result, self._job.smoothing_window, subset_px=self._job.subset_px)
         result = mark_extrapolated(result, self._volume)
-        name = f"step_{n:04d}.nc"
+        number = self._number(n)
+        name = f"step_{number:04d}.nc"
         strain = strain_of_step(result, self._job.strain, subset_px=self._job.subset_px)
-        write_field(self._job.out / name, result, self._provenance(n), strain)
+        write_field(self._job.out / name, result, self._provenance(n, result), strain, measured=measured)
         summary = {
-            "step": n, "file": name, "cam1": str(pair.files.cam1), "cam2": str(pair.files.cam2),
-            "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]}, **summarise(result, rbe_px=self._rbe_px),
+            "step": number, "file": name, "cam1": str(pair.files.cam1), "cam2": str(pair.files.cam2),
+            "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]},
+            **summarise(result, rbe_px=self._rbe_px, reference=self._number(0)),
             "strain": None if strain is None else summarise_strain(strain),
             "seconds": round(time.monotonic() - started, 3),
         }  # fmt: skip
@@ -229,11 +276,26 @@ class _Runner:
             f"{residual}{_strain_noise(summary['strain'])}{duration(summary['seconds'])}"
         )
         self._say_choice(n, result)
+        self._say_reference(n, result)
+        self._say_smoothing(result, summary["strain"])
         check = summary["epipolar_check"]
         if check is not None and check["level"] != self._checked:
             self._checked = check["level"]
             self._progress.note(f"{check['level']}: step {n}: {check['reason']}")
         return summary
+
+    def _say_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
+        """Say once what smoothing leaves to be told apart."""
+        if result.smoothing is None or self._told_smoothing:
+            return
+        self._told_smoothing = True
+        gauge = (None, None) if strain is None else (strain["gauge_px"], strain["window"])
+        self._progress.note(f"note: {smoothing_note(result.smoothing, gauge[0], strain_window=gauge[1])}")
+
+    def _number(self, n: int) -> int:
+        """The n-th pair's number: in a test's folder, where an incomplete step is left out, its own."""
+        number = self._job.pairs[n].files.number
+        return n if number is None else number
 
     def _say_choice(self, n: int, result: Field) -> None:
         """Say what the patch was chosen for: of the shape, of the first step, and where it changes."""
@@ -246,6 +308,13 @@ class _Runner:
         if n > 0:
             self._chosen = new
 
+    def _say_reference(self, n: int, result: Field) -> None:
+        """Say where another reference took over."""
+        matched = self._number(0) if result.references is None else result.references.step
+        if n > 1 and matched != self._matched and self._job.reference_update == "auto":
+            self._progress.note(f"step {n}: step {self._matched} no longer serves as reference, step {matched} does")
+        self._matched = matched
+
     def _shower(self, n: int) -> Any:
         count = len(self._job.pairs)
 
@@ -257,24 +326,28 @@ class _Runner:
 
         return show
 
-    def _provenance(self, n: int) -> Provenance:
+    def _provenance(self, n: int, result: Field) -> Provenance:
         job, first, now = self._job, self._job.pairs[0], self._job.pairs[n]
         inputs = {"calibration": job.calibration.sha256, "reference_cam1": first.sha256[0],
                   "reference_cam2": first.sha256[1], "cam1": now.sha256[0], "cam2": now.sha256[1]}  # fmt: skip
+        if result.references is not None:
+            matched = job.pairs[self._index(result.references.step)]
+            inputs["matched_cam1"], inputs["matched_cam2"] = matched.sha256
         if job.mask_file is not None:
             inputs["mask"] = sha256_of(job.mask_file)
         if job.noise is not None:
             inputs["noise"] = job.noise.sha256
         return Provenance(
-            settings=job.settings(), inputs=inputs, software_version=software_version(), step=n,
-            frame="target" if job.calibration.source == "calibration_json" else "camera1",
+            settings=job.settings(), inputs=inputs, software_version=software_version(), step=self._number(n),
+            reference=self._number(0), frame="target" if job.calibration.source == "calibration_json" else "camera1",
             extra={"cam1_file": str(now.files.cam1), "cam2_file": str(now.files.cam2)},
         )  # fmt: skip
 
     def _doubt_noise(self, shape: Field) -> None:
         """Say so where the residuals and the noise file tell different stories."""
         model = self._options.noise[0]
-        stated = self._reference.image1.prepared(self._options.interpolation, model).noise_variance
+        image = self._reference.image1.prepared(self._options.interpolation, model, self._options.blur)
+        stated = image.noise_variance
         if stated is None:
             return
         found, expected = float(np.nanmedian(shape.noise_grey)), float(np.sqrt(stated))

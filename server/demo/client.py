@@ -131,6 +131,12 @@ class ServiceClient:
         data = self.call("GET", path, params={"format": "npy"}).content
         return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
 
+    def gauges(self, analysis: AnalysisHandle, **request: Any) -> dict[str, Any]:
+        """Read gauges in every step; the request as ``POST .../gauges`` takes it."""
+        path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/gauges"
+        document: dict[str, Any] = self.call("POST", path, json=request).json()
+        return document
+
     def export(self, analysis: AnalysisHandle, step: int) -> bytes:
         """Fetch the result file of one step."""
         path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/export"

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.result import Field
-from server.demo import pictures
+from server.demo import gauge_pictures, panel_gauges, panel_strain, pictures
+from server.demo.client import AnalysisHandle
 from server.demo.compare import MotionComparison, compare_motion, compare_shape
 from server.demo.session import Check, Outcome, Session, table
+from server.demo.strain import fetched_strain
 from server.io.calibration_any import load_calibration
 from sim.panel import PAPER_LOADS_KN, CrackedPanel
 
@@ -45,8 +47,35 @@ def run(session: Session, calibration_id: str) -> Outcome:
     comparisons = [compare_motion(f, session.rig, "panel", load) for f, load in zip(fields, loads, strict=True)]
     outcome = _judge(shape, fields, comparisons, loads, session)
     image = session.reference_image(test)
-    outcome.pictures = pictures.panel(session.out, image, roi, fields, comparisons, loads, crack)
+    outcome.pictures = pictures.panel(session.out, image, roi, fields, comparisons, loads)
+    _gauge(outcome, session, analysis, fields, comparisons, loads, crack)
     return outcome
+
+
+def _gauge(
+    outcome: Outcome, session: Session, analysis: AnalysisHandle, fields: list[Field],
+    comparisons: list[MotionComparison], loads: list[float], crack: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Read the opening, the buckle and the strain; add tables, figures and pictures."""
+    panel = CrackedPanel()
+    opening = panel_gauges.read_opening(session, analysis, crack, panel, loads)
+    middle, last = 0.5 * (crack[0] + crack[-1]), fields[-1]
+    x, y = last.x_px[0], last.y_px[:, 0]
+    up = panel_gauges.read_slice(session, analysis, np.array([[middle[0], y[0]], [middle[0], y[-1]]]), loads, 1)
+    above = np.where(up.at_mm < 0.0, up.found[-1], np.nan)
+    crest = float(up.xy_px[int(np.nanargmax(above)), 1])
+    across = panel_gauges.read_slice(session, analysis, np.array([[x[0], crest], [x[-1], crest]]), loads, 0)
+    panel_gauges.judge(outcome, opening, up, loads, session.rig, SUBSET_PX)
+    strains = fetched_strain(session, range(1, len(loads) + 1))
+    most = np.max(opening.found, axis=1)
+    found = [
+        panel_strain.panel_strain(f, s, c, float(wide))
+        for f, s, c, wide in zip(fields, strains, comparisons, most, strict=True)
+    ]
+    panel_strain.judge(outcome, found, strains[-1], loads)
+    outcome.pictures |= gauge_pictures.opening(session.out, opening, loads, panel.half_crack_mm)
+    outcome.pictures |= gauge_pictures.buckle(session.out, up, across, loads)
+    outcome.pictures |= gauge_pictures.strain(session.out, last, found[-1], strains[-1], loads[-1], crack)
 
 
 def _judge(

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from core.field.result import Field
-from server.demo import pictures
+from server.demo import pictures, plate_strain, strain_pictures
+from server.demo.client import AnalysisHandle
 from server.demo.compare import MotionComparison, compare_motion, compare_shape
 from server.demo.session import Check, Outcome, Session, table
+from server.demo.strain import fetched_strain
 from sim.plate import PAPER_PRESSURES_KPA, CircularPlate
 
 Float = NDArray[np.float64]
@@ -92,7 +94,26 @@ def run(session: Session, calibration_id: str) -> Outcome:
     outcome = _judge(shape, fields, comparisons, pressures, plate, fit, session)
     image = session.reference_image(test)
     outcome.pictures |= pictures.plate(session.out, image, ROI_PX, fields, comparisons, pressures, plate, fit)
+    strains = fetched_strain(session, range(1, len(pressures) + 1))
+    found = [
+        plate_strain.plate_strain(f, s, c, q, plate, fit.centre_mm)
+        for f, s, c, q in zip(fields, strains, comparisons, pressures, strict=True)
+    ]
+    plate_strain.judge(outcome, found, strains, pressures, plate, _strain_in_the_centre(session, analysis, fit))
+    outcome.pictures |= strain_pictures.plate(session.out, fields, strains, found, pressures, plate)
     return outcome
+
+
+def _strain_in_the_centre(session: Session, analysis: AnalysisHandle, fit: PlateFit) -> list[tuple[float, float]]:
+    """Read the mean of both normal strains in the plate's centre in every step, with its standard deviation."""
+    centre = {"name": "centre", "xy_mm": list(fit.centre_mm)}
+    steps = session.client.gauges(analysis, points=[centre], variables=["exx", "eyy"])["steps"][1:]
+    found = []
+    for step in steps:
+        exx, eyy = (step["points"][0]["values"][name] for name in ("exx", "eyy"))
+        # their errors hardly go together: a whole window's slopes over column and row do not
+        found.append((0.5 * (exx["value"] + eyy["value"]), 0.5 * float(np.hypot(exx["sigma"], eyy["sigma"]))))
+    return found
 
 
 def _judge(

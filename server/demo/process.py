@@ -80,5 +80,5 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
         process.wait(_STOP_S)
     except subprocess.TimeoutExpired:
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)  # it and its worker: the session is ours alone
+            os.killpg(process.pid, signal.SIGKILL)  # its worker ends when its pipe breaks
         process.wait()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.field.result import Field
 from server.demo.client import AnalysisHandle, ServiceClient
 from server.io.files import make_folder, write_bytes
-from server.io.netcdf import read_field
+from server.io.netcdf_reading import read_field
 from sim.rig import SimRig
 
 

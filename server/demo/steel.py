@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from server.demo import pictures
+from server.demo import gauge_pictures, pictures, steel_motion
 from server.demo.compare import compare_shape, heights_mm
 from server.demo.session import Check, Outcome, Session, pixels_of, table
 from sim.scenes import make_scene
@@ -12,6 +12,7 @@ from sim.truth import subset_planes
 
 ROI_PX = (56.0, 85.0, 456.0, 395.0)  # 400 x 310 px, as in the paper
 SUBSET_PX, STEP_PX = 21, 15  # 27 x 21 = 567 points; the paper has 566
+MOTION_STEP_PX = 10
 CAPTURES = 5  # one is the measurement, all of them tell its noise
 LIMIT_PERCENT = 3.0
 
@@ -23,11 +24,13 @@ def run(session: Session, calibration_id: str) -> Outcome:
     test = client.create_test("Ground steel plate", calibration_id, "Ra 1.775 um")
     for n in range(CAPTURES):
         client.capture(test, "the pair" if n == 0 else f"once more, for the noise ({n})")
-    session.say(f"captured {CAPTURES} pairs")
+    steel_motion.capture(session, test)
+    session.say(f"captured {CAPTURES} pairs of the plate at rest, {len(steel_motion.MOTIONS)} of it moved")
     # plane patches: the truth below is the surface as a plane of the subset's size sees it
     analysis = client.analyse(
-        test, "profile", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, step_px=STEP_PX, patch="stretch"
-    )
+        test, "profile", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, step_px=STEP_PX, patch="stretch",
+        steps=list(range(CAPTURES)),
+    )  # fmt: skip
     fields = session.fetch(analysis, range(CAPTURES))
 
     use = np.logical_and.reduce([f.valid for f in fields])
@@ -69,4 +72,15 @@ def run(session: Session, calibration_id: str) -> Outcome:
     outcome.data = {"points": int(use.sum()), "mean_um": mean_um, "noise_um": noise_um, "clean_um": clean_um,
                     "true_um": truth_um,
                     "correlation_with_truth": float(np.corrcoef(found_um[0][use], true_um[use])[0, 1])}  # fmt: skip
+    moved, moved_fields, strains = steel_motion.measure(
+        session,
+        test,
+        CAPTURES,
+        {"rectangle": list(ROI_PX)},
+        "results_moved",
+        subset_px=SUBSET_PX,
+        step_px=MOTION_STEP_PX,
+    )
+    steel_motion.judge(outcome, moved, strains)
+    outcome.pictures |= gauge_pictures.moved(session.out, moved_fields, strains, moved)
     return outcome

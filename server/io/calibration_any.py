@@ -15,7 +15,9 @@ from core.errors import FileFormatError
 from core.stereo import StereoPair
 from server.io.dice_xml import looks_like_dice, parse_dice_xml
 from server.io.imported_pair import invalid, unreadable
+from server.io.matchid_caldat import looks_like_caldat, parse_caldat
 from server.io.opencv_yaml import looks_like_opencv, parse_opencv
+from server.io.vic3d_xml import looks_like_vic3d, parse_vic3d
 
 PARAMETER_NAMES = (
     "phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect",
@@ -36,7 +38,7 @@ class LoadedCalibration:
     image_size1_px, image_size2_px
         (width, height) the calibration was made for, None where the file does not say.
     source
-        ``calibration_json``, ``dice_xml`` or ``opencv_yaml``.
+        ``calibration_json``, ``dice_xml``, ``opencv_yaml``, ``matchid_caldat`` or ``vic3d_xml``.
     sha256
         Of the file's bytes.
     details
@@ -74,7 +76,9 @@ def imported_content(data: bytes, *, name: str) -> dict[str, Any]:
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise unreadable(name, "it is not UTF-8 text") from error
+        if loaded.source != "vic3d_xml":
+            raise unreadable(name, "it is not UTF-8 text") from error
+        text = data.decode("latin-1")  # VIC-3D's names of folders; no number is among them
     sizes = {"cam1": loaded.image_size1_px, "cam2": loaded.image_size2_px}
     return {
         IMPORTED: {"kind": loaded.source, "sha256": loaded.sha256, "text": text},
@@ -131,9 +135,13 @@ def _unwrapped(data: bytes, digest: str, name: str) -> LoadedCalibration:
     part = content.get(IMPORTED)
     text = part.get("text") if isinstance(part, dict) else None
     known = text.encode("utf-8", "replace") if isinstance(text, str) else b""
-    if _wraps_another(known) or not (looks_like_dice(known) or looks_like_opencv(known)):
+    if _wraps_another(known) or not _of_another(known):
         raise unreadable(name, "what it says was imported is no calibration")
     return replace(parse_calibration(known, name=name), sha256=digest, details=content)
+
+
+def _of_another(data: bytes) -> bool:
+    return any(looks(data) for looks in (looks_like_dice, looks_like_opencv, looks_like_caldat, looks_like_vic3d))
 
 
 def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
@@ -147,6 +155,11 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     if looks_like_opencv(data):
         pair, size = parse_opencv(data, name=name)
         return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {})
+    if looks_like_vic3d(data):
+        pair, size = parse_vic3d(data, name=name)
+        return LoadedCalibration(pair, size, size, "vic3d_xml", digest, {})
+    if looks_like_caldat(data):
+        return LoadedCalibration(parse_caldat(data, name=name), None, None, "matchid_caldat", digest, {})
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -162,7 +175,7 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
 
 
 def load_calibration(path: str | Path) -> LoadedCalibration:
-    """Read a calibration.json, a DICe XML camera system or an OpenCV stereo calibration.
+    """Read a calibration.json, or another program's: DICe XML, OpenCV, MatchID caldat, VIC-3D XML.
 
     Raises
     ------

@@ -147,3 +147,34 @@ def parse_dice_xml(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, Im
     relative = top.get("extrinsics_relative_camera_to_camera", "false").strip().lower() in ("true", "1")
     cam2_from_cam1 = pose2 if relative else pose2 @ pose1.inverse()
     return pair_of(name, lens1, lens2, cam2_from_cam1.rotation, cam2_from_cam1.translation_mm), size1, size2
+
+
+def dice_text(
+    lens1: OpenCVLens, lens2: OpenCVLens, pair: StereoPair, sizes: tuple[tuple[int, int], tuple[int, int]] | None,
+    comment: str,
+) -> str:  # fmt: skip
+    """Return a camera system as DICe reads it; the skew must be 0, DICe's own is an angle or not, as one reads it."""
+    safe = comment.replace("--", "- -")
+    lines = ["<ParameterList>", f"<!-- {safe} -->", _parameter("xml_file_format", "DICe_xml_camera_system_file"),
+             _parameter("system_type_3D", "OPENCV"),
+             _parameter("extrinsics_relative_camera_to_camera", "true", "bool")]  # fmt: skip
+    poses = (RigidTransform.identity(), pair.cam2_from_cam1)
+    for k, (lens, pose) in enumerate(zip((lens1, lens2), poses, strict=True)):
+        lines.append(f'<ParameterList name="CAMERA {k}">')
+        numbers = {"CX": lens.cx_px, "CY": lens.cy_px, "FX": lens.fx_px, "FY": lens.fy_px}
+        numbers |= {name: getattr(lens, name.lower()) for name in _DISTORTION}
+        numbers |= dict(zip(("TX", "TY", "TZ"), pose.translation_mm.tolist(), strict=True))
+        lines += [_parameter(name, repr(float(value)), "double") for name, value in numbers.items()]
+        lines += [_parameter("LENS_DISTORTION_MODEL", _OPENCV_LENSES[0]), '<ParameterList name="rotation_3x3_matrix">']
+        for i, row in enumerate(pose.rotation.tolist()):
+            lines.append(_parameter(f"ROW {i}", "{ " + ", ".join(map(repr, row)) + " }"))
+        lines.append("</ParameterList>")
+        if sizes is not None:
+            width, height = sizes[k]
+            lines.append(_parameter("IMAGE_HEIGHT_WIDTH", f"{{ {height}, {width} }}"))
+        lines.append("</ParameterList>")
+    return "\n".join([*lines, "</ParameterList>"]) + "\n"
+
+
+def _parameter(name: str, value: str, kind: str = "string") -> str:
+    return f'<Parameter name="{name}" type="{kind}" value="{value}" />'

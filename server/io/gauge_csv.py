@@ -25,7 +25,16 @@ def gauges_csv(document: dict[str, Any]) -> bytes:
         Of :func:`server.gauging.read_gauges`.
     """
     text = io.StringIO(newline="")
-    for name in ("software_version", "frame", "subset_px", "settings", "inputs_sha256", "alignment"):
+    for name in (
+        "software_version",
+        "stale_reasons",
+        "frame",
+        "subset_px",
+        "smoothing_window",
+        "settings",
+        "inputs_sha256",
+        "alignment",
+    ):
         text.write(f"# {name}: {json.dumps(document[name], ensure_ascii=False, sort_keys=True)}\n")
     writer = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()

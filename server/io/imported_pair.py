@@ -23,7 +23,8 @@ def unreadable(name: str, why: str) -> FileFormatError:
     return FileFormatError(
         f"{name} cannot be read as a calibration: {why}.",
         code="calibration_unreadable",
-        remedy="Give a calibration.json, a DICe XML camera system or an OpenCV YAML stereo calibration.",
+        remedy="Give a calibration.json, a DICe XML camera system, an OpenCV YAML stereo calibration, a MatchID caldat "
+        "or a VIC-3D file.",
     )
 
 
@@ -92,3 +93,23 @@ def pair_of(
     if not np.linalg.norm(t) > 0.0:
         raise invalid(name, "both cameras stand at the same place (T is zero)")
     return StereoPair(Camera(lens1, RigidTransform.identity()), Camera(lens2, RigidTransform(R, t)))
+
+
+def euler_zyx(alpha_deg: float, beta_deg: float, gamma_deg: float) -> NDArray[np.float64]:
+    """Return ``Rz(gamma) Ry(beta) Rx(alpha)``, angles in degrees."""
+    (ca, cb, cg), (sa, sb, sg) = (f(np.radians([alpha_deg, beta_deg, gamma_deg])) for f in (np.cos, np.sin))
+    rz = np.array([[cg, -sg, 0.0], [sg, cg, 0.0], [0.0, 0.0, 1.0]])
+    ry = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
+    rx = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+    return np.asarray(rz @ ry @ rx)
+
+
+def euler_zyx_deg(rotation: NDArray[np.float64]) -> list[float]:
+    """Return the angles alpha, beta, gamma of :func:`euler_zyx`; alpha is zero where beta is a right angle."""
+    beta = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    if np.hypot(rotation[2, 1], rotation[2, 2]) > 1e-9:
+        alpha = np.arctan2(rotation[2, 1], rotation[2, 2])
+        gamma = np.arctan2(rotation[1, 0], rotation[0, 0])
+    else:  # alpha and gamma turn about one axis then
+        alpha, gamma = 0.0, np.arctan2(-rotation[0, 1], rotation[1, 1])
+    return [float(v) for v in np.degrees([alpha, beta, gamma])]

@@ -1,97 +1,51 @@
 """Result files: one field, one NetCDF-4 file (classic model: xarray, MATLAB and ncdump all open it).
 
 Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` that says why. Files are written aside, so
-that a half-written one cannot be met.
+that a half-written one cannot be met. :mod:`server.io.netcdf_reading` reads them back.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError
-from core.field.cuts import Cuts, as_arrays, from_arrays
-from core.field.patch import PatchChoice
-from core.field.result import Field
+from core.field.cuts import Cuts, as_arrays
+from core.field.result import Field, References
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
 from server.io.files import written_aside
+from server.io.netcdf_layout import (
+    COMPARISONS,
+    COVARIANCE_NAMES,
+    CURVATURE,
+    ENTRIES,
+    FORMAT_VERSION,
+    HANDED_ON,
+    MOTION,
+    SHAPE,
+)  # fmt: skip
 from server.io.strain_netcdf import put_strain
 
-FORMAT_VERSION = 1
 _NEARLY_FULL_BYTES = 1 << 20
 # measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
 # the file. What repeats is always deflated; everything is where at least this share of the points has no numbers
 _MANY_EMPTY = 0.2
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
-COMPARISONS = ("cam1_t0__cam2_t0", "cam1_t0__cam1_t", "cam1_t0__cam2_t")
-COVARIANCE_NAMES = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
 _FRAMES = {
     "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
     "camera1": "sys = camera 1: X along the rows, Y down the columns, Z along the optical axis, away from the camera",
 }
-
-
-class _Variable(NamedTuple):
-    """One two-dimensional variable: where it stands in a Field, and how it is described."""
-
-    name: str
-    attribute: str
-    component: int | None
-    units: str
-    long_name: str
-    dtype: str = "f8"
-
-
-_SHAPE = (
-    _Variable("x_px", "x_px", None, "pixel", "column of the point in camera 1's reference image"),
-    _Variable("y_px", "y_px", None, "pixel", "row of the point in camera 1's reference image"),
-    _Variable("x_mm", "xyz_mm", 0, "mm", "reference position of the material point, X_sys"),
-    _Variable("y_mm", "xyz_mm", 1, "mm", "reference position of the material point, Y_sys"),
-    _Variable("z_mm", "xyz_mm", 2, "mm", "reference position of the material point, Z_sys"),
-    _Variable("normal_x", "normal_sys", 0, "1", "surface normal, X_sys component"),
-    _Variable("normal_y", "normal_sys", 1, "1", "surface normal, Y_sys component"),
-    _Variable("normal_z", "normal_sys", 2, "1", "surface normal, Z_sys component"),
-    _Variable("theta_rad", "theta_rad", None, "rad", "angle of the patch's normal to X_cam1, Eq. (12)"),
-    _Variable("phi_rad", "phi_rad", None, "rad", "angle of the patch's normal to Y_cam1, Eq. (12)"),
-    _Variable("zp_mm", "zp_mm", None, "mm", "where camera 1's axis meets the patch's plane, Eq. (12)"),
-    _Variable(
-        "epipolar_px",
-        "epipolar_px",
-        None,
-        "pixel",
-        "full offset across the epipolar line in camera 2; half of it is left in each image when both share it",
-        "f4",
-    ),
-    _Variable("noise_grey", "noise_grey", None, "count", "noise of the reference image, from the residuals", "f4"),
-)
-_MOTION = (
-    _Variable("u_mm", "uvw_mm", 0, "mm", "displacement from the reference, X_sys component"),
-    _Variable("v_mm", "uvw_mm", 1, "mm", "displacement from the reference, Y_sys component"),
-    _Variable("w_mm", "uvw_mm", 2, "mm", "displacement from the reference, Z_sys component"),
-    _Variable("rotation_x_rad", "rotation_rad", 0, "rad", "rotation vector of the patch, X_sys component"),
-    _Variable("rotation_y_rad", "rotation_rad", 1, "rad", "rotation vector of the patch, Y_sys component"),
-    _Variable("rotation_z_rad", "rotation_rad", 2, "rad", "rotation vector of the patch, Z_sys component"),
-    _Variable("stretch_11", "stretch", 0, "1", "in-plane stretch of the patch, e11 in its tangent frame"),
-    _Variable("stretch_22", "stretch", 1, "1", "in-plane stretch of the patch, e22 in its tangent frame"),
-    _Variable("stretch_12", "stretch", 2, "1", "in-plane stretch of the patch, e12 in its tangent frame"),
-)
-_CURVATURE = (
-    _Variable("curvature_1", "curvature_per_mm", 0, "mm-1",
-              "larger principal curvature of the reference's surface, positive where it bulges towards the cameras"),
-    _Variable("curvature_2", "curvature_per_mm", 1, "mm-1",
-              "smaller principal curvature of the reference's surface, positive where it bulges towards the cameras"),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,9 +61,11 @@ class Provenance:
     software_version
         Of this program.
     frame
-        ``target`` or ``camera1``: what the system frame is.
+        ``target`` or ``camera1``: what the system frame is; or its description.
     step
         Number of the step, 0 = the reference.
+    reference
+        Number of the reference.
     extra
         Further text attributes (a label, a load).
     """
@@ -119,6 +75,7 @@ class Provenance:
     software_version: str
     frame: str = "target"
     step: int = 0
+    reference: int = 0
     extra: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -157,12 +114,14 @@ def _fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFie
     sparse = float(np.mean(~result.valid)) >= _MANY_EMPTY
     for name, size in (("row", rows), ("col", cols), ("comparison", result.zncc.shape[-1])):
         dataset.createDimension(name, size)
-    curved = _CURVATURE if result.curvature_per_mm is not None else ()
-    for v in _SHAPE + (_MOTION if result.has_motion else ()) + curved:
+    curved = CURVATURE if result.curvature_per_mm is not None else ()
+    for v in SHAPE + (MOTION if result.has_motion else ()) + curved:
         values = getattr(result, v.attribute)
         if v.component is not None:
             values = values[..., v.component]
-        _put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=v.long_name, dtype=v.dtype,
+        smooth = result.smoothing is not None and v.attribute == "uvw_mm"
+        long_name = f"{v.long_name}, smoothed" if smooth else v.long_name
+        _put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=long_name, dtype=v.dtype,
              sparse=sparse)  # fmt: skip
     _put_status(dataset, result.status)
     _put(dataset, "iterations", result.iterations, ("row", "col"), units="1",
@@ -175,7 +134,16 @@ def _fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFie
         _put_cuts(dataset, result.cuts)
     if strain is not None:
         put_strain(dataset, strain, sparse=sparse)
+    if result.references is not None:
+        _put_references(dataset, result.references)
     dataset.setncatts(_attributes(provenance, moved=result.has_motion))
+    if result.has_motion:
+        matched = provenance.reference if result.references is None else result.references.step
+        dataset.reference_step = np.int32(matched)
+    if result.smoothing is not None:
+        dataset.smoothing = json.dumps(result.smoothing.document(), sort_keys=True)
+        if strain is not None:
+            dataset.strain_note = "strain of smoothed displacements: gauge_px and gauge_mm hold the smoothing's window"
     if result.patch is not None:
         dataset.setncatts({
             "patch": result.patch.patch,
@@ -209,11 +177,25 @@ def _put_cuts(dataset: Any, cuts: Cuts) -> None:
          dtype="i4")  # fmt: skip
 
 
-def _cuts_of(variables: Any) -> Cuts | None:
-    if "cut_line" not in variables:
-        return None
-    points = np.stack([np.asarray(variables[name][...], dtype=np.float64) for name in ("cut_x_px", "cut_y_px")], axis=1)
-    return from_arrays(points, np.asarray(variables["cut_line"][...], dtype=np.int32))
+def _put_references(dataset: Any, references: References) -> None:
+    _put(dataset, "reference_step", references.steps, ("row", "col"), units="1", dtype="i4",
+         long_name="step that the point was matched against; without numbers, the newest such step that shows it",
+         sparse=True)  # fmt: skip
+    for what, cause in HANDED_ON.items():
+        values = getattr(references, f"{what}_px2")
+        for name, (i, j) in ENTRIES.items():
+            _put(dataset, f"handed_on_{what}_{name}_px2", values[..., i, j], ("row", "col"), units="pixel2", dtype="f8",
+                 long_name=f"covariance by {cause} of where camera 1 sees the point, as far as later steps inherit it "
+                 "that are matched against this one")  # fmt: skip
+
+
+def _put_measured(dataset: Any, measured: Field) -> None:
+    assert measured.uvw_mm is not None
+    for k, name in enumerate(("u", "v", "w")):
+        _put(dataset, f"measured_{name}_mm", measured.uvw_mm[..., k], ("row", "col"), units="mm", dtype="f8",
+             long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing")  # fmt: skip
+    _put(dataset, "measured_covariance", measured.covariance, ("row", "col", "i", "j"), units="mm2", dtype="f4",
+         long_name="covariance of x_mm, y_mm, z_mm and the displacement as measured")  # fmt: skip
 
 
 def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
@@ -226,14 +208,22 @@ def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
         "source": f"stereorig {provenance.software_version}",
         "software_version": provenance.software_version,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "frame": _FRAMES[provenance.frame],
+        "frame": _FRAMES.get(provenance.frame, provenance.frame),
         "settings": json.dumps(provenance.settings, sort_keys=True),
         "inputs_sha256": json.dumps(provenance.inputs, sort_keys=True),
         **provenance.extra,
     }
 
 
-def write_field(path: str | Path, result: Field, provenance: Provenance, strain: StrainField | None = None) -> None:
+def write_field(
+    path: str | Path,
+    result: Field,
+    provenance: Provenance,
+    strain: StrainField | None = None,
+    *,
+    measured: Field | None = None,
+    checksum: bool = False,
+) -> None:
     """Write one result file: aside, synced, renamed.
 
     Parameters
@@ -246,98 +236,35 @@ def write_field(path: str | Path, result: Field, provenance: Provenance, strain:
         What it was made from and how.
     strain
         Of the same points, if it was computed; :func:`server.io.strain_netcdf.read_strain` reads it back.
+    measured
+        The field before its displacement was smoothed; later steps may go on from it.
+    checksum
+        Put the file's SHA-256 beside it.
 
     Raises
     ------
     StorageError
         ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
     """
-    with written_aside(Path(path)) as aside:
+    with written_dataset(Path(path), checksum=checksum) as dataset:
+        _fill(dataset, result, provenance, strain)
+        if result.smoothing is not None and measured is not None:
+            _put_measured(dataset, measured)
+
+
+@contextlib.contextmanager
+def written_dataset(path: Path, *, checksum: bool = False) -> Iterator[Any]:
+    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.io.files.written_aside`.
+
+    Raises
+    ------
+    StorageError
+        ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
+    """
+    with written_aside(path, checksum=checksum) as aside:
         try:
             with netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
-                _fill(dataset, result, provenance, strain)
+                yield dataset
         except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
             full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
-
-
-def _open(path: Path) -> Any:
-    if not path.exists():
-        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
-    try:
-        dataset = netCDF4.Dataset(str(path), "r")
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read as a result file: {error.strerror or error}.") from error
-    version = int(getattr(dataset, "format_version", 0))
-    if not 1 <= version <= FORMAT_VERSION:
-        dataset.close()
-        raise FileFormatError(
-            f"{path} has the result format {version or 'none'}; this program reads up to {FORMAT_VERSION}.",
-            code="format_too_new" if version else "file_unreadable",
-            remedy="Read it with the program's version that wrote it.",
-        )
-    dataset.set_auto_mask(False)
-    return dataset
-
-
-def read_field(path: str | Path) -> Field:
-    """Read one result file back.
-
-    Raises
-    ------
-    FileFormatError
-        ``file_missing``, ``file_unreadable`` (not such a file, a variable missing) or ``format_too_new``.
-    """
-    path = Path(path)
-    with _open(path) as dataset:
-        variables = dataset.variables
-        shape = (dataset.dimensions["row"].size, dataset.dimensions["col"].size)
-        curved = _CURVATURE if _CURVATURE[0].name in variables else ()
-        wanted = _SHAPE + (_MOTION if dataset.kind == "displacement" else ()) + curved
-        names = [v.name for v in wanted] + ["status", "iterations", "zncc", "covariance"]
-        missing = [name for name in names if name not in variables]
-        if missing:
-            raise FileFormatError(f"{path} lacks the variables {', '.join(missing)}.")
-        arrays: dict[str, Any] = {}
-        for v in wanted:
-            values = np.asarray(variables[v.name][...], dtype=np.float64)
-            if v.component is None:
-                arrays[v.attribute] = values
-            else:
-                tail = 2 if v in _CURVATURE else 3
-                arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
-        choice = getattr(dataset, "patch_choice", None)
-        return Field(
-            **arrays,
-            status=np.asarray(variables["status"][...], dtype=np.int8),
-            iterations=np.asarray(variables["iterations"][...], dtype=np.int32),
-            zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
-            covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
-            patch=None if choice is None else PatchChoice.from_document(json.loads(choice)),
-            cuts=_cuts_of(variables),
-        )
-
-
-def read_attributes(path: str | Path) -> dict[str, Any]:
-    """Read a result file's global attributes; ``settings``, ``inputs_sha256``, ``patch_choice`` come back as objects.
-
-    Raises
-    ------
-    FileFormatError
-        As :func:`read_field`.
-    """
-    with _open(Path(path)) as dataset:
-        attributes = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
-    for name in ("settings", "inputs_sha256", "patch_choice"):
-        if name in attributes:
-            attributes[name] = json.loads(attributes[name])
-    return attributes
-
-
-def field_variable(result: Field, name: str) -> tuple[NDArray[np.float64], str, str] | None:
-    """Return values (r, c), unit and meaning of a variable as a result file would hold it; None for others."""
-    for v in _SHAPE + _MOTION + _CURVATURE:
-        values = getattr(result, v.attribute) if v.name == name else None
-        if values is not None:
-            return values if v.component is None else values[..., v.component], v.units, v.long_name
-    return None

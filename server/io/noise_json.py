@@ -62,7 +62,7 @@ def noise_content(
     }
 
 
-def write_noise(path: Path, content: Mapping[str, Any]) -> None:
+def write_noise(path: Path, content: Mapping[str, Any], *, checksum: bool = False) -> None:
     """Write noise.json aside, sync it and rename it.
 
     Raises
@@ -70,7 +70,7 @@ def write_noise(path: Path, content: Mapping[str, Any]) -> None:
     StorageError
         ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
     """
-    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode(), checksum=checksum)
 
 
 def load_noise(path: str | Path) -> LoadedNoise:

@@ -154,3 +154,29 @@ def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
     if size.size != 2 or size.min() < 1 or np.any(size % 1):
         raise invalid(name, f"imageSize is {size.tolist()}, not (width, height)")
     return pair, (int(size[0]), int(size[1]))
+
+
+def opencv_text(
+    lens1: OpenCVLens, lens2: OpenCVLens, pair: StereoPair, sizes: tuple[tuple[int, int], tuple[int, int]] | None,
+    comment: str,
+) -> str:  # fmt: skip
+    """Return a stereo calibration as ``cv2.FileStorage`` reads it; the skew, which OpenCV does not know, must be 0.
+
+    The image size is told where both cameras share one.
+    """
+    pose = pair.cam2_from_cam1
+    lines = ["%YAML:1.0", "---", f"# {comment}"]
+    if sizes is not None and sizes[0] == sizes[1]:
+        lines.append(f"imageSize: [ {sizes[0][0]}, {sizes[0][1]} ]")
+    for k, lens in enumerate((lens1, lens2), 1):
+        matrix = [[lens.fx_px, lens.skew_px, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
+        lines += _text_of(f"cameraMatrix{k}", np.array(matrix))
+        lines += _text_of(f"distCoeffs{k}", np.array([[getattr(lens, name) for name in _ORDER]]))
+    lines += _text_of("R", pose.rotation) + _text_of("T", pose.translation_mm.reshape(3, 1))
+    return "\n".join(lines) + "\n"
+
+
+def _text_of(name: str, matrix: NDArray[np.float64]) -> list[str]:
+    numbers = ", ".join(f"{v:.17g}" if v % 1 else f"{v:.0f}." for v in matrix.ravel())
+    rows, cols = matrix.shape
+    return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {numbers} ]"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.field.epipolar_check import check_epipolar
 from core.field.result import Field
 from core.status import PointStatus
-from server.io.netcdf import COMPARISONS
+from server.io.netcdf_layout import COMPARISONS
 
 
 def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -26,7 +26,7 @@ def _rms(values: NDArray[np.float64]) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def summarise(result: Field, *, rbe_px: float | None = None) -> dict[str, Any]:
+def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0) -> dict[str, Any]:
     """Summarise one field.
 
     Parameters
@@ -35,6 +35,8 @@ def summarise(result: Field, *, rbe_px: float | None = None) -> dict[str, Any]:
         The field.
     rbe_px
         The calibration's own reprojection error, where it is known.
+    reference
+        Number of the sequence's reference.
 
     Returns
     -------
@@ -46,8 +48,10 @@ def summarise(result: Field, *, rbe_px: float | None = None) -> dict[str, Any]:
         ``epipolar_offset_rms_px``), ``epipolar_check`` (whether the cameras still stand as calibrated, see
         :class:`core.field.epipolar_check.EpipolarCheck`), ``plane_residual_rms_mm`` (of the reference positions),
         ``zncc_median`` and ``sigma_median_mm``, ``patch`` (what the field was measured with, why, and the numbers of
-        the choice; see :class:`core.field.patch.PatchChoice`), for displacements also ``displacement_mm`` (mean, min,
-        max of u, v, w).
+        the choice; see :class:`core.field.patch.PatchChoice`), ``smoothing`` (how the displacement was smoothed and
+        what can still be told apart; see :class:`core.field.smoothing.Smoothing`), for displacements also
+        ``displacement_mm`` (mean, min, max of u, v, w), ``reference_step`` (what the step was matched against) and
+        ``points_by_reference`` (valid points by what they were matched against).
         What cannot be told is None.
     """
     status = result.status
@@ -78,8 +82,15 @@ def summarise(result: Field, *, rbe_px: float | None = None) -> dict[str, Any]:
             for k, name in enumerate(names)
         },
     }
+    summary["smoothing"] = None if result.smoothing is None else result.smoothing.document()
     summary["patch"] = None if result.patch is None else result.patch.document()
     if result.uvw_mm is not None:
+        matched = result.references
+        summary["reference_step"] = reference if matched is None else matched.step
+        steps, counts = np.unique(
+            np.full(n, reference) if matched is None else matched.steps[valid], return_counts=True
+        )  # fmt: skip
+        summary["points_by_reference"] = {str(k): int(c) for k, c in zip(steps, counts, strict=True)}
         uvw = result.uvw_mm[valid]
         summary["displacement_mm"] = {
             name: {"mean": float(a.mean()), "min": float(a.min()), "max": float(a.max())} if n else None

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
-from core.errors import CameraError
-from drivers.frames import CameraSettings, FrameGrabber
-from drivers.registry import open_stage
+from core.errors import CameraError, StageError
+from drivers.frames import CameraOptions, CameraSettings, FrameGrabber
+from drivers.registry import make_camera, open_stage
 from drivers.stage import AxisOptions, Stage
 from server.config import CameraName, RigConfig
-from server.rig.cameras import CAMERAS, CameraPair, CameraUnit
+from server.rig.cameras import CAMERAS, Cam, CameraPair, CameraUnit
+from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
 from sim.controllers.esp301 import SimESP301
+from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
 from sim.controllers.smc100 import SimSMC100
 from sim.grabber import SimFrameGrabber
 from sim.rig import SimRig
 from sim.world import SimWorld
 
+OnLost = Callable[[Cam, CameraError], None]
+
 _RENDER_S_PER_PIXEL = 100e-6
+# The first view also compiles the renderer, behind whatever else this process compiles: numba does one at a time
+_COMPILE_S = 120.0
 
 
 @dataclass(eq=False)
@@ -42,12 +50,38 @@ def first_settings(config: RigConfig, cam: CameraName) -> CameraSettings:
     """Return the settings that the rig file gives."""
     section = config.camera(cam)
     return CameraSettings(
-        exposure_ms=section.exposure_ms, gain_db=section.gain_db, bit_depth=section.bit_depth, trigger="software"
+        exposure_ms=section.exposure_ms,
+        gain_db=section.gain_db,
+        bit_depth=section.bit_depth if section.pixel_format is None else None,
+        pixel_format=section.pixel_format,
+        region_px=section.region_px,
+        features=section.features or None,
+        trigger=config.rig.trigger,
     )
 
 
-def open_devices(config: RigConfig, settings: Mapping[CameraName, CameraSettings]) -> Devices:
+def open_devices(
+    config: RigConfig,
+    settings: Mapping[CameraName, CameraSettings],
+    *,
+    record: Path | None = None,
+    dynamics: Mapping[int, tuple[float | None, float | None]] | None = None,
+    on_lost: OnLost | None = None,
+) -> Devices:
     """Open stage and cameras, push the cameras' settings.
+
+    Parameters
+    ----------
+    config
+        The rig file.
+    settings
+        What each camera is set to.
+    record
+        File that gets a transcript of the stage's wire.
+    dynamics
+        Axis -> (velocity in mm/s, acceleration in mm/s^2) in place of the rig file's.
+    on_lost
+        Called from a camera's reader thread when the camera is lost.
 
     Raises
     ------
@@ -58,21 +92,58 @@ def open_devices(config: RigConfig, settings: Mapping[CameraName, CameraSettings
         world: SimWorld | None = None
         controller: SimESP301 | SimSMC100 | None = None
         url = config.stage.url
-        if config.rig.kind == "simulated":
+        reader = _PositionReader()
+        if url == "sim":
             controller = _simulated_controller(config)
             url = stack.enter_context(ControllerServer(controller)).url
-            world = SimWorld(SimRig.from_dict(_tables(config)), controller.true_position_mm)
-        units = []
+        if config.rig.kind == "simulated":
+            where = reader if controller is None else controller.true_position_mm
+            world = SimWorld(SimRig.from_dict(_tables(config)), where)
+        units: dict[Cam, CameraUnit] = {}
         for cam in CAMERAS:
-            unit = CameraUnit(cam, _grabber(config, cam, world))
-            stack.callback(unit.close)
+            unit = make_unit(config, cam, world, on_lost)
+            stack.callback(unit.release)
             unit.open(settings[cam])
-            units.append(unit)
-        stage = open_stage(config.stage.driver, url, _axis_options(config))
-        stack.callback(stage.close)
-        return Devices(
-            CameraPair(*units, max_skew_ms=config.rig.max_skew_ms), stage, world, controller, stack.pop_all()
+            units[cam] = unit
+        pair = CameraPair(
+            units["cam1"],
+            units["cam2"],
+            make_source=functools.partial(_pair_source, config, units),
+            skew_is_set=config.rig.max_skew_ms is not None,
         )
+        stack.callback(pair.close)
+        stage = open_configured_stage(config, url, record=record, dynamics=dynamics)
+        stack.callback(stage.close)
+        reader.stage = stage
+        return Devices(pair, stage, world, controller, stack.pop_all())
+
+
+def make_unit(
+    config: RigConfig, cam: CameraName, world: SimWorld | None = None, on_lost: OnLost | None = None
+) -> CameraUnit:
+    """Make one camera as the rig file says, not yet opened; parameters as in :func:`open_devices`."""
+    section = config.camera(cam)
+    return CameraUnit(
+        cam,
+        functools.partial(_grabber, config, cam, world),
+        trigger=config.rig.trigger,
+        rate_hz=config.rig.frame_rate_hz,
+        serial=section.serial,
+        size_px=section.image_size_px,
+        on_lost=on_lost,
+    )
+
+
+def _pair_source(config: RigConfig, units: Mapping[Cam, CameraUnit]) -> PairSource:
+    section = config.rig
+    if section.trigger == "software":
+        return TriggeredPairs(units, max_skew_ms=section.skew_bound_ms)
+    by: Literal["time", "frame"] = "time"
+    if section.pairing == "frame" or (
+        section.pairing == "auto" and section.trigger == "hardware" and section.frame_rate_hz is not None
+    ):
+        by = "frame"
+    return StreamedPairs(units, by=by, max_skew_ms=section.skew_bound_ms, capture_timeout_s=section.capture_timeout_s)
 
 
 def check_config(config: RigConfig) -> None:
@@ -87,46 +158,89 @@ def check_config(config: RigConfig) -> None:
         SimRig.from_dict(_tables(config))
 
 
-def _axis_options(config: RigConfig) -> dict[int, AxisOptions]:
+def open_configured_stage(
+    config: RigConfig,
+    url: str,
+    *,
+    record: Path | None = None,
+    dynamics: Mapping[int, tuple[float | None, float | None]] | None = None,
+) -> Stage:
+    """Open the stage alone, as the rig file says; parameters and errors as in :func:`open_devices`."""
     section = config.stage
-    options = AxisOptions(
+    return open_stage(
+        section.driver,
+        url,
+        {axis: _axis_options(config, axis, (dynamics or {}).get(axis, (None, None))) for axis in config.axes},
+        baudrate=section.baudrate,
+        flow_control=section.flow_control,
+        record=record,
+        timeout_s=section.reply_timeout_ms / 1000,
+    )
+
+
+class _PositionReader:
+    """Where a stage stands that is real though its cameras are simulated; where it last stood, when it cannot say."""
+
+    def __init__(self) -> None:
+        self.stage: Stage | None = None
+        self._last_mm: dict[int, float] = {}
+
+    def __call__(self, axis: int) -> float:
+        if self.stage is not None:
+            with contextlib.suppress(StageError):
+                self._last_mm[axis] = self.stage.position(axis)
+        return self._last_mm.get(axis, 0.0)
+
+
+def _axis_options(config: RigConfig, axis: int, dynamics: tuple[float | None, float | None]) -> AxisOptions:
+    section = config.stage.of_axis(axis)
+    velocity, acceleration = dynamics
+    return AxisOptions(
         soft_limits_mm=section.soft_limits_mm,
-        velocity_mm_s=section.velocity_mm_s,
-        acceleration_mm_s2=section.acceleration_mm_s2,
+        velocity_mm_s=section.velocity_mm_s if velocity is None else velocity,
+        acceleration_mm_s2=section.acceleration_mm_s2 if acceleration is None else acceleration,
         backlash_mm=section.backlash_mm,
         approach_from=section.approach_from,
         settle_ms=section.settle_ms,
         tolerance_mm=section.tolerance_mm,
+        assume_homed=section.assume_homed,
+        home_mode=section.home_mode,
     )
-    return dict.fromkeys(config.axes, options)
 
 
 def _tables(config: RigConfig) -> dict[str, Any]:
     tables = config.model_dump(mode="python", exclude_none=True)
     for cam in CAMERAS:
-        tables[cam]["stage_zero_mm"] = config.stage.zero_mm
+        tables[cam]["stage_zero_mm"] = config.stage.of_axis(config.camera(cam).stage_axis).zero_mm
     return tables
 
 
 def _simulated_controller(config: RigConfig) -> SimESP301 | SimSMC100:
     # room beyond the soft limits, as on a real stage
-    low, high = config.stage.soft_limits_mm
-    travel = (low - 5.0, high + 5.0)
-    time_scale = float((config.sim or {}).get("time_scale", 1.0))
-    if config.stage.driver == "smc100":
-        return SimSMC100(addresses=config.axes, travel_mm=travel, time_scale=time_scale)
-    return SimESP301(axes=max(config.axes), travel_mm=travel, time_scale=time_scale)
+    limits = [config.stage.of_axis(axis).soft_limits_mm for axis in config.axes]
+    return make_controller(
+        config.stage.driver,
+        config.axes,
+        travel_mm=(min(low for low, _ in limits) - 5.0, max(high for _, high in limits) + 5.0),
+        time_scale=float((config.sim or {}).get("time_scale", 1.0)),
+    )
 
 
 def _grabber(config: RigConfig, cam: CameraName, world: SimWorld | None) -> FrameGrabber:
-    driver = config.camera(cam).driver
-    if driver == "sim" and world is not None:
-        columns, rows = config.camera(cam).image_size_px
+    section = config.camera(cam)
+    if world is not None:
+        columns, rows = section.image_size_px
         # a view is rendered when it is first asked for; the watchdog must not take that for death
-        return SimFrameGrabber(world, cam, latency_s=max(30.0, _RENDER_S_PER_PIXEL * columns * rows))
-    raise CameraError(
-        f"There is no camera driver {driver!r} in this version.",
-        code="unknown_driver",
-        remedy="Use a simulated rig.",
-        camera=cam,
+        return SimFrameGrabber(world, cam, latency_s=max(_COMPILE_S, _RENDER_S_PER_PIXEL * columns * rows))
+    return make_camera(
+        section.driver,
+        CameraOptions(
+            device=section.device or "",
+            buffers=section.buffers,
+            packet_size_bytes=section.packet_size_bytes,
+            ptp=section.ptp,
+            trigger_source=section.trigger_source,
+            trigger_edge=section.trigger_edge,
+            trigger_features=dict(section.trigger_features),
+        ),
     )

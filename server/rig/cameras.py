@@ -1,7 +1,7 @@
-"""Both cameras together: synchronised captures, averages, live frames.
+"""Both cameras together: synchronised captures, averages, live frames, and their return after a loss.
 
-Cameras wait for software triggers. A capture fires both and takes the frames that carry those trigger numbers. Live
-views use the same way when nobody captures, and otherwise show what the captures brought: recording comes first.
+A capture takes the next pairs of the rig's `server.rig.pairs.PairSource`. Live views use the same way when nobody
+captures, and otherwise show what the captures brought: recording comes first.
 """
 
 from __future__ import annotations
@@ -9,20 +9,23 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CameraError, StateError
-from drivers.frames import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, Pixels
-from drivers.pairing import NumberPairing, Pair, PairingAccount
-from drivers.reader import CameraReader
+from drivers.frames import CameraSettings, Frame, Pixels
+from drivers.pairing import Pair, PairingAccount
+from server.config import SKEW_PX
+from server.rig.image_speed import ImageMotion, image_motion
+from server.rig.pairs import PairSource
+from server.rig.unit import CAMERAS, Cam, CameraUnit
 
-Cam = Literal["cam1", "cam2"]
-CAMERAS: tuple[Cam, Cam] = ("cam1", "cam2")
-_SLICE_S = 0.1
+__all__ = ["CAMERAS", "Cam", "CameraPair", "CameraUnit", "PairShot"]
+
+#: where there is nothing older to show, a look waits this long behind another one or a capture
+_FIRST_FRAME_S = 5.0
 _STALE_DURING_CAPTURE_S = 0.5
 
 
@@ -38,6 +41,9 @@ class PairShot:
         What one grey level of the camera became in ``pixels`` (1 for a single frame).
     skew_ms
         Largest difference of the two exposures' beginnings.
+    image_speed_px_s
+        How fast camera 1's image moved from the first to the last frame; None for a single frame, or where it cannot
+        be told.
     """
 
     pixels: dict[str, Pixels]
@@ -47,122 +53,43 @@ class PairShot:
     scale: int
     skew_ms: float
     host_ns: int
-
-
-class CameraUnit:
-    """One camera: its grabber, its reader thread, the settings it has."""
-
-    def __init__(self, name: Cam, grabber: FrameGrabber) -> None:
-        self.name = name
-        self.grabber = grabber
-        self.latest: Frame | None = None
-        self._reader: CameraReader | None = None
-        self._earlier = FrameCounters()
-
-    def open(self, settings: CameraSettings) -> None:
-        """Connect, push settings, arm for software triggers."""
-        self.grabber.open()
-        self.description: CameraDescription = self.grabber.describe()
-        self.settings: CameraSettings = self.grabber.configure(settings)
-        self._start()
-
-    def _start(self) -> None:
-        # from a trigger to its frame: the exposure, and a generous read-out
-        period_s = (self.settings.exposure_ms or 0.0) / 1000.0 + 0.2
-        self._reader = CameraReader(self.grabber, name=self.name, period_s=period_s, expects_frames=False)
-        self._reader.start()
-
-    def _stop(self) -> None:
-        reader, self._reader = self._reader, None
-        if reader is not None:
-            reader.stop()
-            new, old = reader.counters.as_dict(), self._earlier.as_dict()
-            self._earlier = FrameCounters(**{name: old[name] + n for name, n in new.items()})
-
-    @property
-    def reader(self) -> CameraReader:
-        """The running reader."""
-        if self._reader is None:
-            raise CameraError(f"{self.name} is not armed.", code="camera_lost", remedy="POST /rig/reconnect.")
-        return self._reader
-
-    @property
-    def fault(self) -> CameraError | None:
-        """Why the camera was lost, or None."""
-        return None if self._reader is None else self._reader.fault
-
-    def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Change settings; the camera is armed again afterwards, whatever happens."""
-        self._stop()
-        try:
-            self.settings = self.grabber.configure(settings)
-        finally:
-            self._start()
-        return self.settings
-
-    def counters(self) -> dict[str, int]:
-        """What became of the frames since the camera was opened."""
-        now = FrameCounters() if self._reader is None else self._reader.counters
-        old = self._earlier.as_dict()
-        return {name: old[name] + n for name, n in now.as_dict().items()}
-
-    def close(self) -> None:
-        """End the reader, release the camera."""
-        self._stop()
-        self.grabber.close()
+    image_speed_px_s: float | None = None
 
 
 class CameraPair:
-    """Camera 1 and camera 2 with one trigger."""
+    """Camera 1 and camera 2 with one source of pairs.
 
-    def __init__(self, cam1: CameraUnit, cam2: CameraUnit, *, max_skew_ms: float) -> None:
+    Parameters
+    ----------
+    cam1, cam2
+        Opened.
+    make_source
+        Makes the source; called again after anything that arms a camera anew.
+    skew_is_set
+        Whether the rig's skew limit was set by its user. Else a pair whose skew moves the image by more than 0.01 px,
+        at the speed that was seen, is refused too.
+    """
+
+    def __init__(
+        self, cam1: CameraUnit, cam2: CameraUnit, *, make_source: Callable[[], PairSource], skew_is_set: bool = False
+    ) -> None:
         self.units: dict[Cam, CameraUnit] = {"cam1": cam1, "cam2": cam2}
-        self._max_skew_ms = max_skew_ms
-        self._pairing: NumberPairing | None = None
+        self._make_source = make_source
+        self._skew_is_set = skew_is_set
+        self._earlier = PairingAccount()
+        self._source = make_source()
         self._lock = threading.Lock()
         self._capturing = threading.Event()
 
     def account(self) -> dict[str, int]:
         """What became of every trigger."""
-        return PairingAccount().as_dict() if self._pairing is None else self._pairing.account.as_dict()
+        now = self._source.account()
+        return {f.name: getattr(self._earlier, f.name) + getattr(now, f.name) for f in fields(PairingAccount)}
 
-    def _grab(self) -> Pair:
-        numbers = {cam: self.units[cam].reader.trigger() or 0 for cam in CAMERAS}
-        if self._pairing is None:
-            # all cameras hang on one trigger line, whose clock the simulated ones share
-            self._pairing = NumberPairing(
-                by="trigger", max_skew_ms=self._max_skew_ms, common_clock=True, origin=dict(numbers)
-            )
-        made: Pair | None = None
-        for cam in CAMERAS:
-            made = self._pairing.feed(cam, self._frame_of(cam, numbers[cam], self._pairing)) or made
-        if made is None:
-            raise CameraError(
-                f"The frames of trigger {numbers['cam1']} make no pair.",
-                code="pair_incomplete",
-                remedy="Capture again; POST /rig/reconnect if it comes back.",
-            )
-        return made
-
-    def _frame_of(self, cam: Cam, number: int, pairing: NumberPairing) -> Frame:
-        """Wait for a camera's frame of one trigger; what still comes of earlier ones goes into the account."""
-        unit = self.units[cam]
-        damaged = unit.counters()["incomplete"]
-        while True:
-            frame = unit.reader.take(_SLICE_S)  # raises when the watchdog gives the camera up
-            if frame is None:
-                if unit.counters()["incomplete"] > damaged:
-                    raise CameraError(
-                        f"{cam} delivered an incomplete frame.",
-                        code="frame_incomplete",
-                        remedy="Capture again; check cable and packet size if it comes back.",
-                        camera=cam,
-                    )
-                continue
-            unit.latest = frame
-            if frame.trigger is None or frame.trigger == number:
-                return frame
-            pairing.feed(cam, frame)
+    def _restart_source(self) -> None:
+        source = self._source
+        source.stop()
+        self._earlier, self._source = PairingAccount(**self.account()), self._make_source()
 
     def shoot(self, frames: int, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs and average each camera's; ``check`` may raise between them.
@@ -182,10 +109,12 @@ class CameraPair:
     def _shoot(self, frames: int, check: Callable[[], None] | None) -> PairShot:
         sums: dict[str, NDArray[np.uint32]] = {}
         worst = 0.0
+        begin: Pair | None = None
         for index in range(frames):
             if check is not None:
                 check()
-            pair = self._grab().require()
+            pair = self._source.next_pair(check).require()
+            begin = begin or pair
             one, two = pair.cam1, pair.cam2
             worst = max(worst, abs(pair.skew_ms))
             if frames > 1:
@@ -193,6 +122,10 @@ class CameraPair:
                     if index == 0:
                         sums[cam] = np.zeros(frame.pixels.shape, dtype=np.uint32)
                     sums[cam] += frame.pixels
+        assert begin is not None
+        motion = image_motion(begin.cam1, one) if frames > 1 else None
+        if not self._skew_is_set and motion is not None:
+            _check_skew(worst, motion)
         pixels: dict[str, Pixels] = {"cam1": one.pixels, "cam2": two.pixels}
         scale = 1
         if frames > 1:
@@ -209,33 +142,78 @@ class CameraPair:
             scale,
             worst,
             one.host_ns,
+            None if motion is None else motion.speed_px_s,
         )
 
-    def live(self, cam: Cam, max_age_s: float) -> Frame:
-        """Return a frame for looking at, at most ``max_age_s`` old where recording allows it."""
+    def live(self, cam: Cam, max_age_s: float, after: int | None = None) -> Frame:
+        """Return a frame for looking at, at most ``max_age_s`` old where recording allows it.
+
+        ``after`` is the number of the frame that the caller has: it is given another one, unless a capture goes on or
+        the camera made none since. Those who look at the same time share a frame.
+        """
         unit = self.units[cam]
         frame = unit.latest
         age = float("inf") if frame is None else time.monotonic() - frame.host_ns / 1e9
-        limit = max(max_age_s, _STALE_DURING_CAPTURE_S) if self._capturing.is_set() else max_age_s
-        if frame is not None and age <= limit:
+        capturing = self._capturing.is_set()
+        limit = max(max_age_s, _STALE_DURING_CAPTURE_S) if capturing else max_age_s
+        if frame is not None and age <= limit and (capturing or frame.sequence != after):
             return frame
-        if not self._lock.acquire(timeout=0.5 if frame is None else 0.05):
+        if not self._lock.acquire(timeout=_FIRST_FRAME_S if frame is None else 0.05):
             if frame is not None:
                 return frame
             raise StateError("The cameras are capturing and have no live frame yet.", code="camera_busy")
         try:
-            self._grab()
+            if unit.latest is frame:  # else somebody else looked meanwhile
+                self._source.look()
         finally:
             self._lock.release()
-        assert unit.latest is not None
-        return unit.latest
+        frame = unit.latest
+        if frame is None:
+            raise CameraError(
+                f"{cam} has not delivered a frame yet.",
+                code="no_frames",
+                remedy="Check that its trigger reaches it.",
+                camera=cam,
+            )
+        return frame
 
     def configure(self, cam: Cam, settings: CameraSettings) -> CameraSettings:
         """Change one camera's settings between captures."""
         with self._lock:
-            return self.units[cam].configure(settings)
+            self._source.stop()
+            try:
+                return self.units[cam].configure(settings)
+            finally:
+                self._restart_source()
+
+    def lost(self) -> list[Cam]:
+        """Cameras that cannot be used."""
+        return [cam for cam in CAMERAS if self.units[cam].fault is not None]
+
+    def reopen(self, cam: Cam) -> None:
+        """Connect a lost camera again, with its settings; raises when that fails."""
+        unit = self.units[cam]
+        unit.reconnect()
+        with self._lock:
+            self._source.stop()
+            unit.resume()
+            self._restart_source()
 
     def close(self) -> None:
         """Release both cameras."""
         for unit in self.units.values():
-            unit.close()
+            unit.release()
+        self._source.stop()
+
+
+def _check_skew(skew_ms: float, motion: ImageMotion) -> None:
+    moved_px = motion.within_px(skew_ms)
+    if moved_px > SKEW_PX:
+        raise CameraError(
+            f"The exposures began {abs(skew_ms):.3f} ms apart while the image moved at {motion.speed_px_s:.3g} px/s: "
+            f"at least {moved_px:.3f} px between the two cameras, {SKEW_PX:g} px are allowed.",
+            code="skew_too_large",
+            remedy="Use a common hardware trigger, let the specimen rest, or set max_skew_ms in the rig file.",
+            skew_ms=skew_ms,
+            image_speed_px_s=motion.speed_px_s,
+        )

@@ -8,19 +8,27 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from core.errors import DeviceError, InputError, StageError, StateError, StereorigError
+from core.errors import CameraError, DeviceError, InputError, StageError, StateError, StereorigError
 from drivers.frames import CameraSettings
 from drivers.stage import MoveResult
 from server.config import CameraName, RigConfig
 from server.hardware import HardwareGate
 from server.problem import problem_of
 from server.rig.build import Devices, first_settings, open_devices
-from server.rig.cameras import CAMERAS, CameraPair, PairShot
+from server.rig.cameras import CAMERAS, Cam, CameraPair, PairShot
+from server.rig.reconnect import ReconnectWatch
+from server.rig.shared import SharedReading
+from server.rig.stage_controls import StageControls
 
 _log = logging.getLogger("stereorig.rig")
+
+
+def _tell_nobody(_name: str, _data: dict[str, Any]) -> None:
+    """Stand in for an event hub."""
 
 
 class Rig:
@@ -32,32 +40,68 @@ class Rig:
         The rig file.
     gate
         Hold and owner thread, shared with the jobs.
+    announce
+        Called with ``camera`` and what happened when a camera is lost or comes back.
+    record
+        File that gets a transcript of the stage's wire.
     """
 
-    def __init__(self, config: RigConfig, gate: HardwareGate) -> None:
+    def __init__(
+        self,
+        config: RigConfig,
+        gate: HardwareGate,
+        announce: Callable[[str, dict[str, Any]], None] | None = None,
+        *,
+        record: Path | None = None,
+    ) -> None:
         self.config = config
+        self._record = record
         self.gate = gate
+        self._announce = announce if announce is not None else _tell_nobody
         self._devices: Devices | None = None
         self._fault: dict[str, Any] | None = {"code": "not_connected", "cause": "The rig was not opened yet."}
         # what the cameras were last set to, so that a reconnected one gets it again
         self._settings = {cam: first_settings(config, cam) for cam in CAMERAS}
         self.scene: dict[str, Any] | None = None
+        self._watch: ReconnectWatch | None = None
+        self._stage_reading = SharedReading(self._read_stage)
+        self.controls = StageControls(lambda: self._ready().stage)
 
     # opening and closing ----------------------------------------------------------------------------------------
 
     def open(self) -> None:
         """Open cameras and stage; a fault is kept and shown, and :meth:`reconnect` tries again."""
         try:
-            self._devices = open_devices(self.config, self._settings)
+            self._devices = open_devices(
+                self.config,
+                self._settings,
+                record=self._record,
+                dynamics=self.controls.dynamics,
+                on_lost=self._lost,
+            )
             self._fault = None
+            self.controls.collect(self._devices.stage)
+            if self.config.rig.auto_reconnect:
+                self._watch = ReconnectWatch(self._devices.pair, self._came_back)
             if self._devices.world is not None and self.scene is None:
                 self.scene = {"scene": "grid", "load": 0.0}
             if self.config.home_at_start:
-                self.home(self.config.axes)
+                self._home_at_start()
         except StereorigError as error:
             _log.exception("the rig could not be opened")
             self._fault = problem_of(error)
             self._close_devices()
+
+    def _home_at_start(self) -> None:
+        # an axis in configuration state is shown as such, and can only be helped with the rig open
+        stuck = self.controls.in_configuration(self.config.axes)
+        try:
+            self.home(tuple(axis for axis in self.config.axes if axis not in stuck))
+        except StageError as error:
+            if error.code != "stage_stopped":
+                raise
+            # somebody wants it to stand still, and the cameras to go on
+            _log.warning("homing was stopped; the rig is open, and its axes are to be homed before they move")
 
     def close(self) -> None:
         """Stop the stage first, then release everything."""
@@ -73,9 +117,21 @@ class Rig:
             scene = dict(self.scene)
             self.set_scene(scene.pop("scene"), load=scene.pop("load"), **scene)
 
+    def _lost(self, cam: Cam, error: CameraError) -> None:
+        _log.warning("%s was lost: %s", cam, error)
+        self._announce("camera", {"camera": cam, "state": "lost", "problem": problem_of(error)})
+
+    def _came_back(self, cam: Cam) -> None:
+        _log.warning("%s is connected again", cam)
+        self._announce("camera", {"camera": cam, "state": "connected"})
+
     def _close_devices(self) -> None:
+        watch, self._watch = self._watch, None
+        if watch is not None:
+            watch.stop()
         devices, self._devices = self._devices, None
         if devices is not None:
+            self.controls.collect(devices.stage, ask=False)
             devices.close()
 
     @property
@@ -109,11 +165,12 @@ class Rig:
             "fault": self._fault,
             "holder": self.gate.holder,
             "scene": self.scene,
-            "max_skew_ms": config.rig.max_skew_ms,
+            "trigger": config.rig.trigger,
+            "max_skew_ms": config.rig.skew_bound_ms,
             "target": config.target.model_dump(mode="json"),
             "calibration_plan": config.calibration.model_dump(mode="json"),
             "cameras": {cam: self.describe_camera(cam) for cam in CAMERAS},
-            "stage": self.describe_stage(),
+            "stage": self._describe_stage_or_fault(),
         }
 
     def describe_camera(self, cam: CameraName) -> dict[str, Any]:
@@ -130,20 +187,62 @@ class Rig:
             shown["device"] = asdict(unit.description)
             shown["settings"] = asdict(unit.settings)
             shown["fault"] = None if unit.fault is None else problem_of(unit.fault)
+            shown["reconnections"] = unit.reconnections
         return shown
 
+    def identities(self) -> dict[str, dict[str, str]]:
+        """Model and serial number of each camera, for the records of what they took."""
+        described = {cam: self.pair.units[cam].description for cam in CAMERAS}
+        return {cam: {"model": found.model, "serial": found.serial} for cam, found in described.items()}
+
+    def record(self) -> dict[str, Any]:
+        """What a report wants to know of the rig that took a step: how it runs, and each camera's settings and lens."""
+        section = self.config.rig
+        cameras: dict[str, Any] = {}
+        for cam in CAMERAS:
+            has = self.pair.units[cam].settings
+            cameras[cam] = {
+                "exposure_ms": has.exposure_ms, "gain_db": has.gain_db, "frame_rate_hz": has.frame_rate_hz,
+                "pixel_format": has.pixel_format,
+                **self.config.camera(cam).facts().model_dump(mode="json", exclude_none=True),
+            }  # fmt: skip
+        return {
+            "name": section.name, "simulated": section.kind == "simulated", "trigger": section.trigger,
+            "frame_rate_hz": section.frame_rate_hz, "max_skew_ms": section.skew_bound_ms, "lighting": section.lighting,
+            "cameras": cameras,
+        }  # fmt: skip
+
+    def _describe_stage_or_fault(self) -> dict[str, Any]:
+        # a silent stage must not hide the cameras
+        try:
+            return self.describe_stage()
+        except StageError as error:
+            section = self.config.stage
+            return {
+                "driver": section.driver,
+                "identity": None,
+                "axes": [],
+                "zero_mm": section.zero_mm,
+                "fault": problem_of(error),
+            }
+
     def describe_stage(self) -> dict[str, Any]:
-        """Identity, limits and state of each axis."""
+        """Identity, limits and state of each axis; who asks while others do shares their reading."""
+        return self._stage_reading()
+
+    def _read_stage(self) -> dict[str, Any]:
         section = self.config.stage
-        shown: dict[str, Any] = {"driver": section.driver, "identity": None, "axes": [], "zero_mm": section.zero_mm}
+        shown: dict[str, Any] = {"driver": section.driver, "identity": None, "axes": [], "zero_mm": section.zero_mm,
+                                 "fault": None}  # fmt: skip
         devices = self._devices
         if devices is None:
-            return shown
+            return shown | {"fault": self._fault}
         shown["identity"] = asdict(devices.stage.identify())
         for axis in devices.stage.axes:
             status = devices.stage.state(axis)
             shown["axes"].append({
                 **asdict(status), "state": status.state.value, "limits": asdict(devices.stage.limits(axis)),
+                "dynamics": asdict(devices.stage.dynamics(axis)), "zero_mm": section.of_axis(axis).zero_mm,
                 "cameras": [cam for cam in CAMERAS if self.config.camera(cam).stage_axis == axis],
             })  # fmt: skip
         return shown
@@ -154,7 +253,7 @@ class Rig:
         """Change settings on the owner thread; returns what the device really took."""
         pair = self.pair
         taken = self.gate.call(lambda: pair.configure(cam, settings))
-        self._settings[cam] = replace(taken, region_px=None)
+        self._settings[cam] = pair.units[cam].wanted
         return taken
 
     def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
@@ -190,7 +289,7 @@ class Rig:
         targets: dict[int, float] = {}
         for cam, dz in dz_mm.items():
             section = self.config.camera(cam)
-            position = self.config.stage.zero_mm + section.stage_sign * dz
+            position = self.config.stage.of_axis(section.stage_axis).zero_mm + section.stage_sign * dz
             if abs(targets.setdefault(section.stage_axis, position) - position) > 1e-9:
                 raise InputError(
                     f"Axis {section.stage_axis} moves both cameras, and they are sent to different places.",
@@ -201,7 +300,8 @@ class Rig:
 
     def dz_of(self, cam: CameraName, position_mm: float) -> float:
         """Travel of a camera along its optical axis at a position that was read back."""
-        return self.config.camera(cam).stage_sign * (position_mm - self.config.stage.zero_mm)
+        section = self.config.camera(cam)
+        return section.stage_sign * (position_mm - self.config.stage.of_axis(section.stage_axis).zero_mm)
 
     def check_axes(self, axes: tuple[int, ...]) -> None:
         """Refuse axes that the rig does not have."""
@@ -232,18 +332,24 @@ class Rig:
         for axis, target in targets_mm.items():
             status = stage.state(axis)
             if status.state.value in ("not_homed", "motor_off", "fault", "configuration"):
-                code = status.state.value if status.state.value in ("not_homed", "motor_off") else "stage_not_ready"
+                code = {"fault": "stage_not_ready", "configuration": "configuration_state"}.get(
+                    status.state.value, status.state.value
+                )
+                remedies = {
+                    "motor_off": "POST /stage/enable; POST /stage/home where it was not homed either.",
+                    "configuration_state": "POST /stage/axes/N/leave-configuration, which writes the flash memory.",
+                }
                 raise StateError(
                     f"Axis {axis} cannot move: it is {status.state.value}. {status.detail}".strip(),
                     code=code,
-                    remedy="POST /stage/home first.",
+                    remedy=remedies.get(code, "POST /stage/home first."),
                     axis=axis,
                 )
             self._check_room_to_arrive(axis, status.position_mm, target)
 
     def _check_room_to_arrive(self, axis: int, here_mm: float, target_mm: float) -> None:
         """Refuse a target that could only be arrived at from the wrong side; the driver would, but in mid-job."""
-        section, limits = self.config.stage, self._ready().stage.limits(axis)
+        section, limits = self.config.stage.of_axis(axis), self._ready().stage.limits(axis)
         sign = 1.0 if section.approach_from == "below" else -1.0
         turn = target_mm - sign * section.backlash_mm
         needed = section.backlash_mm > 0.0 and sign * (target_mm - here_mm) < section.backlash_mm

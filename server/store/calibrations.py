@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from server.errors import NotFoundError
-from server.io.files import sha256_of
+from server.io.files import known_sha256, mismatch, require_recorded, sha256_of
 from server.io.images import GrayImage, encode_tiff
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
@@ -57,7 +57,7 @@ class CalibrationStore:
         path = self._folder.calibrations / calibration_id
         make_folder(path)
         # plan.json is what makes the folder one of ours: after it, nothing is missing
-        write_json(path / "calibration.json", content)
+        write_json(path / "calibration.json", content, checksum=True)
         write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
         return calibration_id
 
@@ -75,16 +75,26 @@ class CalibrationStore:
         """Record why there is no calibration."""
         write_json(self.path(calibration_id) / "failure.json", problem)
 
+    def put_judgement(self, calibration_id: str, document: dict[str, Any] | None) -> None:
+        """Keep what was decided on a calibration beside it; None takes it back."""
+        path = self.path(calibration_id) / "judgement.json"
+        write_json(path, {"decision": None} if document is None else document)
+
     def read(self, calibration_id: str) -> dict[str, Any]:
         """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``)."""
         path = self.path(calibration_id)
         document: dict[str, Any] = {"id": calibration_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
         document["taken"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
         if (path / "calibration.json").exists():
+            require_recorded(
+                path / "calibration.json", f"calibration {calibration_id}", f"calibrations/{calibration_id}"
+            )
             # a file from elsewhere may hold anything; what the service itself says comes last
             document = {**read_json(path / "calibration.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
+        judgement = read_json(path / "judgement.json") if (path / "judgement.json").exists() else {}
+        document["judgement"] = judgement if judgement.get("decision") is not None else None
         return document
 
     def view_file(self, calibration_id: str, index: int, cam: str) -> Path:
@@ -92,6 +102,10 @@ class CalibrationStore:
         path = self.path(calibration_id) / "views" / f"{index:03d}_{cam}.tif"
         if not path.is_file():
             raise NotFoundError(f"Calibration {calibration_id} has no view {index} of {cam}.", what="view")
+        taken = self.path(calibration_id) / "view.json"
+        for view in read_json(taken)["views"] if taken.exists() else ():
+            if view.get("file") == f"views/{path.name}" and known_sha256(path) != view.get("sha256"):
+                raise mismatch(path.name, f"calibration {calibration_id}", f"calibrations/{calibration_id}/views")
         return path
 
     def checksum(self, calibration_id: str) -> str:

@@ -29,6 +29,7 @@ CREATE TABLE IF NOT EXISTS requests (
 CREATE TABLE IF NOT EXISTS entries (
     kind TEXT NOT NULL, parent TEXT NOT NULL, id TEXT NOT NULL, document TEXT NOT NULL, PRIMARY KEY (kind, parent, id)
 );
+CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
 CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state);
 """
 
@@ -87,10 +88,12 @@ class Catalog:
                 connection.execute("BEGIN IMMEDIATE")
                 try:
                     result = function(connection)
+                    connection.execute("COMMIT")
                 except BaseException:
-                    connection.execute("ROLLBACK")
+                    # a full disk ends a transaction by itself, or leaves it open at its commit
+                    if connection.in_transaction:
+                        connection.execute("ROLLBACK")
                     raise
-                connection.execute("COMMIT")
             except sqlite3.Error as error:
                 full = "full" in str(error)
                 future.set_exception(
@@ -108,28 +111,49 @@ class Catalog:
         self._work.put((function, future))
         return future.result(timeout=30.0)
 
+    @property
+    def alive(self) -> bool:
+        """Whether the writer runs."""
+        return self._thread.is_alive()
+
     def close(self) -> None:
         """Finish what is queued and close."""
         self._work.put(None)
         self._thread.join(timeout=30.0)
 
-    def put_job(self, job_id: str, state: str, document: dict[str, Any]) -> None:
-        """Insert or update a job."""
+    def put_job(
+        self,
+        job_id: str,
+        state: str,
+        document: dict[str, Any],
+        request: tuple[str, str, str, dict[str, Any]] | None = None,
+    ) -> None:
+        """Insert or update a job; with the request (scope, key, body_sha256, made) that asked for it, both or none."""
         text = json.dumps(document)
-        self.transact(
-            lambda c: c.execute(
-                "INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job_id, state, text)
-            )
-        )
 
-    def jobs(self, *, states: tuple[str, ...] | None = None, limit: int | None = None) -> list[dict[str, Any]]:
-        """Return jobs, newest first."""
+        def write(c: sqlite3.Connection) -> None:
+            c.execute("INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job_id, state, text))
+            if request is not None:
+                scope, key, digest, made = request
+                c.execute("INSERT OR REPLACE INTO requests VALUES (?, ?, ?, ?)", (scope, key, digest, json.dumps(made)))
+
+        self.transact(write)
+
+    def jobs(
+        self, *, states: tuple[str, ...] | None = None, limit: int | None = None, before: str | None = None
+    ) -> list[dict[str, Any]]:
+        """Return jobs, newest first; ``before``: only those whose id is smaller."""
 
         def read(c: sqlite3.Connection) -> list[dict[str, Any]]:
-            where, values = "", []
+            terms: list[str] = []
+            values: list[str] = []
             if states is not None:
-                where = f"WHERE state IN ({','.join('?' * len(states))})"
-                values = list(states)
+                terms.append(f"state IN ({','.join('?' * len(states))})")
+                values += states
+            if before is not None:
+                terms.append("id < ?")
+                values.append(before)
+            where = f"WHERE {' AND '.join(terms)}" if terms else ""
             rows = c.execute(f"SELECT document FROM jobs {where} ORDER BY id DESC LIMIT ?", (*values, limit or -1))
             return [json.loads(row[0]) for row in rows]
 
@@ -155,6 +179,16 @@ class Catalog:
             ).fetchall()
         )
         return [json.loads(row[0]) for row in rows]
+
+    def remove_entry(self, kind: str, parent: str, entry_id: str) -> None:
+        """Take something out of the index; with a test, its steps and analyses."""
+
+        def write(c: sqlite3.Connection) -> None:
+            c.execute("DELETE FROM entries WHERE kind = ? AND parent = ? AND id = ?", (kind, parent, entry_id))
+            if kind == "test":
+                c.execute("DELETE FROM entries WHERE parent = ?", (entry_id,))
+
+        self.transact(write)
 
     def replace_entries(self, entries: list[tuple[str, str, str, dict[str, Any]]]) -> list[str]:
         """Make the index hold exactly ``entries`` (kind, parent, id, document); return the differences found."""
@@ -188,3 +222,34 @@ class Catalog:
             ).fetchone()
         )
         return None if row is None else (row[0], json.loads(row[1]))
+
+    def request_keys(self) -> set[tuple[str, str]]:
+        """Return (scope, key) of every request that is remembered."""
+        return self.transact(lambda c: set(c.execute("SELECT scope, key FROM requests").fetchall()))
+
+    def job_ids(self) -> set[str]:
+        """Return the id of every job."""
+        return self.transact(lambda c: {row[0] for row in c.execute("SELECT id FROM jobs")})
+
+    def restore(self, jobs: list[dict[str, Any]], requests: list[tuple[str, str, str, dict[str, Any]]]) -> None:
+        """Take over jobs and requests (scope, key, body_sha256, made) that were found elsewhere."""
+        job_rows = [(d["id"], d["state"], json.dumps(d)) for d in jobs]
+        request_rows = [(scope, key, digest, json.dumps(made)) for scope, key, digest, made in requests]
+
+        def write(c: sqlite3.Connection) -> None:
+            c.executemany("INSERT OR IGNORE INTO jobs (id, state, document) VALUES (?, ?, ?)", job_rows)
+            c.executemany("INSERT OR IGNORE INTO requests VALUES (?, ?, ?, ?)", request_rows)
+
+        if job_rows or request_rows:
+            self.transact(write)
+
+    def count_up(self, name: str, at_least: int = 0) -> int:
+        """Return a number that is larger than every one returned before under this name, and not below ``at_least``."""
+
+        def write(c: sqlite3.Connection) -> int:
+            row = c.execute("SELECT value FROM counters WHERE name = ?", (name,)).fetchone()
+            value = max(at_least, 0 if row is None else int(row[0]) + 1)
+            c.execute("INSERT OR REPLACE INTO counters VALUES (?, ?)", (name, value))
+            return value
+
+        return self.transact(write)

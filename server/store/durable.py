@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError
-from server.io.files import fsync_path, storage_error, written_aside
+from server.io import disk as _disk
+from server.io import files
+from server.io.files import fsync_path, storage_error
 
 
 def make_folder(folder: Path) -> None:
@@ -25,23 +27,22 @@ def make_folder(folder: Path) -> None:
         If it exists already or cannot be created.
     """
     try:
-        folder.mkdir()
+        _disk.disk.make_folder(folder)
         fsync_path(folder.parent)
     except OSError as error:
         raise storage_error(error, folder) from error
 
 
-def write_bytes(path: Path, data: bytes) -> str:
-    """Write ``data`` durably; return its SHA-256 in hex."""
-    with written_aside(path) as aside:
-        aside.write_bytes(data)
+def write_bytes(path: Path, data: bytes, *, checksum: bool = False) -> str:
+    """Write ``data`` durably, with its checksum beside it if wanted; return its SHA-256 in hex."""
+    files.write_bytes(path, data, checksum=checksum)
     return hashlib.sha256(data).hexdigest()
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write a JSON document durably; NaN has no place in it and becomes null."""
+def write_json(path: Path, document: Any, *, checksum: bool = False) -> None:
+    """Write a JSON document durably, with its checksum beside it if wanted; NaN has no place in it and becomes null."""
     text = json.dumps(without_nan(document), indent=1, ensure_ascii=False, allow_nan=False)
-    write_bytes(path, text.encode() + b"\n")
+    write_bytes(path, text.encode() + b"\n", checksum=checksum)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -61,6 +62,14 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise FileFormatError(f"{path.name} holds {type(document).__name__}, not an object.", file=path.name)
     return document
+
+
+def known_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; empty where the file is missing or damaged, for readers who can do without it."""
+    try:
+        return read_json(path)
+    except FileFormatError:
+        return {}
 
 
 def without_nan(value: Any) -> Any:

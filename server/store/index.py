@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from core.errors import FileFormatError
+from server.errors import NotFoundError
 from server.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
-from server.store.folder import DataFolder
+from server.store.folder import DataFolder, is_id
+from server.store.lost_jobs import LostJobs
+from server.store.noise import NoiseStore
 from server.store.tests import TestStore
+from server.store.trash import Trash
+
+Entry = tuple[str, str, str, dict[str, Any]]  # kind, parent, id, document
 
 
 def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, Any]:
@@ -21,7 +29,8 @@ def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str,
         "state": document["state"],
         "label": document["plan"].get("label", ""),
         "created_utc": document["plan"]["created_utc"],
-        "verdict": verdict,
+        "verdict": verdict if isinstance(verdict, dict) else None,  # an imported file may hold anything
+        "decision": (document["judgement"] or {}).get("decision"),
     }
 
 
@@ -32,7 +41,7 @@ def test_entry(document: dict[str, Any]) -> dict[str, Any]:
 
 def step_entry(document: dict[str, Any]) -> dict[str, Any]:
     """What a list shows of a step."""
-    entry = {k: document.get(k) for k in ("n", "label", "load_n", "source", "captured_utc", "skew_ms")}
+    entry = {k: document.get(k) for k in ("n", "label", "load_n", "timestamp_utc", "source", "captured_utc", "skew_ms")}
     return {**entry, "quality": document.get("quality", {}).get("code")}
 
 
@@ -41,47 +50,105 @@ def analysis_entry(document: dict[str, Any]) -> dict[str, Any]:
     return {k: document.get(k) for k in ("id", "kind", "label", "created_utc", "job_id")}
 
 
-def rebuild(catalog: Catalog, folder: DataFolder, calibrations: CalibrationStore, tests: TestStore) -> list[str]:
-    """Make the index say what the folders hold; also take over Idempotency-Keys and ids found there.
+def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: list[str]) -> list[Entry]:
+    """Everything that the index holds of a test; what cannot be read is left out and told.
+
+    Parameters
+    ----------
+    lost
+        Told of every document.
+    trouble
+        Gets a line for each document that cannot be read.
+    """
+    entries: list[Entry] = []
+
+    def take(what: str, read: Callable[[], Entry]) -> None:
+        try:
+            entries.append(read())
+        except (FileFormatError, NotFoundError, KeyError, TypeError) as error:
+            trouble.append(f"{what}: {error}")
+
+    def test() -> Entry:
+        document = tests.read(test_id)
+        lost.made(document, {"test_id": test_id})
+        return "test", "", test_id, test_entry(document)
+
+    def step(n: int, document: dict[str, Any] | FileFormatError) -> Entry:
+        if isinstance(document, FileFormatError):
+            raise document
+        lost.step(document)
+        return "step", test_id, f"{n:04d}", step_entry(document)
+
+    def analysis(analysis_id: str) -> Entry:
+        document = tests.analysis(test_id, analysis_id)
+        runs = tests.analysis_jobs(test_id, analysis_id)
+        lost.analysis(document, runs, tests.summary(test_id, analysis_id))
+        shown = {**document, "job_id": runs[-1]["job_id"] if runs else None}
+        return "analysis", test_id, analysis_id, analysis_entry(shown)
+
+    take(f"test {test_id}", test)
+    for n, document in tests.step_documents(test_id):
+        take(f"step {n} of test {test_id}", partial(step, n, document))
+    for analysis_id in tests.analysis_ids(test_id):
+        take(f"analysis {analysis_id} of test {test_id}", partial(analysis, analysis_id))
+    return entries
+
+
+def rebuild(
+    catalog: Catalog,
+    folder: DataFolder,
+    calibrations: CalibrationStore,
+    tests: TestStore,
+    noise: NoiseStore | None = None,
+) -> list[str]:
+    """Make the index say what the folders hold; also take over ids, Idempotency-Keys and ended jobs found there.
 
     Returns
     -------
     list of str
         Differences between index and folders, and files that cannot be read.
     """
-    entries: list[tuple[str, str, str, dict[str, Any]]] = []
-    trouble: list[str] = []
-    requests: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    entries: list[Entry] = []
+    trouble = _look_into_trash(folder)
+    lost = LostJobs()
     for calibration_id in calibrations.ids():
         folder.ids.seen(calibration_id)
         try:
             if calibrations.read(calibration_id)["state"] == "unfinished":
                 # nobody works on it any more: the job that did ended with the last service
                 calibrations.put_failure(calibration_id, problem_of(RESTART))
-            document = calibrations.read(calibration_id)
-            if document["plan"].get("source") == "import":  # the others' requests were for jobs that are gone
-                requests.append((document["plan"], {"calibration_id": calibration_id}))
+            lost.calibration(calibrations.read(calibration_id))
             entries.append(("calibration", "", calibration_id, calibration_entry(calibrations, calibration_id)))
         except (FileFormatError, KeyError) as error:
             trouble.append(f"calibration {calibration_id}: {error}")
+    if noise is not None:
+        for noise_id in noise.ids():
+            try:
+                lost.noise(noise.read(noise_id))
+            except (FileFormatError, KeyError) as error:
+                trouble.append(f"noise measurement {noise_id}: {error}")
     for test_id in tests.ids():
         folder.ids.seen(test_id)
-        try:
-            document = tests.read(test_id)
-            requests.append((document, {"test_id": test_id}))
-            entries.append(("test", "", test_id, test_entry(document)))
-            for n in tests.step_numbers(test_id):
-                step = tests.step(test_id, n).document
-                requests.append((step, {"test_id": test_id, "n": n}))
-                entries.append(("step", test_id, f"{n:04d}", step_entry(step)))
-            for analysis_id in tests.analysis_ids(test_id):
-                folder.ids.seen(analysis_id)
-                analysis = tests.analysis(test_id, analysis_id)
-                entries.append(("analysis", test_id, analysis_id, analysis_entry(analysis)))
-        except (FileFormatError, KeyError) as error:
-            trouble.append(f"test {test_id}: {error}")
-    for document, made in requests:
-        request = document.get("request")
-        if request and catalog.request(request["scope"], request["key"]) is None:
-            catalog.put_request(request["scope"], request["key"], request["body_sha256"], made)
+        found = entries_of_test(tests, test_id, lost, trouble)
+        entries += found
+        for kind, _, name, _ in found:
+            if kind == "analysis":
+                folder.ids.seen(name)
+    lost.restore(catalog, folder.ids)
     return catalog.replace_entries(entries) + trouble
+
+
+def _look_into_trash(folder: DataFolder) -> list[str]:
+    """Put the trash in order; what lies there keeps its ids."""
+    trash = Trash(folder.root)
+    done = trash.tidy()
+    for trash_id in trash.ids():
+        folder.ids.seen(trash_id)
+        try:
+            document = trash.entry(trash_id)
+        except (FileFormatError, NotFoundError):
+            continue  # `stereorig verify` and the list of the trash say so
+        for name, letter in (("test_id", "t"), ("analysis_id", "a"), ("calibration_id", "c"), ("noise_id", "n")):
+            if is_id(str(document.get(name)), letter):
+                folder.ids.seen(str(document[name]))
+    return done

@@ -6,11 +6,13 @@ it is a noise measurement.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
-from core.errors import StateError
+from core.errors import FileFormatError, StateError
 from server.errors import NotFoundError
+from server.io.files import require_recorded
 from server.io.images import GrayImage, encode_tiff
 from server.problem import RESTART, problem_of
 from server.store.durable import make_folder, read_json, write_bytes, write_json
@@ -24,9 +26,10 @@ class NoiseStore:
         self._folder = folder
         for noise_id in self.ids():
             folder.ids.seen(noise_id)
-            if self.read(noise_id)["state"] == "unfinished":
-                # nobody works on it any more: the job that did ended with the last service
-                self.put_failure(noise_id, problem_of(RESTART))
+            with contextlib.suppress(FileFormatError):  # one that is damaged must not keep the service from starting
+                if self.read(noise_id)["state"] == "unfinished":
+                    # nobody works on it any more: the job that did ended with the last service
+                    self.put_failure(noise_id, problem_of(RESTART))
 
     @property
     def _root(self) -> Path:
@@ -78,6 +81,7 @@ class NoiseStore:
         path = self.path(noise_id)
         document: dict[str, Any] = {"id": noise_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
         if (path / "noise.json").exists():
+            require_recorded(path / "noise.json", f"noise measurement {noise_id}", f"noise/{noise_id}")
             document = {**read_json(path / "noise.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
@@ -98,4 +102,5 @@ class NoiseStore:
                 code="noise_not_complete",
                 remedy="Wait for its job, or measure again.",
             )
+        require_recorded(path, f"noise measurement {noise_id}", f"noise/{noise_id}")
         return path

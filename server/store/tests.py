@@ -6,20 +6,28 @@ images. What a kill left without it is listed as incomplete and never read.
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import re
 import shutil
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError, StateError, StorageError
 from server.errors import NotFoundError
-from server.io.files import sha256_of
+from server.io import disk as _disk
+from server.io.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
 CAMERAS = ("cam1", "cam2")
 MAX_STEPS = 9999
+_STEP_FOLDER = re.compile(r"(?:incomplete-\d+-)?(\d{4})")
+_DELETED = re.compile(r"(\d{4})\.deleted")
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,35 @@ class StepFiles:
     cam2: Path
 
 
+def number_of(name: str) -> int | None:
+    """Return the number in the name of a step's folder, also of one that was set aside; None for other names."""
+    found = _STEP_FOLDER.fullmatch(name)
+    return None if found is None else int(found[1])
+
+
+def deleted_mark(folder: Path) -> Path:
+    """Where it is kept that a step was deleted: its number is not given again."""
+    return folder.with_name(f"{folder.name}.deleted")
+
+
+def set_aside(folder: Path) -> Path:
+    """Rename an incomplete step's folder, so that nobody takes it for a step; returns its new path.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be renamed.
+    """
+    number = len(list(folder.parent.glob("incomplete-*"))) + 1
+    aside = folder.parent / f"incomplete-{number}-{folder.name}"
+    try:
+        _disk.disk.replace(folder, aside)
+        fsync_path(folder.parent)
+    except OSError as error:
+        raise storage_error(error, folder) from error
+    return aside
+
+
 class TestStore:
     """The tests of one data folder."""
 
@@ -39,6 +76,7 @@ class TestStore:
     def __init__(self, folder: DataFolder) -> None:
         self._folder = folder
         self._lock = threading.Lock()
+        self._commits = 0
 
     # tests ------------------------------------------------------------------------------------------------------
 
@@ -85,6 +123,40 @@ class TestStore:
             write_json(self.path(test_id) / "test.json", document)
         return document
 
+    @contextlib.contextmanager
+    def still(self) -> Iterator[None]:
+        """Let no step be added and no test changed meanwhile."""
+        with self._lock:
+            yield
+
+    def facts(self, test_id: str) -> dict[str, Any]:
+        """Return what was told about a test besides its images; empty where nothing was."""
+        found = self.read(test_id).get("facts")
+        return found if isinstance(found, dict) else {}
+
+    def put_facts(self, test_id: str, facts: dict[str, Any], expected: dict[str, Any] | None = None) -> None:
+        """Replace what was told about a test; durable when this returns.
+
+        Parameters
+        ----------
+        expected
+            What the caller takes for the facts so far; None: whatever they are.
+
+        Raises
+        ------
+        StateError
+            ``facts_changed`` if they are not what was expected.
+        """
+        with self._lock:
+            document = self.read(test_id)
+            if expected is not None and document.get("facts", {}) != expected:
+                raise StateError(
+                    f"The facts of test {test_id} were changed meanwhile.",
+                    code="facts_changed",
+                    remedy="Read them again, then send the change.",
+                )
+            write_json(self.path(test_id) / "test.json", document | {"facts": facts})
+
     def is_calibrated(self, test_id: str) -> bool:
         """Whether the test has a calibration to measure with."""
         return (self.path(test_id) / "calibration.json").is_file()
@@ -112,10 +184,43 @@ class TestStore:
         """Numbers of the complete steps, ascending."""
         return sorted(int(p.parent.name) for p in (self.path(test_id) / "steps").glob("[0-9]*/step.json"))
 
+    def steps_mark(self, test_id: str) -> tuple[int, int]:
+        """Return something cheap that differs whenever the steps of a test may have changed."""
+        return (self.path(test_id) / "steps").stat().st_mtime_ns, self._commits
+
+    def step_documents(self, test_id: str) -> Iterator[tuple[int, dict[str, Any] | FileFormatError]]:
+        """Return the number and ``step.json`` of every complete step, ascending, or why it cannot be read.
+
+        A start reads them all: with ten thousand steps, each look at a path counts.
+        """
+        steps = str(self.path(test_id) / "steps")
+        names = sorted(os.listdir(steps)) if Path(steps).is_dir() else []  # noqa: PTH208 - names, not paths
+        for name in names:
+            if len(name) != 4 or not name.isdecimal():
+                continue
+            try:
+                document = json.loads(Path(f"{steps}/{name}/step.json").read_bytes())
+                if not isinstance(document, dict):
+                    raise ValueError("it holds no object")
+            except FileNotFoundError:
+                continue
+            except (OSError, ValueError) as error:
+                yield int(name), FileFormatError(f"step.json cannot be read: {error}.", file=f"steps/{name}/step.json")
+            else:
+                yield int(name), document
+
     def incomplete_steps(self, test_id: str) -> list[int]:
-        """Numbers of step folders without their commit mark."""
+        """Numbers of step folders without their commit mark, those set aside among them."""
         steps = self.path(test_id) / "steps"
-        return sorted(int(p.name) for p in steps.iterdir() if p.name.isdigit() and not (p / "step.json").is_file())
+        return sorted(
+            n for p in steps.iterdir() if (n := number_of(p.name)) is not None and not (p / "step.json").is_file()
+        )
+
+    def deleted_steps(self, test_id: str) -> list[int]:
+        """Numbers of the steps that lie in the trash, or that were removed for good."""
+        steps = self.path(test_id) / "steps"
+        marks = {int(found[1]) for p in steps.iterdir() if (found := _DELETED.fullmatch(p.name)) is not None}
+        return sorted(marks.difference(self.step_numbers(test_id)))
 
     def add_step(self, test_id: str, images: dict[str, bytes], document: dict[str, Any]) -> dict[str, Any]:
         """Commit a step: both images, then ``step.json`` with their checksums.
@@ -124,11 +229,13 @@ class TestStore:
         """
         with self._lock:
             steps = self.path(test_id) / "steps"
-            used = [int(p.name) for p in steps.iterdir() if p.name.isdigit()]
-            # an incomplete reference would leave the test without step 0 for good
-            n = max(used, default=-1) + 1
-            if used == [0] and not (steps / "0000" / "step.json").exists():
-                self._set_aside(steps / "0000")
+            deleted = self.deleted_steps(test_id)
+            if deleted or self.step_numbers(test_id):
+                n = 1 + max([*deleted, *(n for p in steps.iterdir() if (n := number_of(p.name)) is not None)])
+            else:
+                # an incomplete reference would leave the test without step 0 for good
+                for folder in [p for p in steps.iterdir() if p.name.isdigit()]:
+                    set_aside(folder)
                 n = 0
             if n > MAX_STEPS:
                 raise StateError(f"Test {test_id} is full: {n} steps.", code="test_full", remedy="Make a new test.")
@@ -138,14 +245,11 @@ class TestStore:
                 sha256 = {cam: write_bytes(folder / f"{cam}.tif", images[cam]) for cam in CAMERAS}
                 document = {"n": n, "test_id": test_id, **document, "sha256": sha256}
                 write_json(folder / "step.json", document)
+                self._commits += 1
             except StorageError:
                 shutil.rmtree(folder, ignore_errors=True)  # frees the number where the disk allows it
                 raise
         return document
-
-    def _set_aside(self, folder: Path) -> None:
-        number = len(list(folder.parent.glob("incomplete-*"))) + 1
-        folder.rename(folder.parent / f"incomplete-{number}-{folder.name}")
 
     def step(self, test_id: str, n: int) -> StepFiles:
         """Return a complete step.
@@ -159,6 +263,14 @@ class TestStore:
         if not 0 <= n <= MAX_STEPS or not (folder / "step.json").is_file():
             raise NotFoundError(f"Test {test_id} has no step {n}.", what="step")
         return StepFiles(read_json(folder / "step.json"), folder / "cam1.tif", folder / "cam2.tif")
+
+    def update_step(self, test_id: str, n: int, changes: dict[str, Any]) -> dict[str, Any]:
+        """Change fields of a step's ``step.json``; its images and their checksums stay."""
+        with self._lock:
+            step = self.step(test_id, n)
+            document = step.document | changes
+            write_json(step.cam1.with_name("step.json"), document)
+        return document
 
     def verified_step(self, test_id: str, n: int) -> StepFiles:
         """Return a step whose images match their checksums.
@@ -194,9 +306,17 @@ class TestStore:
         return sorted(p.parent.name for p in folder.glob("a*/analysis.json") if is_id(p.parent.name, "a"))
 
     def create_analysis(
-        self, test_id: str, document: dict[str, Any], mask: bytes | None = None, noise: Path | None = None
+        self,
+        test_id: str,
+        document: dict[str, Any],
+        mask: bytes | None = None,
+        noise: Path | None = None,
+        run: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Make an analysis: settings and inputs, fixed from now on; with its own copy of the noise models."""
+        """Make an analysis: settings and inputs, fixed from now on; with its own copy of the noise models.
+
+        ``run`` is the job that will work on it, see `add_analysis_job`.
+        """
         analysis_id = self._folder.ids.new("a")
         path = self.path(test_id) / "analyses" / analysis_id
         make_folder(path)
@@ -204,6 +324,8 @@ class TestStore:
             document = {**document, "mask_sha256": write_bytes(path / "mask.png", mask)}
         if noise is not None:
             write_bytes(path / "noise.json", noise.read_bytes())
+        if run is not None:
+            write_json(path / "jobs.json", {"jobs": [{**run, "created_utc": now_utc()}]})
         document = {"id": analysis_id, "test_id": test_id, "created_utc": now_utc(), **document}
         write_json(path / "analysis.json", document)
         return document
@@ -212,16 +334,77 @@ class TestStore:
         """Return ``analysis.json``."""
         return read_json(self.analysis_path(test_id, analysis_id) / "analysis.json")
 
+    def analysis_jobs(self, test_id: str, analysis_id: str) -> list[dict[str, Any]]:
+        """Jobs that worked on an analysis, the last one last: ``job_id``, and the ``request`` that asked for each."""
+        path = self.analysis_path(test_id, analysis_id) / "jobs.json"
+        return list(read_json(path)["jobs"]) if path.is_file() else []
+
+    def add_analysis_job(self, test_id: str, analysis_id: str, run: dict[str, Any]) -> None:
+        """Note that another job goes on with an analysis."""
+        jobs = [*self.analysis_jobs(test_id, analysis_id), {**run, "created_utc": now_utc()}]
+        write_json(self.analysis_path(test_id, analysis_id) / "jobs.json", {"jobs": jobs})
+
+    def extend_analysis(
+        self, test_id: str, analysis_id: str, steps: list[int], sha256: dict[str, dict[str, str]]
+    ) -> dict[str, Any]:
+        """Make further steps, with their images' checksums, part of an analysis that follows its test."""
+        document = self.analysis(test_id, analysis_id)
+        document["steps"] = [*document["steps"], *steps]
+        document["inputs"]["steps"] |= sha256
+        write_json(self.analysis_path(test_id, analysis_id) / "analysis.json", document)
+        return document
+
+    def put_step_summary(self, test_id: str, analysis_id: str, n: int, summary: dict[str, Any]) -> None:
+        """Write what was found in one step, beside its result."""
+        write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
+
+    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, dict[str, Any]]:
+        """What was found, by step; only of steps whose result is there."""
+        path = self.analysis_path(test_id, analysis_id)
+        files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
+        return {n: read_json(file) for n, file in files.items() if file.is_file()}
+
     def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:
         """Numbers of the steps whose result file is there."""
         return sorted(int(p.stem[5:]) for p in self.analysis_path(test_id, analysis_id).glob("step_[0-9]*.nc"))
 
     def result_file(self, test_id: str, analysis_id: str, n: int) -> Path:
-        """Result file of one step."""
+        """Result file of one step, its checksum verified where it is known.
+
+        Raises
+        ------
+        FileFormatError
+            ``checksum_mismatch``, naming the file.
+        """
         path = self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
         if not path.is_file():
             raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.", what="result")
+        recorded = recorded_sha256(path)
+        if recorded is not None and known_sha256(path) != recorded:
+            raise FileFormatError(
+                f"{path.name} of analysis {analysis_id} does not match its checksum.",
+                code="checksum_mismatch",
+                remedy="Restore the file from a backup, or measure again; the other steps are not touched.",
+                file=f"analyses/{analysis_id}/{path.name}",
+            )
         return path
+
+    def drop_starts(self, test_id: str, analysis_id: str) -> None:
+        """Remove what only an unfinished analysis needs, see :mod:`server.io.starts`."""
+        for path in self.analysis_path(test_id, analysis_id).glob("starts_[0-9]*.npz"):
+            path.unlink(missing_ok=True)
+
+    def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
+        """Remove what a worker that was ended left of a result: half a file, a checksum without its result.
+
+        Nobody may write into the analysis meanwhile. Returns what was removed.
+        """
+        folder = self.analysis_path(test_id, analysis_id)
+        lone = [path for path in folder.glob("step_[0-9]*.nc.sha256") if not path.with_suffix("").exists()]
+        removed = sorted([*folder.glob(".*.part"), *lone])
+        for path in removed:
+            path.unlink(missing_ok=True)
+        return removed
 
     def put_summary(self, test_id: str, analysis_id: str, document: dict[str, Any]) -> None:
         """Write what the analysis found, step by step."""

@@ -1,0 +1,68 @@
+"""Entity tags: which state of a thing a client has seen, and refusing a change that was meant for another one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Annotated, Any
+
+from fastapi import Header, Response
+
+from core.errors import StateError
+
+IfMatch = Annotated[
+    str | None,
+    Header(
+        max_length=1000,
+        description="ETag of the state that is to be changed, as it was read; `*` for any. Another state is refused.",
+    ),
+]
+
+
+class PreconditionFailedError(StateError):
+    """The thing was changed since it was read."""
+
+    code = "precondition_failed"
+    remedy = "Read it again, then send the change with the new ETag."
+
+
+class PreconditionRequiredError(StateError):
+    """A change must say which state it was meant for."""
+
+    code = "precondition_required"
+    remedy = "Send If-Match with the ETag that reading it gave, or `If-Match: *` to change whatever is there."
+
+
+def etag_of(document: Any) -> str:
+    """Return the entity tag of a document."""
+    text = json.dumps(document, sort_keys=True, ensure_ascii=False, default=str)
+    return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
+
+
+def tagged(response: Response, document: dict[str, Any]) -> dict[str, Any]:
+    """Return the document, and name its state in the answer's ETag."""
+    response.headers["ETag"] = etag_of(document)
+    return document
+
+
+def tags_in(header: str) -> list[str]:
+    """Return the tags of If-Match or If-None-Match, weak or not."""
+    return [tag.strip().removeprefix("W/") for tag in header.split(",")]
+
+
+def require_match(header: str | None, etag: str, what: str, *, required: bool = True) -> None:
+    """Refuse a change that was meant for another state.
+
+    Raises
+    ------
+    PreconditionRequiredError
+        ``precondition_required`` if nothing was said and it must be.
+    PreconditionFailedError
+        ``precondition_failed``.
+    """
+    if header is None:
+        if required:
+            raise PreconditionRequiredError(f"A change of {what} needs If-Match.")
+        return
+    if header.strip() != "*" and etag not in tags_in(header):
+        raise PreconditionFailedError(f"The state of {what} is not the one that If-Match names.", etag=etag)

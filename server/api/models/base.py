@@ -1,0 +1,151 @@
+"""What all models share: strict numbers, closed requests, open replies."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    StringConstraints,
+    WithJsonSchema,
+)
+from pydantic.config import JsonDict
+from pydantic_core import PydanticCustomError
+
+
+def _not_a_truth_value(value: Any) -> Any:
+    # true would be taken for 1: an axis would move by a millimetre
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+def _a_number(value: Any) -> Any:
+    if isinstance(value, str):
+        raise ValueError("must be a number, not text")
+    return _not_a_truth_value(value)
+
+
+AXIS_PATTERN = r"^([1-9]|[12][0-9]|3[01])$"
+
+
+def _axis_number(value: Any) -> Any:
+    # as int() reads them, "01", "+1" and " 1 " would name an axis too
+    if isinstance(value, str) and not re.fullmatch(AXIS_PATTERN, value):
+        raise ValueError("must be the number of an axis, 1 to 31")
+    return _not_a_truth_value(value)
+
+
+def _a_text(value: Any) -> Any:
+    # a bare number could be seconds or milliseconds, of any clock
+    if not isinstance(value, str):
+        raise ValueError("must be text as in 2026-03-01T12:00:00Z")
+    return value
+
+
+def _in_utc(value: datetime) -> datetime:
+    try:
+        return value.astimezone(UTC)
+    except OverflowError as error:
+        raise ValueError("lies outside the calendar in UTC") from error
+
+
+def utc_text(value: datetime) -> str:
+    """Write a time as it is stored: ISO 8601 in UTC, to the microsecond."""
+    return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+Real = Annotated[float, BeforeValidator(_a_number)]
+Whole = Annotated[int, BeforeValidator(_a_number)]
+#: true or false, and no number or text that could be read so
+Switch = Annotated[bool, Field(strict=True)]
+Number = Annotated[Real, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+Label = Annotated[str, StringConstraints(max_length=300)]
+StepNumber = Annotated[Whole, Field(ge=0, le=9999)]
+#: a number for each of some axes
+AxisValues = Annotated[
+    dict[Annotated[int, BeforeValidator(_axis_number), Field(ge=1, le=31)], Number],
+    Field(min_length=1, max_length=6),
+    WithJsonSchema(
+        {
+            "type": "object",
+            "propertyNames": {"pattern": AXIS_PATTERN},
+            "additionalProperties": {"type": "number", "minimum": -1e9, "maximum": 1e9},
+            "minProperties": 1,
+            "maxProperties": 6,
+        }
+    ),
+]
+#: a number in a form, where everything is text
+FormNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+Channels = Annotated[
+    dict[Annotated[str, StringConstraints(min_length=1, max_length=100)], Number], Field(max_length=50)
+]
+Timestamp = Annotated[
+    AwareDatetime,
+    BeforeValidator(_a_text),
+    AfterValidator(_in_utc),
+    PlainSerializer(utc_text, return_type=str),
+    Field(examples=["2026-03-01T12:00:00.250Z"]),
+]
+CameraName = Literal["cam1", "cam2"]
+Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
+JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
+
+
+class Request(BaseModel):
+    """A body: closed, finite numbers only."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+def disagreement(text: str) -> PydanticCustomError:
+    """Return the error for values that are right each by itself and cannot be together."""
+    return PydanticCustomError("values_disagree", "{text}", {"text": text})
+
+
+def one_of(*names: str) -> JsonDict:
+    """Return the schema's words for: exactly one of these fields, and not null."""
+    return {"oneOf": [given(name) for name in names]}
+
+
+def any_of(*names: str) -> JsonDict:
+    """Return the schema's words for: at least one of these fields, and not null."""
+    return {"anyOf": [given(name) for name in names]}
+
+
+def not_both(*names: str) -> JsonDict:
+    """Return the schema's words for: not all of these fields."""
+    return {"not": {"allOf": [given(name) for name in names]}}
+
+
+def given(name: str) -> JsonDict:
+    """Return the schema's words for: this field is there, and not null."""
+    return {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
+
+
+ODD: JsonDict = {"not": {"multipleOf": 2}}
+
+
+class Listing(BaseModel):
+    """A page of a list."""
+
+    model_config = ConfigDict(extra="allow")
+
+    next_cursor: str | None = Field(
+        None, description="Send it as `cursor` for the page after this one; null on the last page."
+    )
+
+
+class Reply(BaseModel):
+    """An answer; may gain fields in later versions."""
+
+    model_config = ConfigDict(extra="allow")

@@ -1,0 +1,214 @@
+"""Calibrations, as they travel."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from server.api.models.base import Label, Listing, Number, Real, Reply, Request, Whole
+from server.api.models.jobs import Accepted, JobProblem
+
+
+class CalibrationRequest(Request):
+    """Plan of a calibration; what is left out comes from the rig file."""
+
+    positions_mm: list[Number] | None = Field(
+        None, description="dZ of the positions that are fitted.", min_length=1, max_length=100
+    )
+    held_out_mm: list[Number] | None = Field(
+        None, description="dZ of the positions kept for the check.", max_length=100
+    )
+    frames: Annotated[Whole, Field(ge=1, le=256)] | None = Field(None, description="Frames averaged at each position.")
+    localiser: Literal["profile", "paper"] | None = Field(None, description="Grid line localiser.")
+    label: Label = Field("", description="Free text.")
+
+
+class CalibrationAccepted(Accepted):
+    """A calibration was begun."""
+
+    calibration_id: str = Field(description="Id of the calibration to be.", examples=["c000001-5b02aa"])
+
+
+class ExpectRequest(Request):
+    """Plan of a calibration that is only thought about; what is left out comes from the rig file."""
+
+    positions_mm: list[Number] | None = Field(
+        None, description="dZ of the positions that are fitted.", min_length=1, max_length=100, examples=[[0.0, 5.0]]
+    )
+    held_out_mm: list[Number] | None = Field(
+        None, description="dZ of the positions kept for the check; they change nothing here.", max_length=100
+    )
+    localiser: Literal["profile", "paper"] | None = Field(None, description="Grid line localiser.")
+    noise_px: Annotated[Real, Field(ge=1e-6, le=10.0)] | None = Field(
+        None, description="Standard deviation with which an intersection's coordinate is found; 0.005 if left out."
+    )
+    roll_deg: Annotated[Real, Field(ge=-180.0, le=180.0)] = Field(
+        0.0, description="Turn of the grid in the images; matters where its corners leave them."
+    )
+
+
+class ExpectedNumber(Reply):
+    """A parameter and its expected uncertainty."""
+
+    value: float = Field(description="Nominal value.", examples=[12300.0])
+    sigma: float = Field(description="Expected standard deviation.", examples=[6.1])
+
+
+class ExpectedPoint(Reply):
+    """What the parameters' uncertainty does to a point."""
+
+    name: str = Field(description="`middle`, or the corner of the target's volume.", examples=["middle"])
+    xyz_mm: list[float] = Field(description="The point, system frame.", examples=[[0.0, 0.0, 0.0]])
+    sigma_mm: list[float] = Field(
+        description="Standard deviation of its X, Y, Z, from the calibration alone.", examples=[[2e-5, 2e-5, 3e-5]]
+    )
+
+
+class ExpectReply(Reply):
+    """What a plan may be expected to leave uncertain."""
+
+    assumed: dict[str, Any] = Field(description="What was assumed: noise_px, line_model, roll_deg, and as a text.")
+    parameters: dict[str, ExpectedNumber] = Field(description="Each parameter, as `cam1.phd_px`.")
+    points: list[ExpectedPoint] = Field(description="The middle and the corners of the target's volume.")
+    shape_rms_mm: float = Field(description="Rms error of shape over the volume, rigid motion taken out.")
+    scale: float = Field(description="Standard deviation of the common scale, 1 = 100 %.")
+    centre_px: float = Field(description="Largest standard deviation of an image centre.")
+    standoff_relative: float = Field(description="Largest standard deviation of a standoff, relative.")
+    seen_share: dict[str, float] = Field(description="Share of the intersections seen at the worst position.")
+    refused: bool = Field(description="Whether views at these positions would be refused.")
+    reasons: list[str] = Field(description="Why.")
+
+
+class JudgementRequest(Request):
+    """A decision on a calibration."""
+
+    decision: Literal["accepted", "discarded"] | None = Field(
+        description="`accepted`: to measure with by default; `discarded`: no test may be made with it; null: neither."
+    )
+    note: Label = Field("", description="Why.")
+
+
+class Judgement(Reply):
+    """What somebody decided on a calibration."""
+
+    decision: Literal["accepted", "discarded"] = Field(description="The decision.")
+    note: str = Field("", description="Why.")
+    by: str = Field("", description="Name of the key, or `local`.")
+    decided_utc: str = Field(description="When.")
+
+
+class CameraIdentity(Reply):
+    """Which camera took an image."""
+
+    model: str = Field(description="Model.")
+    serial: str = Field(description="Serial number.")
+
+
+class ViewReply(Reply):
+    """One view of the target by one camera."""
+
+    index: int = Field(description="Number of the stop, from 0; the second part of the image's path.")
+    camera: Literal["cam1", "cam2"] = Field(description="Which camera.")
+    device: CameraIdentity | None = Field(None, description="The camera that took it.")
+    role: str = Field(description="`fitted`, `held_out`, `zero` or `zero_again`.", examples=["fitted"])
+    dz_mm: float = Field(description="Travel of the camera from its zero, read back.")
+    dz_commanded_mm: float | None = Field(None, description="Travel that was asked for.")
+    axis: int | None = Field(None, description="Stage axis that moved it.")
+    position_mm: float | None = Field(None, description="The axis' position, read back.")
+    frames: int | None = Field(None, description="Frames averaged.")
+    full_scale: float | None = Field(None, description="Largest grey level that the image can hold.")
+    skew_ms: float | None = Field(None, description="Difference of both cameras' exposures.")
+    file: str = Field(description="Its file in the calibration's folder.", examples=["views/000_cam1.tif"])
+    sha256: str = Field(description="Checksum of that file.")
+
+
+class ViewList(Reply):
+    """The views of a calibration."""
+
+    views: list[ViewReply] = Field(description="In the order that they were taken; empty until all are.")
+
+
+class ViewResiduals(Reply):
+    """What the model leaves in one view."""
+
+    name: str = Field(description="Name of the view.", examples=["cam1 dZ 5.000 mm"])
+    camera: int | str = Field(description="Which camera.")
+    dz_mm: float = Field(description="Travel of the camera.")
+    held_out: bool = Field(description="Whether it was kept for the check.")
+    rbe_px: float | None = Field(description="Rms residual.")
+    raz_mm: float | None = Field(description="Rms error in space.")
+    nsce: float | None = Field(description="Normalised stereo calibration error.")
+    found_px: list[Any] = Field(
+        description="Column and row where each intersection was found: rows of lines of pairs; null: not seen."
+    )
+    residual_px: list[Any] = Field(description="Measured minus projected place, in the same order.")
+
+
+class ResidualsReply(Reply):
+    """Residuals of a calibration."""
+
+    views: list[ViewResiduals] = Field(description="Each view.")
+
+
+class CalibrationReply(Reply):
+    """A calibration: its plan, and once complete everything in calibration.json."""
+
+    id: str = Field(description="Id.")
+    state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")
+    plan: dict[str, Any] = Field(description="Positions, frames and localiser asked for.")
+    taken: list[dict[str, Any]] | None = Field(
+        None, description="Views taken, each as in GET /calibrations/{id}/views."
+    )
+    problem: JobProblem | None = Field(None, description="Why there is no calibration.")
+    judgement: Judgement | None = Field(None, description="What somebody decided on it; null: nothing yet.")
+
+
+class CalibrationFile(Reply):
+    """calibration.json, which `stereorig measure` reads; its statistics stand beside these."""
+
+    cam1: dict[str, Any] | None = Field(None, description="Camera 1: parameters, their standard deviations.")
+    cam2: dict[str, Any] | None = Field(None, description="Camera 2.")
+    image_size_px: dict[str, list[int]] | None = Field(None, description="Width and height of each camera's images.")
+    imported: dict[str, Any] | None = Field(None, description="Another program's file, whole, in place of the above.")
+
+
+class CalibrationEntry(Reply):
+    """What a list shows of a calibration."""
+
+    id: str = Field(description="Id.", examples=["c000001-5b02aa"])
+    state: str = Field(description="`unfinished`, `failed` or `complete`.")
+    label: str = Field(description="Free text.")
+    created_utc: str = Field(description="When it was begun or imported.")
+    verdict: dict[str, Any] | None = Field(
+        description="`level`: `good`, `warning` or `failed`, with `reasons`; null: none, as of most imported ones."
+    )
+    decision: str | None = Field(None, description="`accepted`, `discarded`; null: nobody decided.")
+
+
+class CalibrationList(Listing):
+    """Calibrations, oldest first."""
+
+    calibrations: list[CalibrationEntry] = Field(description="What there is to know of each in short.")
+
+
+class ConversionReply(Reply):
+    """What becomes of a calibration in another program's form."""
+
+    format: str = Field(description="The form.", examples=["vic3d"])
+    software: str = Field(description="This program and its version.")
+    source: str = Field(description="What it was read as.", examples=["calibration_json"])
+    source_sha256: str = Field(description="Checksum of calibration.json.")
+    units: str = Field(description="Of the numbers.")
+    frame: Literal["target", "camera 1"] = Field(description="System frame of the file.")
+    image_size_px: list[list[int]] | None = Field(description="Width and height of both images; null: not known.")
+    exact: bool = Field(description="Whether both lenses were carried over to the last digits.")
+    lens: dict[str, dict[str, float]] = Field(
+        description="By camera, what is left between both lens models over the image.",
+        examples=[{"cam1": {"rms_px": 0.016, "max_px": 0.065}, "cam2": {"rms_px": 0.013, "max_px": 0.051}}],
+    )
+    read_back: dict[str, float | int | None] = Field(
+        description="What the written file makes of points that both cameras see: epipolar residual, error in space.",
+        examples=[{"points": 370, "rms_px": 2e-12, "max_px": 5e-12, "rms_mm": 5e-13, "max_mm": 2e-12}],
+    )
+    notes: list[str] = Field(description="What was assumed.")

@@ -1,0 +1,61 @@
+"""Noise measurements, as they travel."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from server.api.models.base import Label, Listing, Reply, Request, Whole
+from server.api.models.jobs import Accepted
+
+
+class NoiseRequest(Request):
+    """How to measure the cameras' noise."""
+
+    frames: Annotated[Whole, Field(ge=2, le=200)] = Field(
+        16, description="Pairs of frames; the scene must stand still."
+    )
+    label: Label = Field("", description="Free text.")
+
+
+class NoiseAccepted(Accepted):
+    """A noise measurement was begun."""
+
+    noise_id: str = Field(description="Id of the noise measurement.", examples=["n000001-5b1c22"])
+
+
+class NoiseModelReply(Reply):
+    """One camera's model: variance = c0 + c1 g + c2 g^2 at grey level g."""
+
+    coefficients: list[float] = Field(description="c0, c1, c2, in grey levels squared, grey levels, 1.")
+    coefficients_sd: list[float] = Field(description="Their standard deviations.")
+    range_grey: list[float | None] = Field(description="Grey levels between which it holds; null: no end.")
+    frames: int = Field(description="Frames it was measured from.")
+    misfit: float = Field(description="Scatter of the bins about it, in their own sd; 1 is chance.")
+    drift: float = Field(description="Largest relative change of brightness between frames; taken out.")
+    shift_px: float = Field(description="Largest motion of the image between frames; taken out.")
+
+
+class NoiseFile(Reply):
+    """noise.json, which `stereorig measure --noise` reads."""
+
+    cam1: NoiseModelReply | None = Field(None, description="Camera 1's model.")
+    cam2: NoiseModelReply | None = Field(None, description="Camera 2's model.")
+
+
+class NoiseReply(Reply):
+    """A noise measurement."""
+
+    id: str = Field(description="Id.")
+    state: Literal["unfinished", "failed", "complete"] = Field(description="Where it is in its life.")
+    plan: dict[str, Any] = Field(description="What was asked for.")
+    problem: dict[str, Any] | None = Field(None, description="Why it has no models.")
+    cam1: NoiseModelReply | None = Field(None, description="Camera 1's model.")
+    cam2: NoiseModelReply | None = Field(None, description="Camera 2's model.")
+
+
+class NoiseList(Listing):
+    """Noise measurements, oldest first."""
+
+    noise: list[NoiseReply] = Field(description="Noise measurements, oldest first.")

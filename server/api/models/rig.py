@@ -1,0 +1,144 @@
+"""Cameras, stage and scene, as they travel."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from server.api.models.base import AxisValues, CameraName, Number, Real, Reply, Request, Whole, any_of, one_of
+
+
+class SettingsPatch(Request):
+    """Camera settings to change; what is left out stays."""
+
+    exposure_ms: Annotated[Real, Field(gt=0.0, le=60000.0)] | None = Field(None, description="Exposure time.")
+    gain_db: Annotated[Real, Field(ge=-100.0, le=100.0)] | None = Field(None, description="Gain.")
+    frame_rate_hz: Annotated[Real, Field(gt=0.0, le=10000.0)] | None = Field(None, description="Free-run rate.")
+    bit_depth: Annotated[Whole, Field(ge=8, le=16)] | None = Field(None, description="Significant bits per pixel.")
+    features: dict[Annotated[str, Field(min_length=1, max_length=200)], bool | int | float | str] | None = Field(
+        None,
+        description="Other settings by the device's own name (GenICam feature, V4L2 control), set in this order.",
+        max_length=100,
+        examples=[{"BlackLevel": 4.0}],
+    )
+
+
+class MoveRequest(Request):
+    """Where to move: axes by number, or cameras by their travel dZ."""
+
+    model_config = ConfigDict(json_schema_extra=one_of("positions_mm", "by_mm", "dz_mm"))
+
+    positions_mm: AxisValues | None = Field(
+        None, description="Absolute position of each axis.", examples=[{"1": 5.0, "2": 5.0}]
+    )
+    by_mm: AxisValues | None = Field(None, description="Travel of each axis from where it stands.")
+    dz_mm: dict[CameraName, Number] | None = Field(
+        None, description="Travel of each camera from its zero, positive away from the target.", min_length=1
+    )
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if sum(v is not None for v in (self.positions_mm, self.by_mm, self.dz_mm)) != 1:
+            raise ValueError("give exactly one of positions_mm, by_mm and dz_mm")
+        return self
+
+
+class HomeRequest(Request):
+    """Which axes to home."""
+
+    axes: list[Annotated[Whole, Field(ge=1, le=31)]] | None = Field(
+        None, description="Axis numbers; all that the cameras use if left out.", min_length=1, max_length=6
+    )
+
+
+class AxesRequest(Request):
+    """Which axes."""
+
+    axes: list[Annotated[Whole, Field(ge=1, le=31)]] | None = Field(
+        None, description="Axis numbers; all that the cameras use if left out.", min_length=1, max_length=6
+    )
+
+
+class DynamicsPatch(Request):
+    """How fast an axis moves; what is left out stays."""
+
+    model_config = ConfigDict(json_schema_extra=any_of("velocity_mm_s", "acceleration_mm_s2"))
+
+    velocity_mm_s: Annotated[Real, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = Field(
+        None, description="Velocity of moves."
+    )
+    acceleration_mm_s2: Annotated[Real, Field(gt=0.0, le=1e9, allow_inf_nan=False)] | None = Field(
+        None, description="Acceleration and deceleration of moves."
+    )
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.velocity_mm_s is None and self.acceleration_mm_s2 is None:
+            raise ValueError("give velocity_mm_s, acceleration_mm_s2 or both")
+        return self
+
+
+class DynamicsReply(Reply):
+    """How fast an axis moves, as read back from the controller."""
+
+    axis: int = Field(description="Axis number.")
+    velocity_mm_s: float = Field(description="Velocity of moves.")
+    acceleration_mm_s2: float = Field(description="Acceleration of moves.")
+    max_velocity_mm_s: float | None = Field(None, description="The greatest; null where the controller does not tell.")
+    max_acceleration_mm_s2: float | None = Field(None, description="The greatest; null where it does not tell.")
+
+
+class FlashConsent(Request):
+    """Consent to what cannot be taken back."""
+
+    write_flash: Literal[True] = Field(
+        description="Must be true: leaving writes the controller's flash memory, which bears about a hundred writes."
+    )
+
+    @field_validator("write_flash", mode="before")
+    @classmethod
+    def _only_true(cls, value: Any) -> Any:
+        if value is not True:
+            raise ValueError("must be true")
+        return value
+
+
+class StageMessage(Reply):
+    """Something that the controller had to say."""
+
+    id: int = Field(description="Grows by one with each message.")
+    utc: str = Field(description="When it was read.")
+    code: str = Field(description="The controller's own code.", examples=["103"])
+    text: str = Field(description="The controller's own words.", examples=["FOLLOWING ERROR THRESHOLD EXCEEDED"])
+    axis: int | None = Field(None, description="Axis that it concerns; null for none in particular.")
+
+
+class StageMessages(Reply):
+    """Messages of the controller, oldest first."""
+
+    messages: list[StageMessage] = Field(description="The last 200 at most.")
+
+
+class StopReply(Reply):
+    """The stage was told to stop."""
+
+    stopped: bool = Field(description="True once the stop command is on the wire.")
+    elapsed_ms: float = Field(
+        description="From the request's arrival to the command on the wire; of an abort, to the motors off."
+    )
+    cancelled_job: str | None = Field(None, description="The hardware job that was cancelled with it.")
+
+
+class SceneRequest(Request):
+    """What stands before a simulated rig's cameras."""
+
+    scene: Literal["grid", "steel", "plate", "panel", "block", "strip", "sphere"] = Field(
+        description="Name of the scene."
+    )
+    load: Number = Field(
+        0.0, description="kPa for `plate`, kN for `panel`, per cent for `strip`, share of the motion for `block`."
+    )
+    params: dict[str, Number | list[Number]] = Field(
+        default_factory=dict, description="Further parameters of the scene.", max_length=20
+    )

@@ -1,0 +1,255 @@
+"""Tests and steps, as they travel."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints
+
+from server.api.models.base import Channels, Label, Listing, Number, Real, Reply, Request, Timestamp, Whole
+from server.api.models.jobs import Accepted
+
+
+class TestRequest(Request):
+    """A new test."""
+
+    __test__ = False
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=300)] = Field(description="Name, any characters.")
+    calibration_id: str | None = Field(
+        None,
+        description="Calibration to measure with, copied into the test; `accepted`: the newest one accepted.",
+        max_length=40,
+    )
+    specimen: Label = Field("", description="The specimen, for people.")
+    notes: Annotated[str, StringConstraints(max_length=20000)] = Field("", description="Free text.")
+
+
+class TestPatch(Request):
+    """Fields of a test to change."""
+
+    __test__ = False
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=300)] | None = Field(None, description="Name.")
+    specimen: Label | None = Field(None, description="The specimen.")
+    notes: Annotated[str, StringConstraints(max_length=20000)] | None = Field(None, description="Free text.")
+
+
+class TestEntry(Reply):
+    """What a list shows of a test."""
+
+    __test__ = False
+
+    id: str = Field(description="Id.", examples=["t000001-0c9f1e"])
+    name: str = Field(description="Name.")
+    specimen: str | None = Field(None, description="The specimen.")
+    calibration_id: str | None = Field(None, description="Calibration it measures with.")
+    created_utc: str | None = Field(None, description="When it was made.")
+
+
+class StepEntry(Reply):
+    """What a list shows of a step."""
+
+    n: int = Field(description="Number; 0 is the reference.")
+    label: str | None = Field(None, description="Free text.")
+    load_n: float | None = Field(None, description="Load in newton.")
+    timestamp_utc: str | None = Field(None, description="The client's own time, if it gave one.")
+    source: str | None = Field(None, description="`capture` or `import`.")
+    captured_utc: str | None = Field(None, description="Time of the capture or import, by the service's clock.")
+    skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
+    quality: str | None = Field(None, description="`ok`, or the first thing that is wrong.")
+
+
+class AnalysisEntry(Reply):
+    """What a list shows of an analysis."""
+
+    id: str = Field(description="Id.", examples=["a000001-77d0b3"])
+    kind: str | None = Field(None, description="`profile` or `displacement`.")
+    label: str | None = Field(None, description="Free text.")
+    created_utc: str | None = Field(None, description="When it was begun.")
+    job_id: str | None = Field(None, description="Its job.")
+
+
+class TestReply(Reply):
+    """A test."""
+
+    __test__ = False
+
+    id: str = Field(description="Id.", examples=["t000001-0c9f1e"])
+    name: str = Field(description="Name.")
+    specimen: str = Field(description="The specimen.")
+    notes: str = Field(description="Free text.")
+    calibration_id: str | None = Field(None, description="Calibration it measures with.")
+    created_utc: str = Field(description="When it was made.")
+    steps: list[StepEntry] = Field(default_factory=list, description="Its complete steps.")
+    incomplete_steps: list[int] = Field(default_factory=list, description="Step folders without their commit mark.")
+    analyses: list[AnalysisEntry] = Field(default_factory=list, description="Its analyses.")
+
+
+class TestList(Listing):
+    """Tests, oldest first."""
+
+    __test__ = False
+
+    tests: list[TestEntry] = Field(description="What there is to know of each in short.")
+
+
+class StepList(Listing):
+    """Complete steps, in order."""
+
+    steps: list[StepEntry] = Field(description="What there is to know of each in short.")
+
+
+class StepPatch(Request):
+    """Fields of a step to change; images, times and figures stay as they were taken."""
+
+    label: Label = Field(description="Free text.")
+
+
+class StepRequest(Request):
+    """Capture one step, or a burst of them."""
+
+    label: Label = Field("", description="Free text.")
+    load_n: Number | None = Field(None, description="Load in newton.")
+    timestamp_utc: Timestamp | None = Field(
+        None,
+        description="The client's own time of this load step, with its time zone; kept beside the service's "
+        "`captured_utc`, and never used for order.",
+    )
+    channels: Channels = Field(
+        default_factory=dict,
+        description="Any further scalar readings, by name.",
+        examples=[{"force_n": 1250.5, "stroke_mm": 0.42, "temperature_c": 21.3}],
+    )
+    frames: Annotated[Whole, Field(ge=1, le=256)] = Field(
+        1, description="Frames averaged; 1 stores the frame as it came."
+    )
+    count: Annotated[Whole, Field(ge=1, le=10000)] = Field(
+        1, description="Steps to take. More than one make a burst: the answer is 202 and a job."
+    )
+    interval_ms: Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=86_400_000.0)] = Field(
+        0.0, description="From the beginning of one step of a burst to that of the next; 0: as fast as it goes."
+    )
+
+
+class CameraQuality(Reply):
+    """What one camera's image is worth, before anyone relies on it."""
+
+    code: str = Field(description="`ok`, `saturated`, `dark`, `blank`, `low_texture` or `blurred`.", examples=["ok"])
+    mean_grey: float = Field(description="Mean grey level, counts.", examples=[118.4])
+    mean_share: float | None = Field(None, description="Mean grey level over full scale.", examples=[0.464])
+    saturated_share: float = Field(description="Share of pixels at full scale.", examples=[0.0])
+    contrast_grey: float = Field(description="Standard deviation of the grey levels, counts.", examples=[41.0])
+    texture_grey_per_px: float = Field(
+        description="Median over tiles of the rms gradient, counts per pixel.", examples=[12.7]
+    )
+    focus: float = Field(
+        description="How much of the gradient survives at the scale of a pixel; below 0.12 blurred.", examples=[0.31]
+    )
+    exposure_ms: float | None = Field(None, description="Exposure as read back; null for files.", examples=[10.0])
+    gain_db: float | None = Field(None, description="Gain as read back; null where there is none.", examples=[0.0])
+    frames: dict[str, int] | None = Field(
+        None,
+        description="What became of the camera's frames during the capture: delivered, dropped, incomplete ...",
+        examples=[{"delivered": 1, "overrun": 0, "dropped": 0, "incomplete": 0, "duplicates": 0, "out_of_order": 0}],
+    )
+
+
+class StepQuality(Reply):
+    """What a pair is worth."""
+
+    code: str | None = Field(
+        None, description="`ok`, or the first thing that is wrong; `cameras_off_zero` off their calibrated place."
+    )
+    skew_ms: float | None = Field(None, description="Difference of the exposures' beginnings.", examples=[0.02])
+    max_skew_ms: float | None = Field(None, description="What the rig allows.", examples=[1.0])
+    pairs: dict[str, int] | None = Field(
+        None,
+        description="What became of the triggers during the capture: triggered = paired + unpaired + incomplete + "
+        "dropped.",
+        examples=[{"triggered": 1, "paired": 1, "unpaired": 0, "incomplete": 0, "dropped": 0, "refused": 0, "late": 0}],
+    )
+    cam1: CameraQuality | None = Field(None, description="Camera 1's image.")
+    cam2: CameraQuality | None = Field(None, description="Camera 2's image.")
+
+
+class BurstPlace(Reply):
+    """Where a step stands in its burst."""
+
+    job_id: str = Field(description="Job of the burst.")
+    index: int = Field(description="Number in the burst, from 0.")
+    count: int = Field(description="Steps that were asked for.")
+    interval_ms: float = Field(description="Interval that was asked for.")
+    since_first_ms: float = Field(description="Exposure's beginning after that of the burst's first step.")
+
+
+class StepReply(Reply):
+    """A step: durable on disk when this is sent."""
+
+    n: int = Field(description="Number; 0 is the reference.")
+    test_id: str = Field(description="Its test.")
+    label: str = Field(description="Free text.")
+    load_n: float | None = Field(None, description="Load in newton.")
+    timestamp_utc: str | None = Field(None, description="The client's own time, if it gave one.")
+    channels: dict[str, float] = Field(default_factory=dict, description="Scalar readings, as sent.")
+    source: Literal["capture", "import"] = Field(description="Where the images come from.")
+    captured_utc: str = Field(description="Time of the capture or import, by the service's clock.")
+    skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
+    quality: StepQuality = Field(description="`code` (`ok` or what is wrong), and figures of each camera.")
+    sha256: dict[str, str] = Field(description="Checksums of both image files.")
+    burst: BurstPlace | None = Field(None, description="Where it stands in its burst, if it is of one.")
+
+
+class BurstAccepted(Accepted):
+    """A burst was begun; its job's `result` lists each step that is durable, and each that failed."""
+
+
+class WatchRequest(Request):
+    """Which channel is watched, and what makes a step."""
+
+    channel: Annotated[str, StringConstraints(min_length=1, max_length=100)] = Field(
+        description="Name of a channel of the readings; `load_n` for the load.", examples=["load_n"]
+    )
+    threshold: Annotated[Number, Field(ge=0.0)] = Field(
+        description="A step is taken when the channel differs by this or more from the newest step that bears it; 0: "
+        "at any difference.",
+        examples=[500.0],
+    )
+    frames: Annotated[Whole, Field(ge=1, le=256)] = Field(1, description="Frames averaged in each step.")
+    label: Label = Field("", description="Label of steps whose reading brings none.")
+
+
+class WatchReply(Reply):
+    """What is watched."""
+
+    active: bool = Field(description="Whether readings take steps.")
+    channel: str = Field(description="The channel.")
+    threshold: float = Field(description="Difference that makes a step.")
+    frames: int = Field(description="Frames averaged in each step.")
+    label: str = Field(description="Label of steps whose reading brings none.")
+    since_utc: str = Field(description="When the watch began.")
+    last_value: float | None = Field(None, description="What the next reading is compared with; null: nothing yet.")
+    last_step: int | None = Field(None, description="Step that it is from.")
+
+
+class ReadingRequest(Request):
+    """A reading of a script's channels."""
+
+    label: Label = Field("", description="Label of the step, if one is taken.")
+    load_n: Number | None = Field(None, description="Load in newton.")
+    timestamp_utc: Timestamp | None = Field(None, description="The client's own time of the reading.")
+    channels: Channels = Field(
+        default_factory=dict,
+        description="Scalar readings, by name.",
+        examples=[{"force_n": 1250.5, "stroke_mm": 0.42, "temperature_c": 21.3}],
+    )
+
+
+class ReadingReply(Reply):
+    """What became of a reading."""
+
+    taken: bool = Field(description="Whether it took a step.")
+    reason: Literal["first", "changed", "below_threshold", "channel_absent"] = Field(description="Why, or why not.")
+    value: float | None = Field(None, description="Value of the watched channel; null where it was absent.")
+    last_value: float | None = Field(None, description="Value that it was compared with; null: there was none.")
+    step: StepReply | None = Field(None, description="The step, durable on disk.")

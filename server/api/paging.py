@@ -1,0 +1,95 @@
+"""Lists a page at a time: a cursor names the last thing seen, so that what is made meanwhile moves nothing."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request, Response
+
+from core.errors import InputError
+
+MOST = 1000
+
+
+class Page:
+    """Which part of a list is asked for.
+
+    Parameters
+    ----------
+    after
+        Key of the last thing that was seen; None: from the beginning.
+    """
+
+    def __init__(self, request: Request, response: Response, limit: int, after: str | None) -> None:
+        self._request, self._response = request, response
+        self.limit, self.after = limit, after
+
+    def of(self, things: Sequence[Any], key: Callable[[Any], str], *, newest_first: bool = False) -> list[Any]:
+        """Return the page of a list that is in the order of its keys, and tell where the next one begins."""
+        rest = [t for t in things if self.after is None or self._is_after(key(t), newest_first)]
+        return self.cut(rest, key)
+
+    def cut(self, rest: Sequence[Any], key: Callable[[Any], str]) -> list[Any]:
+        """Return the page at the beginning of what is left."""
+        page = list(rest[: self.limit])
+        if len(rest) > len(page):
+            cursor = base64.urlsafe_b64encode(key(page[-1]).encode()).decode().rstrip("=")
+            url = self._request.url.include_query_params(cursor=cursor)
+            self._response.headers["Link"] = f'<{url.path}?{url.query}>; rel="next"'
+            self._response.headers["X-Next-Cursor"] = cursor
+        return page
+
+    @property
+    def next_cursor(self) -> str | None:
+        """Where the next page begins; None after the last one."""
+        return self._response.headers.get("X-Next-Cursor")
+
+    def _is_after(self, key: str, newest_first: bool) -> bool:
+        assert self.after is not None
+        return key < self.after if newest_first else key > self.after
+
+
+def _position(cursor: str | None) -> str | None:
+    """Read a cursor.
+
+    Raises
+    ------
+    InputError
+        ``cursor_invalid``.
+    """
+    if cursor is None:
+        return None
+    try:
+        return base64.b64decode(cursor + "=" * (-len(cursor) % 4), altchars=b"-_", validate=True).decode("ascii")
+    except (binascii.Error, ValueError) as error:
+        raise InputError(
+            "The cursor is none that this service gave.",
+            code="cursor_invalid",
+            remedy="Send next_cursor as it came, or leave it out to begin anew.",
+        ) from error
+
+
+Limit = Annotated[int, Query(ge=1, le=MOST, description="Most things in the answer.")]
+Cursor = Annotated[
+    str | None,
+    Query(
+        max_length=200,
+        description="`next_cursor` of the page before; the list goes on after it, whatever was made or deleted "
+        "meanwhile.",
+    ),
+]
+
+
+def _page(request: Request, response: Response, limit: Limit = MOST, cursor: Cursor = None) -> Page:
+    return Page(request, response, limit, _position(cursor))
+
+
+def _short_page(request: Request, response: Response, limit: Limit = 100, cursor: Cursor = None) -> Page:
+    return Page(request, response, limit, _position(cursor))
+
+
+PageDep = Annotated[Page, Depends(_page)]
+ShortPageDep = Annotated[Page, Depends(_short_page)]

@@ -1,0 +1,52 @@
+"""What only people know about a camera and its lens: from the rig file, kept with every step.
+
+A fact that nobody told is None, never a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+Text = Annotated[str, StringConstraints(min_length=1, max_length=500, strip_whitespace=True)]
+Above = Annotated[float, Field(strict=True, gt=0.0, le=1e6, allow_inf_nan=False)]
+
+
+class ClosedFacts(BaseModel):
+    """Facts: closed and frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class LensFacts(ClosedFacts):
+    """[cam1.lens], [cam2.lens]: what is printed on the lens; for reports, nothing is computed from it."""
+
+    maker: Text | None = Field(None, description="Maker of the lens.", examples=["Schneider-Kreuznach"])
+    model: Text | None = Field(None, description="Model of the lens.", examples=["Xenoplan 2.8/50"])
+    focal_length_mm: Above | None = Field(None, description="Nominal focal length.", examples=[50.0])
+    f_number: Above | None = Field(None, description="Aperture that was set, as the f-number.", examples=[8.0])
+    note: Text | None = Field(None, description="Filters, extension tubes, polarisers.")
+
+
+class CameraFacts(ClosedFacts):
+    """What a camera's data sheet says; for reports, nothing is computed from it but lengths on the sensor."""
+
+    maker: Text | None = Field(None, description="Maker of the camera.", examples=["Basler"])
+    model: Text | None = Field(None, description="Model; what the camera itself says goes before it.")
+    sensor: Text | None = Field(None, description="The sensor.", examples=["Sony IMX250, CMOS, global shutter"])
+    pixel_um: Above | None = Field(None, description="Width of a pixel on the sensor.", examples=[3.45])
+    lens: LensFacts | None = Field(None, description="The lens.")
+
+
+def merged(over: CameraFacts | None, under: Mapping[str, Any] | None) -> CameraFacts:
+    """Facts of a camera, one by one: those of ``over`` go before those of ``under``, as a step's record has them."""
+    told = CameraFacts.model_validate({k: v for k, v in (under or {}).items() if k in CameraFacts.model_fields})
+    if over is None:
+        return told
+    document, lens = over.model_dump(exclude_none=True), over.lens
+    both = {**told.model_dump(exclude_none=True), **document}
+    if lens is not None and told.lens is not None:
+        both["lens"] = {**told.lens.model_dump(exclude_none=True), **lens.model_dump(exclude_none=True)}
+    return CameraFacts.model_validate(both)

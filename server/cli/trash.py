@@ -1,0 +1,106 @@
+"""``stereorig trash``: what was deleted, bring it back, remove it for good."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from core.errors import InputError
+from server.store.calibrations import CalibrationStore
+from server.store.catalog import Catalog
+from server.store.folder import DataFolder
+from server.store.index import rebuild
+from server.store.noise import NoiseStore
+from server.store.tests import TestStore
+from server.store.trash import Trash
+from server.store.verify import require_data_folder
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.description = (
+        "Deleting moves things into the trash of the data folder. 'list' shows them, 'restore ID ...' moves them back "
+        "(with no service running; a running one does it by POST /trash/ID/restore), 'empty' removes them for good: "
+        "all, or those that were deleted more than --older-than days ago, or those that are named."
+    )
+    parser.add_argument("action", choices=["list", "restore", "empty"])
+    parser.add_argument("ids", nargs="*", metavar="ID", help="as 'list' shows them")
+    parser.add_argument("--older-than", type=float, metavar="DAYS", help="empty: only what was deleted before that")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="data folder (default: ./data)")
+    parser.add_argument("--json", action="store_true", help="list: print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do it."""
+    require_data_folder(args.data)
+    if args.older_than is not None and (args.action != "empty" or args.ids or not args.older_than >= 0.0):
+        raise InputError(
+            "--older-than goes with 'empty' alone, and is 0 or more.", remedy="See stereorig trash --help."
+        )
+    if args.action == "list" and args.ids:
+        raise InputError("'trash list' takes no ID.", remedy="See stereorig trash --help.")
+    if args.action == "restore":
+        return _restore(args.data, args.ids)
+    trash = Trash(args.data.absolute())
+    if args.action == "empty":
+        return _empty(trash, args.ids, args.older_than)
+    entries = trash.entries()
+    if args.json:
+        print(json.dumps(entries, indent=1, ensure_ascii=False))
+    else:
+        print("\n".join([_line(entry) for entry in entries] or ["the trash is empty"]))
+    return 0
+
+
+def _restore(data: Path, ids: list[str]) -> int:
+    if not ids:
+        raise InputError("'trash restore' needs an ID.", remedy="See stereorig trash list.")
+    folder = DataFolder(data)
+    try:
+        trash = Trash(folder.root)
+        for trash_id in ids:
+            print(f"restored {_what(trash.restore(trash_id))}")
+        catalog = Catalog(folder.root / "catalog.sqlite")
+        try:
+            rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), NoiseStore(folder))
+        finally:
+            catalog.close()
+    finally:
+        folder.close()
+    return 0
+
+
+def _empty(trash: Trash, ids: list[str], older_than: float | None) -> int:
+    for trash_id in ids:
+        trash.entry(trash_id)  # nothing is removed if one of them is not there
+    entries = [entry for entry in trash.entries() if not ids or entry["id"] in ids]
+    if older_than is not None:
+        before = datetime.now(UTC) - timedelta(days=older_than)
+        entries = [entry for entry in entries if _deleted_before(entry, before)]
+    for entry in entries:
+        trash.remove(entry["id"])
+        print(f"removed {_line(entry)}")
+    print(f"{sum(entry['size_bytes'] for entry in entries) / 2**20:.1f} MiB freed")
+    return 0
+
+
+def _deleted_before(entry: dict[str, Any], moment: datetime) -> bool:
+    try:
+        return datetime.fromisoformat(str(entry["deleted_utc"])) < moment
+    except (KeyError, ValueError):
+        return False  # nobody knows when
+
+
+def _what(entry: dict[str, Any]) -> str:
+    ids = [str(entry[name]) for name in ("test_id", "analysis_id", "calibration_id", "noise_id") if entry.get(name)]
+    number = f" step {entry['n']}" if entry.get("n") is not None else ""
+    return f"{entry['kind']} {' '.join(ids)}{number}"
+
+
+def _line(entry: dict[str, Any]) -> str:
+    size_mib = entry["size_bytes"] / 2**20
+    when = f"deleted {entry.get('deleted_utc')} by {entry.get('deleted_by')} ({entry.get('why')})"
+    return f"{entry['id']}  {_what(entry)}  {size_mib:.1f} MiB  {when}  {entry.get('name', '')}".rstrip()

@@ -1,0 +1,182 @@
+"""The examination: everything that a rig file names, one part after the other, each in spite of the others' faults."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+from core.errors import StereorigError
+from drivers.serial_ports import port_problem
+from server.config import RigConfig, load_config
+from server.devices import DeviceFinder, DeviceListing, is_called
+from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch
+from server.doctor.disk import check_disk
+from server.doctor.link import check_link, check_network
+from server.doctor.machine import ClockWatch, check_machine, check_software
+from server.doctor.report import Check, Notebook, Report
+from server.doctor.stage import check_stage
+from server.rig.build import Devices, check_config, first_settings, make_unit, open_configured_stage, open_devices
+from server.rig.cameras import CAMERAS
+from server.version import software_version
+
+
+def examine(
+    path: Path,
+    *,
+    seconds: float = 5.0,
+    data: Path = Path("data"),
+    move: bool = False,
+    home: bool = False,
+    record: Path | None = None,
+    tell: Callable[[Check], None] | None = None,
+) -> Report:
+    """Examine the bench that a rig file names.
+
+    Parameters
+    ----------
+    path
+        The rig file.
+    seconds
+        How long pairs are captured for.
+    data
+        The data folder, whose disk is timed.
+    move, home
+        Allow a small move of each axis, and the search for home; a simulated stage does both anyway.
+    record
+        File that gets a transcript of the stage's wire.
+    tell
+        Called with each check as it is made.
+    """
+    book = Notebook(tell)
+    clock = ClockWatch()
+    check_software(book)
+    check_machine(book)
+    config = _read(book, path)
+    if config is not None:
+        _check_drivers(book, config)
+        _check_port(book, config.stage.url)
+        _check_devices(book, config, seconds, move=move, home=home, record=record)
+    # under software triggers pairs come as they are asked for: there is no rate to keep up with
+    rate = None if config is None else config.rig.frame_rate_hz
+    columns, rows = (1024, 1024) if config is None else config.cam1.image_size_px
+    wide = 1 if config is None or config.cam1.bit_depth == 8 else 2
+    check_disk(book, data, image_bytes=columns * rows * wide, pairs_per_s=rate)
+    clock.check(book)
+    good, verdict = book.verdict()
+    return Report(
+        version=software_version(), rig=None if config is None else config.rig.name, config=str(path), seconds=seconds,
+        checks=book.checks, good=good, verdict=verdict,
+    )  # fmt: skip
+
+
+def _read(book: Notebook, path: Path) -> RigConfig | None:
+    try:
+        config = load_config(path)
+        check_config(config)
+    except StereorigError as error:
+        book.fail("rig file", "reading", error)
+        return None
+    book.note("rig file", "reading", "ok", f"{path}: {config.rig.name} ({config.rig.kind})")
+    return config
+
+
+def _check_drivers(book: Notebook, config: RigConfig) -> None:
+    """See whether the rig file's drivers work here and see its cameras."""
+    wanted = {config.camera(cam).driver for cam in CAMERAS} - {"sim"}
+    if not wanted:
+        book.note("software", "camera drivers", "ok", "simulated cameras need none")
+        return
+    listing = DeviceFinder(wanted).find()
+    for driver in listing.drivers:
+        if driver.name in wanted:
+            book.note("software", f"driver {driver.name}", "ok" if driver.state == "ok" else "failed",
+                      driver.problem or f"sees {driver.found} cameras", remedy=driver.remedy)  # fmt: skip
+    looked = {driver.name for driver in listing.drivers if driver.state == "ok"}
+    for cam in CAMERAS:
+        if config.camera(cam).driver in looked:
+            _check_found(book, cam, config, listing)
+
+
+def _check_port(book: Notebook, url: str) -> None:
+    """See what keeps a serial port of this machine from being used."""
+    if url.startswith("/"):
+        problem = port_problem(url)
+        book.note("stage", "port", "failed" if problem else "ok", problem or f"{url} is there, free and ours to use",
+                  remedy="'stereorig devices' lists the serial ports of this machine.")  # fmt: skip
+
+
+def _check_found(book: Notebook, cam: str, config: RigConfig, listing: DeviceListing) -> None:
+    section = config.cam1 if cam == "cam1" else config.cam2
+    named = section.device or ""
+    for found in listing.cameras:
+        if found.driver == section.driver and is_called(found, named):
+            book.note(cam, "found", "failed" if found.problem else "ok", found.problem or f"{named}: {found.model}")
+            return
+    others = ", ".join(camera.device for camera in listing.cameras) or "none"
+    book.note(cam, "found", "warning", f"{named or 'no device'} does not show itself; the driver sees: {others}",
+              remedy="Check power and cable, and the name in the rig file; see 'stereorig devices'.")  # fmt: skip
+
+
+def _check_devices(
+    book: Notebook, config: RigConfig, seconds: float, *, move: bool, home: bool, record: Path | None
+) -> None:
+    settings = {cam: first_settings(config, cam) for cam in CAMERAS}
+    try:
+        devices = open_devices(config, settings, record=record)
+    except StereorigError as error:
+        _check_apart(book, config, error, move=move, home=home, record=record)
+        return
+    with contextlib.closing(devices):
+        _check_cameras(book, devices, config, seconds)
+        # a rig with simulated cameras may still have a real stage
+        simulated = devices.controller is not None
+        check_stage(book, devices.stage, config, move=move or simulated, home=home or simulated)
+
+
+def _check_apart(
+    book: Notebook, config: RigConfig, error: StereorigError, *, move: bool, home: bool, record: Path | None
+) -> None:
+    """Find out which devices are well when they cannot be opened all together."""
+    if config.rig.kind == "simulated":
+        book.fail(str(error.context.get("camera", "devices")), "opening", error)
+        return
+    for cam in CAMERAS:
+        unit = make_unit(config, cam)
+        with book.guard(cam, "opening"), contextlib.closing(unit):
+            unit.open(first_settings(config, cam))
+            book.note(cam, "opening", "ok", f"{unit.description.model} {unit.description.serial}")
+            check_settings(book, unit)
+    bad = [check for check in book.checks if check.state == "failed" and check.name == "opening"]
+    if any("camera_busy" in check.found for check in bad):
+        # over a network a controller takes several programs at once, and the other one may be about to move it
+        book.note("stage", "opening", "not checked", "another program uses the cameras, and perhaps the stage",
+                  remedy="End that program, then run the doctor again.")  # fmt: skip
+    elif config.stage.url == "sim":
+        book.note("stage", "opening", "not checked", "a simulated stage runs with the whole rig only")
+    else:
+        with book.guard("stage", "opening"):
+            stage = open_configured_stage(config, config.stage.url, record=record)
+            with contextlib.closing(stage):
+                check_stage(book, stage, config, move=move, home=home)
+    if not any(check.state == "failed" and check.name == "opening" for check in book.checks):
+        book.fail("devices", "opening", error)  # each is well alone
+    book.note("pairs", "frames", "not checked", "not all devices could be opened",
+              remedy="Put right what failed, then run the doctor again.")  # fmt: skip
+
+
+def _check_cameras(book: Notebook, devices: Devices, config: RigConfig, seconds: float) -> None:
+    pair = devices.pair
+    check_identity(book, pair)
+    for cam in CAMERAS:
+        check_settings(book, pair.units[cam])
+    try:
+        seen = watch(pair, seconds)
+    except StereorigError as error:
+        book.fail(str(error.context.get("camera", "pairs")), "frames", error)
+        return
+    for cam in CAMERAS:
+        check_frames(book, pair.units[cam], seen)
+        check_link(book, pair.units[cam], seen)
+    check_network(book, pair.units, seen)
+    check_pairs(book, pair, seen, config)

@@ -1,0 +1,111 @@
+"""Requests that have one effect however often they come: the Idempotency-Key and what it stands for.
+
+What a key made is remembered in the catalogue, and in the document of what was made: a catalogue that is lost learns
+it again from the folders.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from core.errors import StateError, StorageError
+from server.store.catalog import Catalog
+
+_log = logging.getLogger("stereorig.service")
+
+
+@dataclass(frozen=True)
+class RequestMark:
+    """An Idempotency-Key with what it stands for; kept with whatever the request made.
+
+    Parameters
+    ----------
+    scope
+        What is made: the same key means something else elsewhere.
+    key
+        As the client sent it; None without one.
+    body_sha256
+        Of everything that the client asked for.
+    """
+
+    scope: str
+    key: str | None
+    body_sha256: str
+
+    def document(self) -> dict[str, Any]:
+        """Return what goes into the document of the thing that is made; nothing without a key."""
+        if self.key is None:
+            return {}
+        return {"request": {"scope": self.scope, "key": self.key, "body_sha256": self.body_sha256}}
+
+    def made(self, ids: dict[str, Any]) -> tuple[str, str, str, dict[str, Any]] | None:
+        """Return the row of the catalogue that says what it made."""
+        return None if self.key is None else (self.scope, self.key, self.body_sha256, ids)
+
+
+class OneEffect:
+    """Runs what a key stands for once."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+        self._guard = threading.Lock()
+        self._locks: dict[tuple[str, str], tuple[threading.Lock, list[int]]] = {}
+        # made, but the catalogue could not take it: good until the next start, which finds it in the folders
+        self._unwritten: dict[tuple[str, str], tuple[str, dict[str, Any]]] = {}
+
+    def once(self, mark: RequestMark, make: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
+        """Run ``make`` once per key; return what it made and whether it was made before.
+
+        ``make`` returns the ids of what it made, from which the answer is built again.
+
+        Raises
+        ------
+        StateError
+            ``idempotency_key_reused`` if the key came with another body before.
+        """
+        if mark.key is None:
+            return make(), False
+        place = mark.scope, mark.key
+        with self._turn(place):
+            earlier = self._unwritten.get(place) or self._catalog.request(*place)
+            if earlier is not None:
+                if earlier[0] != mark.body_sha256:
+                    raise StateError(
+                        "This Idempotency-Key was used with another body.",
+                        code="idempotency_key_reused",
+                        remedy="Use a new key for a new request.",
+                    )
+                return earlier[1], True
+            made = make()
+            self._remember(mark, made)
+        return made, False
+
+    def _remember(self, mark: RequestMark, made: dict[str, Any]) -> None:
+        assert mark.key is not None
+        try:
+            if self._catalog.request(mark.scope, mark.key) is None:  # a job brought it along
+                self._catalog.put_request(mark.scope, mark.key, mark.body_sha256, made)
+        except StorageError:
+            # it is made and durable; an error now would bring the client to ask for a second one
+            _log.exception("an Idempotency-Key could not be written; it is kept in memory")
+            self._unwritten[mark.scope, mark.key] = mark.body_sha256, made
+
+    @contextlib.contextmanager
+    def _turn(self, place: tuple[str, str]) -> Iterator[None]:
+        """One at a time for each key."""
+        with self._guard:
+            lock, users = self._locks.setdefault(place, (threading.Lock(), [0]))
+            users[0] += 1
+        try:
+            with lock:
+                yield
+        finally:
+            with self._guard:
+                users[0] -= 1
+                if users[0] == 0:
+                    self._locks.pop(place, None)

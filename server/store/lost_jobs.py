@@ -1,0 +1,115 @@
+"""What the folders know of jobs and requests, for a catalogue that was lost, or was not yet told when a kill came.
+
+Whatever a job makes bears the job's id and the Idempotency-Key that asked for it. From there both are known again:
+a client that sends its request once more gets what it made, with its job as it ended.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from server.problem import RESTART, problem_of
+from server.store.catalog import Catalog
+from server.store.folder import IdMaker, is_id
+
+
+class LostJobs:
+    """Collects jobs and requests from documents, then adds those that the catalogue lacks."""
+
+    def __init__(self) -> None:
+        self._jobs: dict[str, dict[str, Any]] = {}
+        self._requests: dict[tuple[str, str], tuple[str, dict[str, Any]]] = {}
+        self._bursts: dict[str, list[dict[str, Any]]] = {}
+
+    def made(self, document: dict[str, Any], ids: dict[str, Any]) -> None:
+        """Take the request that a document was made for."""
+        request = document.get("request")
+        if request:
+            self._requests.setdefault((request["scope"], request["key"]), (request["body_sha256"], ids))
+
+    def calibration(self, document: dict[str, Any]) -> None:
+        """A calibration, as its store reads it."""
+        self._single("calibration", document)
+
+    def noise(self, document: dict[str, Any]) -> None:
+        """A noise measurement, as its store reads it."""
+        self._single("noise", document)
+
+    def _single(self, kind: str, document: dict[str, Any]) -> None:
+        plan = document["plan"]
+        ids = {f"{kind}_id": document["id"]}
+        job_id = plan.get("job_id")
+        if plan.get("source") == "import":
+            self.made(plan, ids)
+        if job_id is None:
+            return
+        problem = document.get("problem")
+        state = "succeeded" if document["state"] == "complete" else (problem or {}).get("job_state", "interrupted")
+        self._job(job_id, kind, ids, state, plan["created_utc"], ids if state == "succeeded" else None, problem)
+        self.made(plan, {**ids, "job_id": job_id})
+
+    def step(self, document: dict[str, Any]) -> None:
+        """A step; those of a burst belong to its job."""
+        burst = document.get("burst")
+        if burst is None:
+            self.made(document, {"test_id": document["test_id"], "n": document["n"]})
+            return
+        self._bursts.setdefault(burst["job_id"], []).append(document)
+
+    def analysis(self, document: dict[str, Any], runs: list[dict[str, Any]], summary: dict[str, Any] | None) -> None:
+        """An analysis, with the jobs that worked on it, the last one last."""
+        ids = {"test_id": document["test_id"], "analysis_id": document["id"]}
+        for run in runs:
+            known = summary if summary is not None and summary.get("job_id") == run["job_id"] else {}
+            state = known.get("state", "interrupted")
+            steps = known.get("steps", [])
+            result = {**ids, "steps_finished": [s["n"] for s in steps], "steps": steps}
+            self._job(
+                run["job_id"], "analysis", ids, state, run.get("created_utc", document["created_utc"]), result,
+                known.get("problem"),
+            )  # fmt: skip
+            self.made(run, {**ids, "job_id": run["job_id"]})
+
+    def _job(
+        self, job_id: str, kind: str, subject: dict[str, Any], state: str, created_utc: str,
+        result: dict[str, Any] | None, problem: dict[str, Any] | None,
+    ) -> None:  # fmt: skip
+        if not is_id(job_id, "j"):  # a folder from elsewhere may say anything
+            return
+        if state != "succeeded" and problem is None:
+            problem = problem_of(RESTART)
+        self._jobs[job_id] = {
+            "id": job_id, "kind": kind, "state": state, "subject": subject,
+            "progress": {"stage": "done" if state == "succeeded" else "ended", "done": 0, "total": 0, "eta_s": None},
+            "created_utc": created_utc, "started_utc": None, "finished_utc": None, "result": result,
+            "problem": problem,
+        }  # fmt: skip
+
+    def _end_bursts(self) -> None:
+        for job_id, steps in self._bursts.items():
+            burst = steps[0]["burst"]
+            subject = {"test_id": steps[0]["test_id"]}
+            taken = [
+                {"index": s["burst"]["index"], "n": s["n"], "quality": s.get("quality", {}).get("code"),
+                 "sha256": s["sha256"]}
+                for s in steps
+            ]  # fmt: skip
+            result = {**subject, "count": burst["count"], "steps": taken, "failures": []}
+            state = "succeeded" if len(steps) == burst["count"] else "interrupted"
+            self._job(job_id, "burst", subject, state, steps[0]["captured_utc"], result, None)
+            self.made(steps[0], {**subject, "job_id": job_id})
+
+    def restore(self, catalog: Catalog, ids: IdMaker) -> None:
+        """Add what the catalogue does not know."""
+        self._end_bursts()
+        known_jobs, known_keys = catalog.job_ids(), catalog.request_keys()
+        for job_id in self._jobs:
+            ids.seen(job_id)
+        catalog.restore(
+            [document for job_id, document in self._jobs.items() if job_id not in known_jobs],
+            [
+                (scope, key, digest, made)
+                for (scope, key), (digest, made) in self._requests.items()
+                if (scope, key) not in known_keys
+            ],
+        )

@@ -1,0 +1,79 @@
+"""Putting a data folder in order: what a crash left is set aside, and the catalogue is made anew from the folders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from server.store.calibrations import CalibrationStore
+from server.store.catalog import Catalog
+from server.store.folder import DataFolder
+from server.store.index import rebuild
+from server.store.noise import NoiseStore
+from server.store.tests import TestStore, set_aside
+from server.store.verify import Verification, require_data_folder, verify
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What was done, and what a look through the folder finds afterwards.
+
+    Parameters
+    ----------
+    done
+        A line for each thing that was changed, each difference between catalogue and folders among them.
+    after
+        Damaged files are in here: no repair brings them back.
+    """
+
+    done: tuple[str, ...]
+    after: Verification
+
+
+def repair(root: Path) -> Repair:
+    """Set incomplete steps aside, remove what was half written, make the catalogue say what the folders hold.
+
+    Parameters
+    ----------
+    root
+        A data folder that no service uses.
+
+    Raises
+    ------
+    StateError
+        ``data_folder_locked`` when a service runs on it.
+    FileFormatError
+        As `server.store.verify.verify`.
+    StorageError
+        When the disk fails.
+    """
+    require_data_folder(root)
+    done = [f"removed the half-written {path.relative_to(root)}" for path in sorted(root.rglob(".*.part"))]
+    folder = DataFolder(root)  # takes the lock, and removes those
+    try:
+        tests = TestStore(folder)
+        done += _tidy(root.absolute(), tests)
+        catalog = Catalog(folder.root / "catalog.sqlite")
+        try:
+            if catalog.was_reset:
+                done.append("the catalogue could not be read; it was set aside and begun anew")
+            NoiseStore(folder)  # says of unfinished measurements that they ended
+            done += rebuild(catalog, folder, CalibrationStore(folder), tests)
+        finally:
+            catalog.close()
+    finally:
+        folder.close()
+    return Repair(tuple(done), verify(root))
+
+
+def _tidy(root: Path, tests: TestStore) -> list[str]:
+    done = []
+    for test_id in tests.ids():
+        path = tests.path(test_id)
+        for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
+            if step.is_dir() and step.name.isdigit() and not (step / "step.json").is_file():
+                done.append(f"set {step.relative_to(root)} aside as {set_aside(step).name}: it has no step.json")
+        for analysis_id in tests.analysis_ids(test_id):
+            for beside in tests.drop_half_written(test_id, analysis_id):
+                done.append(f"removed {beside.relative_to(root)}: its result was never announced")
+    return done

@@ -1,0 +1,216 @@
+"""The trash: what was deleted lies here, whole, until somebody empties it.
+
+Deleting is one rename. An entry's folder with its ``trash.json`` is made first; then the folder that is deleted becomes
+its ``content``. Killed before that rename, nothing is deleted; after it, all is. Emptying begins with a rename too, so
+that half of something never comes back.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+from core.errors import FileFormatError, StateError, StorageError
+from server.errors import NotFoundError
+from server.io import disk as _disk
+from server.io.files import fsync_path, storage_error
+from server.store.durable import make_folder, read_json, write_json
+from server.store.folder import DataFolder, is_id, now_utc
+from server.store.tests import MAX_STEPS, deleted_mark
+
+Kind = Literal["test", "step", "analysis", "calibration", "noise"]
+_CONTENT = "content"
+_DOOMED = "removing"
+
+
+class Trash:
+    """The trash of one data folder.
+
+    Parameters
+    ----------
+    root
+        The data folder.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._data = root
+        self.root = root / "trash"
+
+    # what lies in it -------------------------------------------------------------------------------------------
+
+    def ids(self) -> list[str]:
+        """Ids of all entries, in the order of their deletion."""
+        return sorted(p.parent.name for p in self.root.glob(f"x*/{_CONTENT}") if is_id(p.parent.name, "x"))
+
+    def entry(self, trash_id: str) -> dict[str, Any]:
+        """Return ``trash.json`` of an entry: what it was, when and by whom it was deleted.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none with this id.
+        """
+        folder = self.root / trash_id if is_id(trash_id, "x") else None
+        if folder is None or not (folder / _CONTENT).is_dir():
+            raise NotFoundError(f"There is nothing in the trash with the id {trash_id[:40]!r}.", what="trash")
+        return {"id": trash_id, **read_json(folder / "trash.json")}
+
+    def entries(self) -> list[dict[str, Any]]:
+        """Return every entry, with its size; one whose description cannot be read says so."""
+        found = []
+        for trash_id in self.ids():
+            try:
+                document = self.entry(trash_id)
+            except NotFoundError:
+                continue  # emptied meanwhile
+            except FileFormatError as error:
+                document = {"id": trash_id, "kind": "unknown", "name": error.cause}
+            found.append(document | {"size_bytes": _size_bytes(self.root / trash_id / _CONTENT)})
+        return found
+
+    # in and out ------------------------------------------------------------------------------------------------
+
+    def put(self, folder: DataFolder, kind: Kind, ids: dict[str, Any], *, name: str, by: str, why: str) -> str:
+        """Move something into the trash; return the entry's id.
+
+        Parameters
+        ----------
+        folder
+            The data folder, opened.
+        kind, ids
+            What it is: ``test_id``, ``n``, ``analysis_id``, ``calibration_id``, ``noise_id``.
+        name
+            As people call it.
+        by, why
+            Who deleted it, and on what occasion.
+
+        Raises
+        ------
+        StorageError
+            When the disk does not keep it; then nothing was deleted, or all of it.
+        """
+        place = self.place(kind, ids)
+        trash_id = folder.ids.new("x")
+        entry = self.root / trash_id
+        if not self.root.exists():
+            make_folder(self.root)
+        try:
+            make_folder(entry)
+            document = {"kind": kind, **ids, "name": name, "deleted_utc": now_utc(), "deleted_by": by, "why": why}
+            write_json(entry / "trash.json", document)
+            if kind == "step":
+                # its number stays taken: it stands in results and in people's notes
+                write_json(deleted_mark(place), {"trash_id": trash_id})
+            _move(place, entry / _CONTENT)
+        except StorageError:
+            if place.exists():
+                shutil.rmtree(entry, ignore_errors=True)
+                if kind == "step":
+                    deleted_mark(place).unlink(missing_ok=True)
+            raise
+        return trash_id
+
+    def restore(self, trash_id: str) -> dict[str, Any]:
+        """Move an entry's content back to where it was; return what it is.
+
+        Raises
+        ------
+        NotFoundError
+            If there is no such entry.
+        StateError
+            ``place_taken`` if something lies there by now, ``parent_deleted`` if its test is not there.
+        """
+        document = self.entry(trash_id)
+        place = self.place(document.get("kind"), document)
+        if place.exists():
+            raise StateError(
+                f"{place.relative_to(self._data)} is there again.",
+                code="place_taken",
+                remedy="Delete that first, or take the files out of the trash folder by hand.",
+            )
+        if not place.parent.is_dir():
+            raise StateError(
+                f"{place.parent.relative_to(self._data)} is not there.",
+                code="parent_deleted",
+                remedy="Restore the test first.",
+            )
+        _move(self.root / trash_id / _CONTENT, place)
+        if document["kind"] == "step":
+            deleted_mark(place).unlink(missing_ok=True)
+        shutil.rmtree(self.root / trash_id, ignore_errors=True)
+        return document
+
+    def remove(self, trash_id: str) -> None:
+        """Remove an entry for good.
+
+        Raises
+        ------
+        NotFoundError
+            If there is no such entry.
+        StorageError
+            When the disk does not let it go.
+        """
+        self.entry(trash_id)
+        entry = self.root / trash_id
+        _move(entry / _CONTENT, entry / _DOOMED)
+        try:
+            shutil.rmtree(entry)
+        except OSError as error:
+            raise storage_error(error, entry) from error
+
+    def tidy(self) -> list[str]:
+        """Remove what a kill left of entries that were being made, restored or removed; return a line for each."""
+        done = []
+        for entry in sorted(self.root.glob("x*")):
+            if is_id(entry.name, "x") and not (entry / _CONTENT).exists():
+                shutil.rmtree(entry, ignore_errors=True)
+                done.append(f"removed what was left of trash/{entry.name}")
+        return done
+
+    def place(self, kind: object, ids: dict[str, Any]) -> Path:
+        """Return where something lies that is not deleted; ids that are none never become a path.
+
+        Raises
+        ------
+        FileFormatError
+            ``trash_unreadable``.
+        """
+        test, analysis, n = (str(ids.get(name)) for name in ("test_id", "analysis_id", "n"))
+        if kind == "calibration" and is_id(str(ids.get("calibration_id")), "c"):
+            return self._data / "calibrations" / str(ids["calibration_id"])
+        if kind == "noise" and is_id(str(ids.get("noise_id")), "n"):
+            return self._data / "noise" / str(ids["noise_id"])
+        if kind in ("test", "step", "analysis") and is_id(test, "t"):
+            folder = self._data / "tests" / test
+            if kind == "test":
+                return folder
+            if kind == "analysis" and is_id(analysis, "a"):
+                return folder / "analyses" / analysis
+            if kind == "step" and n.isdecimal() and int(n) <= MAX_STEPS:
+                return folder / "steps" / f"{int(n):04d}"
+        raise FileFormatError(
+            "trash.json does not say what lies there.",
+            code="trash_unreadable",
+            remedy="Take the files out of the trash folder by hand.",
+        )
+
+
+def _move(source: Path, target: Path) -> None:
+    """Rename a folder durably."""
+    try:
+        _disk.disk.replace(source, target)
+        fsync_path(target.parent)
+        fsync_path(source.parent)
+    except OSError as error:
+        raise storage_error(error, source) from error
+
+
+def _size_bytes(folder: Path) -> int:
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.lstat().st_size
+        except OSError:
+            continue  # gone meanwhile
+    return total

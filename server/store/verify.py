@@ -1,0 +1,329 @@
+"""Looking through a data folder: what is damaged, incomplete, foreign, or unknown to the catalogue; changes nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from core.errors import FileFormatError, StorageError
+from server.io.files import recorded_sha256, sha256_of, storage_error
+from server.store.durable import read_json
+from server.store.folder import check_format, is_id, is_in_use
+from server.store.tests import CAMERAS, number_of
+
+Level = Literal["damaged", "incomplete", "index", "foreign"]
+
+# What lies beside the data: made and unmade by a service that runs
+_OURS = frozenset(
+    {"format.json", "service.lock", "catalog.sqlite", "catalog.sqlite-wal", "catalog.sqlite-shm", "keys.json"}
+)
+# What the service writes into a folder of each kind
+_KNOWN = {
+    "calibration": r"(plan|target|view|judgement|failure|rejected)\.json|(calibration\.json|residuals\.nc)(\.sha256)?"
+    r"|views",
+    "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
+    "test": r"(test|calibration|watch)\.json|steps|analyses|exports",
+    "step": r"step\.json|cam[12]\.tif",
+    "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz",
+}
+_WRITING_S = 1.0  # longer than a file is under way
+_FOLDERS = frozenset({"calibrations", "tests", "noise", "trash", ".exports"})
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is not as it ought to be.
+
+    Parameters
+    ----------
+    level
+        ``damaged``: data that were there are not as they were written. ``incomplete``: left by a crash, never
+        acknowledged. ``index``: the catalogue does not say what the folders hold. ``foreign``: no file of ours.
+    path
+        Relative to the data folder.
+    text
+        What is wrong.
+    """
+
+    level: Level
+    path: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was looked at, and what was found.
+
+    Parameters
+    ----------
+    files
+        Files whose checksum was compared.
+    unknown
+        Files of data that have no checksum on record.
+    findings
+        Empty when all is well.
+    """
+
+    files: int
+    unknown: int
+    findings: tuple[Finding, ...]
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is damaged; incomplete, foreign and index findings lose nothing."""
+        return all(finding.level != "damaged" for finding in self.findings)
+
+
+class _Walk:
+    """One pass over a data folder."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.files = 0
+        self.unknown = 0
+        self.findings: list[Finding] = []
+        self.there: set[tuple[str, str, str]] = set()  # kind, parent, id, as the catalogue names them
+
+    def say(self, level: Level, path: Path, text: str) -> None:
+        self.findings.append(Finding(level, path.relative_to(self.root).as_posix(), text))
+
+    def document(self, path: Path) -> dict[str, Any] | None:
+        """A JSON document, or None with a finding."""
+        try:
+            return read_json(path)
+        except FileFormatError as error:
+            self.say("damaged", path, error.cause)
+            return None
+
+    def documents(self, folder: Path, *names: str) -> None:
+        """Read the documents that may be there."""
+        for name in names:
+            if (folder / name).is_file():
+                self.document(folder / name)
+
+    def strangers(self, folder: Path, kind: str) -> None:
+        """Tell what lies in a folder that the service does not write there; half-written files are told elsewhere."""
+        for path in sorted(folder.iterdir()):
+            if re.fullmatch(_KNOWN[kind], path.name) is None and not path.name.endswith(".part"):
+                self.say("foreign", path, "this name is not one that the service makes")
+
+    def compare(self, path: Path, sha256: object) -> None:
+        """Compare a file with its checksum on record."""
+        if not path.is_file():
+            self.say("damaged", path, "the file is gone")
+        elif not isinstance(sha256, str):
+            self.unknown += 1
+        elif sha256_of(path) != sha256:
+            self.say("damaged", path, "does not match its checksum")
+        else:
+            self.files += 1
+
+    def compare_beside(self, path: Path) -> None:
+        """Compare a file with the checksum that stands beside it."""
+        self.compare(path, recorded_sha256(path))
+
+    def entries(self, folder: Path, letter: str, mark: str) -> Iterator[Path]:
+        """Folders of a kind that hold their mark; the others are told."""
+        if not folder.is_dir():
+            return
+        for path in sorted(folder.iterdir()):
+            if not is_id(path.name, letter) or not path.is_dir():
+                self.say("foreign", path, "this name is not one that the service makes")
+            elif (path / mark).exists():
+                yield path
+            else:
+                self.say("incomplete", path, f"has no {mark}: it was never acknowledged")
+
+    def calibration(self, path: Path) -> None:
+        self.there.add(("calibration", "", path.name))
+        self.strangers(path, "calibration")
+        self.documents(path, "target.json", "failure.json", "rejected.json", "judgement.json")
+        if self.document(path / "plan.json") is None:
+            return
+        taken = self.document(path / "view.json") if (path / "view.json").is_file() else None
+        for view in (taken or {}).get("views", []):
+            self.compare(path / view["file"], view.get("sha256"))
+        if (path / "calibration.json").is_file():
+            self.document(path / "calibration.json")
+            self.compare_beside(path / "calibration.json")
+        elif not (path / "failure.json").is_file():
+            self.say("incomplete", path, "neither a result nor the reason why there is none")
+        if (path / "residuals.nc").is_file():
+            self.compare_beside(path / "residuals.nc")
+
+    def noise(self, path: Path) -> None:
+        self.strangers(path, "noise")
+        self.documents(path, "failure.json")
+        if self.document(path / "plan.json") is None:
+            return
+        taken = self.document(path / "frames.json") if (path / "frames.json").is_file() else None
+        for frame in (taken or {}).get("frames", []):
+            self.compare(path / frame["file"], frame.get("sha256"))
+        if (path / "noise.json").is_file():
+            self.document(path / "noise.json")
+            self.compare_beside(path / "noise.json")
+
+    def test(self, path: Path) -> None:
+        self.there.add(("test", "", path.name))
+        document = self.document(path / "test.json")
+        if document is not None and (path / "calibration.json").exists():
+            self.compare(path / "calibration.json", document.get("calibration_sha256"))
+        elif document is not None and document.get("calibration_sha256") is not None:
+            self.say("damaged", path / "calibration.json", "the file is gone")
+        self.strangers(path, "test")
+        self.documents(path, "watch.json")
+        for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
+            self.step(path.name, step)
+        for analysis in self.entries(path / "analyses", "a", "analysis.json"):
+            self.analysis(path.name, analysis)
+
+    def step(self, test_id: str, path: Path) -> None:
+        if path.suffix == ".deleted" and number_of(path.stem) is not None and path.is_file():
+            return
+        number = number_of(path.name)
+        if number is None or not path.is_dir():
+            self.say("foreign", path, "this name is not one that the service makes")
+        elif not (path / "step.json").is_file():
+            if path.name.isdigit():
+                self.say("incomplete", path, "has no step.json: it was never acknowledged")
+        else:
+            self.there.add(("step", test_id, f"{number:04d}"))
+            self.step_files(path)
+
+    def step_files(self, path: Path) -> None:
+        self.strangers(path, "step")
+        document = self.document(path / "step.json")
+        if document is not None:
+            sha256 = document.get("sha256")
+            for cam in CAMERAS:
+                self.compare(path / f"{cam}.tif", sha256.get(cam) if isinstance(sha256, dict) else None)
+
+    def analysis(self, test_id: str, path: Path) -> None:
+        self.there.add(("analysis", test_id, path.name))
+        document = self.document(path / "analysis.json")
+        if document is not None and (path / "mask.png").exists():
+            self.compare(path / "mask.png", document.get("mask_sha256"))
+        for result in sorted(path.glob("step_[0-9]*.nc")):
+            self.compare_beside(result)
+        for beside in sorted(path.glob("step_[0-9]*.nc.sha256")):
+            result = beside.with_suffix("")
+            if not result.is_file():
+                self.say("incomplete", beside, "a checksum without its result: it was never announced")
+        for summary in sorted(path.glob("step_[0-9]*.json")):
+            self.document(summary)
+        self.documents(path, "summary.json", "noise.json", "jobs.json")
+        self.strangers(path, "analysis")
+
+    def trashed(self, path: Path) -> None:
+        """What was deleted can come back: looked at like the rest, after the catalogue, which does not know it."""
+        document = self.document(path / "trash.json")
+        look: dict[str, Callable[[Path], None]] = {
+            "calibration": self.calibration, "noise": self.noise, "test": self.test, "step": self.step_files,
+            "analysis": lambda content: self.analysis("", content),
+        }  # fmt: skip
+        if document is not None and (found := look.get(str(document.get("kind")))) is not None:
+            found(path / "content")
+
+    def top(self) -> None:
+        for path in sorted(self.root.iterdir()):
+            numbered = path.name.startswith(("catalog.corrupt-", "audit.log"))
+            if path.name not in _OURS | _FOLDERS and not numbered and not path.name.endswith(".part"):
+                self.say("foreign", path, "this name is not one that the service makes")
+        for path in sorted(self.root.rglob(".*.part")):
+            self.say("incomplete", path, "half written when the service ended")
+
+    def catalog(self) -> None:
+        path = self.root / "catalog.sqlite"
+        if not path.is_file():
+            self.say("index", path, "the catalogue is gone; it is made anew at the next start")
+            return
+        try:
+            # without the right to write beside it, SQLite opens the file only as one that nobody changes
+            log = path.with_name(path.name + "-wal")
+            still = not os.access(path.parent, os.W_OK) and not (log.exists() and log.stat().st_size)
+            mode = "mode=ro&immutable=1" if still else "mode=ro"
+            connection = sqlite3.connect(f"file:{path}?{mode}", uri=True)
+            try:
+                if connection.execute("PRAGMA quick_check").fetchone()[0] != "ok":
+                    raise sqlite3.DatabaseError("its pages contradict each other")
+                rows = connection.execute("SELECT kind, parent, id, document FROM entries").fetchall()
+            finally:
+                connection.close()
+            entries = {(kind, parent, name) for kind, parent, name, text in rows if json.loads(text) is not None}
+        except (sqlite3.Error, ValueError) as error:
+            self.say("index", path, f"the catalogue cannot be read ({error}); it is made anew at the next start")
+            return
+        for kind, parent, name in sorted(entries ^ self.there):
+            where = f"{kind} {f'{parent}/' if parent else ''}{name}"
+            text = "has no folder" if (kind, parent, name) in entries else "is not in the catalogue"
+            self.say("index", path, f"{where} {text}")
+
+
+def verify(root: Path) -> Verification:
+    """Read every document and compare every file with its checksum.
+
+    Parameters
+    ----------
+    root
+        A data folder; a service may run on it: then only what is found twice, a moment apart, is told.
+
+    Raises
+    ------
+    FileFormatError
+        ``no_data_folder`` when this is none, ``data_format_newer`` when a newer version wrote it.
+    StorageError
+        When the disk does not let it be read.
+    """
+    root = root.absolute()
+    require_data_folder(root)
+    found = _look_through(root)
+    if found.findings and is_in_use(root):
+        time.sleep(_WRITING_S)  # it may have been written, or deleted, just while it was looked at
+        again = _look_through(root)
+        before = set(found.findings)
+        found = replace(again, findings=tuple(finding for finding in again.findings if finding in before))
+    return found
+
+
+def _look_through(root: Path) -> Verification:
+    walk = _Walk(root)
+    try:
+        walk.top()
+        for path in walk.entries(root / "calibrations", "c", "plan.json"):
+            walk.calibration(path)
+        for path in walk.entries(root / "noise", "n", "plan.json"):
+            walk.noise(path)
+        for path in walk.entries(root / "tests", "t", "test.json"):
+            walk.test(path)
+        walk.catalog()
+        for path in walk.entries(root / "trash", "x", "content"):
+            walk.trashed(path)
+    except OSError as error:
+        raise _unreadable(error, root) from error
+    return Verification(walk.files, walk.unknown, tuple(walk.findings))
+
+
+def require_data_folder(root: Path) -> None:
+    """Refuse what is no data folder, or a newer version's; see `verify`."""
+    if not (root / "format.json").is_file() and not (root / "tests").is_dir():
+        raise FileFormatError(
+            f"{root} is no data folder: it has neither format.json nor tests/.",
+            code="no_data_folder",
+            remedy="Give the folder that 'stereorig serve --data' was given.",
+        )
+    if (root / "format.json").is_file():
+        check_format(root / "format.json")
+
+
+def _unreadable(error: OSError, root: Path) -> StorageError:
+    cause = storage_error(error, root).cause
+    return StorageError(
+        f"{root} cannot be read through: {cause}", remedy="Check the disk and the rights on the folder."
+    )
