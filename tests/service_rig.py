@@ -6,6 +6,7 @@ import contextlib
 import socket
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,99 +14,47 @@ from typing import Any
 import httpx
 import uvicorn
 
+from docs.scripts.tiny_rig import TINY, tiny_rig
 from server.api.app import create_app
 from server.config import RigConfig, parse_config
 from server.service import Service
 
-TINY = """
-[rig]
-name = "tiny rig"
-kind = "simulated"
-max_skew_ms = 1.0
-[cam1]
-image_size_px = [160, 144]
-phd_px = 3600.0
-standoff_mm = 404.0
-angle_deg = -30.0
-aspect = 0.9617
-stage_axis = 1
-exposure_ms = 10.0
-gain_db = 0.0
-[cam2]
-image_size_px = [160, 144]
-phd_px = 3600.0
-standoff_mm = 404.0
-angle_deg = 30.0
-aspect = 0.9617
-stage_axis = 2
-exposure_ms = 10.0
-gain_db = 0.0
-[stage]
-driver = "esp301"
-url = "sim"
-soft_limits_mm = [-6.0, 6.0]
-velocity_mm_s = 5.0
-backlash_mm = 0.05
-settle_ms = 0
-[target]
-pitch_mm = 1.0
-lines = [11, 11]
-line_width_mm = 0.1
-[calibration]
-positions_mm = [0.0, 5.0]
-held_out_mm = [2.0]
-frames = 2
-[service]
-compute_queue = 2
-kernel_threads = 1
-[sim]
-seed = 7
-speckle_mm = 0.45
-time_scale = 2.5
-[sim.noise]
-read_noise_e = 280.0
-full_well_e = 40000.0
-[sim.cam1]
-phd_px = 3560.0
-cx_px = 80.4
-cy_px = 71.8
-kappa_per_px2 = 1.0e-8
-aspect = 0.9617
-alpha_rad = 0.7741
-beta_rad = 0.0131
-gamma_rad = -0.5149
-x0_mm = 0.22
-y0_mm = 0.17
-z0_mm = 399.3
-[sim.cam2]
-phd_px = 3530.0
-cx_px = 79.7
-cy_px = 72.1
-kappa_per_px2 = 0.9e-8
-aspect = 0.9617
-alpha_rad = 0.7852
-beta_rad = -0.0087
-gamma_rad = 0.5306
-x0_mm = -0.15
-y0_mm = -0.24
-z0_mm = 401.6
-"""
+# half of the paper rig's pixels: lines of the grid one pixel wide, speckles of four
+SMALL = (
+    TINY.replace("[160, 144]", "[256, 240]")
+    .replace("3600.0", "6100.0")
+    .replace("phd_px = 3560.0", "phd_px = 6031.0")
+    .replace("phd_px = 3530.0", "phd_px = 5969.0")
+    .replace("cx_px = 80.4", "cx_px = 130.4")
+    .replace("cx_px = 79.7", "cx_px = 124.7")
+    .replace("cy_px = 71.8", "cy_px = 117.8")
+    .replace("cy_px = 72.1", "cy_px = 122.1")
+    .replace("line_width_mm = 0.1", "line_width_mm = 0.06")
+    .replace("speckle_mm = 0.45", "speckle_mm = 0.26")
+)
 
 
 def tiny_config(**replacements: str) -> RigConfig:
     """Return the tiny rig's configuration, with lines replaced (``velocity_mm_s="velocity_mm_s = 1.0"``)."""
-    lines = TINY.splitlines()
-    for name, line in replacements.items():
-        lines = [line if old.split(" =")[0] == name else old for old in lines]
-    return parse_config("\n".join(lines))
+    return parse_config(tiny_rig(**replacements))
+
+
+def true_cameras(text: str) -> dict[str, dict[str, float]]:
+    """A simulated rig's own cameras as a calibration file, so that nothing need be calibrated."""
+    world = tomllib.loads(text)["sim"]
+    names = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect", "alpha_rad", "beta_rad", "gamma_rad",
+             "x0_mm", "y0_mm", "z0_mm")  # fmt: skip
+    return {cam: {name: world[cam][name] for name in names} for cam in ("cam1", "cam2")}
 
 
 @contextlib.contextmanager
-def served(service: Service) -> Iterator[httpx.Client]:
-    """Serve on a free loopback port in a thread of this process; yields a client."""
+def served(service: Service, **app: Any) -> Iterator[httpx.Client]:
+    """Serve on a free loopback port in a thread of this process; yields a client. ``app`` goes to `create_app`."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.bind(("127.0.0.1", 0))
-    settings = uvicorn.Config(create_app(service, close_service=False), log_level="error", timeout_graceful_shutdown=2)
+    settings = uvicorn.Config(
+        create_app(service, close_service=False, **app), log_level="error", timeout_graceful_shutdown=2
+    )
     server = uvicorn.Server(settings)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
@@ -132,7 +81,7 @@ def wait_for_rig(client: httpx.Client, seconds: float = 60.0) -> None:
     raise AssertionError("the rig did not come up")
 
 
-def wait_for_job(client: httpx.Client, job: dict[str, Any], seconds: float = 120.0) -> dict[str, Any]:
+def wait_for_job(client: httpx.Client, job: dict[str, Any], seconds: float = 240.0) -> dict[str, Any]:
     """Poll a job until it has ended."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -141,6 +90,14 @@ def wait_for_job(client: httpx.Client, job: dict[str, Any], seconds: float = 120
             return document
         time.sleep(0.02)
     raise AssertionError(f"job {job['id']} did not end: {document}")
+
+
+def a_second(client: httpx.Client) -> float:
+    """A second; more on a machine so busy that a plain answer takes long."""
+    began = time.monotonic()
+    for _ in range(3):
+        client.get("/api/v1/healthz")
+    return 1.0 + 10.0 * (time.monotonic() - began)
 
 
 def new_test(client: httpx.Client, **body: Any) -> str:

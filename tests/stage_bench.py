@@ -16,7 +16,7 @@ from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
 
 Transport = Literal["socket", "pty"]
-CONTROLLERS = ("esp301", "smc100")
+CONTROLLERS = ("esp301", "smc100", "conex-cc")
 # the words that start a motion, by which the tests count what was sent
 MOVE_WORD = "PA"
 

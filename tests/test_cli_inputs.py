@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from core.errors import FileFormatError, ImageError, InputError, RegionError
+from core.field.seeds import Seed
 from server.cli import main
 from server.cli.image_lists import expand, pair_up, pairs_of_test_folder
 from server.cli.region import check_odd, check_region, parse_rectangle
@@ -145,8 +146,17 @@ def test_seeds_must_lie_in_the_region_and_on_white(tmp_path: Path, seed: str, co
 def test_seeds_come_as_points() -> None:
     region = check_region((100.0, 100.0, 300.0, 300.0), image_shape=SHAPE, subset_px=33, step_px=10,
                           mask_path=None, seeds=["150,160.5", "200,210"])  # fmt: skip
-    assert region.seeds_px is not None
-    np.testing.assert_array_equal(region.seeds_px, [[150.0, 160.5], [200.0, 210.0]])
+    assert region.seeds == (Seed((150.0, 160.5)), Seed((200.0, 210.0)))
+
+
+def test_a_seed_may_say_where_camera_2_sees_it() -> None:
+    region = check_region((100.0, 100.0, 300.0, 250.0), image_shape=SHAPE, subset_px=33, step_px=10,
+                          mask_path=None, seeds=["150,160.5,151.25,158", "200,210"])  # fmt: skip
+    assert region.seeds == (Seed((150.0, 160.5), (151.25, 158.0)), Seed((200.0, 210.0)))
+    with pytest.raises(RegionError, match="has 3 numbers") as refused:
+        check_region((100.0, 100.0, 300.0, 250.0), image_shape=SHAPE, subset_px=33, step_px=10,
+                     mask_path=None, seeds=["150,160,151"])  # fmt: skip
+    assert "X2,Y2" in refused.value.remedy
 
 
 @pytest.mark.parametrize("text", ["32", "0", "-33", "5", "999", "33.0", "many", ""])

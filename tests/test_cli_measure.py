@@ -14,10 +14,11 @@ import pytest
 import xarray as xr
 from PIL import Image
 
+from core.field.smoothed import smoothed_displacement
 from core.measure import MeasureOptions
 from server.cli import main, measure
 from server.io.images import read_image, write_image
-from server.io.netcdf import read_field
+from server.io.netcdf_reading import read_field, read_measured
 from sim.render import RenderOptions, render
 from sim.rig import CAMERA_NAMES, SimRig
 from sim.scenes import make_scene
@@ -299,6 +300,8 @@ BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
     ({"step": "0"}, "option_out_of_range", "--step"),
     ({"seed": "10,10"}, "seed_outside", "10,10"),
     ({"seed": "1000,90"}, "seed_outside", "1000,90"),
+    ({"seed": "80,85,500,85"}, "seed_outside", "camera 2"),
+    ({"seed": "80,85,80,150"}, "seed_off_epipolar", "epipolar line"),
     ({"roi": None}, "option_missing", "--roi"),
     ({"out": "IN/cam1_0.tif"}, "output_unusable", "cam1_0.tif"),
 ]
@@ -414,3 +417,84 @@ def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path, capsys:
     assert main(command(folder, out, noise=str(file), roi="90,80,130,110", cam1=[str(folder / "cam1_0.tif")],
                         cam2=[str(folder / "cam2_0.tif")])) == 0  # fmt: skip
     assert "the noise file says 3.46" in capsys.readouterr().err
+
+
+def test_a_prefilter_is_recorded_and_silly_ones_are_refused(
+    originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(originals, tmp_path / "out", cam1=str(originals / "cam1_[01].tif"),
+                        cam2=str(originals / "cam2_[01].tif"), prefilter="0.8")) == 0  # fmt: skip
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["settings"]["prefilter_px"] == 0.8
+    with xr.open_dataset(tmp_path / "out" / "step_0001.nc") as data:
+        assert json.loads(data.attrs["settings"])["prefilter_px"] == 0.8
+    for wrong in ("-1", "nan", "5.3", "much"):
+        capsys.readouterr()
+        assert main(command(originals, tmp_path / "no", prefilter=wrong)) != 0
+        assert "prefilter" in capsys.readouterr().err
+        assert not (tmp_path / "no").exists()
+
+
+def test_smoothing_is_told_and_the_measurement_stays_reproducible(
+    originals: Path, measured: Path, tmp_path: Path, capfd: Any
+) -> None:
+    assert main(command(originals, tmp_path / "out", smooth="5")) == 0
+    said = capfd.readouterr()
+    assert "smoothed over 5 points: what is told apart is 61 px" in said.err + said.out
+    assert "gauge grows from 101 to 141 px" in said.err + said.out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["settings"]["smoothing_window"] == 5
+    assert summary["steps"][0]["smoothing"] is None
+    told = summary["steps"][2]["smoothing"]
+    assert (told["window"], told["resolution_px"]) == (5, 61.0)
+    # 33 um a pixel, more along the surface where it stands aslant
+    assert 0.033 * 61 < told["resolution_mm"] < 0.04 * 61
+    raw, smooth = (read_field(folder / "step_0002.nc") for folder in (measured, tmp_path / "out"))
+    assert smooth.smoothing is not None
+    np.testing.assert_array_equal(smooth.status, raw.status)
+    np.testing.assert_array_equal(smooth.xyz_mm, raw.xyz_mm)
+    again = smoothed_displacement(raw, 5, subset_px=21)
+    np.testing.assert_allclose(smooth.uvw_mm, again.uvw_mm, atol=1e-9)
+    assert np.nanmean(smooth.sigma_mm[..., 5]) < 0.9 * np.nanmean(raw.sigma_mm[..., 5])
+    with xr.open_dataset(tmp_path / "out" / "step_0002.nc") as data:
+        assert data["exx"].attrs["gauge_px"] == 141.0
+        assert "smoothed" in data["u_mm"].attrs["long_name"]
+        assert "smoothing" in data.attrs["strain_note"]
+    assert main(["gauge", str(tmp_path / "out"), "--area", "all"]) == 0
+    for wrong in ("4", "1", "53", "some"):
+        assert main(command(originals, tmp_path / "no", smooth=wrong)) != 0
+        assert "--smooth" in capfd.readouterr().err
+
+
+def test_each_step_against_the_one_before_it(folder: Path, tmp_path: Path, rig: SimRig) -> None:
+    """Incremental correlation: displacements stay totals; each file says what it was matched against."""
+    out = tmp_path / "out"
+    assert main([*command(folder, out), "--reference-update", "always", "--smooth", "3"]) == 0
+    steps = json.loads((out / "summary.json").read_text())["steps"]
+    assert [step.get("reference_step") for step in steps] == [None, 0, 1]
+    assert steps[2]["points_by_reference"] == {"1": steps[2]["valid"]}
+    with xr.open_dataset(out / "step_0002.nc") as data:
+        assert data.attrs["reference_step"] == 1
+        assert json.loads(data.attrs["settings"])["reference_update"] == "always"
+        inputs = json.loads(data.attrs["inputs_sha256"])
+        assert inputs["matched_cam1"] == steps[1]["sha256"]["cam1"]
+        xy = np.stack([data["x_px"], data["y_px"]], axis=-1)
+        ok = data["status"].values == 0
+        assert (data["reference_step"].values[ok] == 1).all()
+        smooth, plain = (np.stack([data[f"{p}{c}_mm"] for c in "uvw"], axis=-1) for p in ("", "measured_"))
+    truth = truth_at(make_scene(rig, "block"), rig.cam1.camera, xy, now=make_scene(rig, "block", load=LOADS[2]))
+    assert ok.mean() > 0.99
+    assert np.abs(plain - truth.uvw_mm)[ok].max() < 3e-3
+    assert np.abs(smooth - plain)[ok].max() > 1e-5
+    with xr.open_dataset(out / "step_0001.nc") as data:
+        assert data.attrs["reference_step"] == 0
+    again = read_measured(out / "step_0002.nc")
+    np.testing.assert_array_equal(again.uvw_mm, plain)
+    assert again.references is not None
+    assert np.isfinite(again.references.noise_px2[ok]).all()
+
+
+def test_a_way_of_updating_that_is_none_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([*command(folder, tmp_path / "out"), "--reference-update", "sometimes"])
+    assert caught.value.code == 2

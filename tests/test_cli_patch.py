@@ -13,7 +13,7 @@ from test_cli_measure import command, small_rig
 
 from server.cli import main
 from server.io.images import write_image
-from server.io.netcdf import read_field
+from server.io.netcdf_reading import read_field
 from sim.render import RenderOptions, render
 from sim.rig import CAMERA_NAMES, SimRig
 from sim.scene import UPRIGHT, Scene

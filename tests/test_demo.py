@@ -28,6 +28,7 @@ from server.demo.compare import compare_motion, compare_shape, heights_mm, pixel
 from server.demo.plate import centre_deflection_um, fit_plate
 from server.demo.process import free_port, running_service
 from server.demo.session import Check, Outcome, table
+from server.exports.mesh import triangles_of
 from server.io.images import read_image
 from sim.plate import CircularPlate
 from sim.rig import SimRig
@@ -118,7 +119,7 @@ def test_pictures_are_drawn_for_fields_with_holes(tmp_path: Path) -> None:
     image = np.zeros((480, 512), np.uint8)
     fit = fit_plate([one], [689.0], CircularPlate())
     found = pictures.plate(tmp_path, image, (46, 30, 466, 450), [one], [comparison], [689.0], CircularPlate(), fit)
-    found |= pictures.panel(tmp_path, image, (46, 30, 466, 450), [one], [comparison], [1.0], np.zeros((2, 2)))
+    found |= pictures.panel(tmp_path, image, (46, 30, 466, 450), [one], [comparison], [1.0])
     heights = heights_mm(one.xyz_mm, one.valid)
     found |= pictures.steel(tmp_path, image, (46, 30, 466, 450), one, heights, heights)
     view = {"title": "cam1", "held_out": True, "rbe_px": 0.1, "xy_px": np.ones((3, 2)), "residual_px": np.ones((3, 2))}
@@ -240,7 +241,8 @@ def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
     assert answers(port)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    # a shell says 130 to both; Python ends by the signal itself where it came while a string was executed
+    assert process.returncode in (130, -signal.SIGINT)
     assert "stereorig: interrupted" in err
     assert "Traceback" not in err
     assert not answers(port)
@@ -255,9 +257,10 @@ def test_no_triangle_of_a_picture_reaches_over_a_crack() -> None:
     y = float(field.y_px[2, 0]) + 1.5
     line = [(float(field.x_px[0, 0]), y), (float(field.x_px[0, 3]), y)]
     rows, cols = field.shape
-    whole = {frozenset(t) for t in pictures.triangles(field).tolist()}
+    x_px, y_px = field.x_px, field.y_px
+    whole = {frozenset(t) for t in triangles_of(x_px, y_px, field.valid, None).tolist()}
     assert len(whole) == 2 * (rows - 1) * (cols - 1)
-    cut = {frozenset(t) for t in pictures.triangles(dataclasses.replace(field, cuts=Cuts([line]))).tolist()}
+    cut = {frozenset(t) for t in triangles_of(x_px, y_px, field.valid, Cuts([line])).tolist()}
     gone = {k for t in whole - cut for k in t}
     # between rows 2 and 3 as far as the line goes; its end touches the next triangle's side in column 3
     assert gone == {2 * cols + c for c in range(5)} | {3 * cols + c for c in range(4)}

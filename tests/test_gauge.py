@@ -95,6 +95,24 @@ def test_values_between_points_are_exact_for_what_is_linear_in_a_cell() -> None:
     assert got == pytest.approx(3.0 + 2.0 * xy[:, 0] - 0.5 * xy[:, 1], abs=1e-10)
 
 
+def test_a_bent_surface_is_read_on_the_surface_and_not_on_its_chords() -> None:
+    failed = np.zeros((14, 17), bool)
+    failed[3, 4] = True  # at 68, 81
+    field = make_field(rigid, failed=failed)
+
+    def bent(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.asarray(1.0 + 0.3 * x - 0.002 * x**2 + 0.001 * x * y - 0.003 * y**2)
+
+    rng = np.random.default_rng(2)
+    inside = np.column_stack([rng.uniform(90, 145, 50), rng.uniform(95, 144, 50)])
+    values = bent(field.x_px, field.y_px)
+    assert sample(field, inside).of(values) == pytest.approx(bent(*inside.T), abs=1e-9)
+    # beside the failed point and at the grid's edge the cell's corners serve alone: off by f'' step^2 / 8 each way
+    beside = np.array([(40.0 + 2.5 * STEP, 60.0 + 4.5 * STEP), (40.0 + 10.5 * STEP, 60.0 + 0.5 * STEP)])
+    chords = 0.5 * (0.004 + 0.006) * (0.5 * STEP) ** 2
+    assert sample(field, beside).of(values) == pytest.approx(bent(*beside.T) - chords, abs=1e-9)
+
+
 def test_no_value_reaches_over_a_failed_point() -> None:
     failed = np.zeros((14, 17), bool)
     failed[3, 4] = True  # at 68, 81
@@ -287,6 +305,22 @@ def test_rigid_motion_states_its_covariance_and_that_of_what_is_left() -> None:
               for e in pixel_noise(np.random.default_rng(3), field, 50)]  # fmt: skip
     # a quarter of the independent values went into the six parameters and the overlap
     assert 0.85 < np.mean(ratios) < 1.02
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_body_that_only_stretches_is_not_turned(robust: bool) -> None:
+    # a bar in tension: depth is five times as noisy as the plane, so a turn about the bar could pass for contraction
+    turn = Rotation.from_rotvec([0.02, -0.01, 0.05]).as_matrix()
+    F = turn @ np.diag([1.08, 0.965, 1.0])
+    field = make_field(lambda x: x @ F.T + SHIFT, rows=9, cols=40, shape=lambda x, y: surface(x, y) * [1.0, 1.0, 0.02])
+    got = rigid_motion(field, shared=SHARED, robust=robust)
+    np.testing.assert_allclose(got.rotation_vector_rad, [0.02, -0.01, 0.05], atol=2e-3)
+    assert got.noise_ratio > 20.0
+    # with noise alone, points still count by their noise
+    still = make_field(rigid)
+    tight = rigid_motion(noisy(still, pixel_noise(np.random.default_rng(8), still, 1)[0]), shared=SHARED)
+    sigma = np.sqrt(np.diag(tight.covariance))[:3]
+    assert (np.abs(tight.rotation_vector_rad - Rotation.from_matrix(TURN).as_rotvec()) < 4.0 * sigma).all()
 
 
 def test_robust_fit_is_not_drawn_by_outliers() -> None:

@@ -16,7 +16,8 @@ from core.field.cuts import Cuts
 from core.field.patch import PatchChoice
 from core.field.result import Field
 from core.status import PointStatus
-from server.io.netcdf import Provenance, read_attributes, read_field, write_field
+from server.io.netcdf import Provenance, write_field
+from server.io.netcdf_reading import read_attributes, read_field
 from server.io.summary import summarise, to_json
 
 ROWS, COLS = 4, 6

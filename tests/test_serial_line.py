@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import random
+import select
 import socket
+import struct
 import threading
 import time
 
@@ -44,9 +46,22 @@ def test_a_port_that_another_program_holds_is_named_so() -> None:
 
 
 def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(StageError, match="esp301, smc100") as caught:
+    with pytest.raises(StageError, match="conex-cc, esp301, smc100") as caught:
         open_stage("xps", "socket://127.0.0.1:1", {1: AxisOptions()})
     assert caught.value.code == "unknown_driver"
+
+
+def test_a_line_whose_other_side_went_first_is_closed_all_the_same() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        line = SerialLine(f"socket://127.0.0.1:{listener.getsockname()[1]}", terminator=b"\r", baudrate=9600)
+        line.open()
+        far, _ = listener.accept()
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closing resets the connection
+        far.close()
+        near = line._port._socket
+        assert select.select([near], [], [], 5.0)[0], "the reset never came"
+        line.close()
+        assert near.fileno() == -1
 
 
 def test_a_closed_line_says_so() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import xarray
 from PIL import Image
-from service_rig import TINY, served, wait_for_job, wait_for_rig
+from service_rig import SMALL, served, wait_for_job, wait_for_rig
 
 from server.config import parse_config
 from server.io.noise_json import load_noise
@@ -22,19 +22,6 @@ from server.service import Service
 
 API = "/api/v1"
 RECTANGLE = [60, 60, 180, 170]
-# half of the paper rig's pixels: lines of the grid one pixel wide, speckles of four
-SMALL = (
-    TINY.replace("[160, 144]", "[256, 240]")
-    .replace("3600.0", "6100.0")
-    .replace("phd_px = 3560.0", "phd_px = 6031.0")
-    .replace("phd_px = 3530.0", "phd_px = 5969.0")
-    .replace("cx_px = 80.4", "cx_px = 130.4")
-    .replace("cx_px = 79.7", "cx_px = 124.7")
-    .replace("cy_px = 71.8", "cy_px = 117.8")
-    .replace("cy_px = 72.1", "cy_px = 122.1")
-    .replace("line_width_mm = 0.1", "line_width_mm = 0.06")
-    .replace("speckle_mm = 0.45", "speckle_mm = 0.26")
-)
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +83,37 @@ def test_calibration_finds_the_cameras_and_says_how_well(client: httpx.Client, c
     assert document["checks"]["drift_px"]["cam1"] < 0.02
     assert [v["role"] for v in document["taken"][::2]] == ["fitted", "held_out", "fitted", "zero_again"]
     assert all(abs(v["dz_mm"] - v["dz_commanded_mm"]) < 0.002 for v in document["taken"])
+
+
+def test_prefilter_and_smoothing_are_recorded_and_told(client: httpx.Client, plate_test: str) -> None:
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, "patch": "stretch",
+            "prefilter_px": 0.8, "smoothing_window": 5, "strain": {"window": 5}}  # fmt: skip
+    found = {}
+    for changes in ({}, {"smoothing_window": None}):
+        accepted = client.post(f"{API}/tests/{plate_test}/analyses", json={**body, **changes})
+        assert accepted.status_code == 202, accepted.text
+        done = wait_for_job(client, accepted.json()["job"], 240.0)
+        assert done["state"] == "succeeded", done["problem"]
+        url = f"{API}/tests/{plate_test}/analyses/{accepted.json()['analysis_id']}"
+        shown = client.get(url).json()
+        assert shown["settings"]["prefilter_px"] == 0.8
+        step = shown["summary"]["steps"][-1]
+        sigma = client.get(f"{url}/steps/2/fields/sigma_w_mm").json()["values"]
+        found[bool(changes)] = step["smoothing"], step["strain"]["gauge_px"], np.array(sigma, dtype=float)
+    smoothing, gauge_px, sigma = found[False]
+    assert (smoothing["window"], smoothing["resolution_px"], gauge_px) == (5, 65.0, 105.0)
+    assert found[True][:2] == (None, 65.0)
+    assert np.nanmean(sigma) < 0.95 * np.nanmean(found[True][2])
+
+
+@pytest.mark.parametrize(
+    "change", [{"prefilter_px": -1}, {"prefilter_px": 6.3}, {"prefilter_px": "wide"}, {"smoothing_window": 4},
+               {"smoothing_window": 1}, {"smoothing_window": 53}]
+)  # fmt: skip
+def test_prefilters_and_windows_that_cannot_be(client: httpx.Client, plate_test: str, change: dict[str, Any]) -> None:
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, **change}
+    code = "values_disagree" if change.get("prefilter_px") == 6.3 else "invalid_request"  # 6.3 px suit larger subsets
+    refused(client.post(f"{API}/tests/{plate_test}/analyses", json=body), 422, code)
 
 
 def test_residuals_views_and_file_can_be_fetched(client: httpx.Client, calibration_id: str) -> None:
@@ -217,6 +235,7 @@ def test_strain_that_cannot_be_is_refused(client: httpx.Client, plate_test: str)
         ({"region": {"rectangle": RECTANGLE}, "seeds": [[300, 10]]}, "seed_outside"),
         ({"region": {"rectangle": RECTANGLE}, "steps": [1, 9]}, "step_missing"),
         ({"region": {"mask_png_base64": "!!"}}, "mask_unreadable"),
+        ({"region": {"mask_png_base64": "\u00e9"}}, "mask_unreadable"),
         ({"region": {"rectangle": RECTANGLE, "cracks": [[[100, 100]]]}}, "invalid_request"),
         ({"region": {"rectangle": RECTANGLE, "cracks": [[[100, 100], [100, 100]]]}}, "cut_invalid"),
         ({"region": {"rectangle": RECTANGLE, "cracks": [[[100, 100], [300, 100]]]}}, "cut_outside_image"),
@@ -348,6 +367,18 @@ def test_cancelled_analysis_keeps_its_finished_steps(client: httpx.Client, plate
     assert 0 in shown["steps_finished"]
     assert shown["summary"]["state"] == "cancelled"
     assert client.get(f"{url}/steps/0/fields/z_mm").status_code == 200
+
+
+def test_each_step_can_be_matched_against_the_one_before(client: httpx.Client, plate_test: str) -> None:
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 20, "reference_update": "always"}
+    accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body).json()
+    done = wait_for_job(client, accepted["job"], 240.0)
+    assert done["state"] == "succeeded", done["problem"]
+    reply = client.get(f"{API}/tests/{plate_test}/analyses/{accepted['analysis_id']}").json()
+    assert reply["settings"]["reference_update"] == "always"
+    assert [step.get("reference_step") for step in reply["summary"]["steps"]] == [None, 0, 1]
+    body["reference_update"] = "often"
+    assert client.post(f"{API}/tests/{plate_test}/analyses", json=body).status_code == 422
 
 
 @pytest.mark.fault(29)

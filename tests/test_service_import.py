@@ -14,6 +14,7 @@ from service_rig import served, tiny_config, wait_for_job
 
 from server.io.calibration_any import load_calibration
 from server.io.images import encode_tiff
+from server.io.netcdf_reading import read_attributes
 from server.service import Service
 
 API = "/api/v1"
@@ -75,6 +76,9 @@ def test_specimen_is_measured_with_an_imported_calibration(
     assert (status == 0).mean() > 0.97
     epipolar = np.array(client.get(f"{url}/steps/0/fields/epipolar_px").json()["values"], dtype=float)
     assert np.sqrt(np.nanmean(epipolar**2)) < 0.1  # DICe's calibration is off by 0.08 px in this part of the face
+    # an import's system frame is its camera 1, and results say so
+    stored = folder / "tests" / test_id / "analyses" / accepted["analysis_id"] / "step_0001.nc"
+    assert read_attributes(stored)["frame"].startswith("sys = camera 1")
     # the copy in the test's folder is the same pair to the last bit
     kept, original = (load_calibration(p) for p in (folder / "tests" / test_id / "calibration.json", xml))
     np.testing.assert_array_equal(kept.pair.cam2_from_cam1.translation_mm, original.pair.cam2_from_cam1.translation_mm)

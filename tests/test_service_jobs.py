@@ -24,7 +24,8 @@ from server.compute import run_task
 from server.errors import BusyError, QueueFullError
 from server.events import EventHub
 from server.hardware import HardwareGate
-from server.jobs import Job, JobManager, Phase
+from server.job import Job, Phase
+from server.jobs import JobManager
 from server.service import Service
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder, IdMaker
@@ -103,6 +104,42 @@ def test_hardware_jobs_exclude_each_other_and_name_the_holder(bench: Bench) -> N
     go.set()
     assert bench.end_of(job)["state"] == "succeeded"
     assert bench.gate.holder is None
+
+
+@pytest.mark.fault(28)
+def test_what_is_done_to_a_holder_never_meets_the_next_one() -> None:
+    """A cancelled job is stopped again until it has let go; whoever holds the hardware then must not be stopped."""
+    gate = HardwareGate()
+    first = gate.claim("a move", job_id="j1")
+    stopping, stopped, order = threading.Event(), threading.Event(), []
+
+    def stop() -> None:
+        stopping.set()
+        assert stopped.wait(10.0)
+        order.append("stopped")
+
+    stopper = threading.Thread(target=lambda: gate.while_held_by("j1", stop))
+    stopper.start()
+    assert stopping.wait(10.0)
+    assert gate.holder is not None  # looking waits for nothing
+    gate.release(first)  # nor does letting go
+    assert gate.holder is None
+
+    def next_one() -> None:
+        gate.claim("another move", job_id="j2")
+        order.append("claimed")
+
+    other = threading.Thread(target=next_one)
+    other.start()
+    other.join(0.2)
+    assert order == []
+    stopped.set()
+    stopper.join(10.0)
+    other.join(10.0)
+    assert order == ["stopped", "claimed"]
+    assert not gate.while_held_by("j1", lambda: order.append("too late"))
+    assert order == ["stopped", "claimed"]
+    gate.close()
 
 
 def test_hardware_is_free_while_the_second_phase_computes(bench: Bench) -> None:

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CONFIG = TINY.replace("speckle_mm = 0.45", "speckle_mm = 0.4").replace("kernel_threads = 1", "kernel_threads = 2")
 
 
-def write_test_folder(folder: Path, steps: int) -> None:
+def write_test_folder(folder: Path, steps: int, load_a_step: float = 0.0) -> None:
     """Write a test as another service would have left it: a copied folder is a valid test."""
     config = parse_config(CONFIG)
     rig = SimRig.from_dict(config.model_dump(exclude_none=True))
@@ -34,8 +34,8 @@ def write_test_folder(folder: Path, steps: int) -> None:
     pair = world.true_pair()
     calibration = {"cam1": pair.cam1.paper_parameters(), "cam2": pair.cam2.paper_parameters()}
     (folder / "calibration.json").write_text(json.dumps(calibration))
-    world.set_scene("plate", load=0.0)
     for n in range(steps):
+        world.set_scene("plate", load=n * load_a_step)
         step = folder / "steps" / f"{n:04d}"
         step.mkdir(parents=True)
         sha256 = {}
@@ -127,6 +127,29 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
             for cam in ("cam1", "cam2"):
                 content = client.get(f"/tests/{new}/steps/{step['n']}/{cam}").content
                 assert hashlib.sha256(content).hexdigest() == step["sha256"][cam]
+        assert [s["n"] for s in shown["summary"]["steps"]] == shown["steps_finished"]
+        # a new analysis can start at once, and comes to its end
+        fresh = client.post(f"{test}/analyses", json={**body, "step_px": 20, "steps": [0, 1]})
+        assert fresh.status_code == 202, fresh.text
+        deadline = time.monotonic() + 240
+        while (new_job := client.get(f"/jobs/{fresh.json()['job']['id']}").json())["state"] in ("queued", "running"):
+            assert time.monotonic() < deadline, new_job
+            time.sleep(0.02)
+        assert new_job["state"] == "succeeded", new_job["problem"]
+        rest = client.post(f"{url}:continue", headers={"Idempotency-Key": "rest"})
+        assert rest.status_code == 202, rest.text
+        assert (
+            client.post(f"{url}:continue", headers={"Idempotency-Key": "rest"}).json()["job"]["id"]
+            == (rest.json()["job"]["id"])
+        )
+        kept = shown["steps_finished"]
+        deadline = time.monotonic() + 240
+        while len(client.get(url).json()["steps_finished"]) < len(kept) + 1 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        finished = client.get(url).json()["steps_finished"]
+        assert len(finished) > len(kept)
+        assert finished == list(range(len(finished)))
+        assert client.post(f"/jobs/{rest.json()['job']['id']}/cancel").status_code == 202
         again = client.post(f"{test}/analyses", json={**body, "steps": [1]})
         assert again.status_code == 202
         assert not list((tmp_path / "data").rglob(".*.part"))
@@ -136,3 +159,25 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
         client.close()
     assert process.returncode == 0
     assert errors == ""
+
+
+@pytest.mark.fault(6)
+def test_a_second_service_on_the_same_folder_ends_and_names_the_first(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(TINY)
+    process, client = start(tmp_path)
+    try:
+        second = subprocess.run(
+            [sys.executable, "-m", "server.cli", "serve", "--config", str(tmp_path / "rig.toml"), "--port", "0",
+             "--data", str(tmp_path / "data")],
+            cwd=ROOT, capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert second.returncode == 1, second.stderr
+        assert f"process {process.pid} on " in second.stderr
+        assert "data_folder_locked" in second.stderr
+        assert client.get("/healthz").json()["status"] == "ok"  # the first goes on
+        test_id = client.post("/tests", json={"name": "still there"}).json()["id"]
+        assert client.get(f"/tests/{test_id}").status_code == 200
+    finally:
+        process.kill()
+        process.communicate()
+        client.close()

@@ -32,6 +32,10 @@ def test_it_is_an_executor_with_one_long_lived_process_and_pinned_threads(worker
     assert one["numba"] == "1"
 
 
+def test_what_a_task_leaves_in_circles_is_gone_before_the_next(worker: ComputeWorker) -> None:
+    assert [worker.submit(work.leave_a_circle).result(timeout=30) for _ in range(5)] == [0, 0, 0, 0, 0]
+
+
 def test_an_error_comes_back_whole(worker: ComputeWorker) -> None:
     with pytest.raises(RegionError, match="value 7") as caught:
         worker.submit(work.refuse, 7).result(timeout=30)

@@ -91,8 +91,8 @@ def test_settings_come_back_as_taken_and_bad_ones_change_nothing(
         CameraSettings(exposure_ms=math.nan),
         CameraSettings(gain_db=-1.0),
         CameraSettings(bit_depth=8),
-        CameraSettings(trigger="hardware"),
-        CameraSettings(region_px=(0, 0, 8, 8)),
+        CameraSettings(trigger="by hand"),  # type: ignore[arg-type]
+        CameraSettings(region_px=(20, 0, 8, 8)),
     ):
         with pytest.raises(CameraError) as caught:
             cam.configure(bad)
@@ -108,10 +108,10 @@ def test_free_run_delivers_at_its_rate_until_disarmed(pair: tuple[SimFrameGrabbe
     cam.configure(CameraSettings(trigger="free", frame_rate_hz=50.0))
     cam.disarm()
     cam.arm()
-    frames = [cam.next_frame(2.0) for _ in range(6)]
-    assert [frame.sequence for frame in frames if frame] == list(range(6))
+    frames = [cam.next_frame(2.0) for _ in range(12)]
+    assert [frame.sequence for frame in frames if frame] == list(range(12))
     gaps = np.diff([frame.device_ns for frame in frames if frame]) / 1e6
-    assert gaps.min() > 5.0
+    assert np.median(gaps) > 10.0  # of 20: on a busy machine one comes late, and the next after it in time
     with pytest.raises(CameraError) as caught:
         cam.trigger()
     assert caught.value.code == "wrong_trigger"

@@ -82,6 +82,29 @@ def test_plate_bends_as_equation_18_says() -> None:
     assert (plate.surface(275.6).place([[14.0, 3.0]]) == [[14.0, 3.0, 0.0]]).all()
 
 
+@pytest.mark.parametrize("large", [False, True])
+def test_the_plates_face_strains_as_its_places_move(large: bool) -> None:
+    plate = CircularPlate(large_deflection=large)
+    h, surface = 1e-4, plate.surface(551.2)
+    for angle in (0.0, 0.4, 2.0):
+        r = np.linspace(0.5, 13.0, 26)
+        out, round_ = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        at = r[:, None] * out
+        # the metric of the face by differences of its places
+        along = [(surface.place(at + h * d) - surface.place(at - h * d)) / (2 * h) for d in (out, round_)]
+        radial, hoop = plate.face_strain(r, 551.2)
+        np.testing.assert_allclose(radial, 0.5 * ((along[0] ** 2).sum(-1) - 1.0), atol=2e-9)
+        np.testing.assert_allclose(hoop, 0.5 * ((along[1] ** 2).sum(-1) - 1.0), atol=2e-9)
+        np.testing.assert_allclose((along[0] * along[1]).sum(-1), 0.0, atol=2e-9)
+    # bending: half the thickness times the deflection's curvatures, stretched where it bulges
+    w = [plate.deflection_mm(r + d, 551.2) for d in (-1e-3, 0.0, 1e-3)]
+    bent = plate.bending_strain(r, 551.2)
+    np.testing.assert_allclose(bent[0], -0.381 * (w[0] - 2.0 * w[1] + w[2]) / 1e-6, atol=1e-8)
+    np.testing.assert_allclose(bent[1], -0.381 * (w[2] - w[0]) / 2e-3 / r, atol=1e-8)
+    for strain in (plate.face_strain, plate.bending_strain):
+        np.testing.assert_array_equal(strain([13.4, 20.0], 551.2), 0.0)
+
+
 def test_plate_stiffens_as_timoshenko_says() -> None:
     # Timoshenko and Woinowsky-Krieger, art. 101, table 82: edge clamped and held, nu = 0.3: A = 0.471
     assert CircularPlate(poisson=0.3).stiffening == pytest.approx(0.471, abs=1e-3)

@@ -11,10 +11,16 @@ from pathlib import Path
 import pytest
 
 from core.errors import StageError
-from drivers.stage import AxisOptions, AxisState, Stage
+from drivers.stage import AxisOptions, AxisState, AxisStatus, Stage
 from tests.stage_bench import CONTROLLERS, MOVE_WORD, Bench, Transport, bench
 
-KINDS = [(driver, transport) for driver in CONTROLLERS for transport in ("socket", "pty")]
+KINDS: list[tuple[str, Transport]] = [
+    ("esp301", "socket"),
+    ("esp301", "pty"),
+    ("smc100", "socket"),
+    ("smc100", "pty"),
+    ("conex-cc", "pty"),
+]
 
 
 @pytest.fixture(params=KINDS, ids=["-".join(kind) for kind in KINDS])
@@ -270,6 +276,26 @@ def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Tran
         assert not stand.stage.state(1).homed
 
 
+def test_a_stop_between_a_question_and_its_answer_is_a_stop_and_no_fault(
+    kind: tuple[str, Transport], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Homing has just been seen to go on when the stop comes; the next answer says that the axis rests."""
+    with bench(*kind, time_scale=1.0, start_mm=30.0) as stand:
+        stand.stage.enable(1)
+        read = stand.stage._read_status
+
+        def stopped_first(axis: int) -> AxisStatus:
+            if stand.axis(1).velocity_now_mm_s != 0:
+                stand.stage.stop(1)
+                wait_until(lambda: stand.axis(1).velocity_now_mm_s == 0)
+            return read(axis)
+
+        monkeypatch.setattr(stand.stage, "_read_status", stopped_first)
+        with pytest.raises(StageError) as caught:
+            stand.stage.home(1)
+        assert code_of(caught) == "stage_stopped"
+
+
 @pytest.mark.fault(25)
 def test_a_disturbed_reply_is_flushed_and_asked_for_once_more(homed: Bench) -> None:
     homed.stage.move_to(1, 7.25)
@@ -421,7 +447,106 @@ def test_velocities_are_set_and_refusals_named(kind: tuple[str, Transport]) -> N
         assert stand.axis(1).acceleration_mm_s2 == pytest.approx(12.0)
         with pytest.raises(StageError, match="velocity") as caught:
             stand.another({1: AxisOptions(velocity_mm_s=1e6)})
-        assert code_of(caught) == "stage_refused"
+        assert code_of(caught) == "out_of_range"
+
+
+def test_velocity_and_acceleration_are_set_at_run_time_and_read_back(homed: Bench) -> None:
+    stage = homed.stage
+    assert stage.dynamics(1).velocity_mm_s == pytest.approx(10.0)
+    taken = stage.set_dynamics(1, velocity_mm_s=2.5)
+    assert (taken.velocity_mm_s, taken.acceleration_mm_s2) == pytest.approx((2.5, 40.0))
+    assert homed.axis(1).velocity_mm_s == pytest.approx(2.5)
+    assert homed.axis(2).velocity_mm_s == pytest.approx(10.0)
+    taken = stage.set_dynamics(1, acceleration_mm_s2=12.0)
+    assert (taken.velocity_mm_s, taken.acceleration_mm_s2) == pytest.approx((2.5, 12.0))
+    assert homed.axis(1).acceleration_mm_s2 == pytest.approx(12.0)
+    assert stage.move_to(1, 1.0).position_mm == pytest.approx(1.0, abs=1e-4)
+    stage.home(1)
+    assert homed.axis(1).velocity_mm_s == pytest.approx(2.5)  # homing keeps it
+    if homed.driver == "esp301":  # it tells what it can do: four times and ten times the power-on values
+        assert (taken.max_velocity_mm_s, taken.max_acceleration_mm_s2) == pytest.approx((40.0, 400.0))
+
+
+def test_a_velocity_that_is_none_goes_over_no_line(homed: Bench) -> None:
+    before = len(homed.controller.received)
+    for wrong in (0.0, -1.0, math.nan, math.inf, True, "fast", [1.0]):
+        for given in ({"velocity_mm_s": wrong}, {"acceleration_mm_s2": wrong}):
+            with pytest.raises(StageError) as caught:
+                homed.stage.set_dynamics(1, **given)  # type: ignore[arg-type]
+            assert code_of(caught) == "out_of_range", given
+    assert len(homed.controller.received) == before
+
+
+def test_a_velocity_beyond_the_controllers_greatest_is_refused_and_the_old_one_stays(homed: Bench) -> None:
+    for given in ({"velocity_mm_s": 41.0}, {"acceleration_mm_s2": 401.0}):
+        with pytest.raises(StageError) as caught:
+            homed.stage.set_dynamics(1, **given)
+        assert code_of(caught) == "out_of_range"
+    assert homed.stage.dynamics(1).velocity_mm_s == pytest.approx(10.0)
+    homed.stage.home(1)
+    assert homed.axis(1).velocity_mm_s == pytest.approx(10.0)
+    assert homed.axis(1).acceleration_mm_s2 == pytest.approx(40.0)
+
+
+def test_abort_stops_everything_at_once_and_switches_the_motors_off(kind: tuple[str, Transport]) -> None:
+    with bench(*kind, time_scale=1.0, start_mm=0.0, acceleration_mm_s2=200.0) as stand:
+        stand.ready(1, 2)
+        thread, errors = in_thread(lambda: stand.stage.move_many({1: 40.0, 2: -40.0}))
+        wait_until(lambda: stand.axis(1).velocity_now_mm_s > 5 and stand.axis(2).velocity_now_mm_s < -5)
+        asked = time.monotonic()
+        stand.stage.abort()
+        thread.join(5.0)
+        assert [error.code for error in errors] == ["stage_stopped"]
+        word = "AB" if stand.driver == "esp301" else "ST"
+        arrived = next(entry.at_s for entry in stand.controller.received if entry.text == word)
+        assert arrived - asked < 0.05
+        for axis in (1, 2):
+            status = stand.stage.state(axis)
+            assert not status.moving
+            assert not status.motor_on
+            assert status.state is AxisState.MOTOR_OFF
+            assert abs(stand.controller.true_position_mm(axis)) < 20.0
+        with pytest.raises(StageError) as caught:
+            stand.stage.move_to(1, 0.0)
+        assert code_of(caught) == "motor_off"
+        stand.stage.enable(1)
+        assert stand.stage.move_to(1, 0.5).position_mm == pytest.approx(0.5, abs=1e-4)
+
+
+def test_abort_at_rest_and_before_homing_does_no_harm(stand: Bench) -> None:
+    stand.stage.abort()
+    assert not stand.stage.state(1).motor_on
+    stand.stage.errors()
+    stand.ready(1)
+    assert stand.stage.move_to(1, 1.0).position_mm == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.fault(27)
+def test_what_an_earlier_program_left_moving_is_stopped_at_opening(kind: tuple[str, Transport]) -> None:
+    option = AxisOptions(assume_homed=True)
+    with bench(*kind, time_scale=1.0, start_mm=0.0, options={1: option, 2: option}) as stand:
+        stand.ready(1, 2)
+        end = stand.controller.terminator
+        # the program that sent this is dead: nobody is left to stop it
+        stand.stage.close()
+        stand.controller.take_line(b"1PA40" + end)
+        wait_until(lambda: stand.axis(1).velocity_now_mm_s > 1)
+        stand.stage.open()
+        assert not stand.axis(1).moving
+        assert stand.controller.true_position_mm(1) < 20.0
+        found = [message for message in stand.stage.errors() if message.code == "opened_moving"]
+        assert [message.axis for message in found] == [1]
+        # the ESP301 cannot say whether that was a search for home; the SMC100 knows that it still has its reference
+        assert stand.stage.state(1).homed is (stand.driver != "esp301")
+        assert stand.stage.state(2).homed
+
+
+def test_only_the_smc100_has_a_configuration_to_leave(stand: Bench) -> None:
+    before = len(stand.controller.commands("PW"))
+    with pytest.raises(StageError) as caught:
+        stand.stage.leave_configuration(1)
+    assert code_of(caught) == "not_in_configuration"
+    assert len(stand.controller.commands("PW")) == before
 
 
 def test_the_wire_is_recorded_on_request(kind: tuple[str, Transport], tmp_path: Path) -> None:

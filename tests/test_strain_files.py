@@ -10,7 +10,8 @@ import pytest
 
 from core.errors import FileFormatError, InputError
 from core.strain import StrainOptions, StrainStatus, surface_strain
-from server.io.netcdf import Provenance, read_field, write_field
+from server.io.netcdf import Provenance, write_field
+from server.io.netcdf_reading import read_field
 from server.io.strain_netcdf import read_strain
 from server.straining import strain_of_step, strain_options, strain_settings, summarise_strain
 from tests.strain_fields import make_field, plane

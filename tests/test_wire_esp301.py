@@ -44,6 +44,8 @@ REPLIES: dict[str, str | list[str]] = {
     "1SR?": "25.000",
     "1VA?": "10",
     "1AC?": "40",
+    "1VU?": "20",
+    "1AU?": "400",
     "TB?": "0, 451322, NO ERROR DETECTED",
     "1MD?": "1",
     "1MO?": "1",
@@ -139,6 +141,7 @@ def test_the_drivers_bytes_for_a_move_are_these(scripted: tuple[Scripted, Contro
     sent = [entry.text for entry in fake.received]
     assert sent == [
         "1MD?", "1MO?", "1TP",  # ready?
+        "1SN?",  # still in millimetres?
         "TB?",  # old errors out of the way
         "1PA5.000000",
         "TB?",  # accepted?
@@ -166,7 +169,68 @@ def test_an_axis_that_does_not_count_lengths_is_refused(scripted: tuple[Scripted
     fake.replies["1SN?"] = unit
     with pytest.raises(StageError, match="no length") as caught:
         ESP301Stage(server.url, {1: AxisOptions()}, timeout_s=0.25).open()
-    assert caught.value.code == "stage_refused"
+    assert caught.value.code == "unit_not_length"
+
+
+def test_a_firmware_that_does_not_tell_its_greatest_velocity_is_taken(
+    scripted: tuple[Scripted, ControllerServer],
+) -> None:
+    fake, server = scripted
+    del fake.replies["1VU?"], fake.replies["1AU?"]
+    stage = ESP301Stage(server.url, {1: AxisOptions(assume_homed=True)}, timeout_s=0.1)
+    stage.open()
+    assert stage.dynamics(1).max_velocity_mm_s is None
+    assert stage.state(1).homed
+    stage.close()
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "name"), [(2, 1.0, "mm"), (3, 1e3, "um"), (4, 1 / 25.4, "in"), (5, 1e3 / 25.4, "milli-in")]
+)
+def test_every_unit_of_length_means_the_same_millimetres(unit: int, factor: float, name: str) -> None:
+    controller = SimESP301(time_scale=100.0, travel_mm=(-20.0, 20.0))
+    controller.take_line(f"1SN{unit}".encode())
+    with ControllerServer(controller) as server:
+        stage = ESP301Stage(server.url, {1: AxisOptions(velocity_mm_s=5.0, acceleration_mm_s2=20.0)}, timeout_s=0.25)
+        stage.open()
+        assert stage.identify().axes[0].units == name
+        assert (stage.limits(1).low_mm, stage.limits(1).high_mm) == pytest.approx((-20.0, 20.0), abs=1e-3)
+        assert controller.axis(1).velocity_mm_s == pytest.approx(5.0, rel=1e-4)
+        assert stage.dynamics(1).max_velocity_mm_s == pytest.approx(40.0, rel=1e-4)
+        stage.enable(1)
+        stage.home(1)
+        assert stage.move_to(1, 12.7).position_mm == pytest.approx(12.7, abs=1.5e-4)
+        assert controller.true_position_mm(1) == pytest.approx(12.7, abs=1e-5)
+        assert float(controller.take_line(b"1TP")) == pytest.approx(12.7 * factor, rel=1e-4)
+        stage.close()
+
+
+def test_units_changed_behind_our_back_stop_the_next_move_before_it_starts() -> None:
+    controller = SimESP301(time_scale=100.0)
+    with ControllerServer(controller) as server:
+        stage = ESP301Stage(server.url, {1: AxisOptions()}, timeout_s=0.25)
+        stage.open()
+        stage.enable(1)
+        stage.home(1)
+        stage.move_to(1, 5.0)
+        controller.take_line(b"1SN3")  # at the front panel: 5 would now mean 5 um
+        before = len(controller.commands("PA"))
+        with pytest.raises(StageError, match="counts in um") as caught:
+            stage.move_to(1, 5.0)
+        assert caught.value.code == "units_changed"
+        assert len(controller.commands("PA")) == before
+        controller.take_line(b"1SN2")
+        stage.move_to(1, 6.0)
+        stage.close()
+
+
+def test_an_axis_homes_in_the_way_that_the_rig_file_names(scripted: tuple[Scripted, ControllerServer]) -> None:
+    fake, server = scripted
+    stage = ESP301Stage(server.url, {1: AxisOptions(home_mode=4)}, timeout_s=0.25)
+    stage.open()
+    stage.home(1)
+    assert fake.commands("OR") == ["1OR4"]
+    stage.close()
 
 
 def test_another_device_on_the_line_is_no_esp301(scripted: tuple[Scripted, ControllerServer]) -> None:

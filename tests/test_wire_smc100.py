@@ -86,12 +86,46 @@ def test_the_configuration_trap_is_named_and_left_on_request_only(chain: SimSMC1
     status = stage.state(1)
     assert status.state is AxisState.CONFIGURATION
     assert "PW0" in status.detail
-    with pytest.raises(StageError, match="CONFIGURATION"):
-        stage.home(1)
+    for call in (
+        lambda: stage.home(1),
+        lambda: stage.move_to(1, 1.0),
+        lambda: stage.set_dynamics(1, velocity_mm_s=1.0),
+    ):
+        with pytest.raises(StageError, match="CONFIGURATION") as caught:
+            call()
+        assert caught.value.code == "configuration_state"
+        assert "flash" in caught.value.remedy
     assert not chain.commands("PW0")
+    assert chain.flash_writes(1) == 0
     stage.leave_configuration(1)
+    assert chain.flash_writes(1) == 1
     assert stage.state(1).state is AxisState.NOT_HOMED
     assert stage.home(1) == pytest.approx(0.0)
+    # asked for once more, there is nothing to leave: the flash is spared
+    with pytest.raises(StageError) as caught:
+        stage.leave_configuration(1)
+    assert caught.value.code == "not_in_configuration"
+    assert chain.commands("PW0") == ["1PW0"]
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [("36", "TK0"), ("37", "TK0"), ("46", "keypad"), ("47", "keypad"), ("7F", "unknown state 7F")]
+)
+def test_states_in_which_others_move_the_axis_are_faults_in_words(
+    chain: SimSMC100, stage: SMC100Stage, number: str, words: str
+) -> None:
+    stage.home(1)
+    chain.line_faults.stray = f"1TS0000{number}\r\n".encode()
+    status = stage.state(1)
+    assert status.state is AxisState.FAULT
+    assert words in status.detail
+
+
+def test_a_velocity_before_homing_is_refused_in_the_controllers_sense(chain: SimSMC100, stage: SMC100Stage) -> None:
+    with pytest.raises(StageError) as caught:
+        stage.set_dynamics(1, velocity_mm_s=1.0)
+    assert caught.value.code == "not_homed"
+    assert not [line for line in chain.commands("VA") if line != "1VA?" and line != "2VA?"]
 
 
 def test_cut_motor_power_is_seen_behind_its_nul_byte(chain: SimSMC100, stage: SMC100Stage) -> None:
