@@ -18,6 +18,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from docs.scripts import (
+    accuracy_adversarial,
     accuracy_calibration,
     accuracy_cracks,
     accuracy_curved,
@@ -26,6 +27,10 @@ from docs.scripts import (
     accuracy_large,
     accuracy_matching,
     accuracy_noise,
+    accuracy_prefilter,
+    accuracy_sequence,
+    accuracy_smoothing,
+    accuracy_specimen,
     accuracy_strain,
 )
 from docs.scripts.table import Row, Section
@@ -43,12 +48,17 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "epipolar": accuracy_matching.epipolar,
     **accuracy_curved.SECTIONS,
     **accuracy_strain.SECTIONS,
+    **accuracy_specimen.SECTIONS,
     **accuracy_gauges.SECTIONS,
     "cracks": accuracy_cracks.cracks,
     "large": accuracy_large.large_motion,
+    "updates": accuracy_sequence.updates,
+    "adversarial": accuracy_adversarial.adversarial,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,
+    "prefilter": accuracy_prefilter.prefilter,
+    "smoothing": accuracy_smoothing.smoothing,
     "plate": accuracy_experiments.plate,
     "steel": accuracy_experiments.steel,
     "panel": accuracy_experiments.panel,

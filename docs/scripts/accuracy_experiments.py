@@ -41,7 +41,8 @@ def _demo(name: str, figures: Path) -> Section:
         f"`stereorig demo --experiment {name}`: the service on the simulated rig, calibrated from its own grid pictures with a "
         "4 um grid, everything over HTTP. Columns show the error against the truth."
     )
-    return Section(titles[name], how, rows, pictures, [])
+    printed = "\n".join(["What the demo prints:", "", "```", *report["table"], "```"])
+    return Section(titles[name], how, rows, pictures, [printed])
 
 
 def plate(figures: Path) -> Section:

@@ -199,12 +199,12 @@ def mean_error(figures: Path) -> Section:
                 clean = [*before, *window.clean(shift)]
                 for kind in KINDS:
                     free = [[prepare(c, kind) for c in clean]]  # type: ignore[arg-type]
-                    curves[rig, label, kind, 0.0].append(_mean_px(window, free, xy, shift, subset, kind))
+                    curves[rig, label, kind, 0.0].append(phase_error_px(window, free, xy, shift, subset, kind))
                     if phase in NOISY_PHASES:
                         # repeats enough for a mean to 0.0003 px
                         repeats = 8 if kind == "cubic" else (48 if label in ("coarse", "low contrast") else 16)
                         sets = _noisy(clean, 6.0, repeats, kind, seed=k)
-                        curves[rig, label, kind, 6.0].append(_mean_px(window, sets, xy, shift, subset, kind))
+                        curves[rig, label, kind, 6.0].append(phase_error_px(window, sets, xy, shift, subset, kind))
             for kind in KINDS:
                 for noise, limit in ((0.0, 0.001), (6.0, 0.002)):
                     mean = np.array(curves[rig, label, kind, noise])
@@ -237,7 +237,9 @@ def mean_error(figures: Path) -> Section:
     )
 
 
-def _mean_px(window: Window, sets: list[list[ImageData]], xy: Float, shift: Float, subset_px: int, kind: str) -> Float:
+def phase_error_px(
+    window: Window, sets: list[list[ImageData]], xy: Float, shift: Float, subset_px: int, kind: str
+) -> Float:
     """Mean errors (5, 2): px, and their standard deviations: camera 2 at t0, camera 1 at t (x, y), camera 2 at t (x, y)."""
     w, G = window.unknowns(xy, shift)
     options = MatchOptions(subset_px=subset_px, interpolation=kind)  # type: ignore[arg-type]

@@ -38,7 +38,7 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
 
 def read_fields(out: Path, steps: int) -> dict[str, Any]:
     """Results (N, 3) and (steps, N, 3) as files hold them, in the calibration's system frame, which is camera 1's here."""
-    from server.io.netcdf import read_field
+    from server.io.netcdf_reading import read_field
 
     fields = [read_field(out / f"step_{n:04d}.nc") for n in range(steps + 1)]
     first = fields[0]
