@@ -9,15 +9,22 @@ STAMP := $(VENV)/.installed
 PEER := .venv-bench
 PEER_STAMP := $(PEER)/.installed
 ARGS ?=
+# test files side by side, a process each; more than four only compile the same kernels again
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 4 ? 4 : n)))
 
-.PHONY: help demo test serve check bench format accuracy clean
+.PHONY: help demo test serve check bench format accuracy fuzz load openapi torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
-	@echo "make test    run every test"
+	@echo "make test    run every test (WORKERS=1: one file at a time)"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls"
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a few minutes)"
+	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/reliability.md (ARGS='--minutes N')"
+	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/reliability.md (ARGS='--kills N')"
+	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
+	@echo "make openapi write docs/openapi.json, the description of the API, and the list of problems, after a change of either"
+	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/page.md"
 	@echo "make accuracy   measure every figure of docs/accuracy.md again (about twenty minutes)"
 
 $(STAMP): pyproject.toml
@@ -28,13 +35,16 @@ $(STAMP): pyproject.toml
 	@echo "Setting up $(VENV) (once) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; rm -rf $(VENV); exit 1; }
+	@# needs headers and a compiler, so it is not part of what everybody must have
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[aravis]' >$(VENV)/aravis.log 2>&1 \
+		|| echo "No Aravis cameras here: PyGObject could not be built. For them: apt-get install gir1.2-aravis-0.8 aravis-tools libgirepository1.0-dev libcairo2-dev pkg-config gcc python3-dev, then make clean."
 	@touch $@
 
 demo: $(STAMP)
 	$(BIN)/stereorig demo $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 serve: $(STAMP)
 	$(BIN)/stereorig serve $(ARGS)
@@ -60,10 +70,29 @@ bench: $(STAMP) $(PEER_STAMP)
 accuracy: $(STAMP)
 	$(BIN)/python -m docs.scripts.accuracy $(ARGS)
 
+load: $(STAMP)
+	$(BIN)/python -m docs.scripts.load --page $(ARGS)
+
+fuzz: $(STAMP)
+	cd tests && PYTHONPATH=.:.. ../$(BIN)/python api_fuzz.py $(ARGS)
+
+openapi: $(STAMP)
+	$(BIN)/python -m docs.scripts.problem_list
+	$(BIN)/python -m docs.scripts.openapi $(ARGS)
+
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+torture: $(STAMP)
+	$(BIN)/python -m docs.scripts.torture --write $(ARGS)
+
+pagespeed: $(STAMP)
+	$(BIN)/python -m docs.scripts.page_speed $(ARGS)
+
+pagepictures: $(STAMP)
+	$(BIN)/python -m docs.scripts.page_pictures $(ARGS)
+
 clean:
-	rm -rf $(VENV) $(PEER) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(PEER) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
