@@ -180,6 +180,7 @@ class ComputeWorker(Executor):
 
     def _start(self) -> None:
         self._end_process()
+        self._held_mib = None
         self.ready.clear()
         self.compiling.clear()
         ours, theirs = self._context.Pipe()
@@ -227,7 +228,7 @@ class ComputeWorker(Executor):
         if not self._wait_ready(task, connection, process):
             return self._died(process)
         self._cancel.clear()
-        self._kills, self._held_mib, look_at = MemoryWatch.now(), None, 0.0
+        self._kills, look_at = MemoryWatch.now(), 0.0
         try:
             connection.send((task.id, task.function, task.args, task.kwargs))
         except (BrokenPipeError, ConnectionResetError):
@@ -280,9 +281,9 @@ class ComputeWorker(Executor):
 
     def _died(self, process: multiprocessing.process.BaseProcess) -> Any:
         process.join(timeout=2.0)
-        code = process.exitcode
+        code, held_mib = process.exitcode, self._held_mib
         out_of_memory = self._kills.killed_since()
-        how = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=self._held_mib)
+        how = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=held_mib)
         _log.error("the compute worker ended during a task, %s; starting it again", how.rstrip("."))
         self._start()
         raise WorkerDiedError(
@@ -290,7 +291,7 @@ class ComputeWorker(Executor):
             exit_code=code,
             signal=None if code is None or code >= 0 else -code,
             out_of_memory=out_of_memory,
-            memory_mib=self._held_mib,
+            memory_mib=held_mib,
         )
 
 
