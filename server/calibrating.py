@@ -20,6 +20,7 @@ from core.target import GridTarget
 from server.io.calibration_json import calibration_content
 from server.io.images import GrayImage, read_image
 from server.io.netcdf import written_dataset
+from server.store.calibrations import REJECTED
 from server.store.durable import write_json
 from server.tasks import FitTask
 from server.version import software_version
@@ -83,7 +84,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     _judge_drift(content, drift)
     _write_residuals(folder / "residuals.nc", found.result, {Path(f).name: grid for f, grid in known.items()})
     if content["verdict"]["level"] == "failed":
-        write_json(folder / "rejected.json", content)
+        write_json(folder / REJECTED, content)
         raise CalibrationError(
             f"The calibration is not usable: {' '.join(content['verdict']['reasons'])}", code="calibration_rejected"
         )

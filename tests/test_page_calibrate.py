@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -17,6 +18,7 @@ from test_service_chain import SMALL
 
 from server.config import parse_config
 from server.service import Service
+from sim.rig import CameraName
 
 pytestmark = pytest.mark.timeout(500)
 API = "/api/v1"
@@ -127,6 +129,60 @@ def test_a_scene_without_a_grid_is_refused_with_cause_and_remedy(page: Watched, 
         expect(shown.locator("tr", has_text=newest(client))).to_contain_text("failed")
     finally:
         client.put(f"{API}/sim/scene", json={"scene": "grid"}).raise_for_status()
+    page.sound()
+
+
+@pytest.mark.fault(34)
+def test_what_a_verdict_refused_is_shown_with_its_reasons(
+    page: Watched, client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = service.rig._devices.world
+    assert world is not None
+    expose = world.expose
+
+    # somebody leans on camera 2 while it stands at 2 mm
+    def leant_on(cam: CameraName, **how: Any) -> Any:
+        image = expose(cam, **how)
+        return np.roll(image, 1, axis=1) if cam == "cam2" and abs(world._position_mm(2) - 2.0) < 0.2 else image
+
+    monkeypatch.setattr(world, "expose", leant_on)
+    shown = page.open("#/calibrate")
+    shown.get_by_label("Fitted positions").fill("0, 5")
+    shown.get_by_label("Held-out positions").fill("2")
+    begin(shown)
+    progress = shown.locator('[data-role="progress"]')
+    expect(progress.locator(".problem")).to_contain_text("calibration_rejected", timeout=SLOW)
+    refused = newest(client)
+    document = client.get(f"{API}/calibrations/{refused}").json()
+    assert (document["state"], document["verdict"]["level"]) == ("failed", "failed")
+    assert document["checks"]["held_out"]["rbe_px"] > 10 * document["checks"]["fitted"]["rbe_px"]
+    verdict = shown.get_by_role("region", name="Verdict")
+    assert len(document["verdict"]["reasons"]) >= 1
+    for reason in document["verdict"]["reasons"]:
+        expect(verdict).to_contain_text(reason)
+    expect(verdict).to_contain_text(document["problem"]["remedy"])
+    # which view it was is seen: its arrows are the long ones
+    views = client.get(f"{API}/calibrations/{refused}/residuals").json()["views"]
+    worst = max(views, key=lambda view: float(view["rbe_px"]))
+    assert (worst["camera"], worst["held_out"]) == ("cam2", True)
+    shown.get_by_label("Position", exact=True).select_option(index=1)
+    expect(shown.get_by_text(re.compile(r"held out, dZ .*; RBE (1\.0|0\.99)\d*\spx"))).to_be_visible()
+    arrows = shown.locator('.view [data-role="arrows"]')
+    expect(arrows).to_have_count(2)
+    # long, and yet in the picture
+    found = re.search(r"l([-\d.e]+) ([-\d.e]+)", arrows.nth(1).get_attribute("d") or "")
+    assert found is not None
+    assert 25 < np.hypot(float(found[1]), float(found[2])) < 60
+    # it is there to be looked at, and for nothing else
+    expect(verdict.get_by_role("button", name="Accept", exact=True)).to_have_count(0)
+    expect(shown.get_by_label(f"Compare {refused}")).to_be_disabled()
+    for answer in (
+        client.get(f"{API}/calibrations/{refused}/file"),
+        client.post(f"{API}/tests", json={"name": "hasty", "calibration_id": refused}),
+    ):
+        assert (answer.status_code, answer.json()["code"]) == (409, "calibration_not_complete"), answer.text
+    answer = client.put(f"{API}/calibrations/{refused}/judgement", json={"decision": "accepted"})
+    assert answer.status_code == 409
     page.sound()
 
 

@@ -31,6 +31,7 @@ from server.io.calibration_check import check_calibration
 from server.io.images import read_image
 from server.job import Job, Phase
 from server.results import read_residuals
+from server.store.calibrations import REJECTED
 from server.store.durable import without_nan
 from server.store.index import calibration_entry
 
@@ -103,7 +104,10 @@ def list_calibrations(service: ServiceDep, page: PageDep) -> dict[str, Any]:
 
 @router.get("/{calibration_id}", summary="One calibration", response_model=CalibrationReply, responses=errors(404, 409))
 def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> dict[str, Any]:
-    """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it."""
+    """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it.
+
+    One that failed its verdict has what was refused in the same places, to be looked at; `state` stays `failed`.
+    """
     return tagged(response, service.calibrations.read(calibration_id))
 
 
@@ -181,8 +185,14 @@ def list_views(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, 
     responses=errors(404, 409),
 )
 def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
-    """Return, for each view, where every intersection was found and by how much the model misses it."""
-    path = complete(service, calibration_id) / "residuals.nc"
+    """Return, for each view, where every intersection was found and by how much the model misses it.
+
+    A calibration that failed its verdict has them too: they tell what was wrong.
+    """
+    path = service.calibrations.path(calibration_id)
+    if not (path / REJECTED).exists():
+        complete(service, calibration_id)
+    path /= "residuals.nc"
     if not path.is_file():
         raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
     return read_residuals(path)

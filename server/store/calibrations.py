@@ -1,7 +1,7 @@
 """Calibrations on disk: the plan, the views as taken, the result.
 
 ``plan.json`` is written first, ``view.json`` when every view is there, ``calibration.json`` last: only a folder that
-holds it is a calibration.
+holds it is a calibration. What a verdict refused lies in ``rejected.json`` in its place.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from server.io.files import known_sha256, mismatch, require_recorded, sha256_of
 from server.io.images import GrayImage, encode_tiff
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
+
+REJECTED = "rejected.json"
 
 
 class CalibrationStore:
@@ -81,7 +83,10 @@ class CalibrationStore:
         write_json(path, {"decision": None} if document is None else document)
 
     def read(self, calibration_id: str) -> dict[str, Any]:
-        """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``)."""
+        """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``).
+
+        One that failed its verdict has the result that was refused.
+        """
         path = self.path(calibration_id)
         document: dict[str, Any] = {"id": calibration_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
         document["taken"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
@@ -93,6 +98,8 @@ class CalibrationStore:
             document = {**read_json(path / "calibration.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
+            if (path / REJECTED).exists():  # what its verdict refused is there to be looked at
+                document = {**read_json(path / REJECTED), **document}
         judgement = read_json(path / "judgement.json") if (path / "judgement.json").exists() else {}
         document["judgement"] = judgement if judgement.get("decision") is not None else None
         return document

@@ -152,7 +152,7 @@ class ResidualsReply(Reply):
 
 
 class CalibrationReply(Reply):
-    """A calibration: its plan, and once complete everything in calibration.json."""
+    """A calibration: its plan, and once complete everything in calibration.json; what a verdict refused, too."""
 
     id: str = Field(description="Id.")
     state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")

@@ -68,9 +68,11 @@ export async function open(root, { path }) {
       if (location.hash === "#/calibrate") await show(true);
       else location.hash = "#/calibrate";
     }));
-    if (document_.state !== "complete") {
+    const { problem } = document_;
+    // one that its verdict refused is shown like any other: what was wrong is in its residuals
+    if (document_.state !== "complete" && !document_.verdict) {
       return { nodes: h("section.panel", heading,
-        document_.problem ? problemText(Object.assign(new Error(document_.problem.cause ?? document_.problem.detail), document_.problem)) : h("p.quiet", "It is not complete yet; the job's course is above, or under Jobs."),
+        problem ? problemText(Object.assign(new Error(problem.cause ?? problem.detail), problem)) : h("p.quiet", "It is not complete yet; the job's course is above, or under Jobs."),
         document_.state === "unfinished" ? null : decide, await viewsOf(document_, null)), close: () => {} };
     }
     let residuals = null;
@@ -215,6 +217,7 @@ function verdict(document_) {
   if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it brings no verdict.`);
   return [
     h("p", badge(v.level, LEVEL[v.level])), h("ul", (v.reasons ?? []).map((text) => h("li", text))),
+    document_.problem ? h("p", document_.problem.remedy, " ", h("code.quiet", document_.problem.code)) : null,
     u ? facts([["shape", `${um(u.shape_rms_mm)} rms, expected from this calibration alone`], ["Z at the middle, at the corners", `${um(u.centre_z_mm)}, ${um(u.corner_z_mm)}`], ["common scale", quantity(100 * u.scale, "%", 2)]]) : null,
     checks?.made ? h("details", h("summary", "What was checked, and what was not"), h("ul", checks.made.map((check) => h("li", badge(check.made ? "checked" : "not checked", check.made ? "good" : "warn"), " ", check.text)))) : null,
     document_.judgement?.note ? h("p.quiet", `${document_.judgement.decision} by ${document_.judgement.by}: ${document_.judgement.note}`) : null,

@@ -4,6 +4,7 @@ import { View, stroke } from "./view.js";
 import { h, replace, svg, field, select, num, quantity } from "./dom.js";
 
 const COLOUR = { lines: "#33c6ff", node: "#ffd23e", arrow: "#ff4d3d" };
+const LONGEST = 0.15; // of the picture's width
 const ROLE = { fitted: "fitted", held_out: "held out", zero: "zero", zero_again: "zero, again" };
 
 /** Both cameras' views of one position side by side; {root, close}, or null where none were taken. */
@@ -14,7 +15,7 @@ export async function calibrationViews(calibration, residuals) {
   const at = (index, cam) => taken.find((view) => view.index === index && view.camera === cam);
   const text = (index) => { const view = at(index, "cam1") ?? at(index, "cam2"); return `${quantity(view.dz_commanded_mm ?? view.dz_mm, "mm", 4)} · ${ROLE[view.role] ?? view.role}`; };
   const position = select(indices.map((index) => [index, text(index)]), indices[0]);
-  const magnification = h("input", { type: "range", min: 0, max: 4, step: 0.05, value: 3 });
+  const magnification = h("input", { type: "range", min: 0, max: 4, step: 0.05, value: Math.log10(exaggeration(residuals, calibration.image_size_px?.cam1?.[0] ?? 640)).toFixed(2) });
   const told = h("output");
   const lines = h("input", { type: "checkbox", checked: true });
   const arrows = h("input", { type: "checkbox", checked: true });
@@ -55,6 +56,13 @@ export async function calibrationViews(calibration, residuals) {
     h("div.grid.two.views", views.map((one) => one.root)));
   magnification.setAttribute("aria-label", "Magnification of the residual arrows");
   return { root, close: () => views.forEach((one) => one.view.close()) };
+}
+
+/** By how much arrows are longer at first: a thousand times, less where the longest would leave the picture. */
+function exaggeration(residuals, width) {
+  let longest = 1e-9;
+  for (const view of residuals ?? []) for (const r of view.residual_px?.flat() ?? []) if (there(r)) longest = Math.max(longest, Math.hypot(...r));
+  return Math.min(1000, Math.max(1, LONGEST * width / longest));
 }
 
 const fine = (colour, width = 1) => stroke(colour, width);
