@@ -200,9 +200,9 @@ async def get_stream(
 
     async def parts() -> AsyncIterator[bytes]:
         last: int | None = None
+        due = anyio.current_time()
         with service.streams.counted("live_view"):
             while not service.closing:
-                began = anyio.current_time()
                 try:
                     sequence, data = await anyio.to_thread.run_sync(
                         newer, last, limiter=limiter, abandon_on_cancel=True
@@ -211,14 +211,15 @@ async def get_stream(
                     if error.code == "camera_busy":  # a capture goes on, and nothing older is there to show
                         continue
                     return  # the stream ends; GET /rig says why
-                pause_s = 1.0 / rate_hz
-                if data is None:
-                    pause_s /= 4  # none yet: it is not waited for a whole period, which would halve the rate
-                else:
+                # by a timetable, since pauses are each a little too long; where there is no frame yet, it is not waited
+                # for a whole period, which would halve the rate
+                due += (0.25 if data is None else 1.0) / rate_hz
+                if data is not None:
                     last = sequence
                     head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     yield head.encode() + data + b"\r\n"
-                await anyio.sleep(max(pause_s - (anyio.current_time() - began), 0.0))
+                due = max(due, anyio.current_time())  # what was missed is not made up for
+                await anyio.sleep_until(due)
 
     return StreamingResponse(
         parts(), media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}", headers={"Cache-Control": "no-store"}
