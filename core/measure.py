@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from core.errors import InputError
+from core.field.growing import Image
 from core.field.images import MeasureImage
 from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
 from core.field.region import PointGrid
 from core.field.result import Field
-from core.field.run import Image, Run, Seeds
+from core.field.run import Run, Seeds
 from core.field.settings import MeasureOptions
 from core.field.updating import Earlier, Updating
 from core.progress import CancelToken, Progress

@@ -42,7 +42,7 @@ STAGES = (
     ("read and decode", "server.cli.sequence", "read_image"),
     ("splines", "core.field.images", "prepare"),
     ("fit", "core.field.fitter", "fit_motion"),
-    ("gates", "core.field.run", "apply_gates"),
+    ("gates", "core.field.growing", "apply_gates"),
     ("assemble", "core.field.run", "assemble"),
     ("summary", "server.cli.sequence", "summarise"),
     ("write", "server.cli.sequence", "write_field"),
