@@ -15,6 +15,7 @@ from core.errors import InputError
 from core.field.gates import GateOptions
 from core.field.observed import SigmaLimits, judge
 from core.field.run import Run
+from core.field.starts import depth_per_px
 from core.matching import MatchOptions, fit_motion, fit_shape
 from core.matching.kernels.observed import blocks_across
 from core.matching.observed import observed_covariance
@@ -208,6 +209,23 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
         statuses[limit_px] = field.status[field.x_px > 160 + 21]
     assert (statuses[0.02] == PointStatus.OK).mean() < 0.02
     assert (statuses[1.0] == PointStatus.OK).mean() > 0.4
+
+
+@pytest.mark.parametrize(("said", "kept"), [(1.0, 1.0), (1.5, 1.0), (6.0, 0.0)])
+def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(said, kept):
+    """Residuals show ``said`` times the variance that the fit tells; of noise there is too much for any point."""
+    reference, _ = pictures()
+    run = Run(bench.pair(), *reference, None, None, bench.grid(step_px=6.0), OPTIONS, None, None)
+    run.seed_shape(None)
+    run.finish(True, None)
+    points, count = run.points, int(run.points.ok.sum())
+    sd = np.sqrt(np.diagonal(points.covariance[points.ok], axis1=1, axis2=2)).mean(0)
+    depth_px = max(sd[1], (sd[0] / depth_per_px(run.pair, run.rays, points.w[:, 0])).mean())
+    points.covariance /= said
+    limits = SigmaLimits(motion_px=0.1, depth_px=0.75 * depth_px)
+    judged = judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits)
+    assert judged.factor[0] == pytest.approx(said, rel=0.25)
+    assert points.ok.sum() / count == pytest.approx(kept, abs=0.05)
 
 
 def test_matches_without_any_residual_stay_as_they_are():
