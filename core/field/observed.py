@@ -40,7 +40,7 @@ class SigmaLimits:
     motion_px
         Of the point's place in camera 1 at t.
     depth_px
-        Of what depth is told by, in camera 2 along and across the epipolar line, above its noise.
+        Of what depth is told by, in camera 2 along and across the epipolar line, above what is known to be noise.
     """
 
     motion_px: float
@@ -119,15 +119,14 @@ def judge(
     _scale(points, usual, told / shared)
     refused = 0
     if (told > 1.0).any():
-        refused = _refuse_far(fitter, points, usual, told / shared, xy_px, limits)
+        refused = _refuse_far(fitter, points, usual, xy_px, limits, noise=shared / told)
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
         # a single estimate scatters itself: what the field in general shows is the least
-        grown = np.fmax(own, told) / points.zncc[index].min(axis=1)[:, None] ** 2
-        _scale(points, index, grown)
-        refused += _refuse_far(fitter, points, index, grown, xy_px, limits)
+        _scale(points, index, np.fmax(own, told) / points.zncc[index].min(axis=1)[:, None] ** 2)
+        refused += _refuse_far(fitter, points, index, xy_px, limits, noise=np.zeros_like(own))
     return Judged(factor=factor, one_by_one=len(alone), refused=refused)
 
 
@@ -156,9 +155,9 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -
 
 
 def _refuse_far(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], grown: Float, xy_px: Float, limits: SigmaLimits
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits, *, noise: Float
 ) -> int:
-    motion, depth = _sigma_px(fitter, points, index, grown, xy_px)
+    motion, depth = _sigma_px(fitter, points, index, xy_px, noise)
     far = ~((motion < limits.motion_px) & (depth < limits.depth_px))
     mask = np.zeros(len(points.status), bool)
     mask[index[far]] = True
@@ -167,16 +166,16 @@ def _refuse_far(
 
 
 def _sigma_px(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], grown: Float, xy_px: Float
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, noise: Float
 ) -> tuple[Float, Float]:
     """(m,) standard deviations, px: of the place in camera 1 at t, and the largest of those that depth hangs on.
 
-    Of depth only what ``grown``, the factor (m, q) that variances were given, added to them: weak texture under plain
-    noise, told as it is, is no reason to refuse a point.
+    Of depth without the part (m, q) of its variances that is known to be ``noise``: weak texture under plain noise,
+    told as it is, is no reason to refuse a point. A field's sample knows that part; a point's own residuals do not.
     """
     rays = fitter.pair.cam1.rays_cam(xy_px[index]).xyz_mm
     w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index]))
-    other = sd * np.sqrt(np.maximum(1.0 - 1.0 / grown, 0.0))
+    other = sd * np.sqrt(np.maximum(1.0 - noise, 0.0))
     per_px = depth_per_px(fitter.pair, rays, w)
     depth = np.maximum(other[:, 0] / per_px, other[:, -1])
     if sd.shape[1] == 2:
