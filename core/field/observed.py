@@ -8,7 +8,7 @@ than the field's others, and all points if the sample does not speak with one vo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class SigmaLimits:
     motion_px
         Of the point's place in camera 1 at t.
     depth_px
-        Of what depth is told by, in camera 2 along and across the epipolar line, above what is known to be noise.
+        Of what depth is told by, in camera 2 along and across the epipolar line, of points that are judged one by one.
     """
 
     motion_px: float
@@ -109,7 +109,8 @@ def judge(
         told = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
         if fitter.ref1.blur is not None:  # its noise hangs together over more than a block
             told = np.maximum(told, 1.0)
-        one_voice = (np.quantile(own, 0.9, axis=0) < _ONE_VOICE * np.median(own, axis=0)).all()
+        # what all say to be less than noise, as a shape told by images less noisy than the others, is no reason to doubt
+        one_voice = (np.quantile(own, 0.9, axis=0) < _ONE_VOICE * np.maximum(np.median(own, axis=0), 1.0)).all()
         if not one_voice or (told > _MOSTLY_OTHER).any():
             unusual[:] = True
     else:
@@ -119,14 +120,15 @@ def judge(
     _scale(points, usual, told / shared)
     refused = 0
     if (told > 1.0).any():
-        refused = _refuse_far(fitter, points, usual, xy_px, limits, noise=shared / told)
+        # most of it is noise and the rest is known: depth that scatters for that is told as it is
+        refused = _refuse_far(fitter, points, usual, xy_px, replace(limits, depth_px=np.inf))
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
         # a single estimate scatters itself: what the field in general shows is the least
         _scale(points, index, np.fmax(own, told) / points.zncc[index].min(axis=1)[:, None] ** 2)
-        refused += _refuse_far(fitter, points, index, xy_px, limits, noise=np.zeros_like(own))
+        refused += _refuse_far(fitter, points, index, xy_px, limits)
     return Judged(factor=factor, one_by_one=len(alone), refused=refused)
 
 
@@ -154,10 +156,8 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -
     points.epipolar_sigma_px[index] *= root[:, -1]
 
 
-def _refuse_far(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits, *, noise: Float
-) -> int:
-    motion, depth = _sigma_px(fitter, points, index, xy_px, noise)
+def _refuse_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
+    motion, depth = _sigma_px(fitter, points, index, xy_px)
     far = ~((motion < limits.motion_px) & (depth < limits.depth_px))
     mask = np.zeros(len(points.status), bool)
     mask[index[far]] = True
@@ -165,24 +165,17 @@ def _refuse_far(
     return int(far.sum())
 
 
-def _sigma_px(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, noise: Float
-) -> tuple[Float, Float]:
-    """(m,) standard deviations, px: of the place in camera 1 at t, and the largest of those that depth hangs on.
-
-    Of depth without the part (m, q) of its variances that is known to be ``noise``: weak texture under plain noise,
-    told as it is, is no reason to refuse a point. A field's sample knows that part; a point's own residuals do not.
-    """
+def _sigma_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> tuple[Float, Float]:
+    """(m,) standard deviations, px: of the place in camera 1 at t, and the largest of those that depth hangs on."""
     rays = fitter.pair.cam1.rays_cam(xy_px[index]).xyz_mm
     w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index]))
-    other = sd * np.sqrt(np.maximum(1.0 - noise, 0.0))
     per_px = depth_per_px(fitter.pair, rays, w)
-    depth = np.maximum(other[:, 0] / per_px, other[:, -1])
+    depth = np.maximum(sd[:, 0] / per_px, sd[:, -1])
     if sd.shape[1] == 2:
         return np.zeros(len(index)), depth
     z = points.G[index, 2, 0]  # of the point at t, times w
     px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[:, :2]))))
-    return np.maximum(sd[:, 1], sd[:, 2]) * px / z, np.maximum(depth, other[:, 3] * w / z**2 / per_px)
+    return np.maximum(sd[:, 1], sd[:, 2]) * px / z, np.maximum(depth, sd[:, 3] * w / z**2 / per_px)
 
 
 def _diagonal(covariance: Float) -> Float:
