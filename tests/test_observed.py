@@ -54,7 +54,8 @@ def twins_covariance(twin: Twin, p: np.ndarray) -> np.ndarray:
     W = np.diag(s2) - np.outer(s2, s2) / (1.0 + s2.sum())
     _, N = twin.equations(p, np.eye(len(p)))
     J = [twin.jacobian(k, p, steps) for k in range(count)]
-    left = [d + (1.0 - zncc) * twin.f for d, _, zncc in levels]
+    best = max(zncc for *_, zncc in levels)
+    left = [(d + (1.0 - zncc) * twin.f) * best / zncc for d, _, zncc in levels]
     across = blocks_across(SUBSET)
     number = np.zeros((SUBSET, SUBSET), int)
     for a in range(across):

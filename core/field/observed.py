@@ -116,7 +116,7 @@ def judge(
     else:
         unusual[:] = True
     usual, alone = ok[~unusual], ok[unusual]
-    shared = np.where(told > 1.0, points.quality[usual, None] ** 2, 1.0)
+    shared = np.where(told > 1.0, points.zncc[usual].max(axis=1)[:, None] ** 2, 1.0)
     _scale(points, usual, told / shared)
     refused = 0
     if (told > 1.0).any():
@@ -127,7 +127,7 @@ def judge(
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
         # a single estimate scatters itself: what the field in general shows is the least
-        _scale(points, index, np.fmax(own, told) / points.zncc[index].min(axis=1)[:, None] ** 2)
+        _scale(points, index, np.fmax(own, told) / points.zncc[index].max(axis=1)[:, None] ** 2)
         refused += _refuse_far(fitter, points, index, xy_px, limits)
     return Judged(factor=factor, one_by_one=len(alone), refused=refused)
 

@@ -13,6 +13,7 @@ from core.matching.kernels.naming import inner
 VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
 ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
 UNLIKE = 1.5  # small differences of the views raise residuals by less, and do not pull the solution as noise does
+LEAST_CORRELATION = 0.05  # what is matched at all has several times as much
 MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
 
 # an image's levels; the misfit is the residuals' sum of squares, then the noise of its interpolated grey levels over
@@ -91,18 +92,31 @@ def noise_from_residuals(levels, images, n, unknowns):
 
 
 @inner
+def best_correlation(levels, images):
+    """Of the comparisons, at least ``LEAST_CORRELATION``."""
+    best = LEAST_CORRELATION
+    for k in range(images):
+        best = max(best, levels[k, ZNCC])
+    return best
+
+
+@inner
 def unlike_noise(levels, images, n, unknowns):
     """Variance by which the noisiest image exceeds what the quietest comparison tells of all; zero where all are alike.
 
     The weights take all images' noise for equal. Where one has clearly more (less light, blur, a surface that changed),
     the unknowns that depend on it scatter with the mean of its variance and the reference's, which is what its own
-    comparison tells; so the covariance is that of the noisiest comparison.
+    comparison tells; so the covariance is that of the noisiest comparison. Its contrast is noise for the larger part
+    and its residuals were scaled down by it: by its correlation over the best one's, which tells what the reference's
+    own noise leaves of a correlation.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
+    best = best_correlation(levels, images)
     smallest, largest = np.inf, 0.0
     for k in range(images):
         one = _one_variance(levels, k)
-        smallest, largest = min(smallest, one), max(largest, one)
+        smallest = min(smallest, one)
+        largest = max(largest, one * (best / max(levels[k, ZNCC], LEAST_CORRELATION)) ** 2)
     return max(largest - UNLIKE * smallest, 0.0) / freedom
 
 

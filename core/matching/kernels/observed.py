@@ -18,7 +18,7 @@ import numpy as np
 from core.matching.kernels.linear import solve
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
 from core.matching.kernels.naming import kernel
-from core.matching.kernels.noise import CONTRAST, GAIN, SHIFT, ZNCC, noise_from_residuals, share_correction
+from core.matching.kernels.noise import CONTRAST, GAIN, SHIFT, ZNCC, best_correlation, noise_from_residuals, share_correction
 from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR, epipolar_shift, make_sum_pixels
 from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
 from core.matching.kernels.vectors import LANES
@@ -85,7 +85,7 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
         return blocks, texture
 
     @kernel(f"{degree}_{images}")
-    def sum_blocks(coefficients, subset, order, ref, base, stride, warp, correlation, part, sums, scores):
+    def sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores):
         """One image's residuals times the columns, summed in each block; returns how many even blocks that is worth."""
         across = int(math.sqrt(scores.shape[0]) + 0.5)
         total, squares = 0.0, 0.0
@@ -99,7 +99,7 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
                 squares += texture * texture
                 sum_pixels(coefficients, order, base, stride, warp, part, blocks, sums)
                 for i in range(n_columns):
-                    scores[a * across + b, i] = correlation * sums[3 + i]
+                    scores[a * across + b, i] = sums[3 + i]
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
@@ -147,7 +147,9 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
             base = set_up_warp(
                 lens, M[k], of_reference[2], rows, cols, stride, 1 if order == 3 else 2, warp_space[1], warp
             )
-            worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, correlation, part, sums, scores[k])
+            worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores[k])
+        # the contrast of all is taken for the best one's: what another lacks of its correlation is noise of its own
+        best = best_correlation(levels, images)
         n = unknowns
         if images == 3 and few == 3 and rigid:
             n = N_RIGID
@@ -183,7 +185,7 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
                 for o in range(images):
                     for r in range(n_columns):
                         s += pull[i, o, r] * scores[o, b, r]
-                z[i] = s
+                z[i] = best * s
             for i in range(last):
                 for j in range(last):
                     out[last * i + j] += z[i] * z[j]
