@@ -58,7 +58,7 @@ class GateOptions:
         Scatter of a point's place in camera 1, px, as its residuals show it, beyond which a point whose residuals are
         not noise is refused: five times as much is half a pixel.
     largest_depth_sigma_px
-        The same of what its depth is told by, in camera 2, where it counts several times, of points judged one by one.
+        The same of what its depth is told by, in camera 2: it counts several times in depth.
     """
 
     epipolar_sigmas: float = 5.0

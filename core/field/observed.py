@@ -8,7 +8,7 @@ than the field's others, and all points if the sample does not speak with one vo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class SigmaLimits:
     motion_px
         Of the point's place in camera 1 at t.
     depth_px
-        Of what depth is told by, in camera 2 along and across the epipolar line, of points that are judged one by one.
+        Of what depth is told by, in camera 2 along and across the epipolar line.
     """
 
     motion_px: float
@@ -103,7 +103,7 @@ def judge(
     own = _own_factors(fitter, points, sample, xy_px)
     own = own[np.isfinite(own).all(axis=1)]
     factor = nothing.factor
-    told = np.ones(q)
+    told = np.ones(q)  # the offset's, the last, is no witness: interpolation and images of unlike noise raise it
     if len(own) >= _FEWEST:
         factor = np.median(own, axis=0) / _MEDIAN_OF_MEAN
         told = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
@@ -111,7 +111,7 @@ def judge(
             told = np.maximum(told, 1.0)
         # what all say to be less than noise, as a shape told by images less noisy than the others, is no reason to doubt
         one_voice = (np.quantile(own, 0.9, axis=0) < _ONE_VOICE * np.maximum(np.median(own, axis=0), 1.0)).all()
-        if not one_voice or (told > _MOSTLY_OTHER).any():
+        if not one_voice or (told[:-1] > _MOSTLY_OTHER).any():
             unusual[:] = True
     else:
         unusual[:] = True
@@ -119,9 +119,8 @@ def judge(
     shared = np.where(told > 1.0, points.zncc[usual].max(axis=1)[:, None] ** 2, 1.0)
     _scale(points, usual, told / shared)
     refused = 0
-    if (told > 1.0).any():
-        # most of it is noise and the rest is known: depth that scatters for that is told as it is
-        refused = _refuse_far(fitter, points, usual, xy_px, replace(limits, depth_px=np.inf))
+    if (told[:-1] > 1.0).any():
+        refused = _refuse_far(fitter, points, usual, xy_px, limits)
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
