@@ -109,7 +109,7 @@ def judge(
         told = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
         if fitter.ref1.blur is not None:  # its noise hangs together over more than a block
             told = np.maximum(told, 1.0)
-        # what all say to be less than noise, as a shape told by images less noisy than the others, is no reason to doubt
+        # what all say is less than noise, as of a shape that less noisy images tell, is no reason to doubt
         one_voice = (np.quantile(own, 0.9, axis=0) < _ONE_VOICE * np.maximum(np.median(own, axis=0), 1.0)).all()
         if not one_voice or (told[:-1] > _MOSTLY_OTHER).any():
             unusual[:] = True

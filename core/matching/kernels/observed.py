@@ -18,7 +18,15 @@ import numpy as np
 from core.matching.kernels.linear import solve
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
 from core.matching.kernels.naming import kernel
-from core.matching.kernels.noise import CONTRAST, GAIN, SHIFT, ZNCC, best_correlation, noise_from_residuals, share_correction
+from core.matching.kernels.noise import (
+    CONTRAST,
+    GAIN,
+    SHIFT,
+    ZNCC,
+    best_correlation,
+    noise_from_residuals,
+    share_correction,
+)
 from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR, epipolar_shift, make_sum_pixels
 from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
 from core.matching.kernels.vectors import LANES
