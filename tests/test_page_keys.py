@@ -75,6 +75,7 @@ def test_tab_reaches_everything_and_the_focus_is_seen(page: Watched, plate: str,
 
 def test_the_skip_link_goes_to_the_content_of_the_same_screen(page: Watched) -> None:
     at = page.open("#/jobs")
+    expect(at.locator("#main").locator("a, button, input, select, summary").first).to_be_visible()  # to come to by Tab
     at.keyboard.press("Tab")
     at.keyboard.press("Enter")
     expect(at.locator("#main")).to_be_focused()
