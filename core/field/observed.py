@@ -116,8 +116,7 @@ def judge(
     else:
         unusual[:] = True
     usual, alone = ok[~unusual], ok[unusual]
-    shared = np.where(told > 1.0, points.zncc[usual].max(axis=1)[:, None] ** 2, 1.0)
-    _scale(points, usual, told / shared)
+    _scale(points, usual, told / np.where(told > 1.0, _shared_texture(points, usual), 1.0))
     refused = 0
     if (told[:-1] > 1.0).any():
         refused = _refuse_far(fitter, points, usual, xy_px, limits)
@@ -126,7 +125,7 @@ def judge(
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
         # a single estimate scatters itself: what the field in general shows is the least
-        _scale(points, index, np.fmax(own, told) / points.zncc[index].max(axis=1)[:, None] ** 2)
+        _scale(points, index, np.fmax(own, told) / _shared_texture(points, index))
         refused += _refuse_far(fitter, points, index, xy_px, limits)
     return Judged(factor=factor, one_by_one=len(alone), refused=refused)
 
@@ -147,6 +146,11 @@ def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_
     factors = np.full(told.shape, np.nan)
     np.divide(_diagonal(observed), told, out=factors, where=told > 0.0)
     return factors
+
+
+def _shared_texture(points: PointFits, index: NDArray[np.intp]) -> Float:
+    """(m, 1) share of the squared gradients that counts; what a comparison lacks beside the best, its pulls hold."""
+    return np.asarray(points.zncc[index].max(axis=1)[:, None] ** 2)
 
 
 def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -> None:

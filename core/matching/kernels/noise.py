@@ -106,9 +106,9 @@ def unlike_noise(levels, images, n, unknowns):
 
     The weights take all images' noise for equal. Where one has clearly more (less light, blur, a surface that changed),
     the unknowns that depend on it scatter with the mean of its variance and the reference's, which is what its own
-    comparison tells; so the covariance is that of the noisiest comparison. Its contrast is noise for the larger part
-    and its residuals were scaled down by it: by its correlation over the best one's, which tells what the reference's
-    own noise leaves of a correlation.
+    comparison tells; so the covariance is that of the noisiest comparison. That image's contrast is noise in part, so
+    its residuals, brought to the reference's contrast, are smaller than the noise: by its correlation over the best
+    one, which tells what the reference's own noise leaves of a correlation.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
     best = best_correlation(levels, images)
