@@ -65,33 +65,33 @@ $(PEER_STAMP): pyproject.toml | $(STAMP)
 		|| { echo "pip could not install the peer; its message is above. The bench goes on without it."; rm -rf $(PEER); }
 
 bench: $(STAMP) $(PEER_STAMP)
-	$(BIN)/python -m docs.scripts.bench $(ARGS)
+	$(BIN)/python -m tests.bench.speed.bench $(ARGS)
 
 accuracy: $(STAMP)
-	$(BIN)/python -m docs.scripts.accuracy $(ARGS)
+	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)
 
 load: $(STAMP)
-	$(BIN)/python -m docs.scripts.load --page $(ARGS)
+	$(BIN)/python -m tests.bench.reliability.load --page $(ARGS)
 
 fuzz: $(STAMP)
 	cd tests && PYTHONPATH=.:.. ../$(BIN)/python api_fuzz.py $(ARGS)
 
 openapi: $(STAMP)
-	$(BIN)/python -m docs.scripts.problem_list
-	$(BIN)/python -m docs.scripts.openapi $(ARGS)
+	$(BIN)/python -m tests.bench.documents.problem_list
+	$(BIN)/python -m tests.bench.documents.openapi $(ARGS)
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 torture: $(STAMP)
-	$(BIN)/python -m docs.scripts.torture --write $(ARGS)
+	$(BIN)/python -m tests.bench.reliability.torture --write $(ARGS)
 
 pagespeed: $(STAMP)
-	$(BIN)/python -m docs.scripts.page_speed $(ARGS)
+	$(BIN)/python -m tests.bench.page.speed $(ARGS)
 
 pagepictures: $(STAMP)
-	$(BIN)/python -m docs.scripts.page_pictures $(ARGS)
+	$(BIN)/python -m tests.bench.page.pictures $(ARGS)
 
 clean:
 	rm -rf $(VENV) $(PEER) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from core.cameras.stereo import StereoPair
 from core.errors import InputError
-from core.field.growing import Image
-from core.field.images import MeasureImage
+from core.field.growth.run import Run, Seeds
+from core.field.growth.state import Image
+from core.field.points.images import MeasureImage
+from core.field.points.result import Field
 from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
-from core.field.region import PointGrid
-from core.field.result import Field
-from core.field.run import Run, Seeds
+from core.field.region.region import PointGrid
+from core.field.sequence.reference_steps import Earlier, Updating
 from core.field.settings import MeasureOptions
-from core.field.updating import Earlier, Updating
 from core.progress import CancelToken, Progress
-from core.stereo import StereoPair
 
 __all__ = ["Earlier", "MeasureOptions", "ReferencePair", "Updating", "measure_motion", "measure_shape"]
 
@@ -72,16 +72,23 @@ class ReferencePair:
         shape, grid, options
             The reference's shape, as for :meth:`motion`.
         reference_update
-            ``never``, ``auto`` or ``always``, see :mod:`core.field.updating`.
+            ``never``, ``auto`` or ``always``, see :mod:`core.field.sequence.reference_steps`.
         images_of, field_of
             Images and field of an earlier step, by its number.
         first
             Number of the reference.
         """
         return Updating(
-            self.pair, (self.image1, self.image2), shape, grid, options or MeasureOptions(), mode=reference_update,
-            images_of=images_of, field_of=field_of, first=first,
-        )  # fmt: skip
+            self.pair,
+            (self.image1, self.image2),
+            shape,
+            grid,
+            options or MeasureOptions(),
+            mode=reference_update,
+            images_of=images_of,
+            field_of=field_of,
+            first=first,
+        )
 
 
 def measure_shape(

@@ -102,11 +102,16 @@ class NoiseModel:
         return NoiseModel(
             coefficients=(c[0] * factors[0], c[1] * factors[1], c[2] * factors[2]),
             coefficients_sd=(s[0] * factors[0], s[1] * factors[1], s[2] * factors[2]),
-            range_grey=(low * scale, high * scale), frames=self.frames, levels=tuple(v * scale for v in self.levels),
+            range_grey=(low * scale, high * scale),
+            frames=self.frames,
+            levels=tuple(v * scale for v in self.levels),
             variances=tuple(v * factors[0] for v in self.variances),
             variances_sd=tuple(v * factors[0] for v in self.variances_sd),
-            misfit=self.misfit, drift=self.drift, shift_px=self.shift_px, excess=self.excess,
-        )  # fmt: skip
+            misfit=self.misfit,
+            drift=self.drift,
+            shift_px=self.shift_px,
+            excess=self.excess,
+        )
 
     def times(self, factor: float) -> NoiseModel:
         """Return the model of images whose noise has ``factor`` times this variance at the same grey levels."""
@@ -178,10 +183,18 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
         low = 0.0 if low > 0.0 and c[0] > _CLEAR * (c[0] + c[1] * low) else low
         high = full_scale if high < full_scale < np.inf and c[1] >= 0.0 else high
     return NoiseModel(
-        coefficients=c, coefficients_sd=sd, range_grey=(low, high), frames=len(images),
-        levels=tuple(map(float, levels)), variances=tuple(map(float, variances)), variances_sd=tuple(map(float, sds)),
-        misfit=misfit, drift=drift, shift_px=shift, excess=float(excess),
-    )  # fmt: skip
+        coefficients=c,
+        coefficients_sd=sd,
+        range_grey=(low, high),
+        frames=len(images),
+        levels=tuple(map(float, levels)),
+        variances=tuple(map(float, variances)),
+        variances_sd=tuple(map(float, sds)),
+        misfit=misfit,
+        drift=drift,
+        shift_px=shift,
+        excess=float(excess),
+    )
 
 
 def _not_static(what: str) -> ImageError:

@@ -112,9 +112,11 @@ def _starts(size: int) -> list[int]:
     if size <= _TILE_PX:
         return [0]
     n = size // _TILE_PX
-    return [int(v) for v in np.linspace(0, size - _TILE_PX, n + 1)] if size % _TILE_PX else [
-        k * _TILE_PX for k in range(n)
-    ]  # fmt: skip
+    return (
+        [int(v) for v in np.linspace(0, size - _TILE_PX, n + 1)]
+        if size % _TILE_PX
+        else [k * _TILE_PX for k in range(n)]
+    )
 
 
 def _flattened(values: Float, weight: Float) -> Float:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.cameras.lens import Float
 from core.errors import TargetError
-from core.lens import Float
 
 _LEAST_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
 

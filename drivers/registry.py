@@ -8,12 +8,12 @@ from pathlib import Path
 from types import ModuleType
 
 from core.errors import CameraError, StageError
-from drivers.esp301 import ESP301Stage
-from drivers.frames import CameraOptions, FoundDevice, FrameGrabber
-from drivers.motion import SerialStage
-from drivers.serial_line import FlowControl
-from drivers.smc100 import ConexCCStage, SMC100Stage
-from drivers.stage import AxisOptions
+from drivers.cameras.protocol import CameraOptions, FoundDevice, FrameGrabber
+from drivers.stages.esp301 import ESP301Stage
+from drivers.stages.protocol import AxisOptions
+from drivers.stages.serial_line import FlowControl
+from drivers.stages.serial_stage import SerialStage
+from drivers.stages.smc100 import ConexCCStage, SMC100Stage
 
 STAGE_DRIVERS: dict[str, Callable[..., SerialStage]] = {
     "conex-cc": ConexCCStage,
@@ -22,7 +22,7 @@ STAGE_DRIVERS: dict[str, Callable[..., SerialStage]] = {
 }
 
 #: driver -> module that has ``make(options) -> FrameGrabber`` and ``discover() -> list[FoundDevice]``
-CAMERA_DRIVERS: dict[str, str] = {"aravis": "drivers.aravis", "v4l2": "drivers.v4l2"}
+CAMERA_DRIVERS: dict[str, str] = {"aravis": "drivers.cameras.aravis", "v4l2": "drivers.cameras.v4l2"}
 
 
 def make_camera(driver: str, options: CameraOptions) -> FrameGrabber:

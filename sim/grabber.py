@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from core.errors import CameraError
-from drivers.frames import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
+from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
 
 _NICE = 5
 
@@ -140,7 +140,7 @@ def _line_of(world: Exposer) -> TriggerLine:
 
 
 class SimFrameGrabber:
-    """A simulated camera; see `drivers.frames.FrameGrabber`.
+    """A simulated camera; see `drivers.cameras.protocol.FrameGrabber`.
 
     Parameters
     ----------

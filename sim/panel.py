@@ -92,9 +92,19 @@ class CrackedPanel:
         amplitude = self.buckle_at_mm(load_kn)
         return Surface(
             kind=PANEL,
-            parameters=np.array([
-                self.half_crack_mm, self.stress_mpa(load_kn), self.youngs_modulus_mpa / (1.0 + nu), (3.0 - nu) / (1.0
-                + nu), -self.bow_at_mm(load_kn), *self.bow_length_mm, -amplitude, self.lip_share * amplitude,
-                *self.buckle_reach_mm, c0, peak,
-            ]),
-        )  # fmt: skip
+            parameters=np.array(
+                [
+                    self.half_crack_mm,
+                    self.stress_mpa(load_kn),
+                    self.youngs_modulus_mpa / (1.0 + nu),
+                    (3.0 - nu) / (1.0 + nu),
+                    -self.bow_at_mm(load_kn),
+                    *self.bow_length_mm,
+                    -amplitude,
+                    self.lip_share * amplitude,
+                    *self.buckle_reach_mm,
+                    c0,
+                    peak,
+                ]
+            ),
+        )

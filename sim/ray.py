@@ -1,6 +1,6 @@
 """Rays of image points: Eqs. (8), (7), (5) backwards, written for whole lattices of sample points.
 
-The same mapping as `core.lens`, in compiled form, and checked against it by the tests.
+The same mapping as `core.cameras.lens`, in compiled form, and checked against it by the tests.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _STEPS: Final = 30
 def rays(lens: Float, x0: float, y0: float, step: float, nx: Float, ny: Float) -> None:
     """Write the directions (nx, ny, 1) of the points (x0 + i step, y0 + j step) into (rows, columns); NaN: no ray.
 
-    ``lens`` is the flat form of :meth:`core.lens.LensModel.kernel_parameters`.
+    ``lens`` is the flat form of :meth:`core.cameras.lens.LensModel.kernel_parameters`.
     """
     fx, fy, skew, cx, cy, k1 = lens[1], lens[2], lens[3], lens[4], lens[5], lens[6]
     for j in range(nx.shape[0]):

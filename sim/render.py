@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
-from core.camera import Camera
+from core.cameras.camera import Camera
 from sim.ray import rays
 from sim.scene import Scene
 from sim.texture import GRID

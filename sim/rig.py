@@ -15,16 +15,25 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.camera import Camera, RigidTransform
+from core.cameras.camera import Camera, RigidTransform
 from core.errors import InputError
 from sim.sensor import Lighting, Sensor
 
 CameraName = Literal["cam1", "cam2"]
 CAMERA_NAMES: tuple[CameraName, CameraName] = ("cam1", "cam2")
 _PARAMETERS = (
-    "phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect",
-    "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm",
-)  # fmt: skip
+    "phd_px",
+    "cx_px",
+    "cy_px",
+    "kappa_per_px2",
+    "aspect",
+    "alpha_rad",
+    "beta_rad",
+    "gamma_rad",
+    "x0_mm",
+    "y0_mm",
+    "z0_mm",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from core.camera import RigidTransform
+from core.cameras.camera import RigidTransform
 from sim.surface import Surface
 from sim.texture import Texture
 

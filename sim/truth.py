@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.camera import Camera
+from core.cameras.camera import Camera
 from sim.render import material_points
 from sim.scene import Scene
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.camera import Camera
+from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
 from core.errors import InputError
-from core.stereo import StereoPair
+from sim.catalog import make_scene
 from sim.render import RenderOptions, render
 from sim.rig import CAMERA_NAMES, CameraName, SimCamera, SimRig
 from sim.scene import Scene
-from sim.scenes import make_scene
 from sim.truth import Truth, truth_at
 
 _KEY_MM = 1e-7  # positions closer than this are one: a ten-thousandth of a micrometre
@@ -69,7 +69,7 @@ class SimWorld:
             return self._scene
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> None:
-        """Put another scene, or another state of it, before the cameras; see :func:`sim.scenes.make_scene`."""
+        """Put another scene, or another state of it, before the cameras; see :func:`sim.catalog.make_scene`."""
         scene = make_scene(self._rig, name, load=load, **params)
         with self._state:
             self._scene = scene

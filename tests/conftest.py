@@ -9,32 +9,51 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.support.requirements import ROOT, missing
+
 if TYPE_CHECKING:  # most tests need neither
     import httpx
-    from page_bench import Watched
     from playwright.sync_api import Browser
 
-    from server.service import Service
+    from server.workflows.service import Service
+    from tests.support.page_bench import Watched
 
-ROOT = Path(__file__).resolve().parent.parent
-pytest.register_assert_rewrite("page_bench")  # its assertions say what they found
+pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions say what they found
 
 
 # Real programs on the wire, by the real clock, beside what else the machine does: what fails twice more is broken
-_AGAINST_THE_CLOCK = frozenset({
-    "test_aravis.py", "test_camera_contract.py", "test_cluster.py", "test_connections.py", "test_continue_follow.py",
-    "test_death.py", "test_demo.py", "test_doctor.py", "test_ending.py", "test_event_streams.py",
-    "test_exports_api.py", "test_fake_gige_bench.py", "test_gige_service.py", "test_logs.py",
-    "test_reader.py", "test_rig_pairs.py",
-    "test_names_and_clocks.py",
-    "test_security.py", "test_serial_line.py", "test_service_worker.py", "test_stage_contract.py", "test_stage_http.py",
-    "test_stage_lines.py", "test_stage_stop.py", "test_stage_witnesses.py",
-})  # fmt: skip
+_AGAINST_THE_CLOCK = frozenset(
+    {
+        "test_aravis.py",
+        "test_camera_contract.py",
+        "test_cluster.py",
+        "test_connections.py",
+        "test_continue_follow.py",
+        "test_death.py",
+        "test_demo.py",
+        "test_doctor.py",
+        "test_ending.py",
+        "test_event_streams.py",
+        "test_exports_api.py",
+        "test_fake_gige_bench.py",
+        "test_gige_service.py",
+        "test_logs.py",
+        "test_reader.py",
+        "test_rig_pairs.py",
+        "test_names_and_clocks.py",
+        "test_security.py",
+        "test_serial_line.py",
+        "test_service_worker.py",
+        "test_stage_contract.py",
+        "test_stage_http.py",
+        "test_stage_lines.py",
+        "test_stage_stop.py",
+        "test_stage_witnesses.py",
+    }
+)
 _USES_A_SERVICE = frozenset({"client", "service", "page", "chromium"})
 # Nothing may be lost once: only what took too long is tried again
-_STRICT = frozenset({
-    "test_load.py", "test_real_disks.py", "test_service_kill.py", "test_torture.py", "test_trash.py",
-})  # fmt: skip
+_STRICT = frozenset({"test_load.py", "test_real_disks.py", "test_service_kill.py", "test_torture.py", "test_trash.py"})
 # Minutes each: begun first, so that nobody waits for them at the end
 _LONGEST = ("test_torture.py", "test_fuzz_more.py", "test_fuzz.py", "test_v4l2_in_qemu.py")
 _TOO_LONG = ["Timeout", "ConnectError", "ReadError", "is silent", "did not answer"]
@@ -53,13 +72,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.flaky(reruns=2))
 
 
-def _missing(what: str) -> None:
-    """Fail in CI, where nothing may be missing; elsewhere skip and say what to do."""
-    if os.environ.get("CI", "").lower() == "true":
-        pytest.fail(f"CI needs {what}")
-    pytest.skip(f"{what} not found: put it there to run this test")
-
-
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """The folder `shared` that lies beside the checkout, or the one STEREORIG_SHARED names."""
@@ -69,7 +81,7 @@ def shared_dir() -> Path:
     for folder in candidates:
         if folder.is_dir():
             return folder
-    _missing("the folder ../shared")
+    missing("the folder ../shared")
     raise AssertionError
 
 
@@ -78,16 +90,15 @@ def specimen_dir(shared_dir: Path) -> Path:
     """Real images of the D-shaped tension specimen, with their calibration."""
     folder = shared_dir / "data" / "d_specimen"
     if not (folder / "calibration_dice.xml").is_file():
-        _missing(f"{folder}")
+        missing(f"{folder}")
     return folder
 
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """The service on the tiny rig, with an empty data folder of its own."""
-    from service_rig import tiny_config
-
-    from server.service import Service
+    from server.workflows.service import Service
+    from tests.support.service_rig import tiny_config
 
     made = Service(tiny_config(), tmp_path_factory.mktemp("service") / "data")
     yield made
@@ -97,7 +108,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 @pytest.fixture(scope="module")
 def client(service: Service) -> Iterator[httpx.Client]:
     """A client of that service, its rig connected and homed."""
-    from service_rig import served, wait_for_rig
+    from tests.support.service_rig import served, wait_for_rig
 
     with served(service) as made:
         wait_for_rig(made)
@@ -107,7 +118,7 @@ def client(service: Service) -> Iterator[httpx.Client]:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
     """Debian's Chromium, without a window."""
-    from page_bench import browser
+    from tests.support.page_bench import browser
 
     with browser() as made:
         yield made
@@ -116,7 +127,7 @@ def chromium() -> Iterator[Browser]:
 @pytest.fixture
 def page(chromium: Browser, client: httpx.Client) -> Iterator[Watched]:
     """A page of its own on the service, watched."""
-    from page_bench import watched
+    from tests.support.page_bench import watched
 
     with watched(chromium, str(client.base_url).rstrip("/")) as made:
         yield made

@@ -1,8 +1,8 @@
 """Calibration of the pair from views of the grid: ten parameters a camera, checks, verdict."""
 
-from core.calibration.distance import DistanceCheck, check_known_distance
+from core.calibration.checks.distance import DistanceCheck, check_known_distance
+from core.calibration.checks.measures import CheckMeasures, Measures, measure_points
 from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, TargetLike, inner_nodes_mm
-from core.calibration.measures import CheckMeasures, Measures, measure_points
 from core.calibration.prepare import predict_uncertainty
 from core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
 from core.calibration.solve import calibrate

@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from core.calibration.adjust import covariance_of
+from core.calibration.fit.adjust import covariance_of
+from core.calibration.fit.model import N_CAMERA, camera_at, camera_of, collect
 from core.calibration.inputs import (
     CAMERAS,
     CalibrationOptions,
@@ -18,14 +19,13 @@ from core.calibration.inputs import (
     extent_mm,
     inner_nodes_mm,
 )
-from core.calibration.model import N_CAMERA, camera_at, camera_of, collect
 from core.calibration.prepare import EXPECTED_NOISE_PX
 from core.calibration.result import COVARIANCE_NAMES, TEN_OF_BOTH
 from core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
-from core.camera import TEN_PARAMETER_NAMES
+from core.cameras.camera import TEN_PARAMETER_NAMES
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
-from core.lens import Float
-from core.stereo import StereoPair
 
 LineModel = Literal["straight", "parabola", "local"]
 _PER_LINE = {"straight": 2, "parabola": 3}
@@ -111,9 +111,17 @@ def expect(
     for c, (name, nominal) in enumerate(zip(CAMERAS, nominals, strict=True)):
         cx, cy = nominal.centre_px
         parameters[c, :10] = (
-            nominal.phd_px, cx, cy, 0.0, np.radians(roll_deg), 0.0, np.radians(nominal.angle_deg), 0.0, 0.0,
+            nominal.phd_px,
+            cx,
+            cy,
+            0.0,
+            np.radians(roll_deg),
+            0.0,
+            np.radians(nominal.angle_deg),
+            0.0,
+            0.0,
             nominal.standoff_mm,
-        )  # fmt: skip
+        )
         width, height = nominal.image_size_px
         views, shares = [], []
         for dz in positions_mm:
@@ -135,9 +143,14 @@ def expect(
         observations.append(collect(views))
     estimated = options.estimate_nodes is not False and target.node_tolerance_mm > 0.0
     covariance = covariance_of(
-        parameters, nodes.reshape(-1, 2), observations, nominals, options, noise_px=np.full(2, noise_px),
+        parameters,
+        nodes.reshape(-1, 2),
+        observations,
+        nominals,
+        options,
+        noise_px=np.full(2, noise_px),
         node_sigma_mm=target.node_tolerance_mm / float(np.sqrt(3.0)) if estimated else 0.0,
-    )  # fmt: skip
+    )
     pair = StereoPair(*(camera_of(parameters[c], nominals[c].aspect) for c in range(2)))
     volume = volume_uncertainty(pair, covariance, target)
     points = np.concatenate([np.zeros((1, 3)), _corners(volume.points_mm)])
@@ -163,14 +176,23 @@ def _corners(points_mm: Float) -> Float:
 
 def _reasons(volume: VolumeUncertainty, target: TargetLike, options: CalibrationOptions) -> tuple[str, ...]:
     limits = (
-        (volume.relative_shape, options.max_shape_uncertainty,
-         f"Shape would be uncertain by {1e3 * volume.shape_rms_mm:.3g} um rms; allowed are "
-         f"{1e3 * options.max_shape_uncertainty * extent_mm(target):.3g} um."),
-        (volume.centre_px, options.max_centre_sigma_px,
-         f"An image centre would be uncertain by {volume.centre_px:.3g} px; allowed are "
-         f"{options.max_centre_sigma_px:g} px."),
-        (volume.standoff_relative, options.max_standoff_sigma,
-         f"A standoff would be uncertain by {100 * volume.standoff_relative:.3g} %; allowed are "
-         f"{100 * options.max_standoff_sigma:g} %."),
-    )  # fmt: skip
+        (
+            volume.relative_shape,
+            options.max_shape_uncertainty,
+            f"Shape would be uncertain by {1e3 * volume.shape_rms_mm:.3g} um rms; allowed are "
+            f"{1e3 * options.max_shape_uncertainty * extent_mm(target):.3g} um.",
+        ),
+        (
+            volume.centre_px,
+            options.max_centre_sigma_px,
+            f"An image centre would be uncertain by {volume.centre_px:.3g} px; allowed are "
+            f"{options.max_centre_sigma_px:g} px.",
+        ),
+        (
+            volume.standoff_relative,
+            options.max_standoff_sigma,
+            f"A standoff would be uncertain by {100 * volume.standoff_relative:.3g} %; allowed are "
+            f"{100 * options.max_standoff_sigma:g} %.",
+        ),
+    )
     return tuple(text for value, limit, text in limits if not value <= limit)

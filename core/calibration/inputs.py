@@ -8,8 +8,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from core.cameras.lens import Bool, Float
 from core.errors import CalibrationInputError
-from core.lens import Bool, Float
 
 CameraName = Literal["cam1", "cam2"]
 _SMALLEST_SPREAD_PX = 5.0  # rms over the narrower direction

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.calibration.adjust import Adjustment
+from core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
+from core.calibration.checks.positions import PositionCheck
+from core.calibration.fit.adjust import Adjustment
+from core.calibration.fit.model import camera_at, camera_of, predicted_residual
 from core.calibration.inputs import (
     CalibrationOptions,
     CalibrationView,
@@ -15,16 +18,13 @@ from core.calibration.inputs import (
     inner_nodes_mm,
     is_held_out,
 )
-from core.calibration.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
-from core.calibration.model import camera_at, camera_of, predicted_residual
-from core.calibration.positions import PositionCheck
 from core.calibration.prepare import Views
 from core.calibration.result import TEN_OF_BOTH, CalibrationResult, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 from core.calibration.verdict import checks_made, judge
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
-from core.lens import Float
-from core.stereo import StereoPair
 
 
 def build_result(

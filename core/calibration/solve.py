@@ -6,8 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.calibration.adjust import Adjustment, adjust
-from core.calibration.angles import check_angles
+from core.calibration.checks.angles import check_angles
+from core.calibration.fit.adjust import Adjustment, adjust
+from core.calibration.fit.model import N_CAMERA, camera_of, collect
+from core.calibration.fit.single import fit_single
+from core.calibration.fit.start import start_values
 from core.calibration.inputs import (
     CAMERAS,
     CalibrationOptions,
@@ -16,14 +19,11 @@ from core.calibration.inputs import (
     TargetLike,
     inner_nodes_mm,
 )
-from core.calibration.model import N_CAMERA, camera_of, collect
 from core.calibration.prepare import Views, compare_positions, predict_or_refuse, sort_views, split_hold_out
 from core.calibration.report import build_result
 from core.calibration.result import CalibrationResult
-from core.calibration.single import fit_single
-from core.calibration.start import start_values
+from core.cameras.lens import Float
 from core.errors import CalibrationError
-from core.lens import Float
 
 
 def calibrate(

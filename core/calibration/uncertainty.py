@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.calibration.fit.model import N_CAMERA
 from core.calibration.inputs import TargetLike, extent_mm
-from core.calibration.model import N_CAMERA
-from core.lens import Float
-from core.stereo import StereoPair
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from core.calibration.checks.measures import CheckMeasures
 from core.calibration.inputs import CalibrationOptions
-from core.calibration.measures import CheckMeasures
 from core.calibration.result import CheckDone, Level, Verdict, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty
-from core.lens import Float
+from core.cameras.lens import Float
 
 GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
 #: lenses sit within some per cent of the sensor's centre; a share of the image's diagonal

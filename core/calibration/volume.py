@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.calibration.model import N_CAMERA
+from core.calibration.fit.model import N_CAMERA
 from core.calibration.uncertainty import point_derivatives
-from core.camera import Camera
-from core.lens import Bool, Float
-from core.stereo import StereoPair
+from core.cameras.camera import Camera
+from core.cameras.lens import Bool, Float
+from core.cameras.stereo import StereoPair
 
 _FEWEST_POINTS = 8
 _AT_ONCE = 20_000

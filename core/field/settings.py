@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from core.errors import InputError
-from core.field.gates import GateOptions
-from core.field.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting
+from core.field.checks.gates import GateOptions
+from core.field.points.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting
 from core.field.prefilter import check_prefilter
-from core.field.region import check_subset
+from core.field.region.region import check_subset
 from core.matching.blur import Blur
 from core.matching.options import Interpolation, MatchOptions, Patch
 from core.noise import NoiseModel

@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from core.cameras.lens import Bool, Float
 from core.errors import InputError
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels, steps_px
-from core.field.smoothing import Order, Smoothing, check_smoothing, whole_weights
-from core.field.window import fit_terms, points_seen, ways_cut, window_offsets
-from core.lens import Bool, Float
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels, steps_px
+from core.field.points.smoothing_record import Order, Smoothing, check_smoothing, whole_weights
+from core.field.region.window import fit_terms, points_seen, ways_cut, window_offsets
 
 _AT_ONCE = 1024
 _FIRM = 1e-9
@@ -55,11 +55,15 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     """
     check_smoothing(window, order)
     if field.uvw_mm is None:
-        raise InputError("the field is a shape and has no displacement.", code="smoothing_needs_motion",
-                         remedy="Give the field of a later step.")  # fmt: skip
+        raise InputError(
+            "the field is a shape and has no displacement.",
+            code="smoothing_needs_motion",
+            remedy="Give the field of a later step.",
+        )
     if field.smoothing is not None:
-        raise InputError("the field was smoothed before.", code="smoothed_already",
-                         remedy="Smooth the field as it was measured.")  # fmt: skip
+        raise InputError(
+            "the field was smoothed before.", code="smoothed_already", remedy="Smooth the field as it was measured."
+        )
     half, step, valid = window // 2, steps_px(field), field.valid
     offsets, _ = window_offsets(half)
     apart = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
@@ -93,10 +97,16 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     mm_per_px = _mm_per_px(field, step)
     n_whole = int(whole.sum())
     told = Smoothing(
-        window=window, order=order, step_px=step[0], subset_px=subset_px, resolution_px=resolution_px,
+        window=window,
+        order=order,
+        step_px=step[0],
+        subset_px=subset_px,
+        resolution_px=resolution_px,
         resolution_mm=None if np.isnan(mm_per_px) else resolution_px * mm_per_px,
-        whole=n_whole, reduced=int(valid.sum()) - n_whole - n_raw, raw=n_raw,
-    )  # fmt: skip
+        whole=n_whole,
+        reduced=int(valid.sum()) - n_whole - n_raw,
+        raw=n_raw,
+    )
     return replace(field, uvw_mm=uvw, covariance=covariance, smoothing=told)
 
 

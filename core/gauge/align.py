@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import MeasurementError, RegionError
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels, roots_of
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.gauge.sampling import sample
 
 Float = NDArray[np.float64]
@@ -136,8 +136,11 @@ def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> 
     """
     xy = np.asarray(places_px, dtype=np.float64)
     if xy.shape != (6, 2):
-        raise RegionError(f"3-2-1 takes six places, got an array of shape {xy.shape}.", code="gauge_unusable",
-                          remedy="Give three places on the plane, two on the line, one at the origin.")  # fmt: skip
+        raise RegionError(
+            f"3-2-1 takes six places, got an array of shape {xy.shape}.",
+            code="gauge_unusable",
+            remedy="Give three places on the plane, two on the line, one at the origin.",
+        )
     places = sample(field, xy)
     if not places.found.all():
         k = int(np.argmin(places.found))
@@ -171,8 +174,11 @@ def _three_two_one(x: Float) -> tuple[Float, Float]:
     size = float(np.linalg.norm(normal))
     reach = max(float(np.linalg.norm(x[1] - x[0])), float(np.linalg.norm(x[2] - x[0])))
     if size <= _STRAIGHT * reach**2:
-        raise RegionError("The three places of the plane lie on one line.", code="gauge_unusable",
-                          remedy="Choose three places that span a plane.")  # fmt: skip
+        raise RegionError(
+            "The three places of the plane lie on one line.",
+            code="gauge_unusable",
+            remedy="Choose three places that span a plane.",
+        )
     normal *= (1.0 if normal[2] >= 0.0 else -1.0) / size
     R = _frame(normal, x[4] - x[3])
     along = np.array([R[0] @ x[5], R[1] @ x[3], R[2] @ x[0]])
@@ -183,8 +189,11 @@ def _frame(normal: Float, direction: Float) -> Float:
     x = direction - (direction @ normal) * normal
     size = float(np.linalg.norm(x))
     if not np.isfinite(size) or size <= _STRAIGHT * float(np.linalg.norm(direction)):
-        raise RegionError("The direction of X stands on the plane, or has no length.", code="gauge_unusable",
-                          remedy="Give a direction that runs along the plane.")  # fmt: skip
+        raise RegionError(
+            "The direction of X stands on the plane, or has no length.",
+            code="gauge_unusable",
+            remedy="Give a direction that runs along the plane.",
+        )
     x /= size
     return np.stack([x, np.cross(normal, x), normal])
 

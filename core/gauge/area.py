@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
-from core.field.region import PointGrid
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels, steps_px
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels, steps_px
+from core.field.region.region import PointGrid
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels
 from core.gauge.reading import MISSING, Reading
 from core.gauge.sampling import Samples, sample
 
@@ -65,8 +65,11 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     """
     ends = np.array([a_px, b_px], dtype=np.float64)
     if np.array_equal(ends[0], ends[1]):
-        raise RegionError(f"Both ends of the extensometer lie at ({ends[0, 0]:g}, {ends[0, 1]:g}) px.",
-                          code="gauge_unusable", remedy="Give two different places.")  # fmt: skip
+        raise RegionError(
+            f"Both ends of the extensometer lie at ({ends[0, 0]:g}, {ends[0, 1]:g}) px.",
+            code="gauge_unusable",
+            remedy="Give two different places.",
+        )
     places = sample(field, ends)
     why = [f"end {k}: {text}" for k, text in zip("ab", places.missing, strict=True) if text]
     if why:

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
-from core.field.result import Field
-from core.field.shared_pixels import steps_px
+from core.field.points.result import Field
+from core.field.points.shared_pixels import steps_px
 
 Float = NDArray[np.float64]
 MOST_PLACES = 100_000
@@ -45,7 +45,10 @@ def places_along(field: Field, vertices_px: ArrayLike, count: int | None = None)
         count = min(int(np.floor(reach[-1] / min(steps_px(field)))) + 1, MOST_PLACES)
         count = max(count, 2)
     if not 2 <= count <= MOST_PLACES:
-        raise RegionError(f"A line of {count} places cannot be read.", code="gauge_unusable",
-                          remedy=f"Give 2 to {MOST_PLACES} places.")  # fmt: skip
+        raise RegionError(
+            f"A line of {count} places cannot be read.",
+            code="gauge_unusable",
+            remedy=f"Give 2 to {MOST_PLACES} places.",
+        )
     at = np.linspace(0.0, reach[-1], count)
     return np.column_stack([np.interp(at, reach, v[:, 0]), np.interp(at, reach, v[:, 1])]), at

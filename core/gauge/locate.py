@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
-from core.field.result import Field
-from core.field.shared_pixels import steps_px
+from core.field.points.result import Field
+from core.field.points.shared_pixels import steps_px
 from core.gauge.sampling import sample
 
 Float = NDArray[np.float64]
@@ -36,8 +36,9 @@ def places_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
     """
     wanted = np.atleast_2d(np.asarray(xy_mm, dtype=np.float64))
     if wanted.ndim != 2 or wanted.shape[1] != 2 or not np.isfinite(wanted).all():
-        raise RegionError(f"Places are (n, 2) finite millimetres, got an array of shape {wanted.shape}.",
-                          code="gauge_unusable")  # fmt: skip
+        raise RegionError(
+            f"Places are (n, 2) finite millimetres, got an array of shape {wanted.shape}.", code="gauge_unusable"
+        )
     steps = np.array(steps_px(field))
     xy = field.xyz_mm[..., :2]
     valid = field.valid

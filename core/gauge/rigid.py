@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from core.errors import InputError, MeasurementError
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels, roots_of
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels, roots_of
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -141,11 +141,17 @@ def rigid_motion(
     to_vector = np.eye(6)
     to_vector[:3, :3] = _vector_slope(vector)
     return RigidMotion(
-        rotation=R, rotation_vector_rad=vector, translation_mm=d, centre_mm=centre,
-        covariance=to_vector @ small @ to_vector.T, small_covariance=small, points=int(kept.sum()),
+        rotation=R,
+        rotation_vector_rad=vector,
+        translation_mm=d,
+        centre_mm=centre,
+        covariance=to_vector @ small @ to_vector.T,
+        small_covariance=small,
+        points=int(kept.sum()),
         residual_rms_mm=float(np.sqrt(np.mean(np.sum(r[kept] ** 2, axis=1)))),
-        noise_ratio=float(np.sqrt(np.mean(distance2[kept]) / 3.0)), gain=gain,
-    )  # fmt: skip
+        noise_ratio=float(np.sqrt(np.mean(distance2[kept]) / 3.0)),
+        gain=gain,
+    )
 
 
 def _residuals(arm: Float, moved: Float, cov: Float, R: Float, d: Float) -> tuple[Float, Float]:

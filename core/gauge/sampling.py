@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import RegionError
-from core.field.cuts import crosses
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels, roots_of, steps_px
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
+from core.field.region.cuts import crosses
 from core.status import PointStatus
 
 Float = NDArray[np.float64]
@@ -179,10 +179,15 @@ def _by_cubics(field: Field, xy_px: Float, low: NDArray[np.int64], t: Float) -> 
     rows, cols = field.shape
     at = low[:, None, :] + _ABOUT[:, None]  # (m, 4, 2)
     u = t[:, None, :]
-    each = np.concatenate([
-        u * (-0.5 + u * (1.0 - 0.5 * u)), 1.0 + u * u * (1.5 * u - 2.5), u * (0.5 + u * (2.0 - 1.5 * u)),
-        u * u * (0.5 * u - 0.5),
-    ], axis=1)  # fmt: skip
+    each = np.concatenate(
+        [
+            u * (-0.5 + u * (1.0 - 0.5 * u)),
+            1.0 + u * u * (1.5 * u - 2.5),
+            u * (0.5 + u * (2.0 - 1.5 * u)),
+            u * u * (0.5 * u - 0.5),
+        ],
+        axis=1,
+    )
     weight = (each[:, :, None, 1] * each[:, None, :, 0]).reshape(-1, 16)
     row, col = np.broadcast_arrays(at[:, :, None, 1], at[:, None, :, 0])
     there = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cameras.lens import Bool, Float
 from core.grid.pieces import Pieces
-from core.lens import Bool, Float
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens
 _MOST_ROUNDS = 40

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cameras.lens import Bool, Float
 from core.errors import TargetError
 from core.grid.lattice import Lattice, apply_homography, homography
 from core.grid.piece_table import PieceTable
 from core.grid.profile import IN, OUT
 from core.grid.view import GridOptions
-from core.lens import Bool, Float
 from core.target import GridTarget
 
 Cause = Literal["", "dirt", "glare"]

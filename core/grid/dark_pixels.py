@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from core.cameras.lens import Bool, Float
 from core.grid.piece_table import PieceTable
 from core.grid.profile import in_strip, strip_bounds
-from core.lens import Bool, Float
 
 # of the depth, below the ground: nearer to the ground noise rules, further down the few pixels left beat with the
 # lattice;
@@ -48,9 +48,19 @@ class Parabolas:
 
 @njit(cache=True, nogil=True)
 def _collect(
-    image: NDArray[np.float32], rows: Float, fits: Float, use: Bool, line: Float, steep: Bool, centre: Float,
-    share: float, guard_blurs: float, sign: float, N: Float, g: Float,
-) -> None:  # fmt: skip
+    image: NDArray[np.float32],
+    rows: Float,
+    fits: Float,
+    use: Bool,
+    line: Float,
+    steep: Bool,
+    centre: Float,
+    share: float,
+    guard_blurs: float,
+    sign: float,
+    N: Float,
+    g: Float,
+) -> None:
     for k in range(rows.shape[0]):
         if not use[k]:
             continue
@@ -121,9 +131,19 @@ def dark_pixel_lines(
     n_piece = len(index)
     N, g = np.zeros((n_piece, 5)), np.zeros((n_piece, 3))
     _collect(
-        image, table.rows, fits, good, index.astype(np.float64), steep, centre, share, _BLURS,
-        -1.0 if dark_lines else 1.0, N, g,
-    )  # fmt: skip
+        image,
+        table.rows,
+        fits,
+        good,
+        index.astype(np.float64),
+        steep,
+        centre,
+        share,
+        _BLURS,
+        -1.0 if dark_lines else 1.0,
+        N,
+        g,
+    )
     M = N[:, np.add.outer(np.arange(3), np.arange(3))]  # (n_piece, 3, 3) normal equations of each piece
     seen = N[:, 0] > 0.0
     coefficients, inverse = np.zeros((n_line, 3)), np.zeros((n_line, 3, 3))

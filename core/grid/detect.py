@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cameras.lens import Bool, Float
 from core.errors import TargetError
 from core.grid.checks import blame_glare, check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
@@ -18,7 +19,6 @@ from core.grid.pieces import directions
 from core.grid.profile import OUT, fit_pieces
 from core.grid.threshold import checked_image, coarse_factors, line_picture
 from core.grid.view import GridOptions, GridView, LineModel, Localiser
-from core.lens import Bool, Float
 from core.target import GridTarget
 
 _OUTLIER = 6.0  # standard deviations at which a line point is a blemish
@@ -159,9 +159,16 @@ class _Measured(NamedTuple):
 
 
 def _measure(
-    grey: NDArray[np.float32], nodes_px: Float, target: GridTarget, saturation: float, options: GridOptions, *,
-    model: LineModel, blur_px: float | None, floor_px: float,
-) -> _Measured:  # fmt: skip
+    grey: NDArray[np.float32],
+    nodes_px: Float,
+    target: GridTarget,
+    saturation: float,
+    options: GridOptions,
+    *,
+    model: LineModel,
+    blur_px: float | None,
+    floor_px: float,
+) -> _Measured:
     """Fit the pieces between given intersections, judge them, and fit the lines.
 
     ``floor_px``: a piece that is off by no more than a few times this is no blemish, however little noise there is.

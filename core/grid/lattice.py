@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from core.cameras.lens import Float
 from core.errors import TargetError
 from core.grid.chains import Chain, CoarseLine, link, order
 from core.grid.lines import meet_parabolas
 from core.grid.pieces import Directions, family_pieces
 from core.grid.threshold import LinePicture
-from core.lens import Float
 
 _COARSE = ("centre_px", "direction", "bend")
 _LEAST_CROSSING_RAD = np.radians(40.0)

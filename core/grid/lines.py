@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cameras.lens import Bool, Float
 from core.grid.view import LineModel
-from core.lens import Bool, Float
 
 _BASE_TERMS = 5
 _ALL_TERMS = 10
@@ -250,9 +250,15 @@ def _meet_straight(point: Float, along: Float, counts: tuple[int, int]) -> Float
 
 
 def _straight_covariance(
-    straight: Float, origin: Float, direction: Float, normal: Float, covariance: Float, distortion: _Distortion,
-    nodes_px: Float, counts: tuple[int, int],
-) -> Float:  # fmt: skip
+    straight: Float,
+    origin: Float,
+    direction: Float,
+    normal: Float,
+    covariance: Float,
+    distortion: _Distortion,
+    nodes_px: Float,
+    counts: tuple[int, int],
+) -> Float:
     """Noise of the intersections: the two lines' offsets there, each moved also by the distortion's terms."""
     na, nb = counts
     n_line = na + nb
@@ -340,9 +346,8 @@ def meet_parabolas(
 
 
 def _fit_polygons(
-    points: LinePoints, counts: tuple[int, int], fit: LineFit, distortion: _Distortion, normal: Float,
-    used: Bool,
-) -> LineFit:  # fmt: skip
+    points: LinePoints, counts: tuple[int, int], fit: LineFit, distortion: _Distortion, normal: Float, used: Bool
+) -> LineFit:
     """Move the straight model's intersections across each line by a polygon through its own points' residuals."""
     na, nb = counts
     index = _line_index(points, counts)

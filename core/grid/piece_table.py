@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cameras.lens import Float
 from core.grid.lines import LinePoints
 from core.grid.profile import IN, INPUTS, OUT
-from core.lens import Float
 from core.target import GridTarget
 
 _FIRST_BLUR_PX = 0.7
@@ -88,9 +88,13 @@ def _family(nodes: Float, family: int) -> tuple[Float, Float, NDArray[np.intp], 
     spacing = np.abs(np.sum(gap * normal, axis=-1))
     rows = np.zeros((n_line, n_cross - 1, len(INPUTS)))
     for names, value in (
-        (("x", "y"), middle), (("dir_x", "dir_y"), direction), (("start_x", "start_y"), start),
-        (("end_x", "end_y"), end), (("start_nx", "start_ny"), cross[:, :-1]), (("end_nx", "end_ny"), cross[:, 1:]),
-    ):  # fmt: skip
+        (("x", "y"), middle),
+        (("dir_x", "dir_y"), direction),
+        (("start_x", "start_y"), start),
+        (("end_x", "end_y"), end),
+        (("start_nx", "start_ny"), cross[:, :-1]),
+        (("end_nx", "end_ny"), cross[:, 1:]),
+    ):
         for k, name in enumerate(names):
             rows[..., IN[name]] = value[..., k]
     rows[..., IN["half_length"]] = 0.5 * length

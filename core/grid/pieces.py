@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
+from core.cameras.lens import Float
 from core.grid.threshold import LinePicture
-from core.lens import Float
 
 _COHERENCE = 0.5
 _FAMILY_REACH_DEG = 22.0

@@ -23,18 +23,48 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.lens import Float
+from core.cameras.lens import Float
 
 # columns of the table of pieces
 INPUTS = (
-    "x", "y", "dir_x", "dir_y", "half_length", "bend",
-    "start_x", "start_y", "start_nx", "start_ny", "end_x", "end_y", "end_nx", "end_ny",
-    "width", "blur", "search", "room",
-)  # fmt: skip
+    "x",
+    "y",
+    "dir_x",
+    "dir_y",
+    "half_length",
+    "bend",
+    "start_x",
+    "start_y",
+    "start_nx",
+    "start_ny",
+    "end_x",
+    "end_y",
+    "end_nx",
+    "end_ny",
+    "width",
+    "blur",
+    "search",
+    "room",
+)
 OUTPUTS = (
-    "c0", "c1", "var_c0", "cov_c01", "var_c1", "amplitude", "var_amplitude", "ground", "ground_t", "ground_d", "blur",
-    "width", "rms", "n_pixels", "brightest", "ok", "peak",
-)  # fmt: skip
+    "c0",
+    "c1",
+    "var_c0",
+    "cov_c01",
+    "var_c1",
+    "amplitude",
+    "var_amplitude",
+    "ground",
+    "ground_t",
+    "ground_d",
+    "blur",
+    "width",
+    "rms",
+    "n_pixels",
+    "brightest",
+    "ok",
+    "peak",
+)
 IN = {name: k for k, name in enumerate(INPUTS)}
 OUT = {name: k for k, name in enumerate(OUTPUTS)}
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cameras.lens import Bool, Float
 from core.errors import ImageError
-from core.lens import Bool, Float
 from core.target import GridTarget
 
 _LEAST_SIDE_PX = 64

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from core.lens import Bool, Float
+from core.cameras.lens import Bool, Float
 from core.target import GridTarget
 
 Localiser = Literal["profile", "paper"]

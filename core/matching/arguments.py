@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.camera import Camera
+from core.cameras.camera import Camera
+from core.cameras.lens import Float
 from core.errors import InputError
-from core.lens import Float
 from core.matching.image import PAD, ImageData
 from core.matching.options import SPLINE_ORDER, MatchOptions
 
@@ -86,10 +86,16 @@ def setting_of(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...
         variances = variances if known else [assumed_variance(images[0])] * len(images)
         known = True
     return (
-        options.subset_px, SPLINE_ORDER[options.interpolation], options.max_iterations, options.tolerance_px,
-        max_sigma_px, options.max_step_px, (images[0].slope_noise, images[0].slope_share),
-        tuple(variances) if known else (1.0,) * len(images), known,
-    )  # fmt: skip
+        options.subset_px,
+        SPLINE_ORDER[options.interpolation],
+        options.max_iterations,
+        options.tolerance_px,
+        max_sigma_px,
+        options.max_step_px,
+        (images[0].slope_noise, images[0].slope_share),
+        tuple(variances) if known else (1.0,) * len(images),
+        known,
+    )
 
 
 def assumed_variance(blurred: ImageData) -> float:

@@ -9,8 +9,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
 from core.errors import ImageError, InputError
-from core.lens import Float
 from core.matching.arguments import (
     FEWEST_AT_ONCE,
     POINTS_AT_ONCE,
@@ -34,7 +35,6 @@ from core.matching.kernels.motion import n_motion_out
 from core.matching.kernels.shape import n_shape_out
 from core.matching.options import MatchOptions
 from core.status import PointStatus
-from core.stereo import StereoPair
 from core.threads import run_ranges
 
 Status = NDArray[np.int8]
@@ -164,9 +164,17 @@ def fit_shape(
     pose = pair.cam2_from_cam1
     setting = setting_of(options, images)
     fixed = (
-        reference_of(images[0]), visible_of(visible, n, options.subset_px), flat(images[1]), lens_of(pair.cam1),
-        lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), xy, w, setting,
-    )  # fmt: skip
+        reference_of(images[0]),
+        visible_of(visible, n, options.subset_px),
+        flat(images[1]),
+        lens_of(pair.cam1),
+        lens_of(pair.cam2),
+        own(pose.rotation),
+        own(pose.translation_mm),
+        xy,
+        w,
+        setting,
+    )
     kernel, space = shape_points[degree], one_a_thread(shape_space[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
     failed = status != 0
@@ -174,10 +182,16 @@ def fit_shape(
     out[failed, terms + 3 :] = np.nan
     covariance = out[:, [terms + 3, terms + 4, terms + 4, terms + 5]].reshape(n, 2, 2)
     fit = ShapeFit(
-        w=out[:, :terms], epipolar_px=out[:, terms], epipolar_sigma_px=np.sqrt(out[:, terms + 5]),
-        zncc=out[:, terms + 1 : terms + 2], noise=out[:, terms + 2], covariance=covariance, iterations=iterations,
-        status=status, variance=out[:, terms + 2] ** 2,
-    )  # fmt: skip
+        w=out[:, :terms],
+        epipolar_px=out[:, terms],
+        epipolar_sigma_px=np.sqrt(out[:, terms + 5]),
+        zncc=out[:, terms + 1 : terms + 2],
+        noise=out[:, terms + 2],
+        covariance=covariance,
+        iterations=iterations,
+        status=status,
+        variance=out[:, terms + 2] ** 2,
+    )
     if images[0].blur is None:
         return fit
 
@@ -249,10 +263,20 @@ def fit_motion(
     pose = pair.cam2_from_cam1
     setting = (*setting_of(options, images), options.patch == "rigid")
     fixed = (
-        reference_of(images[0]), visible_of(visible, n, options.subset_px), flat(images[1]), flat(images[2]),
-        flat(images[3]), lens_of(pair.cam1), lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), xy, w, G,
+        reference_of(images[0]),
+        visible_of(visible, n, options.subset_px),
+        flat(images[1]),
+        flat(images[2]),
+        flat(images[3]),
+        lens_of(pair.cam1),
+        lens_of(pair.cam2),
+        own(pose.rotation),
+        own(pose.translation_mm),
+        xy,
+        w,
+        G,
         setting,
-    )  # fmt: skip
+    )
     kernel, space = motion_points[degree], one_a_thread(motion_space[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
     failed, at = status != 0, 4 * terms
@@ -260,10 +284,17 @@ def fit_motion(
     out[failed, at + 5 : at + 30] = np.nan
     covariance = out[:, at + 5 : at + 30].reshape(n, 5, 5)
     fit = MotionFit(
-        w=out[:, :terms], G=out[:, terms:at].reshape(n, 3, terms), epipolar_px=out[:, at],
-        epipolar_sigma_px=np.sqrt(covariance[:, 4, 4]), zncc=out[:, at + 1 : at + 4], noise=out[:, at + 4],
-        covariance=covariance, iterations=iterations, status=status, variance=out[:, at + 30],
-    )  # fmt: skip
+        w=out[:, :terms],
+        G=out[:, terms:at].reshape(n, 3, terms),
+        epipolar_px=out[:, at],
+        epipolar_sigma_px=np.sqrt(covariance[:, 4, 4]),
+        zncc=out[:, at + 1 : at + 4],
+        noise=out[:, at + 4],
+        covariance=covariance,
+        iterations=iterations,
+        status=status,
+        variance=out[:, at + 30],
+    )
     if images[0].blur is None:
         return fit
 
@@ -276,8 +307,9 @@ def fit_motion(
 
 def _check_blur(images: list[ImageData]) -> None:
     if any(image.blur != images[0].blur for image in images):
-        raise InputError("the images were not blurred alike.", code="blur_mismatch",
-                         remedy="Prepare all images with the same blur.")  # fmt: skip
+        raise InputError(
+            "the images were not blurred alike.", code="blur_mismatch", remedy="Prepare all images with the same blur."
+        )
 
 
 def _with_blurred_noise(
@@ -305,5 +337,6 @@ def _with_blurred_noise(
     unseen = (fit.status == PointStatus.OK) & ~np.isfinite(told.variance)
     status, noise = np.where(unseen, told.status, fit.status), np.sqrt(blur.gain) * told.noise
     covariance = fit.covariance * factor[:, None, None]
-    return replace(fit, status=status, noise=noise, covariance=covariance,
-                   epipolar_sigma_px=np.sqrt(covariance[:, -1, -1]))  # fmt: skip
+    return replace(
+        fit, status=status, noise=noise, covariance=covariance, epipolar_sigma_px=np.sqrt(covariance[:, -1, -1])
+    )

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.lens import Float
-from core.stereo import StereoPair
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.cameras.lens import Bool, Float
+from core.cameras.stereo import StereoPair
 from core.errors import InputError
-from core.lens import Bool, Float
 from core.matching.arguments import (
     FEWEST_AT_ONCE,
     POINTS_AT_ONCE,
@@ -27,7 +28,6 @@ from core.matching.arguments import (
 from core.matching.image import ImageData, prepare
 from core.matching.kernels.drivers import observe_motion, observe_shape, observed_motion_space, observed_shape_space
 from core.matching.options import MatchOptions
-from core.stereo import StereoPair
 from core.threads import run_ranges
 
 
@@ -89,10 +89,20 @@ def observed_covariance(
     seen = [flat(image) for image in prepared[1:]]
     pose = pair.cam2_from_cam1
     fixed = (
-        reference_of(prepared[0]), visible_of(visible, n, options.subset_px), *(seen if motion else 3 * seen),
-        lens_of(pair.cam1), lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), xy, unknown_w, unknown_g,
-        offsets, setting_of(options, prepared), options.patch == "rigid",
-    )  # fmt: skip
+        reference_of(prepared[0]),
+        visible_of(visible, n, options.subset_px),
+        *(seen if motion else 3 * seen),
+        lens_of(pair.cam1),
+        lens_of(pair.cam2),
+        own(pose.rotation),
+        own(pose.translation_mm),
+        xy,
+        unknown_w,
+        unknown_g,
+        offsets,
+        setting_of(options, prepared),
+        options.patch == "rigid",
+    )
     kernels, spaces = (observe_motion, observed_motion_space) if motion else (observe_shape, observed_shape_space)
     kernel, space = kernels[degree], one_a_thread(spaces[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), out, status), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)

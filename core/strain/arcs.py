@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from core.field.window import fit_terms, window_offsets
-from core.lens import Bool, Float
+from core.cameras.lens import Bool, Float
+from core.field.region.window import fit_terms, window_offsets
 
 _FIRM = 1e-6
 _FACTORS = np.array([1.0 / 6.0, 0.5, 0.5, 1.0 / 6.0])  # of s^3, s^2 t, s t^2, t^3 in a Taylor series
@@ -82,10 +82,15 @@ def missed_slope(slope: Float, second: Float, moments: Float) -> Float:
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     ss, st, tt = np.moveaxis(np.einsum("na,nab->nb", normal, second), -1, 0)
     # the third derivatives along x_s and x_t: (n, 4, 2)
-    along = -np.stack([
-        np.stack([ss * ss, ss * st], -1), np.stack([ss * st, st * st], -1),
-        np.stack([st * st, tt * st], -1), np.stack([tt * st, tt * tt], -1),
-    ], axis=1)  # fmt: skip
+    along = -np.stack(
+        [
+            np.stack([ss * ss, ss * st], -1),
+            np.stack([ss * st, st * st], -1),
+            np.stack([st * st, tt * st], -1),
+            np.stack([tt * st, tt * tt], -1),
+        ],
+        axis=1,
+    )
     metric = np.swapaxes(slope, -1, -2) @ slope
     third = np.linalg.solve(metric[:, None], along[..., None])[..., 0] @ np.swapaxes(slope, -1, -2)  # (n, 4, 3)
     return np.swapaxes(moments @ third, -1, -2)

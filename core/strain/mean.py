@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels, roots_of
-from core.field.window import window_offsets
-from core.lens import Bool, Float
+from core.cameras.lens import Bool, Float
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels, roots_of
+from core.field.region.window import window_offsets
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
 from core.strain.surface import surface_slopes

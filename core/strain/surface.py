@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from core.cameras.lens import Bool, Float
 from core.errors import InputError
-from core.field.result import Field
-from core.field.shared_pixels import SharedPixels
-from core.lens import Bool, Float
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels
 from core.matching.geometry import tangent_frames
 from core.strain.arcs import missed_slope
 from core.strain.options import StrainOptions

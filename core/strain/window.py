@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from core.field.cuts import Cuts
-from core.field.shared_pixels import SharedPixels
-from core.field.window import fit_terms, points_seen, steps_of, ways_cut, window_offsets
-from core.lens import Bool, Float
+from core.cameras.lens import Bool, Float
+from core.field.points.shared_pixels import SharedPixels
+from core.field.region.cuts import Cuts
+from core.field.region.window import fit_terms, points_seen, steps_of, ways_cut, window_offsets
 from core.strain.arcs import reduced_moments, second_weights, third_moments, whole_second_derivatives
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
@@ -53,12 +53,7 @@ class Slopes:
 
 
 def window_slopes(
-    values: Float,
-    valid: Bool,
-    xy_px: Float,
-    cuts: Cuts | None,
-    options: StrainOptions,
-    shared: SharedPixels,
+    values: Float, valid: Bool, xy_px: Float, cuts: Cuts | None, options: StrainOptions, shared: SharedPixels
 ) -> Slopes:
     """Fit the window about each valid point.
 

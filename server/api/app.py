@@ -10,42 +10,24 @@ from anyio import CapacityLimiter
 from fastapi import FastAPI
 from starlette.types import Lifespan
 
-from server.access import KeyFile
-from server.api import (
-    analyses,
-    calibration_exports,
-    calibrations,
-    devices,
-    doc_pages,
-    exports,
-    facts,
-    gauges,
-    jobs,
-    judging,
-    looks,
-    noise,
-    openapi,
-    page,
-    picking,
-    problem_pages,
-    problems,
-    report,
-    results,
-    rig,
-    session,
-    stage,
-    system,
-    tests,
-    watch,
-)
-from server.api.audit import AuditLog, Recorder
-from server.api.auth import AccessRules, Door, Sessions
-from server.api.delivery import Delivery
-from server.api.guard import LOOPBACK_NAMES, Guard
-from server.api.trash import router as trash_router
-from server.retention import Retention
-from server.service import Service
-from server.watching import Watches
+from server.api.docs import front, openapi, problem_pages
+from server.api.docs import pages as doc_pages
+from server.api.protocol import problems
+from server.api.protocol.audit import AuditLog, Recorder
+from server.api.protocol.auth import AccessRules, Door, Sessions
+from server.api.protocol.delivery import Delivery
+from server.api.protocol.guard import LOOPBACK_NAMES, Guard
+from server.api.routes.analyses import analyses, exports, gauges, looks, picking, report, results
+from server.api.routes.calibrations import calibrations, noise, review
+from server.api.routes.calibrations import exports as calibration_exports
+from server.api.routes.rig import cameras, devices, stage
+from server.api.routes.service import jobs, session, system
+from server.api.routes.tests import facts, tests, watch
+from server.api.routes.tests.trash import router as trash_router
+from server.http.access import KeyFile
+from server.workflows.retention import Retention
+from server.workflows.service import Service
+from server.workflows.watch import Watches
 
 PREFIX = "/api/v1"
 _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
@@ -105,7 +87,7 @@ def create_app(
     app.add_api_route("/metrics", system.metrics, include_in_schema=False)
     app.include_router(doc_pages.router)
     app.include_router(problem_pages.router)
-    page.install(app)
+    front.install(app)
     # the last that is added is the first that a request meets
     app.add_middleware(Delivery)
     app.add_middleware(Door, rules=rules, sessions=sessions)
@@ -130,13 +112,13 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
     for module in (
         system,
         session,
-        rig,
+        cameras,
         devices,
         stage,
         noise,
         calibrations,
         calibration_exports,
-        judging,
+        review,
         tests,
         facts,
         watch,

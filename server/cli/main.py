@@ -10,28 +10,31 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from core.errors import Cancelled, StereorigError
-from server.version import software_version
+from server.formats.version import software_version
 
 # name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
 # and is imported only when it is asked for, so that `--help` and errors in one do not wait for the others
 COMMANDS: dict[str, tuple[str, str]] = {
-    "serve": ("server.cli.serve", "start the service"),
-    "keys": ("server.cli.keys", "make, list and remove keys for the service"),
-    "demo": ("server.cli.demo", "run one of the paper's experiments on the simulated rig, over HTTP"),
-    "devices": ("server.cli.devices", "list cameras and serial ports, and what is wrong with them"),
-    "doctor": ("server.cli.doctor", "check the whole bench: cameras, stage, disk, machine"),
-    "rigfile": ("server.cli.rigfile", "check rig files; print every key with its meaning"),
-    "simstage": ("server.cli.simstage", "run a simulated motion controller on a socket or pty"),
-    "calibrate": ("server.cli.calibrate", "calibrate a pair of cameras from grid images"),
-    "noise": ("server.cli.noise", "measure the cameras' noise from repeated frames"),
-    "measure": ("server.cli.measure", "measure shape and displacement from image files"),
-    "report": ("server.cli.report", "write a report of results: one HTML file that a lab can file"),
-    "verify": ("server.cli.verify", "look through a data folder: damage, leftovers, checksums"),
-    "repair": ("server.cli.repair", "put a data folder in order after a crash"),
-    "trash": ("server.cli.trash", "what was deleted: list, restore, remove for good"),
-    "gauge": ("server.cli.gauge", "read extensometers, lines and areas off measured results"),
-    "calibration": ("server.cli.calibration", "calibration files to and from other programs; epipolar checks"),
-    "export": ("server.cli.export", "results as NetCDF, CSV, VTU, MATLAB, HDF5, figures and films"),
+    "serve": ("server.cli.operation.serve", "start the service"),
+    "keys": ("server.cli.operation.keys", "make, list and remove keys for the service"),
+    "demo": ("server.cli.operation.demo", "run one of the paper's experiments on the simulated rig, over HTTP"),
+    "devices": ("server.cli.operation.devices", "list cameras and serial ports, and what is wrong with them"),
+    "doctor": ("server.cli.operation.doctor", "check the whole bench: cameras, stage, disk, machine"),
+    "rigfile": ("server.cli.operation.rigfile", "check rig files; print every key with its meaning"),
+    "simstage": ("server.cli.operation.simstage", "run a simulated motion controller on a socket or pty"),
+    "calibrate": ("server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
+    "noise": ("server.cli.measurement.noise", "measure the cameras' noise from repeated frames"),
+    "measure": ("server.cli.measurement.measure", "measure shape and displacement from image files"),
+    "report": ("server.cli.measurement.report", "write a report of results: one HTML file that a lab can file"),
+    "verify": ("server.cli.operation.verify", "look through a data folder: damage, leftovers, checksums"),
+    "repair": ("server.cli.operation.repair", "put a data folder in order after a crash"),
+    "trash": ("server.cli.operation.trash", "what was deleted: list, restore, remove for good"),
+    "gauge": ("server.cli.measurement.gauge", "read extensometers, lines and areas off measured results"),
+    "calibration": (
+        "server.cli.measurement.calibration_files",
+        "calibration files to and from other programs; epipolar checks",
+    ),
+    "export": ("server.cli.measurement.export", "results as NetCDF, CSV, VTU, MATLAB, HDF5, figures and films"),
 }
 
 _NEGATIVE_LIST = re.compile(r"-[\d.]+(e[-+]?\d+)?,")

@@ -29,11 +29,21 @@ def describe(session: Session, document: dict[str, Any]) -> CalibrationReport:
     for name in ("fitted", "held_out"):
         measures = checks.get(name)
         if measures is not None:
-            rows.append([name.replace("_", " "), f"{measures['rbe_px']:.4f}", f"{1e3 * measures['raz_mm']:.3f}",
-                         f"{measures['nsce']:.4f}"])  # fmt: skip
+            rows.append(
+                [
+                    name.replace("_", " "),
+                    f"{measures['rbe_px']:.4f}",
+                    f"{1e3 * measures['raz_mm']:.3f}",
+                    f"{measures['nsce']:.4f}",
+                ]
+            )
     verdict = document["verdict"]
-    report.lines = ["", *table(["calibration", "RBE px", "RAZ um", "NSCE"], rows),
-                    f"verdict: {verdict['level']}", *(f"  {reason}" for reason in verdict["reasons"])]  # fmt: skip
+    report.lines = [
+        "",
+        *table(["calibration", "RBE px", "RAZ um", "NSCE"], rows),
+        f"verdict: {verdict['level']}",
+        *(f"  {reason}" for reason in verdict["reasons"]),
+    ]
     held_out = checks.get("held_out")
     if held_out is not None:
         rbe = float(held_out["rbe_px"])
@@ -48,6 +58,9 @@ def _view(view: dict[str, Any]) -> dict[str, Any]:
     residual = np.asarray(view["residual_px"], dtype=np.float64).reshape(-1, 2)
     use = np.isfinite(xy).all(axis=1) & np.isfinite(residual).all(axis=1)
     return {
-        "title": f"{view['camera']}, dZ {float(view['dz_mm']):+.3f} mm", "held_out": bool(view["held_out"]),
-        "rbe_px": float(np.mean(np.linalg.norm(residual[use], axis=1))), "xy_px": xy[use], "residual_px": residual[use],
-    }  # fmt: skip
+        "title": f"{view['camera']}, dZ {float(view['dz_mm']):+.3f} mm",
+        "held_out": bool(view["held_out"]),
+        "rbe_px": float(np.mean(np.linalg.norm(residual[use], axis=1))),
+        "xy_px": xy[use],
+        "residual_px": residual[use],
+    }

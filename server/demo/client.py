@@ -73,8 +73,11 @@ class ServiceClient:
         try:
             response = self._http.request(method, path, **options)
         except httpx.TransportError as error:
-            raise StateError(f"{method} {path} got no answer ({type(error).__name__}).", code="service_lost",
-                             remedy="Look at the service's log.") from error  # fmt: skip
+            raise StateError(
+                f"{method} {path} got no answer ({type(error).__name__}).",
+                code="service_lost",
+                remedy="Look at the service's log.",
+            ) from error
         if response.is_success:
             return response
         try:
@@ -158,9 +161,11 @@ class ServiceClient:
             progress = job.get("progress") or {}
             if self._on_progress is not None:
                 self._on_progress(
-                    str(progress.get("stage", job["state"])), int(progress.get("done") or 0),
-                    int(progress.get("total") or 0), progress.get("eta_s"),
-                )  # fmt: skip
+                    str(progress.get("stage", job["state"])),
+                    int(progress.get("done") or 0),
+                    int(progress.get("total") or 0),
+                    progress.get("eta_s"),
+                )
             if job["state"] in _ENDED:
                 break
             time.sleep(_POLL_S)

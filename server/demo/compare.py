@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.result import Field
-from core.stereo import StereoPair
+from core.cameras.stereo import StereoPair
+from core.field.points.result import Field
 from server.demo.session import pixels_of
+from sim.catalog import make_scene
 from sim.rig import SimRig
-from sim.scenes import make_scene
 from sim.truth import Truth, truth_at
 
 Float = NDArray[np.float64]

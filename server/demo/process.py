@@ -37,14 +37,32 @@ def running_service(config: Path, data: Path, log: Path) -> Iterator[str]:
         ``service_not_started``, with the last line of its log.
     """
     port = free_port()
-    command = [sys.executable, "-m", "server.cli", "serve", "--config", str(config), "--data", str(data),
-               "--host", "127.0.0.1", "--port", str(port)]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "server.cli",
+        "serve",
+        "--config",
+        str(config),
+        "--data",
+        str(data),
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(port),
+    ]
     root = Path(__file__).resolve().parents[2]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))}
     with log.open("ab") as log_file:
         # a session of its own: Ctrl-C reaches this process only, which then stops the service in order
-        process = subprocess.Popen(command, stdout=log_file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-                                   env=environment, start_new_session=True)  # fmt: skip
+        process = subprocess.Popen(
+            command,
+            stdout=log_file,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            start_new_session=True,
+        )
     try:
         url = f"http://127.0.0.1:{port}"
         _await_health(process, url, log)
@@ -68,8 +86,11 @@ def _await_health(process: subprocess.Popen[bytes], url: str, log: Path) -> None
         if process.poll() is not None
         else f"did not answer in {_START_S:.0f} s"
     )
-    raise StateError(f"The service {how}: {lines[-1] if lines else 'its log is empty'}", code="service_not_started",
-                     remedy=f"Read {log}.")  # fmt: skip
+    raise StateError(
+        f"The service {how}: {lines[-1] if lines else 'its log is empty'}",
+        code="service_not_started",
+        remedy=f"Read {log}.",
+    )
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:

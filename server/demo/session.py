@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.result import Field
+from core.field.points.result import Field
 from server.demo.client import AnalysisHandle, ServiceClient
-from server.io.files import make_folder, write_bytes
-from server.io.netcdf_reading import read_field
+from server.formats.files import make_folder, write_bytes
+from server.formats.results.reading import read_field
 from sim.rig import SimRig
 
 
@@ -118,7 +118,7 @@ class Session:
 
     def reference_image(self, test_id: str, step: int = 0) -> NDArray[Any]:
         """Fetch camera 1's image of a step."""
-        from server.io.images import decode_image
+        from server.formats.images import decode_image
 
         data = self.client.call("GET", f"/tests/{test_id}/steps/{step}/cam1", params={"format": "tiff"}).content
         return decode_image(data, name=f"step {step} of {test_id}")

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.errors import FileFormatError
-from core.field.result import Field
+from core.field.points.result import Field
 from core.strain import StrainField, surface_strain
 from server.demo.session import Session
-from server.io.strain_netcdf import read_strain
+from server.formats.results.strain import read_strain
 from sim.truth import Truth
 
 Float = NDArray[np.float64]

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from core.errors import CameraError
-from server.config import CameraName, RigConfig
+from server.config.rig_file import CameraName, RigConfig
 from server.doctor.report import Notebook, State, percentile
-from server.quality import image_quality
+from server.results.quality import image_quality
 from server.rig.cameras import CAMERAS, CameraPair, CameraUnit, PairShot
 from server.rig.pairs import common_clock
 
@@ -70,12 +70,21 @@ def check_identity(book: Notebook, pair: CameraPair) -> None:
         who = units[cam].description
         columns, rows = who.image_size_px
         text = f"{who.model} {who.serial} ({who.driver}"
-        book.note(cam, "identity", "ok", f"{text}{', firmware ' + who.firmware if who.firmware else ''}), sensor "
-                  f"{columns} x {rows} px")  # fmt: skip
+        book.note(
+            cam,
+            "identity",
+            "ok",
+            f"{text}{', firmware ' + who.firmware if who.firmware else ''}), sensor {columns} x {rows} px",
+        )
     one, two = (units[cam].description for cam in CAMERAS)
     if one.serial and (one.driver, one.model, one.serial) == (two.driver, two.model, two.serial):
-        book.note("pairs", "identity", "failed", f"cam1 and cam2 are the same camera ({one.model} {one.serial})",
-                  remedy="Name two different devices in the rig file.")  # fmt: skip
+        book.note(
+            "pairs",
+            "identity",
+            "failed",
+            f"cam1 and cam2 are the same camera ({one.model} {one.serial})",
+            remedy="Name two different devices in the rig file.",
+        )
 
 
 def check_settings(book: Notebook, unit: CameraUnit) -> None:
@@ -93,8 +102,13 @@ def check_settings(book: Notebook, unit: CameraUnit) -> None:
             f"{name} {got}" if _agrees(value, got) else f"{name} {got} instead of {value}"
         )
     text = ", ".join([*other, *same]) or "none asked for"
-    book.note(unit.name, "settings", "failed" if other else "ok", f"read back: {text}",
-              remedy="The camera has other values than the rig file: put values there that it can take.")  # fmt: skip
+    book.note(
+        unit.name,
+        "settings",
+        "failed" if other else "ok",
+        f"read back: {text}",
+        remedy="The camera has other values than the rig file: put values there that it can take.",
+    )
 
 
 def _agrees(asked: Any, got: Any) -> bool:
@@ -162,23 +176,33 @@ def check_frames(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
     lost = counts["dropped"] + counts["incomplete"]
     odd = {name: counts[name] for name in ("dropped", "incomplete", "duplicates", "out_of_order") if counts[name]}
     book.note(
-        cam, "losses", _judged(lost, announced) if lost or not odd else "warning",
+        cam,
+        "losses",
+        _judged(lost, announced) if lost or not odd else "warning",
         f"{announced} frames, " + (", ".join(f"{n} {name}" for name, n in odd.items()) or "none lost or damaged"),
         limit=f"1 frame or {100 * _LOSS_SHARE:g} %",
         remedy="Check cable, packet size, socket buffers and the load of link and processors (docs/hardware.md).",
-        frames=announced, dropped=counts["dropped"], incomplete=counts["incomplete"], duplicates=counts["duplicates"],
-    )  # fmt: skip
+        frames=announced,
+        dropped=counts["dropped"],
+        incomplete=counts["incomplete"],
+        duplicates=counts["duplicates"],
+    )
     if seen.last is None:
         return
     pixels = seen.last.pixels[cam]
     quality = image_quality(pixels, seen.last.bit_depth[cam])
     book.note(
-        cam, "image", "ok" if quality.code == "ok" else "warning",
+        cam,
+        "image",
+        "ok" if quality.code == "ok" else "warning",
         f"{quality.code}: mean {quality.mean_grey:.0f} of {2 ** seen.last.bit_depth[cam] - 1}, "
         f"{100 * quality.saturated_share:.2f} % saturated, texture {quality.texture_grey_per_px:.1f} a px",
-        remedy=_QUALITY.get(quality.code), mean_grey=quality.mean_grey, saturated_share=quality.saturated_share,
-        texture_grey_per_px=quality.texture_grey_per_px, focus=quality.focus,
-    )  # fmt: skip
+        remedy=_QUALITY.get(quality.code),
+        mean_grey=quality.mean_grey,
+        saturated_share=quality.saturated_share,
+        texture_grey_per_px=quality.texture_grey_per_px,
+        focus=quality.focus,
+    )
 
 
 def _check_rate(book: Notebook, unit: CameraUnit, announced: int, seconds: float) -> None:
@@ -191,11 +215,15 @@ def _check_rate(book: Notebook, unit: CameraUnit, announced: int, seconds: float
     room = max(_RATE_SHARE * wanted, 1.5 / seconds)
     off = abs(rate - wanted)
     book.note(
-        unit.name, "frame rate", "ok" if off <= room else "warning" if off <= 5 * room else "failed",
-        f"{rate:.2f} Hz", limit=f"{wanted:g} Hz +- {room:.2g}",
+        unit.name,
+        "frame rate",
+        "ok" if off <= room else "warning" if off <= 5 * room else "failed",
+        f"{rate:.2f} Hz",
+        limit=f"{wanted:g} Hz +- {room:.2g}",
         remedy="The camera does not reach its rate: expose for a shorter time, take a smaller region, or ask for less.",
-        rate_hz=rate, wanted_hz=wanted,
-    )  # fmt: skip
+        rate_hz=rate,
+        wanted_hz=wanted,
+    )
 
 
 def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig) -> None:
@@ -206,35 +234,51 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
         # pairs between the captures are refused too, where frames come by themselves
         refused = max(sum(skew > limit for skew in seen.skews_ms), seen.account["refused"])
         book.note(
-            "pairs", "skew", _judged(refused, max(len(seen.skews_ms), seen.account["paired"])),
+            "pairs",
+            "skew",
+            _judged(refused, max(len(seen.skews_ms), seen.account["paired"])),
             f"median {statistics.median(seen.skews_ms):.3f} ms, worst {worst:.3f} ms over {len(seen.skews_ms)} pairs, "
             + ("by the cameras' common clock" if common_clock(pair.units) else "by this machine's clock")
             + (f"; {refused} refused" if refused else ""),
             limit=f"{limit:g} ms but for 1 or {100 * _LOSS_SHARE:g} %",
             remedy="Use a common hardware trigger (docs/hardware.md), or raise max_skew_ms for a specimen at rest.",
-            median_ms=statistics.median(seen.skews_ms), worst_ms=worst, limit_ms=limit, refused=refused,
-        )  # fmt: skip
+            median_ms=statistics.median(seen.skews_ms),
+            worst_ms=worst,
+            limit_ms=limit,
+            refused=refused,
+        )
     count = seen.account
     parts = ("paired", "unpaired", "incomplete", "dropped")
     adds_up = count["triggered"] == sum(count[name] for name in parts)
     lost = count["triggered"] - count["paired"]
     text = f"triggered {count['triggered']} = " + " + ".join(f"{count[name]} {name}" for name in parts)
     book.note(
-        "pairs", "account", _judged(lost, count["triggered"]) if adds_up else "failed",
+        "pairs",
+        "account",
+        _judged(lost, count["triggered"]) if adds_up else "failed",
         text if adds_up else f"does not add up: {text}",
         limit=f"1 or {100 * _LOSS_SHARE:g} % without a partner",
         remedy="Look at the losses above; check that one trigger reaches both cameras.",
         figures={name: float(count[name]) for name in ("triggered", *parts)},
-    )  # fmt: skip
+    )
     if seen.durations_ms:
         p99 = percentile(seen.durations_ms, 0.99)
         book.note(
-            "pairs", "latency", "ok",
+            "pairs",
+            "latency",
+            "ok",
             f"median {statistics.median(seen.durations_ms):.1f} ms, p99 {p99:.1f} ms from the request to both images",
-            median_ms=statistics.median(seen.durations_ms), p99_ms=p99,
-        )  # fmt: skip
-        book.note("pairs", "rate", "ok", f"{seen.pairs_per_s:.2f} pairs/s, {_mib_per_s(seen):.1f} MiB/s",
-                  pairs_per_s=seen.pairs_per_s, mib_per_s=_mib_per_s(seen))  # fmt: skip
+            median_ms=statistics.median(seen.durations_ms),
+            p99_ms=p99,
+        )
+        book.note(
+            "pairs",
+            "rate",
+            "ok",
+            f"{seen.pairs_per_s:.2f} pairs/s, {_mib_per_s(seen):.1f} MiB/s",
+            pairs_per_s=seen.pairs_per_s,
+            mib_per_s=_mib_per_s(seen),
+        )
 
 
 def _judged(bad: int, of: int) -> State:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from core.errors import StorageError
 from server.doctor.report import Notebook, percentile
-from server.io.files import storage_error, write_bytes
+from server.formats.files import storage_error, write_bytes
 
 _SECONDS = 1.5
 _MOST_FILES = 64
@@ -42,13 +42,18 @@ def check_disk(book: Notebook, root: Path, *, image_bytes: int, pairs_per_s: flo
         wanted = None if pairs_per_s is None else 2 * image_bytes * pairs_per_s / _MIB
         slow = wanted is not None and rate < wanted
         book.note(
-            "disk", "writing", "warning" if slow else "ok",
+            "disk",
+            "writing",
+            "warning" if slow else "ok",
             f"{rate:.1f} MiB/s with fsync in {folder}; {1e3 * percentile(times, 0.5):.1f} ms an image, "
             f"p99 {1e3 * slowest:.1f} ms ({len(times)} of {image_bytes / _MIB:.2f} MiB)",
             limit=None if wanted is None else f"{wanted:.1f} MiB/s to keep every pair",
             remedy="The disk cannot keep every pair at the cameras' rate: use a faster one, or capture more seldom.",
-            mib_per_s=rate, median_ms=1e3 * percentile(times, 0.5), p99_ms=1e3 * slowest, wanted_mib_per_s=wanted,
-        )  # fmt: skip
+            mib_per_s=rate,
+            median_ms=1e3 * percentile(times, 0.5),
+            p99_ms=1e3 * slowest,
+            wanted_mib_per_s=wanted,
+        )
     _check_room(book, folder, image_bytes)
 
 
@@ -59,8 +64,13 @@ def _check_lock(book: Notebook, root: Path) -> None:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 holder = file.read().strip() or "another process"
-                book.note("disk", "data folder", "warning", f"{root} is in use by {holder}",
-                          remedy="A running service holds the devices too: stop it for a full check.")  # fmt: skip
+                book.note(
+                    "disk",
+                    "data folder",
+                    "warning",
+                    f"{root} is in use by {holder}",
+                    remedy="A running service holds the devices too: stop it for a full check.",
+                )
                 return
     except FileNotFoundError:
         book.note("disk", "data folder", "ok", f"{root} is free" if root.is_dir() else f"{root} will be made")
@@ -94,7 +104,12 @@ def _check_room(book: Notebook, folder: Path, image_bytes: int) -> None:
         return
     pairs = free // (2 * image_bytes)
     book.note(
-        "disk", "room", "failed" if pairs < _TOO_FEW_PAIRS else "warning" if pairs < _FEW_PAIRS else "ok",
-        f"{free / 2**30:.1f} GiB free, room for {pairs} pairs", limit=f"{_FEW_PAIRS} pairs",
-        remedy="Free space on this disk, or give another folder with --data.", free_gib=free / 2**30, pairs=pairs,
-    )  # fmt: skip
+        "disk",
+        "room",
+        "failed" if pairs < _TOO_FEW_PAIRS else "warning" if pairs < _FEW_PAIRS else "ok",
+        f"{free / 2**30:.1f} GiB free, room for {pairs} pairs",
+        limit=f"{_FEW_PAIRS} pairs",
+        remedy="Free space on this disk, or give another folder with --data.",
+        free_gib=free / 2**30,
+        pairs=pairs,
+    )

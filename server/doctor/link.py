@@ -11,9 +11,20 @@ from server.rig.unit import CAMERAS, Cam, CameraUnit
 
 #: counts of the drivers that grow only when something goes wrong on the way
 _TROUBLES = (
-    "failed_buffers", "underruns", "timeouts", "aborted_buffers", "missing_frames", "size_mismatches",
-    "missing_packets", "error_packets", "resent_packets", "errors", "short", "not_requeued", "odd_stamps",
-)  # fmt: skip
+    "failed_buffers",
+    "underruns",
+    "timeouts",
+    "aborted_buffers",
+    "missing_frames",
+    "size_mismatches",
+    "missing_packets",
+    "error_packets",
+    "resent_packets",
+    "errors",
+    "short",
+    "not_requeued",
+    "odd_stamps",
+)
 #: a link has no room for resends and other traffic above this share
 _LOAD = 0.8
 #: many small packets wear a processor out above this rate
@@ -33,10 +44,13 @@ def check_link(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
         book.note(unit.name, "link", "not checked", "the driver counts nothing")
         return
     book.note(
-        unit.name, "link", "warning" if bad else "ok", text,
+        unit.name,
+        "link",
+        "warning" if bad else "ok",
+        text,
         remedy="Check cable, packet size, socket buffers and the link's load (docs/hardware.md).",
         figures=dict(counts),
-    )  # fmt: skip
+    )
 
 
 def check_network(
@@ -54,8 +68,13 @@ def check_network(
         if units[cam].description.extra.get("protocol") == "GigE Vision" and address:
             name = interface_of(address, proc)
             if name is None:
-                book.note("network", f"way to {cam}", "warning", f"no interface leads to {address}",
-                          remedy="Give the interface an address in the camera's network.")  # fmt: skip
+                book.note(
+                    "network",
+                    f"way to {cam}",
+                    "warning",
+                    f"no interface leads to {address}",
+                    remedy="Give the interface an address in the camera's network.",
+                )
             else:
                 on.setdefault(name, []).append(cam)
     for name, cams in on.items():
@@ -88,15 +107,20 @@ def _check_interface(
     crowded = load is not None and load > _LOAD
     small = mtu is not None and mtu < _JUMBO and mib_per_s > _SMALL_PACKETS_MIB_PER_S
     book.note(
-        "network", name, "warning" if crowded or small else "ok",
+        "network",
+        name,
+        "warning" if crowded or small else "ok",
         f"{' and '.join(cams)}: {mib_per_s:.1f} MiB/s"
         + (f", {100 * load:.0f} % of {speed:.0f} Mbit/s" if load is not None else ", speed of the link unknown")
         + f"; packets of {' and '.join(sizes)} bytes, MTU {'unknown' if mtu is None else f'{mtu:.0f}'}",
         limit=None if load is None else f"{100 * _LOAD:.0f} %",
-        remedy="Give each camera a link of its own, or lower rate, region or bit depth." if crowded
+        remedy="Give each camera a link of its own, or lower rate, region or bit depth."
+        if crowded
         else f"Switch jumbo frames on: ip link set {name} mtu 9000 (cameras and switch must know them too).",
-        mib_per_s=mib_per_s, load=load, mtu=mtu,
-    )  # fmt: skip
+        mib_per_s=mib_per_s,
+        load=load,
+        mtu=mtu,
+    )
 
 
 def _check_buffers(book: Notebook, seen: Watch, proc: Path) -> None:
@@ -106,12 +130,14 @@ def _check_buffers(book: Notebook, seen: Watch, proc: Path) -> None:
         book.note("network", "socket buffers", "not checked", "the system does not tell their size")
         return
     book.note(
-        "network", "socket buffers", "ok" if room >= frame else "warning",
+        "network",
+        "socket buffers",
+        "ok" if room >= frame else "warning",
         f"up to {room / 2**20:.2f} MiB (net.core.rmem_max), an image has {frame / 2**20:.2f} MiB",
         limit="an image",
         remedy="sysctl -w net.core.rmem_max=33554432, so that a short delay of this program loses no packet.",
         rmem_max=room,
-    )  # fmt: skip
+    )
 
 
 def _read(path: Path) -> str:

@@ -7,18 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.errors import StereorigError
-from drivers.serial_ports import port_problem
-from server.config import RigConfig, load_config
-from server.devices import DeviceFinder, DeviceListing, is_called
+from drivers.stages.serial_ports import port_problem
+from server.config.rig_file import RigConfig, load_config
 from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch
 from server.doctor.disk import check_disk
 from server.doctor.link import check_link, check_network
 from server.doctor.machine import ClockWatch, check_machine, check_software
 from server.doctor.report import Check, Notebook, Report
 from server.doctor.stage import check_stage
+from server.formats.version import software_version
 from server.rig.build import Devices, check_config, first_settings, make_unit, open_configured_stage, open_devices
 from server.rig.cameras import CAMERAS
-from server.version import software_version
+from server.rig.devices import DeviceFinder, DeviceListing, is_called
 
 
 def examine(
@@ -65,9 +65,14 @@ def examine(
     clock.check(book)
     good, verdict = book.verdict()
     return Report(
-        version=software_version(), rig=None if config is None else config.rig.name, config=str(path), seconds=seconds,
-        checks=book.checks, good=good, verdict=verdict,
-    )  # fmt: skip
+        version=software_version(),
+        rig=None if config is None else config.rig.name,
+        config=str(path),
+        seconds=seconds,
+        checks=book.checks,
+        good=good,
+        verdict=verdict,
+    )
 
 
 def _read(book: Notebook, path: Path) -> RigConfig | None:
@@ -90,8 +95,13 @@ def _check_drivers(book: Notebook, config: RigConfig) -> None:
     listing = DeviceFinder(wanted).find()
     for driver in listing.drivers:
         if driver.name in wanted:
-            book.note("software", f"driver {driver.name}", "ok" if driver.state == "ok" else "failed",
-                      driver.problem or f"sees {driver.found} cameras", remedy=driver.remedy)  # fmt: skip
+            book.note(
+                "software",
+                f"driver {driver.name}",
+                "ok" if driver.state == "ok" else "failed",
+                driver.problem or f"sees {driver.found} cameras",
+                remedy=driver.remedy,
+            )
     looked = {driver.name for driver in listing.drivers if driver.state == "ok"}
     for cam in CAMERAS:
         if config.camera(cam).driver in looked:
@@ -102,8 +112,13 @@ def _check_port(book: Notebook, url: str) -> None:
     """See what keeps a serial port of this machine from being used."""
     if url.startswith("/"):
         problem = port_problem(url)
-        book.note("stage", "port", "failed" if problem else "ok", problem or f"{url} is there, free and ours to use",
-                  remedy="'stereorig devices' lists the serial ports of this machine.")  # fmt: skip
+        book.note(
+            "stage",
+            "port",
+            "failed" if problem else "ok",
+            problem or f"{url} is there, free and ours to use",
+            remedy="'stereorig devices' lists the serial ports of this machine.",
+        )
 
 
 def _check_found(book: Notebook, cam: str, config: RigConfig, listing: DeviceListing) -> None:
@@ -114,8 +129,13 @@ def _check_found(book: Notebook, cam: str, config: RigConfig, listing: DeviceLis
             book.note(cam, "found", "failed" if found.problem else "ok", found.problem or f"{named}: {found.model}")
             return
     others = ", ".join(camera.device for camera in listing.cameras) or "none"
-    book.note(cam, "found", "warning", f"{named or 'no device'} does not show itself; the driver sees: {others}",
-              remedy="Check power and cable, and the name in the rig file; see 'stereorig devices'.")  # fmt: skip
+    book.note(
+        cam,
+        "found",
+        "warning",
+        f"{named or 'no device'} does not show itself; the driver sees: {others}",
+        remedy="Check power and cable, and the name in the rig file; see 'stereorig devices'.",
+    )
 
 
 def _check_devices(
@@ -150,8 +170,13 @@ def _check_apart(
     bad = [check for check in book.checks if check.state == "failed" and check.name == "opening"]
     if any("camera_busy" in check.found for check in bad):
         # over a network a controller takes several programs at once, and the other one may be about to move it
-        book.note("stage", "opening", "not checked", "another program uses the cameras, and perhaps the stage",
-                  remedy="End that program, then run the doctor again.")  # fmt: skip
+        book.note(
+            "stage",
+            "opening",
+            "not checked",
+            "another program uses the cameras, and perhaps the stage",
+            remedy="End that program, then run the doctor again.",
+        )
     elif config.stage.url == "sim":
         book.note("stage", "opening", "not checked", "a simulated stage runs with the whole rig only")
     else:
@@ -161,8 +186,13 @@ def _check_apart(
                 check_stage(book, stage, config, move=move, home=home)
     if not any(check.state == "failed" and check.name == "opening" for check in book.checks):
         book.fail("devices", "opening", error)  # each is well alone
-    book.note("pairs", "frames", "not checked", "not all devices could be opened",
-              remedy="Put right what failed, then run the doctor again.")  # fmt: skip
+    book.note(
+        "pairs",
+        "frames",
+        "not checked",
+        "not all devices could be opened",
+        remedy="Put right what failed, then run the doctor again.",
+    )
 
 
 def _check_cameras(book: Notebook, devices: Devices, config: RigConfig, seconds: float) -> None:

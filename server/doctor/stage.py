@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-from drivers.stage import AxisState, Stage
-from server.config import RigConfig
+from drivers.stages.protocol import AxisState, Stage
+from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile
 from server.rig.cameras import CAMERAS
 
@@ -30,10 +30,12 @@ def check_stage(book: Notebook, stage: Stage, config: RigConfig, *, move: bool, 
         # read before anything is asked of it: what stands there is older than this run
         messages = stage.errors()
         book.note(
-            "stage", "errors", "warning" if messages else "ok",
+            "stage",
+            "errors",
+            "warning" if messages else "ok",
             "; ".join(f"{m.text} ({m.code})" for m in messages) or "none waiting in the controller",
             remedy="The controller kept these from earlier; they are cleared now. Run the doctor again.",
-        )  # fmt: skip
+        )
     if home:
         _home(book, stage)
     for axis in stage.axes:
@@ -45,8 +47,13 @@ def check_stage(book: Notebook, stage: Stage, config: RigConfig, *, move: bool, 
             with book.guard("stage", f"axis {axis} move"):
                 _move(book, stage, config, axis)
         else:
-            book.note("stage", f"axis {axis} move", "not checked", "nothing moves on a real rig unless it is allowed",
-                      remedy="Give --move for a move of 0.1 mm and back, and --home to search home first.")  # fmt: skip
+            book.note(
+                "stage",
+                f"axis {axis} move",
+                "not checked",
+                "nothing moves on a real rig unless it is allowed",
+                remedy="Give --move for a move of 0.1 mm and back, and --home to search home first.",
+            )
 
 
 def _home(book: Notebook, stage: Stage) -> None:
@@ -56,8 +63,14 @@ def _home(book: Notebook, stage: Stage) -> None:
             stage.enable(axis)
             position = stage.home(axis)
             seconds = time.monotonic() - start
-            book.note("stage", f"axis {axis} homing", "ok", f"home found in {seconds:.1f} s, at {position:.4f} mm",
-                      seconds=seconds, position_mm=position)  # fmt: skip
+            book.note(
+                "stage",
+                f"axis {axis} homing",
+                "ok",
+                f"home found in {seconds:.1f} s, at {position:.4f} mm",
+                seconds=seconds,
+                position_mm=position,
+            )
 
 
 def _check_axis(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> None:
@@ -74,20 +87,26 @@ def _check_axis(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> N
         if status.state in (AxisState.READY, AxisState.FAULT):
             state = "ok" if status.state is AxisState.READY else "failed"
         book.note(
-            "stage", f"{name} state", state,
-            f"{status.state.value}, at {status.position_mm:.4f} mm {status.detail}".rstrip(), limit="ready",
+            "stage",
+            f"{name} state",
+            state,
+            f"{status.state.value}, at {status.position_mm:.4f} mm {status.detail}".rstrip(),
+            limit="ready",
             remedy=remedies.get(status.state, "Put right what the controller names, then run the doctor again."),
             position_mm=status.position_mm,
-        )  # fmt: skip
+        )
         outside = _outside(config, axis, limits.low_mm, limits.high_mm)
         book.note(
-            "stage", f"{name} limits", "failed" if outside else "ok",
+            "stage",
+            f"{name} limits",
+            "failed" if outside else "ok",
             f"{limits.low_mm:g} to {limits.high_mm:g} mm (controller {limits.controller_low_mm:g} to "
             f"{limits.controller_high_mm:g} mm)" + (f"; {outside}" if outside else ""),
             limit="the calibration's positions",
             remedy="Correct soft_limits_mm, zero_mm or the [calibration] plan in the rig file.",
-            low_mm=limits.low_mm, high_mm=limits.high_mm,
-        )  # fmt: skip
+            low_mm=limits.low_mm,
+            high_mm=limits.high_mm,
+        )
 
 
 def _outside(config: RigConfig, axis: int, low_mm: float, high_mm: float) -> str:
@@ -116,20 +135,28 @@ def _check_answers(book: Notebook, stage: Stage) -> None:
             times.append(1e3 * (time.perf_counter() - start))
         p99 = percentile(times, 0.99)
         book.note(
-            "stage", "answers", "ok" if p99 <= _SLOW_ANSWER_MS else "warning",
+            "stage",
+            "answers",
+            "ok" if p99 <= _SLOW_ANSWER_MS else "warning",
             f"median {percentile(times, 0.5):.2f} ms, p99 {p99:.2f} ms ({len(times)} positions read)",
             limit=f"p99 {_SLOW_ANSWER_MS:g} ms",
             remedy="Check baud rate and adapter (an FTDI's latency_timer set to 1 ms), and what lies between.",
-            median_ms=percentile(times, 0.5), p99_ms=p99,
-        )  # fmt: skip
+            median_ms=percentile(times, 0.5),
+            p99_ms=p99,
+        )
 
 
 def _check_stop(book: Notebook, stage: Stage) -> None:
     """Time stops on axes that rest: a stop and the next answer. The answer can only follow the stop on the wire."""
     with book.guard("stage", "stop"):
         if any(stage.state(axis).moving for axis in stage.axes):
-            book.note("stage", "stop", "not checked", "an axis is moving",
-                      remedy="Let the motion end, then run the doctor again.")  # fmt: skip
+            book.note(
+                "stage",
+                "stop",
+                "not checked",
+                "an axis is moving",
+                remedy="Let the motion end, then run the doctor again.",
+            )
             return
         written, answered = [], []
         end = time.perf_counter() + _LONGEST_S
@@ -143,24 +170,38 @@ def _check_stop(book: Notebook, stage: Stage) -> None:
             answered.append(1e3 * (time.perf_counter() - start))
         worst = percentile(answered, 0.99)
         book.note(
-            "stage", "stop", "ok" if worst <= _STOP_MS else "warning",
+            "stage",
+            "stop",
+            "ok" if worst <= _STOP_MS else "warning",
             f"handed to the line in {percentile(written, 0.99):.2f} ms, at the controller within {worst:.2f} ms "
             f"(p99 of {len(written)}; the answer after it)",
-            limit=f"{_STOP_MS:g} ms", remedy="Check baud rate and adapter; connect it without a network between.",
-            written_p99_ms=percentile(written, 0.99), answered_p99_ms=worst,
-        )  # fmt: skip
+            limit=f"{_STOP_MS:g} ms",
+            remedy="Check baud rate and adapter; connect it without a network between.",
+            written_p99_ms=percentile(written, 0.99),
+            answered_p99_ms=worst,
+        )
         messages = stage.errors()
         if messages:
-            book.note("stage", "stop errors", "warning", "; ".join(f"{m.text} ({m.code})" for m in messages),
-                      remedy="The controller refuses to be stopped in this state; home it first.")  # fmt: skip
+            book.note(
+                "stage",
+                "stop errors",
+                "warning",
+                "; ".join(f"{m.text} ({m.code})" for m in messages),
+                remedy="The controller refuses to be stopped in this state; home it first.",
+            )
 
 
 def _move(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> None:
     name = f"axis {axis} move"
     status, limits = stage.state(axis), stage.limits(axis)
     if status.state is not AxisState.READY:
-        book.note("stage", name, "not checked", f"the axis is {status.state.value}",
-                  remedy="Give --home to search home first.")  # fmt: skip
+        book.note(
+            "stage",
+            name,
+            "not checked",
+            f"the axis is {status.state.value}",
+            remedy="Give --home to search home first.",
+        )
         return
     here = status.position_mm
     step = _STEP_MM if here < 0.5 * (limits.low_mm + limits.high_mm) else -_STEP_MM
@@ -171,8 +212,12 @@ def _move(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> None:
     seconds = time.monotonic() - start
     tolerance = config.stage.of_axis(axis).tolerance_mm
     book.note(
-        "stage", name, "ok" if worst <= tolerance else "failed",
+        "stage",
+        name,
+        "ok" if worst <= tolerance else "failed",
         f"{step:+g} mm and back in {seconds:.1f} s, read back within {1e3 * worst:.2f} um",
-        limit=f"{1e3 * tolerance:g} um", remedy="Check the stage's load, backlash and tuning.",
-        error_um=1e3 * worst, seconds=seconds,
-    )  # fmt: skip
+        limit=f"{1e3 * tolerance:g} um",
+        remedy="Check the stage's load, backlash and tuning.",
+        error_um=1e3 * worst,
+        seconds=seconds,
+    )

@@ -14,9 +14,9 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from server.errors import QueueFullError
+from server.base.errors import QueueFullError
 from server.exports.request import ExportRequest
-from server.worker import ComputeWorker, TaskFuture
+from server.worker.executor import ComputeWorker, TaskFuture
 
 FOLDER = ".exports"
 _MOST_WAITING = 4

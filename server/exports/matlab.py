@@ -12,14 +12,34 @@ import numpy as np
 import scipy.io
 
 from core.errors import InputError
-from server.exports.steps import Source, StepResult, provenance
-from server.io.files import written_aside
+from server.formats.files import written_aside
+from server.results.steps import Source, StepResult, provenance
 
 _LONGEST = 63  # namelengthmax
-_KEYWORDS = frozenset({
-    "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function", "global", "if",
-    "otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while",
-})  # fmt: skip
+_KEYWORDS = frozenset(
+    {
+        "break",
+        "case",
+        "catch",
+        "classdef",
+        "continue",
+        "else",
+        "elseif",
+        "end",
+        "for",
+        "function",
+        "global",
+        "if",
+        "otherwise",
+        "parfor",
+        "persistent",
+        "return",
+        "spmd",
+        "switch",
+        "try",
+        "while",
+    }
+)
 _MOST_BYTES = (1 << 31) - (1 << 20)  # of one variable in this version of the format
 
 
@@ -47,20 +67,26 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
         for step in steps:
             size = sum(8 * v.values.size for v in step.variables.values())
             if size > _MOST_BYTES:
-                raise InputError(f"Step {step.n} comes to {size >> 20} MiB; a MATLAB file of version 5 holds 2 GB.",
-                                 code="export_too_large", remedy="Choose variables, or the format h5.")  # fmt: skip
+                raise InputError(
+                    f"Step {step.n} comes to {size >> 20} MiB; a MATLAB file of version 5 holds 2 GB.",
+                    code="export_too_large",
+                    remedy="Choose variables, or the format h5.",
+                )
             names = {name: matlab_name(name) for name in step.variables}
             held: dict[str, Any] = {
-                "n": float(step.n), "load_n": np.nan if step.load_n is None else step.load_n, "label": step.label,
-            }  # fmt: skip
+                "n": float(step.n),
+                "load_n": np.nan if step.load_n is None else step.load_n,
+                "label": step.label,
+            }
             held |= {names[name]: v.values.astype(np.float64) for name, v in step.variables.items()}
             about = {matlab_name(k): _plain(v) for k, v in provenance(step, source).items()}
             about["units"] = {names[name]: v.units for name, v in step.variables.items()}
             about["meaning"] = {names[name]: v.long_name for name, v in step.variables.items()}
             about["states"] = {
                 names[name]: "; ".join(f"{k} = {text}" for k, text in v.flags.items())
-                for name, v in step.variables.items() if v.flags is not None
-            }  # fmt: skip
+                for name, v in step.variables.items()
+                if v.flags is not None
+            }
             about["parts"] = {names[name]: " ".join(v.parts) for name, v in step.variables.items() if v.parts}
             content = {f"step_{step.n:04d}": held, f"about_{step.n:04d}": about}
             # on an open file, each call adds to what is there

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.cuts import Cuts, crosses
+from core.field.region.cuts import Cuts, crosses
 
 Float = NDArray[np.float64]
 Places = NDArray[np.intp]

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from core.errors import InputError, StorageError
-from core.field.cuts import Cuts
-from server.errors import NotFoundError
-from server.exports.steps import Source, StepResult, columns_of, each, notes_of, provenance
-from server.io.figure import Picture, PictureForm, draw, draw_pixels, scale_of
-from server.io.files import write_bytes, written_aside
-from server.io.images import read_image
-from server.io.look import Look
+from core.field.region.cuts import Cuts
+from server.base.errors import NotFoundError
+from server.formats.figure import Picture, PictureForm, draw, draw_pixels, scale_of
+from server.formats.figure_options import Look
+from server.formats.files import write_bytes, written_aside
+from server.formats.images import read_image
+from server.results.steps import Source, StepResult, columns_of, each, notes_of, provenance
 
 FPS_RANGE = (0.1, 60.0)
 # VP9, which browsers play; MPEG-4 part 2, which they do not, only where OpenCV was built without libvpx
@@ -27,9 +27,7 @@ _MOST_SAMPLES = 20_000  # of a step, for the percentiles of a film
 _PALETTE = 255
 
 
-def picture_of(
-    step: StepResult, name: str, source: Source, image: NDArray[np.generic] | None = None
-) -> Picture:  # fmt: skip
+def picture_of(step: StepResult, name: str, source: Source, image: NDArray[np.generic] | None = None) -> Picture:
     """Return a variable of a step as a picture.
 
     Parameters
@@ -46,21 +44,34 @@ def picture_of(
     """
     columns = columns_of(step)
     if name not in columns:
-        raise NotFoundError(f"Step {step.n} has no variable {name!r} with one number a point.", code="field_missing",
-                            remedy="Use one of `available`.", available=sorted(columns))  # fmt: skip
+        raise NotFoundError(
+            f"Step {step.n} has no variable {name!r} with one number a point.",
+            code="field_missing",
+            remedy="Use one of `available`.",
+            available=sorted(columns),
+        )
     variable, document = columns[name], provenance(step, source)
     load = "" if step.load_n is None else f", load {step.load_n:g} N"
     label = f" ({step.label})" if step.label else ""
     cuts: Cuts | None = step.cuts
     return Picture(
-        values=variable.values, x_px=columns["x_px"].values, y_px=columns["y_px"].values,
-        label=f"{name}: {variable.long_name}", units=variable.units, flags=variable.flags,
-        title=f"{source.title or source.name}, step {step.n}{label}{load}", notes=notes_of(document), image=image,
-        cuts=cuts, metadata={
-            "Software": document["software"], "Variable": name, "Units": variable.units,
+        values=variable.values,
+        x_px=columns["x_px"].values,
+        y_px=columns["y_px"].values,
+        label=f"{name}: {variable.long_name}",
+        units=variable.units,
+        flags=variable.flags,
+        title=f"{source.title or source.name}, step {step.n}{label}{load}",
+        notes=notes_of(document),
+        image=image,
+        cuts=cuts,
+        metadata={
+            "Software": document["software"],
+            "Variable": name,
+            "Units": variable.units,
             "Provenance": json.dumps(document, sort_keys=True),
         },
-    )  # fmt: skip
+    )
 
 
 def image_of(source: Source, over_image: bool) -> NDArray[np.generic] | None:
@@ -75,8 +86,11 @@ def image_of(source: Source, over_image: bool) -> NDArray[np.generic] | None:
         return None
     if source.image is None or not source.image.is_file():
         where = "" if source.image is None else f" ({source.image})"
-        raise NotFoundError(f"Camera 1's reference image is not there{where}.", code="image_missing",
-                            remedy="Draw the map alone, or give the image.")  # fmt: skip
+        raise NotFoundError(
+            f"Camera 1's reference image is not there{where}.",
+            code="image_missing",
+            remedy="Draw the map alone, or give the image.",
+        )
     return read_image(source.image)
 
 
@@ -123,8 +137,11 @@ def frames(
             continue  # a reference has no displacement
         pixels = draw_pixels(picture_of(step, name, source, image), common)
         if size is not None and pixels.shape[:2] != size:
-            raise InputError("The steps' fields have different outlines.", code="steps_mixed",
-                             remedy="Make a film of the steps of one analysis.")  # fmt: skip
+            raise InputError(
+                "The steps' fields have different outlines.",
+                code="steps_mixed",
+                remedy="Make a film of the steps of one analysis.",
+            )
         size = (pixels.shape[0], pixels.shape[1])
         yield pixels
     if size is None and last is not None:
@@ -142,9 +159,15 @@ def write_gif(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float, commen
 
     with written_aside(path) as aside:
         _few_colours(first).save(
-            aside, format="GIF", save_all=True, append_images=rest(), duration=max(20, round(1000.0 / fps)), loop=0,
-            comment=comment.encode("ascii", "backslashreplace"), disposal=1,
-        )  # fmt: skip
+            aside,
+            format="GIF",
+            save_all=True,
+            append_images=rest(),
+            duration=max(20, round(1000.0 / fps)),
+            loop=0,
+            comment=comment.encode("ascii", "backslashreplace"),
+            disposal=1,
+        )
 
 
 def _few_colours(pixels: NDArray[np.uint8]) -> Image.Image:
@@ -170,8 +193,10 @@ def write_mp4(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float) -> Non
                 if writer.open(str(named), cv2.VideoWriter.fourcc(*codec), fps, (width, height)):
                     break
             if not writer.isOpened():
-                raise StorageError(f"No film can be written to {path}: OpenCV does not open it.",
-                                   remedy="Check the folder; choose gif if this OpenCV writes no MP4.")  # fmt: skip
+                raise StorageError(
+                    f"No film can be written to {path}: OpenCV does not open it.",
+                    remedy="Check the folder; choose gif if this OpenCV writes no MP4.",
+                )
             write = _writer_of(writer)
             write(first)
             for pixels in drawn:
@@ -193,5 +218,8 @@ def _writer_of(writer: cv2.VideoWriter) -> Callable[[NDArray[np.uint8]], None]:
 def check_fps(fps: float) -> None:
     """Refuse a frame rate that no player plays."""
     if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
-        raise InputError(f"{fps:g} frames a second is not between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}.",
-                         code="look_invalid", remedy="Give another rate.")  # fmt: skip
+        raise InputError(
+            f"{fps:g} frames a second is not between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}.",
+            code="look_invalid",
+            remedy="Give another rate.",
+        )

@@ -7,15 +7,21 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from core.errors import InputError
-from server.io.look import Look
+from server.formats.figure_options import Look
 
 ExportFormat = Literal["nc", "csv", "vtu", "mat", "h5", "png", "svg", "gif", "mp4"]
 FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 MEDIA_TYPES: dict[ExportFormat, str] = {
-    "nc": "application/x-netcdf", "csv": "text/csv; charset=utf-8", "vtu": "application/zip",
-    "mat": "application/x-matlab-data", "h5": "application/x-hdf5", "png": "image/png", "svg": "image/svg+xml",
-    "gif": "image/gif", "mp4": "video/mp4",
-}  # fmt: skip
+    "nc": "application/x-netcdf",
+    "csv": "text/csv; charset=utf-8",
+    "vtu": "application/zip",
+    "mat": "application/x-matlab-data",
+    "h5": "application/x-hdf5",
+    "png": "image/png",
+    "svg": "image/svg+xml",
+    "gif": "image/gif",
+    "mp4": "video/mp4",
+}
 _HIGHEST = 9999
 
 
@@ -63,7 +69,10 @@ def steps_in(text: str) -> list[int]:
         except ValueError:
             low, high = 0, -1
         if not 0 <= low <= high <= _HIGHEST:
-            raise InputError(f"{part!r} is neither a step's number nor a range of them.", code="step_invalid",
-                             remedy="Give a number, or numbers and ranges such as 0,3-7.")  # fmt: skip
+            raise InputError(
+                f"{part!r} is neither a step's number nor a range of them.",
+                code="step_invalid",
+                remedy="Give a number, or numbers and ranges such as 0,3-7.",
+            )
         numbers.update(range(low, high + 1))
     return sorted(numbers)

@@ -15,7 +15,11 @@ from server.exports.matlab import write_mat
 from server.exports.pictures import check_fps, frames, image_of, picture_of, write_figure, write_gif, write_mp4
 from server.exports.request import ExportRequest
 from server.exports.stacked import write_stacked
-from server.exports.steps import (
+from server.exports.table import write_table
+from server.exports.vtu import NEEDS, write_pvd, write_vtu
+from server.formats.files import written_aside
+from server.formats.images import read_mask
+from server.results.steps import (
     Source,
     chosen,
     columns_of,
@@ -26,10 +30,6 @@ from server.exports.steps import (
     require_known,
     variables_of,
 )
-from server.exports.table import write_table
-from server.exports.vtu import NEEDS, write_pvd, write_vtu
-from server.io.files import written_aside
-from server.io.images import read_mask
 
 _PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")
 
@@ -94,8 +94,11 @@ def _path(out: Path, source: Source, n: int, suffix: str) -> Path:
 
 def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
     if request.variables is not None:
-        raise InputError("NetCDF files are given as they are stored, with all variables.", code="option_conflict",
-                         remedy="Leave the variables out, or choose h5.")  # fmt: skip
+        raise InputError(
+            "NetCDF files are given as they are stored, with all variables.",
+            code="option_conflict",
+            remedy="Leave the variables out, or choose h5.",
+        )
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
         with written_aside(copy) as aside:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import InputError
-from server.exports.steps import Source
-from server.io.netcdf_reading import read_attributes
-from server.staleness import stale_results
+from server.formats.results.reading import read_attributes
+from server.results.staleness import stale_results
+from server.results.steps import Source
 
 _RESULT = re.compile(r"step_\d{4,}\.nc")
 
@@ -38,14 +38,18 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
     if (folder / "analyses").is_dir() or (folder / "steps").is_dir():
         folder = _of_test(folder, analysis)
     elif analysis is not None:
-        raise InputError(f"{folder} is not a test's folder; it has no analyses.", code="option_conflict",
-                         remedy="Leave the analysis out, or give the test's folder.")  # fmt: skip
+        raise InputError(
+            f"{folder} is not a test's folder; it has no analyses.",
+            code="option_conflict",
+            remedy="Leave the analysis out, or give the test's folder.",
+        )
     files = results_in(folder)
     if not files:
         raise InputError(
-            f"There is no step_0000.nc or another step's result in {folder}.", code="results_missing",
+            f"There is no step_0000.nc or another step's result in {folder}.",
+            code="results_missing",
             remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-        )  # fmt: skip
+        )
     return source_of(folder.absolute(), files)
 
 
@@ -60,9 +64,11 @@ def source_of(folder: Path, files: list[Path]) -> Source:
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
         about |= {
-            "test_id": document.get("id", test.name), "test": document.get("name", ""),
-            "calibration_id": document.get("calibration_id"), "specimen": document.get("specimen", ""),
-        }  # fmt: skip
+            "test_id": document.get("id", test.name),
+            "test": document.get("name", ""),
+            "calibration_id": document.get("calibration_id"),
+            "specimen": document.get("specimen", ""),
+        }
         if folder.parent.name == "analyses":
             about["analysis_id"] = folder.name
         name = f"{test.name}_{folder.name}" if folder.parent.name == "analyses" else test.name
@@ -71,8 +77,9 @@ def source_of(folder: Path, files: list[Path]) -> Source:
     calibration = _json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
-    return Source(files, folder.name or "results", folder.name, Path(said) if said else None, about,
-                  _mask(folder, heads[0]))  # fmt: skip
+    return Source(
+        files, folder.name or "results", folder.name, Path(said) if said else None, about, _mask(folder, heads[0])
+    )
 
 
 def _mask(folder: Path, head: dict[str, Any]) -> Path | None:
@@ -90,16 +97,22 @@ def _of_test(test: Path, analysis: str | None) -> Path:
         found = [p for p in there if p.name == analysis]
         if not found:
             known = ", ".join(p.name for p in there) or "none with results"
-            raise InputError(f"{test} has no results of an analysis {analysis}; it has {known}.",
-                             code="results_missing", remedy="Name one of these.")  # fmt: skip
+            raise InputError(
+                f"{test} has no results of an analysis {analysis}; it has {known}.",
+                code="results_missing",
+                remedy="Name one of these.",
+            )
         return found[0]
     measured = test / "exports" / "measure"
     if results_in(measured):
         there.append(measured)
     if len(there) > 1:
         names = ", ".join(p.name for p in there)
-        raise InputError(f"{test} has several results: {names}.", code="analysis_ambiguous",
-                         remedy="Name one with --analysis, or give its folder.")  # fmt: skip
+        raise InputError(
+            f"{test} has several results: {names}.",
+            code="analysis_ambiguous",
+            remedy="Name one with --analysis, or give its folder.",
+        )
     return there[0] if there else test
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import netCDF4
 import numpy as np
 
-from server.exports.steps import Source, StepResult, chosen, each, provenance, require_same_grid
-from server.io.files import written_aside
-from server.results import library
+from server.formats.files import written_aside
+from server.results.reader import library
+from server.results.steps import Source, StepResult, chosen, each, provenance, require_same_grid
 
 _NO_STATE = -1  # of an integer variable in a step that does not have it
 _COMMON = ("x_px", "y_px")
@@ -89,8 +89,16 @@ def _declare(data: Any, name: str, variable: Any, *, stacked: bool) -> None:
         data.createDimension(dims[-1], None)
     fill = np.nan if variable.values.dtype.kind == "f" else _NO_STATE
     chunks = [*([1] if stacked else []), *shape[:2], *shape[2:]]
-    made = data.createVariable(name, variable.values.dtype.str[1:], tuple(dims), fill_value=fill, chunksizes=chunks,
-                               compression="zlib", complevel=1, shuffle=True)  # fmt: skip
+    made = data.createVariable(
+        name,
+        variable.values.dtype.str[1:],
+        tuple(dims),
+        fill_value=fill,
+        chunksizes=chunks,
+        compression="zlib",
+        complevel=1,
+        shuffle=True,
+    )
     made.set_auto_mask(False)
     _describe(made, variable.units, variable.long_name)
     if variable.flags is not None:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.exports.steps import Source, StepResult, columns_of, provenance
-from server.io.files import written_aside
+from server.formats.files import written_aside
+from server.results.steps import Source, StepResult, columns_of, provenance
 
 _LINES_AT_ONCE = 2000
 
@@ -37,8 +37,9 @@ def write_table(path: Path, step: StepResult, source: Source) -> None:
         out.write(",".join(header) + "\n")
         rows, cols = step.shape
         texts: list[tuple[Callable[[Any], str], NDArray[Any]]] = [
-            (str, np.repeat(np.arange(rows), cols)), (str, np.tile(np.arange(cols), rows)),
-        ]  # fmt: skip
+            (str, np.repeat(np.arange(rows), cols)),
+            (str, np.tile(np.arange(cols), rows)),
+        ]
         for variable in columns.values():
             flat = variable.values.ravel()
             texts.append((_text_of(flat), flat))

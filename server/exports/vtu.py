@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.exports.mesh import triangles_of, turned_as
-from server.exports.steps import Source, StepResult, columns_of, provenance
-from server.io.files import write_bytes, written_aside
+from server.formats.files import write_bytes, written_aside
+from server.results.steps import Source, StepResult, columns_of, provenance
 
 NEEDS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status", "u_mm", "v_mm", "w_mm", "normal_x", "normal_y", "normal_z")
 _VECTORS = {"displacement": ("u_mm", "v_mm", "w_mm"), "normal": ("normal_x", "normal_y", "normal_z")}
@@ -63,9 +63,11 @@ def write_vtu(
     kinds = np.concatenate([np.full(len(triangles), _TRIANGLE), np.full(alone.size, _VERTEX)]).astype(np.uint8)
     with written_aside(path) as aside, aside.open("w", encoding="utf-8") as out:
         about = _about(step, source, columns)
-        out.write(f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {about} -->\n<VTKFile type="UnstructuredGrid" '
-                  'version="1.0" byte_order="LittleEndian" header_type="UInt64">\n<UnstructuredGrid>\n'
-                  "<FieldData>\n")  # fmt: skip
+        out.write(
+            f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {about} -->\n<VTKFile type="UnstructuredGrid" '
+            'version="1.0" byte_order="LittleEndian" header_type="UInt64">\n<UnstructuredGrid>\n'
+            "<FieldData>\n"
+        )
         _field_data(out, step, about)
         out.write(f'</FieldData>\n<Piece NumberOfPoints="{keep.size}" NumberOfCells="{kinds.size}">\n<Points>\n')
         _array(out, "Points", xyz[keep], units="mm")
@@ -88,9 +90,15 @@ def write_vtu(
 def write_pvd(path: Path, files: Iterable[tuple[int, str]]) -> None:
     """Write the time series: number of each step, as its time, and the file's name beside this one."""
     lines = [f'<DataSet timestep="{n}" group="" part="0" file={quoteattr(name)}/>' for n, name in files]
-    text = ['<?xml version="1.0" encoding="utf-8"?>',
-            '<VTKFile type="Collection" version="1.0" byte_order="LittleEndian">', "<Collection>", *lines,
-            "</Collection>", "</VTKFile>", ""]  # fmt: skip
+    text = [
+        '<?xml version="1.0" encoding="utf-8"?>',
+        '<VTKFile type="Collection" version="1.0" byte_order="LittleEndian">',
+        "<Collection>",
+        *lines,
+        "</Collection>",
+        "</VTKFile>",
+        "",
+    ]
     write_bytes(path, "\n".join(text).encode())
 
 

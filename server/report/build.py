@@ -8,7 +8,8 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.result import Field
+from core.field.points.result import Field
+from server.formats.version import software_version
 from server.report import pictures, sections
 from server.report.floor import STRAINS
 from server.report.geometry import geometry
@@ -18,7 +19,6 @@ from server.report.page import Markup, document, element, picture, policy_of, se
 from server.report.settings import analysis
 from server.report.source import CAMERAS, Source
 from server.report.steps import Measured, Shown, read_steps
-from server.version import software_version
 
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))
 

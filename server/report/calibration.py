@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from server.io.calibration_any import PARAMETER_NAMES
+from server.formats.calibrations.recognise import PARAMETER_NAMES
 from server.report.items import plain
 from server.report.page import Cell, Markup, element, note, table
 from server.report.source import CAMERAS, Source
@@ -29,8 +29,9 @@ def record(source: Source) -> tuple[list[Markup], list[tuple[str, str]]]:
         return [element("p", "The calibration was not found.", class_="missing")], [("Calibration record", remedy)]
     if not loaded.details.get("checks"):
         kind = {"dice_xml": "DICe XML", "opencv_yaml": "OpenCV YAML"}.get(loaded.source, loaded.source)
-        parts = [element("p", f"Cameras from {_name(source)} ({kind}). The file has no record of how they were "
-                         "calibrated.")]  # fmt: skip
+        parts = [
+            element("p", f"Cameras from {_name(source)} ({kind}). The file has no record of how they were calibrated.")
+        ]
         parts.append(_cameras_alone(source))
         remedy = "calibrate with this program, or file the other program's own record with this report"
         return parts, [("Calibration checks (RBE, RAZ, NSCE), parameters' uncertainty, target, positions", remedy)]
@@ -38,8 +39,14 @@ def record(source: Source) -> tuple[list[Markup], list[tuple[str, str]]]:
     missing = []
     if content["checks"].get("held_out") is None:
         missing.append(("Calibration checks at held-out positions", "calibrate with held_out_mm"))
-    parts = [_verdict(content), _checks(content), _made(content), _parameters(content), _views(content),
-             _target(content)]  # fmt: skip
+    parts = [
+        _verdict(content),
+        _checks(content),
+        _made(content),
+        _parameters(content),
+        _views(content),
+        _target(content),
+    ]
     return [p for p in parts if p], missing
 
 
@@ -67,8 +74,9 @@ def _checks(content: Mapping[str, Any]) -> Markup:
                 values = [measures.get(name), *((each.get(cam) or {}).get(name) for cam in CAMERAS)]
             rows.append([f"{label}, {told}", *(_number(v, unit) for v in values)])
             keys.append(f"calibration.{which}.{name}")
-    return table(["check", "both cameras", "camera 1", "camera 2"], rows, keys=keys, key="calibration-checks",
-                 caption="Checks")  # fmt: skip
+    return table(
+        ["check", "both cameras", "camera 1", "camera 2"], rows, keys=keys, key="calibration-checks", caption="Checks"
+    )
 
 
 def _made(content: Mapping[str, Any]) -> Markup:
@@ -96,15 +104,23 @@ def _parameters(content: Mapping[str, Any]) -> Markup:
         for cam in CAMERAS:
             value, sd = content[cam][name], sigma.get(f"{cam}.{name}")
             cells.append(Cell(_with_sd(float(value), sd), float(value)))
-        rows.append([f"{name.rsplit('_', 1)[0] if unit and not name.endswith('px2') else name.split('_')[0]}", *cells,
-                     unit])  # fmt: skip
+        rows.append(
+            [f"{name.rsplit('_', 1)[0] if unit and not name.endswith('px2') else name.split('_')[0]}", *cells, unit]
+        )
         keys.append(f"parameter.{name}")
     return Markup(
-        table(["parameter", "camera 1", "camera 2", "unit"], rows, keys=keys, key="calibration-parameters",
-              caption="Parameters, value \u00b1 standard deviation")
-        + note("The aspect ratio is given, not fitted. Standard deviations are those of each parameter alone; the file "
-               "holds the full covariance.")
-    )  # fmt: skip
+        table(
+            ["parameter", "camera 1", "camera 2", "unit"],
+            rows,
+            keys=keys,
+            key="calibration-parameters",
+            caption="Parameters, value \u00b1 standard deviation",
+        )
+        + note(
+            "The aspect ratio is given, not fitted. Standard deviations are those of each parameter alone; the file "
+            "holds the full covariance."
+        )
+    )
 
 
 def _with_sd(value: float, sd: float | None) -> str:
@@ -122,11 +138,16 @@ def _with_sd(value: float, sd: float | None) -> str:
 def _views(content: Mapping[str, Any]) -> Markup:
     rows = []
     for view in content.get("views", []):
-        rows.append([
-            str(view["camera"]).replace("cam", "camera "), _number(view["dz_mm"], "mm"),
-            "held out" if view.get("held_out") else "fitted",
-            _number(view.get("rbe_px"), "px"), _number(view.get("raz_mm"), "mm"), _number(view.get("nsce"), ""),
-        ])  # fmt: skip
+        rows.append(
+            [
+                str(view["camera"]).replace("cam", "camera "),
+                _number(view["dz_mm"], "mm"),
+                "held out" if view.get("held_out") else "fitted",
+                _number(view.get("rbe_px"), "px"),
+                _number(view.get("raz_mm"), "mm"),
+                _number(view.get("nsce"), ""),
+            ]
+        )
     caption = "Positions of the cameras before the target"
     return table(["camera", "dZ", "use", "RBE", "RAZ", "NSCE"], rows, caption=caption, key="calibration-views")
 
@@ -143,11 +164,13 @@ def _target(content: Mapping[str, Any]) -> Markup:
         f"line width {target['line_width_mm']:g} mm, maker's tolerance "
         f"{target.get('node_tolerance_mm', 0.0):g} mm, {ground}."
     )
-    more = [f"localiser {told['localiser']}" if told.get("localiser") else "",
-            f"{told['frames']} frames averaged at each position" if told.get("frames") else "",
-            f"rig {told['rig']!r}" if told.get("rig") else "",
-            f"stereorig {told['software_version']}" if told.get("software_version") else "",
-            f"axis tilt prior {tilt:g} rad" if tilt else ""]  # fmt: skip
+    more = [
+        f"localiser {told['localiser']}" if told.get("localiser") else "",
+        f"{told['frames']} frames averaged at each position" if told.get("frames") else "",
+        f"rig {told['rig']!r}" if told.get("rig") else "",
+        f"stereorig {told['software_version']}" if told.get("software_version") else "",
+        f"axis tilt prior {tilt:g} rad" if tilt else "",
+    ]
     made = "; ".join(m for m in more if m)
     return element("p", text, f" Made with {made}." if made else "", id="calibration-target")
 

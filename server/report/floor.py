@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.result import Field
+from core.field.points.result import Field
 from core.strain import StrainField
 
 Float = NDArray[np.float64]

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.camera import Camera
-from core.field.result import Field
-from core.stereo import StereoPair
+from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
+from core.field.points.result import Field
 
 Float = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from core.pattern import PatternSize, pattern_size
-from server.camera_facts import CameraFacts, merged
+from server.config.camera_facts import CameraFacts, merged
 from server.report.geometry import Geometry
 from server.report.items import CALIBRATION, MEASURED, RECORD, TOLD, Item, Value, of_number, of_text
 from server.report.source import CAMERAS, Source
@@ -31,8 +31,11 @@ def hardware(source: Source, measured: Measured, found: Geometry | None) -> list
     rig, facts, cameras = _rig_of(source), source.facts, _cameras(source)
     step = source.steps.get(source.reference, {})
     settings: dict[str, Any] = {cam: (rig.get("cameras") or {}).get(cam) or {} for cam in CAMERAS}
-    identity = step.get("cameras") or (source.calibration.details.get("provenance", {}).get("cameras")
-                                       if source.calibration else None) or {}  # fmt: skip
+    identity = (
+        step.get("cameras")
+        or (source.calibration.details.get("provenance", {}).get("cameras") if source.calibration else None)
+        or {}
+    )
     sizes = _sizes(source)
     in_file = "as told (test or rig file)"
 
@@ -71,61 +74,156 @@ def hardware(source: Source, measured: Measured, found: Geometry | None) -> list
     lens = f"[camN.lens] of {rig_file}"
     return [
         Item("camera.maker", "Camera, maker", of_facts("maker"), f"camN.maker of {rig_file}"),
-        Item("camera.model", "Camera, model",
-             each(lambda cam: device(cam, "model") or of_text(cameras[cam].model, in_file)), f"camN.model of {fact}"),
-        Item("camera.serial", "Camera, serial number", each(lambda cam: device(cam, "serial")),
-             "is recorded when the service captures"),
-        Item("camera.resolution", "Image size",
-             each(lambda cam: _size_value(sizes[cam])),
-             "needs the images or the calibration"),
-        Item("camera.depth", "Significant bits", each(lambda cam: of_number((step.get("bit_depth") or {}).get(cam), "d",
-             "bit", RECORD)), "is recorded when the service captures or imports"),
+        Item(
+            "camera.model",
+            "Camera, model",
+            each(lambda cam: device(cam, "model") or of_text(cameras[cam].model, in_file)),
+            f"camN.model of {fact}",
+        ),
+        Item(
+            "camera.serial",
+            "Camera, serial number",
+            each(lambda cam: device(cam, "serial")),
+            "is recorded when the service captures",
+        ),
+        Item(
+            "camera.resolution",
+            "Image size",
+            each(lambda cam: _size_value(sizes[cam])),
+            "needs the images or the calibration",
+        ),
+        Item(
+            "camera.depth",
+            "Significant bits",
+            each(lambda cam: of_number((step.get("bit_depth") or {}).get(cam), "d", "bit", RECORD)),
+            "is recorded when the service captures or imports",
+        ),
         Item("camera.sensor", "Sensor", of_facts("sensor"), f"camN.sensor of {rig_file}"),
-        Item("camera.pixel", "Pixel size", each(lambda cam: of_number(cameras[cam].pixel_um, "g", "\u00b5m", in_file)),
-             f"camN.pixel_um of {rig_file}"),
+        Item(
+            "camera.pixel",
+            "Pixel size",
+            each(lambda cam: of_number(cameras[cam].pixel_um, "g", "\u00b5m", in_file)),
+            f"camN.pixel_um of {rig_file}",
+        ),
         Item("lens.maker", "Lens, maker", of_lens("maker"), f"maker in {lens}"),
         Item("lens.model", "Lens, model", of_lens("model"), f"model in {lens}"),
-        Item("lens.focal_length", "Lens, focal length", of_lens("focal_length_mm", "g", "mm"),
-             f"focal_length_mm in {lens}"),
-        Item("lens.aperture", "Lens, aperture", each(lambda cam: _aperture(cameras[cam], in_file)),
-             f"f_number in {lens}"),
+        Item(
+            "lens.focal_length",
+            "Lens, focal length",
+            of_lens("focal_length_mm", "g", "mm"),
+            f"focal_length_mm in {lens}",
+        ),
+        Item(
+            "lens.aperture", "Lens, aperture", each(lambda cam: _aperture(cameras[cam], in_file)), f"f_number in {lens}"
+        ),
         *_lens_notes(of_lens("note")),
-        Item("lens.pinhole", "Pinhole distance", each(pinhole), needs,
-             "of the fitted camera; longer than the focal length, since the lens is focused near"),
-        Item("field_of_view", "Field of view", view(lambda v: None if v.field_of_view_mm is None else Value(
-             "{:.4g} x {:.4g} mm".format(*v.field_of_view_mm), v.field_of_view_mm[0], CALIBRATION)), needs,
-             "width and height of what the image shows of the surface's plane, through the image's middle"),
-        Item("image_scale", "Image scale", view(lambda v: Value(
-             "{:.5g} mm/px ({:.5g} along rows, {:.5g} down columns; {:.4g} px/mm)".format(
-                 v.mean_scale_mm_per_px, *v.scale_mm_per_px, 1.0 / v.mean_scale_mm_per_px),
-             v.mean_scale_mm_per_px, CALIBRATION)), needs, "on the surface, in the middle of what was measured"),
-        Item("stand_off", "Stand-off distance",
-             view(lambda v: of_number(v.standoff_mm, ".2f", "mm", CALIBRATION)), needs,
-             "from the pinhole along the optical axis to the surface's plane"),
-        *([] if facts.standoff_mm is None else [
-            Item("stand_off.told", "Stand-off distance, by ruler", (of_number(facts.standoff_mm, "g", "mm", TOLD),))]),
+        Item(
+            "lens.pinhole",
+            "Pinhole distance",
+            each(pinhole),
+            needs,
+            "of the fitted camera; longer than the focal length, since the lens is focused near",
+        ),
+        Item(
+            "field_of_view",
+            "Field of view",
+            view(
+                lambda v: (
+                    None
+                    if v.field_of_view_mm is None
+                    else Value("{:.4g} x {:.4g} mm".format(*v.field_of_view_mm), v.field_of_view_mm[0], CALIBRATION)
+                )
+            ),
+            needs,
+            "width and height of what the image shows of the surface's plane, through the image's middle",
+        ),
+        Item(
+            "image_scale",
+            "Image scale",
+            view(
+                lambda v: Value(
+                    "{:.5g} mm/px ({:.5g} along rows, {:.5g} down columns; {:.4g} px/mm)".format(
+                        v.mean_scale_mm_per_px, *v.scale_mm_per_px, 1.0 / v.mean_scale_mm_per_px
+                    ),
+                    v.mean_scale_mm_per_px,
+                    CALIBRATION,
+                )
+            ),
+            needs,
+            "on the surface, in the middle of what was measured",
+        ),
+        Item(
+            "stand_off",
+            "Stand-off distance",
+            view(lambda v: of_number(v.standoff_mm, ".2f", "mm", CALIBRATION)),
+            needs,
+            "from the pinhole along the optical axis to the surface's plane",
+        ),
+        *(
+            []
+            if facts.standoff_mm is None
+            else [
+                Item("stand_off.told", "Stand-off distance, by ruler", (of_number(facts.standoff_mm, "g", "mm", TOLD),))
+            ]
+        ),
         _stereo_angle(found, needs),
-        Item("baseline", "Distance of the pinholes", (None if found is None else of_number(
-             found.baseline_mm, ".3f", "mm", CALIBRATION),), needs),
+        Item(
+            "baseline",
+            "Distance of the pinholes",
+            (None if found is None else of_number(found.baseline_mm, ".3f", "mm", CALIBRATION),),
+            needs,
+        ),
         Item("rate", "Image acquisition rate", (_rate(source, rig, measured),), f"frame_rate_hz of {fact}"),
-        Item("exposure", "Exposure", each(lambda cam: of_number(settings[cam].get("exposure_ms"), "g", "ms",
-             "read back from the camera") or of_number(facts.exposure_ms, "g", "ms", TOLD)), f"exposure_ms of {fact}"),
-        Item("gain", "Gain", each(lambda cam: of_number(settings[cam].get("gain_db"), "g", "dB",
-             "read back from the camera")), "is recorded when the service captures"),
-        Item("frames", "Frames averaged for an image", (of_number(step.get("frames"), "d", "", RECORD),),
-             "is recorded when the service captures"),
-        Item("synchronisation", "Synchronisation", (_synchronisation(rig, measured),),
-             "is recorded when the service captures"),
-        Item("lighting", "Lighting",
-             (of_text(facts.lighting, TOLD) or of_text(rig.get("lighting"), "as told (rig file)"),),
-             f"lighting of {rig_file}"),
-        Item("pattern.technique", "Patterning technique", (of_text(facts.pattern_technique, TOLD),),
-             f"pattern_technique of {fact}"),
+        Item(
+            "exposure",
+            "Exposure",
+            each(
+                lambda cam: (
+                    of_number(settings[cam].get("exposure_ms"), "g", "ms", "read back from the camera")
+                    or of_number(facts.exposure_ms, "g", "ms", TOLD)
+                )
+            ),
+            f"exposure_ms of {fact}",
+        ),
+        Item(
+            "gain",
+            "Gain",
+            each(lambda cam: of_number(settings[cam].get("gain_db"), "g", "dB", "read back from the camera")),
+            "is recorded when the service captures",
+        ),
+        Item(
+            "frames",
+            "Frames averaged for an image",
+            (of_number(step.get("frames"), "d", "", RECORD),),
+            "is recorded when the service captures",
+        ),
+        Item(
+            "synchronisation",
+            "Synchronisation",
+            (_synchronisation(rig, measured),),
+            "is recorded when the service captures",
+        ),
+        Item(
+            "lighting",
+            "Lighting",
+            (of_text(facts.lighting, TOLD) or of_text(rig.get("lighting"), "as told (rig file)"),),
+            f"lighting of {rig_file}",
+        ),
+        Item(
+            "pattern.technique",
+            "Patterning technique",
+            (of_text(facts.pattern_technique, TOLD),),
+            f"pattern_technique of {fact}",
+        ),
         *_pattern(source, measured, found),
-        Item("noise", "Noise of the images", _noise(source, measured),
-             "needs a noise model (stereorig noise) or points that were measured",
-             "standard deviation in grey levels"),
-    ]  # fmt: skip
+        Item(
+            "noise",
+            "Noise of the images",
+            _noise(source, measured),
+            "needs a noise model (stereorig noise) or points that were measured",
+            "standard deviation in grey levels",
+        ),
+    ]
 
 
 def _size_value(size: tuple[tuple[int, int], str] | None) -> Value | None:
@@ -223,8 +321,15 @@ def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list
             Item("pattern.told", "Pattern feature size, as told", (of_number(told, "g", "mm", TOLD),), "", how)
         )
     contrast = None if size is None else Value(f"{size.contrast_grey:.1f} grey levels", size.contrast_grey, MEASURED)
-    items.append(Item("pattern.contrast", "Pattern contrast", (contrast,), "needs the reference image of camera 1",
-                      "standard deviation of the pattern's grey levels in the same region"))  # fmt: skip
+    items.append(
+        Item(
+            "pattern.contrast",
+            "Pattern contrast",
+            (contrast,),
+            "needs the reference image of camera 1",
+            "standard deviation of the pattern's grey levels in the same region",
+        )
+    )
     return items
 
 
@@ -257,8 +362,9 @@ def _noise(source: Source, measured: Measured) -> tuple[Value | None, ...]:
             values.append(Value(f"{at}variance {formula}, from {model['frames']} frames", sd, "from the noise model"))
         elif cam == "cam1" and residual is not None:
             full = f" ({100.0 * residual / (2.0 ** depth[cam] - 1.0):.2f} % of full scale)" if depth.get(cam) else ""
-            values.append(Value(f"{residual:.3g}{full}", residual,
-                                "from the residuals of the matching, median of the points"))  # fmt: skip
+            values.append(
+                Value(f"{residual:.3g}{full}", residual, "from the residuals of the matching, median of the points")
+            )
         else:
             values.append(None)
     if values[1] is None and values[0] is not None and "residuals" in values[0].origin:

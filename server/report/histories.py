@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from core.errors import StereorigError
-from server.gauging import read_gauges
 from server.report.floor import STRAINS
 from server.report.page import Cell, Markup, element, note, picture, table
 from server.report.pictures import SVG, course
 from server.report.sections import UM, axis_of
 from server.report.source import Source
 from server.report.steps import Measured
+from server.results.gauges.readings import read_gauges
 
 _EXTENSOMETER = ("elongation_mm", "strain")
 
@@ -45,15 +45,26 @@ def _own(measured: Measured) -> Markup:
         for component in ("u", "v", "w"):
             told = [s.summary["displacement_mm"][component] for _, s in moved]
             lines[component.upper()] = ([None if t is None else 1e3 * t["mean"] for t in told], None)
-        data = course([xi for xi, _ in moved], lines, x_label=label, y_label=f"mean displacement, {UM}",
-                      title="Displacement, mean over the points")  # fmt: skip
-        drawn.append(picture(data, SVG, "mean displacement over the steps", "Mean of U, V, W over all valid points",
-                             half=True))  # fmt: skip
+        data = course(
+            [xi for xi, _ in moved],
+            lines,
+            x_label=label,
+            y_label=f"mean displacement, {UM}",
+            title="Displacement, mean over the points",
+        )
+        drawn.append(
+            picture(data, SVG, "mean displacement over the steps", "Mean of U, V, W over all valid points", half=True)
+        )
     strained = [(xi, s.strain) for xi, s in zip(x, steps, strict=True) if s.strain and s.strain["points"]]
     if strained:
         lines = {e: ([s["mean_microstrain"][e] for _, s in strained], None) for e in STRAINS}
-        data = course([xi for xi, _ in strained], lines, x_label=label, y_label="mean strain, microstrain",
-                      title="Strain, mean over the points")  # fmt: skip
+        data = course(
+            [xi for xi, _ in strained],
+            lines,
+            x_label=label,
+            y_label="mean strain, microstrain",
+            title="Strain, mean over the points",
+        )
         caption = "Mean of the strains over all points that have it"
         drawn.append(picture(data, SVG, "mean strain over the steps", caption, half=True))
     return element("div", *drawn, class_="pair")
@@ -110,10 +121,18 @@ def _curves(name: str, wanted: Sequence[str], values: list[dict[str, Any]], x: l
 def _line(line: dict[str, Any], n: int) -> list[Markup]:
     drawn = []
     for name, told in list(line["values"].items())[:6]:
-        data = course(line["distance_px"], {name: (told["value"], None)}, x_label="distance along the line, px",
-                      y_label=f"{name}, {told['units']}", title=f"Line {line['name']}, step {n}")  # fmt: skip
-        drawn.append(picture(data, SVG, f"{name} along line {line['name']}", f"Line {line['name']}: {name} in step {n}",
-                             half=True))  # fmt: skip
+        data = course(
+            line["distance_px"],
+            {name: (told["value"], None)},
+            x_label="distance along the line, px",
+            y_label=f"{name}, {told['units']}",
+            title=f"Line {line['name']}, step {n}",
+        )
+        drawn.append(
+            picture(
+                data, SVG, f"{name} along line {line['name']}", f"Line {line['name']}: {name} in step {n}", half=True
+            )
+        )
     return drawn
 
 
@@ -133,5 +152,9 @@ def _table(
         rows.append(cells)
     units = {w: next((t[w]["units"] for t in values if w in t), "") for w in wanted}
     columns = ["step", *(f"{w.removesuffix('_mm')}{'' if units[w] in ('', '1') else ', ' + units[w]}" for w in wanted)]
-    return table(columns, rows, caption=f"{name}, value \u00b1 standard deviation",
-                 keys=[f"gauge.{series[0]['name']}.{n}" for n in numbers])  # fmt: skip
+    return table(
+        columns,
+        rows,
+        caption=f"{name}, value \u00b1 standard deviation",
+        keys=[f"gauge.{series[0]['name']}.{n}" for n in numbers],
+    )

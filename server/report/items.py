@@ -9,8 +9,12 @@ import numpy as np
 from server.report.source import CAMERAS
 
 CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
-    "from the calibration", "measured here", "as told", "recorded with the images", "settings of the analysis",
-)  # fmt: skip
+    "from the calibration",
+    "measured here",
+    "as told",
+    "recorded with the images",
+    "settings of the analysis",
+)
 
 
 @dataclass(frozen=True)

@@ -45,9 +45,13 @@ class Cell:
 
 
 def table(
-    head: Sequence[object], rows: Iterable[Sequence[object]], *, caption: object | None = None, key: str | None = None,
+    head: Sequence[object],
+    rows: Iterable[Sequence[object]],
+    *,
+    caption: object | None = None,
+    key: str | None = None,
     keys: Sequence[str] | None = None,
-) -> Markup:  # fmt: skip
+) -> Markup:
     """Return a table; the first cell of a row is its head.
 
     Parameters
@@ -67,8 +71,14 @@ def table(
         body.append(element("tr", *cells, data_item=None if keys is None else keys[index]))
     parts.append(element("tbody", *body))
     # a table wider than the page is scrolled, by keyboard too
-    return element("div", element("table", *parts, id=key), class_="wide", tabindex="0", role="group",
-                   aria_label=key or "table" if isinstance(caption, Markup) or not caption else caption)  # fmt: skip
+    return element(
+        "div",
+        element("table", *parts, id=key),
+        class_="wide",
+        tabindex="0",
+        role="group",
+        aria_label=key or "table" if isinstance(caption, Markup) or not caption else caption,
+    )
 
 
 def _cell(value: object, *, head: bool) -> Markup:

@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageChops
 
-from core.field.cuts import Cuts
-from core.field.result import Field
+from core.field.points.result import Field
+from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField
-from server.io.figure import Picture, draw
-from server.io.look import Look
+from server.formats.figure import Picture, draw
+from server.formats.figure_options import Look
 
 Float = NDArray[np.float64]
 PNG, SVG = "image/png", "image/svg+xml"
@@ -99,9 +99,11 @@ def region(
     """
     rows, cols = image.shape[:2]
     shrink = max(1.0, cols / _MOST_PX)
-    small = image if shrink == 1.0 else cv2.resize(
-        image, (round(cols / shrink), max(1, round(rows / shrink))), interpolation=cv2.INTER_AREA
-    )  # fmt: skip
+    small = (
+        image
+        if shrink == 1.0
+        else cv2.resize(image, (round(cols / shrink), max(1, round(rows / shrink))), interpolation=cv2.INTER_AREA)
+    )
     low, high = np.percentile(small, (0.5, 99.5))
     width = 4.5
     figure = Figure(figsize=(width, width * min(max(rows / cols, 0.2), 1.6) + 0.35), layout="constrained")
@@ -145,8 +147,18 @@ def course(
     for k, (name, (values, sigma)) in enumerate(lines.items()):
         y = np.array([np.nan if v is None else v for v in values])[order]
         bars = None if sigma is None else np.array([np.nan if s is None else s for s in sigma])[order]
-        axis.errorbar(np.asarray(x)[order], y, yerr=bars, color=_COLOURS[k % len(_COLOURS)], marker="o", markersize=3,
-                      linewidth=1.0, elinewidth=0.7, capsize=1.5, label=_plain(name))  # fmt: skip
+        axis.errorbar(
+            np.asarray(x)[order],
+            y,
+            yerr=bars,
+            color=_COLOURS[k % len(_COLOURS)],
+            marker="o",
+            markersize=3,
+            linewidth=1.0,
+            elinewidth=0.7,
+            capsize=1.5,
+            label=_plain(name),
+        )
     axis.grid(visible=True, color="0.9", linewidth=0.6)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=7)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from server.facts import TestFacts
 from server.report import calibration
 from server.report.floor import LENGTHS, STRAINS, Floor
 from server.report.items import Item, Value, plain
 from server.report.page import Cell, Markup, element, note, section, table
 from server.report.source import Source
 from server.report.steps import Measured, StepFigures
+from server.results.metadata import TestFacts
 
 UM = "\u00b5m"
 _LEVELS = {"ok": "good", "good": "good", "warning": "warning", "failed": "failed"}
@@ -28,8 +28,13 @@ def items_table(items: Sequence[Item], key: str) -> Markup:
         row: list[object] = [item.label]
         single = len(item.values) == 1
         for value in item.values:
-            row.append(Cell(NOT_STATED if value is None else value.text, None if value is None else value.number,
-                            2 if single else None))  # fmt: skip
+            row.append(
+                Cell(
+                    NOT_STATED if value is None else value.text,
+                    None if value is None else value.number,
+                    2 if single else None,
+                )
+            )
         origins = list(dict.fromkeys(v.origin for v in item.values if v is not None and v.origin))
         row.append("; ".join([*origins, *([item.comment] if item.comment else [])]))
         rows.append(row)
@@ -61,8 +66,11 @@ def _boxes(source: Source, measured: Measured) -> list[Markup]:
     content = {} if source.calibration is None else source.calibration.details
     verdict = (content.get("verdict") or {}).get("level")
     held = ((content.get("checks") or {}).get("held_out") or {}).get("rbe_px")
-    boxes = [_box("Calibration", verdict or "no record", "" if held is None else f"held-out RBE {plain(held, 2)} px",
-                  verdict)]  # fmt: skip
+    boxes = [
+        _box(
+            "Calibration", verdict or "no record", "" if held is None else f"held-out RBE {plain(held, 2)} px", verdict
+        )
+    ]
     worst = worst_epipolar(measured)
     level = None if worst is None else str(worst["level"])
     off = "" if worst is None else f"{worst['offset_px']:.3f} px off the epipolar lines"
@@ -85,8 +93,13 @@ def _of_points(measured: Measured) -> str:
 
 
 def _box(name: str, value: str, small: str, level: str | None) -> Markup:
-    return element("div", element("b", name), element("span", value), element("small", small),
-                   class_=f"box {_LEVELS.get(level or '', '')}".strip())  # fmt: skip
+    return element(
+        "div",
+        element("b", name),
+        element("span", value),
+        element("small", small),
+        class_=f"box {_LEVELS.get(level or '', '')}".strip(),
+    )
 
 
 def worst_epipolar(measured: Measured) -> dict[str, Any] | None:
@@ -113,10 +126,17 @@ def the_test(source: Source, measured: Measured) -> tuple[Markup, list[Item]]:
         told("environment", "Environment"),
         told("laboratory", "Laboratory"),
         told("operator", "Operator"),
-        Item("test.images_taken", "Images taken", (None if not times else Value(
-            times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}", None, _taken(source)),),
-            "is recorded when the service captures or imports"),
-    ]  # fmt: skip
+        Item(
+            "test.images_taken",
+            "Images taken",
+            (
+                None
+                if not times
+                else Value(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}", None, _taken(source)),
+            ),
+            "is recorded when the service captures or imports",
+        ),
+    ]
     rows = [[i.label, Cell(NOT_STATED if i.values[0] is None else i.values[0].text)] for i in items]
     notes = [text for text in (document.get("notes"), facts.notes) if text]
     parts: list[object] = [table([], rows, key="test-facts", keys=[i.key for i in items])]
@@ -157,8 +177,15 @@ def noise_floor(source: Source, measured: Measured) -> tuple[Markup, list[tuple[
             missing.append((f"Results of the static steps {', '.join(map(str, lost))}", "measure them too"))
     if measured.static and not any(n in measured.floor for n in ("U", "V", "W")):
         missing.append(("Noise floor and bias of displacement", "measure displacements of the static steps"))
-    head_row = ["quantity", "bias (mean)", "smallest, largest mean of a step", "sd from step to step",
-                "sd over the points", "sd predicted", "points"]  # fmt: skip
+    head_row = [
+        "quantity",
+        "bias (mean)",
+        "smallest, largest mean of a step",
+        "sd from step to step",
+        "sd over the points",
+        "sd predicted",
+        "points",
+    ]
     told_text = (
         "Bias: mean over all points and static steps, where the truth is zero; of the places X, Y, Z it cannot be told "
         "without a known position. Sd from step to step (temporal): at each point over the static steps, root mean "
@@ -169,10 +196,16 @@ def noise_floor(source: Source, measured: Measured) -> tuple[Markup, list[tuple[
     left = measured.static_left_out
     more = [] if not left else [note(f"Static steps {', '.join(map(str, left))} did not fit into memory.")]
     return (
-        section("Noise floor and bias", "noise-floor", intro, table(head_row, rows, keys=keys, key="noise-floor-table"),
-                note(told_text), *more),
+        section(
+            "Noise floor and bias",
+            "noise-floor",
+            intro,
+            table(head_row, rows, keys=keys, key="noise-floor-table"),
+            note(told_text),
+            *more,
+        ),
         missing,
-    )  # fmt: skip
+    )
 
 
 def _floor_row(name: str, floor: Floor | None, told: float | None) -> list[object]:
@@ -227,28 +260,50 @@ def steps_table(measured: Measured, *, loads: bool) -> Markup:
     any_time = any(s.seconds is not None for s in measured.steps)
     channels = sorted({name for s in measured.steps for name in s.channels})[:4]
     any_skew = any(s.skew_ms is not None for s in measured.steps)
-    columns = ["step", "label", *(["load, N"] if loads else []), *channels, *(["time, s"] if any_time else []), "valid",
-               "ZNCC median", "epipolar rms, px", "check", f"sigma X, {UM}", "Y", "Z", f"sigma U, {UM}", "V", "W",
-               *(["skew, ms"] if any_skew else []), "image quality"]  # fmt: skip
+    columns = [
+        "step",
+        "label",
+        *(["load, N"] if loads else []),
+        *channels,
+        *(["time, s"] if any_time else []),
+        "valid",
+        "ZNCC median",
+        "epipolar rms, px",
+        "check",
+        f"sigma X, {UM}",
+        "Y",
+        "Z",
+        f"sigma U, {UM}",
+        "V",
+        "W",
+        *(["skew, ms"] if any_skew else []),
+        "image quality",
+    ]
     rows = []
     for s in measured.steps:
         summary = s.summary
         sigma = summary["sigma_median_mm"]
         check = summary.get("epipolar_check") or {}
         zncc = [v for v in summary["zncc_median"].values() if v is not None]
-        rows.append([
-            f"{s.n}{' (static)' if s.static else ''}", s.label,
-            *([_fixed(s.load_n, "g")] if loads else []),
-            *(_fixed(s.channels.get(name), "g") for name in channels),
-            *([_fixed(s.seconds, ".3f")] if any_time else []),
-            Cell(f"{summary['valid']}/{summary['points']}", float(summary["valid"])),
-            _fixed(min(zncc) if zncc else None, ".4f"),
-            _fixed(summary["epipolar_residual_rms_px"], ".4f"), check.get("level", ""),
-            *(_fixed(None if sigma.get(k) is None else 1e3 * sigma[k], ".3g")
-              for k in ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")),
-            *([_fixed(s.skew_ms, ".3g")] if any_skew else []),
-            "" if s.quality is None else str(s.quality.get("code", "")),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{s.n}{' (static)' if s.static else ''}",
+                s.label,
+                *([_fixed(s.load_n, "g")] if loads else []),
+                *(_fixed(s.channels.get(name), "g") for name in channels),
+                *([_fixed(s.seconds, ".3f")] if any_time else []),
+                Cell(f"{summary['valid']}/{summary['points']}", float(summary["valid"])),
+                _fixed(min(zncc) if zncc else None, ".4f"),
+                _fixed(summary["epipolar_residual_rms_px"], ".4f"),
+                check.get("level", ""),
+                *(
+                    _fixed(None if sigma.get(k) is None else 1e3 * sigma[k], ".3g")
+                    for k in ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
+                ),
+                *([_fixed(s.skew_ms, ".3g")] if any_skew else []),
+                "" if s.quality is None else str(s.quality.get("code", "")),
+            ]
+        )
     return table(columns, rows, key="steps-table", keys=[f"step.{s.n}" for s in measured.steps])
 
 
@@ -258,8 +313,11 @@ def motion_table(measured: Measured) -> Markup | None:
     if not moved:
         return None
     strains = any(s.strain for s in moved)
-    columns = ["step", *(f"{c}, mean (least, largest), {UM}" for c in "UVW"),
-               *((f"{e}, mean, microstrain" for e in STRAINS) if strains else ())]  # fmt: skip
+    columns = [
+        "step",
+        *(f"{c}, mean (least, largest), {UM}" for c in "UVW"),
+        *((f"{e}, mean, microstrain" for e in STRAINS) if strains else ()),
+    ]
     rows = []
     for s in moved:
         cells: list[object] = [str(s.n)]
@@ -274,8 +332,9 @@ def motion_table(measured: Measured) -> Markup | None:
             mean = (s.strain or {}).get("mean_microstrain") or {}
             cells += [_fixed(mean.get(e), ".4g") for e in STRAINS]
         rows.append(cells)
-    return table(columns, rows, key="motion-table", keys=[f"motion.{s.n}" for s in moved],
-                 caption="Over all valid points")  # fmt: skip
+    return table(
+        columns, rows, key="motion-table", keys=[f"motion.{s.n}" for s in moved], caption="Over all valid points"
+    )
 
 
 def quality_table(measured: Measured) -> Markup | None:
@@ -286,11 +345,25 @@ def quality_table(measured: Measured) -> Markup | None:
     rows = []
     for s in known:
         one, two = ((s.quality or {}).get(cam) or {} for cam in ("cam1", "cam2"))
-        rows.append([str(s.n), *(_fixed(cam.get(name), form) for name, form in (
-            ("mean_grey", ".1f"), ("contrast_grey", ".1f"), ("saturated_share", ".2%"), ("focus", ".3f"))
-            for cam in (one, two))])  # fmt: skip
-    columns = ["step", *(f"{what}, camera {k}" for what in ("mean grey", "contrast", "saturated", "focus figure")
-                         for k in (1, 2))]  # fmt: skip
+        rows.append(
+            [
+                str(s.n),
+                *(
+                    _fixed(cam.get(name), form)
+                    for name, form in (
+                        ("mean_grey", ".1f"),
+                        ("contrast_grey", ".1f"),
+                        ("saturated_share", ".2%"),
+                        ("focus", ".3f"),
+                    )
+                    for cam in (one, two)
+                ),
+            ]
+        )
+    columns = [
+        "step",
+        *(f"{what}, camera {k}" for what in ("mean grey", "contrast", "saturated", "focus figure") for k in (1, 2)),
+    ]
     return table(columns, rows, key="quality-table", caption="Images")
 
 
@@ -316,11 +389,13 @@ def provenance(source: Source, facts: TestFacts) -> Markup:
     settings = json.dumps(first.get("settings", {}), sort_keys=True, ensure_ascii=False)
     told = json.dumps(facts.document(), ensure_ascii=False)
     return section(
-        "Where it comes from", "provenance",
-        element("p", "Settings as the result files hold them:"), element("pre", settings, id="settings"),
+        "Where it comes from",
+        "provenance",
+        element("p", "Settings as the result files hold them:"),
+        element("pre", settings, id="settings"),
         *([element("p", "Facts as they were told:"), element("pre", told)] if facts.document() else []),
         table(["result file", "SHA-256 of what it was made from"], rows, key="inputs-table"),
-    )  # fmt: skip
+    )
 
 
 def _hashes(found: dict[str, str]) -> Markup:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from server.formats.version import software_version
 from server.report.geometry import Geometry
 from server.report.items import MEASURED, SETTINGS, Item, Value
 from server.report.source import Source
 from server.report.steps import Measured
-from server.version import software_version
 
 _SHAPES = {
     "rigid": "plane patch, rigid motion (9 unknowns), seen through both calibrated cameras",
@@ -39,33 +39,96 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
     smoothing = measured.steps[-1].summary.get("smoothing")
     update = settings.get("reference_update")
     return [
-        Item("software", "Software", (Value(f"stereorig {head['software_version']} (results), stereorig "
-             f"{software_version()} (this report)", None, "written in the results"),)),
-        Item("prefilter", "Image filtering", (None if blur is None else Value(
-             f"Gaussian, standard deviation {blur:g} px, on all images" if blur else "none", float(blur), SETTINGS),),
-             needs),
+        Item(
+            "software",
+            "Software",
+            (
+                Value(
+                    f"stereorig {head['software_version']} (results), stereorig {software_version()} (this report)",
+                    None,
+                    "written in the results",
+                ),
+            ),
+        ),
+        Item(
+            "prefilter",
+            "Image filtering",
+            (
+                None
+                if blur is None
+                else Value(
+                    f"Gaussian, standard deviation {blur:g} px, on all images" if blur else "none",
+                    float(blur),
+                    SETTINGS,
+                ),
+            ),
+            needs,
+        ),
         Item("subset", "Subset size", (length(settings.get("subset_px")),), needs, "width of the square subset"),
         Item("step", "Step size", (length(settings.get("step_px")),), needs, "distance of the points"),
         Item("shape_function", "Subset shape function", (_shape_function(measured, settings),), needs),
-        Item("criterion", "Matching criterion", (Value("zero-mean normalised sum of squared differences (ZNSSD), "
-             "camera 2 at the reference, camera 1 and camera 2 at the step against camera 1's reference subset", None,
-             "of this program"),)),
-        Item("interpolant", "Interpolant", (None if settings.get("interpolation") is None else Value(
-             f"{settings['interpolation']} B-spline", None, SETTINGS),), needs),
-        Item("reference_update", "Reference", (None if update is None else Value({
-             "never": "the first for all steps (total)", "always": "the step before (incremental), told as totals",
-             "auto": "the first, or a later one where that fails, told as totals"}.get(update, str(update)), None,
-             SETTINGS),), needs, _matched(measured)),
-        Item("smoothing", "Smoothing of displacements", (Value("none", None, SETTINGS) if not smoothing else Value(
-             f"polynomial of order {smoothing['order']} over {smoothing['window']} x {smoothing['window']} points; "
-             f"{smoothing['resolution_px']:g} px"
-             + ("" if smoothing["resolution_mm"] is None else f" ({smoothing['resolution_mm']:.3g} mm)")
-             + " are told apart", float(smoothing["resolution_px"]), SETTINGS),)),
+        Item(
+            "criterion",
+            "Matching criterion",
+            (
+                Value(
+                    "zero-mean normalised sum of squared differences (ZNSSD), "
+                    "camera 2 at the reference, camera 1 and camera 2 at the step against camera 1's reference subset",
+                    None,
+                    "of this program",
+                ),
+            ),
+        ),
+        Item(
+            "interpolant",
+            "Interpolant",
+            (
+                None
+                if settings.get("interpolation") is None
+                else Value(f"{settings['interpolation']} B-spline", None, SETTINGS),
+            ),
+            needs,
+        ),
+        Item(
+            "reference_update",
+            "Reference",
+            (
+                None
+                if update is None
+                else Value(
+                    {
+                        "never": "the first for all steps (total)",
+                        "always": "the step before (incremental), told as totals",
+                        "auto": "the first, or a later one where that fails, told as totals",
+                    }.get(update, str(update)),
+                    None,
+                    SETTINGS,
+                ),
+            ),
+            needs,
+            _matched(measured),
+        ),
+        Item(
+            "smoothing",
+            "Smoothing of displacements",
+            (
+                Value("none", None, SETTINGS)
+                if not smoothing
+                else Value(
+                    f"polynomial of order {smoothing['order']} over {smoothing['window']} x {smoothing['window']}"
+                    f" points; {smoothing['resolution_px']:g} px"
+                    + ("" if smoothing["resolution_mm"] is None else f" ({smoothing['resolution_mm']:.3g} mm)")
+                    + " are told apart",
+                    float(smoothing["resolution_px"]),
+                    SETTINGS,
+                ),
+            ),
+        ),
         *_strain_items(source, measured),
         Item("frame", "Coordinate system", (Value(str(head.get("frame", "")), None, "written in the results"),)),
         Item("points", "Points", (Value(_points(measured), float(measured.steps[0].summary["points"]), MEASURED),)),
         Item("region", "Region", (_region(settings),), needs),
-    ]  # fmt: skip
+    ]
 
 
 def _shape_function(measured: Measured, settings: Mapping[str, Any]) -> Value | None:
@@ -119,12 +182,36 @@ def _strain_items(source: Source, measured: Measured) -> list[Item]:
     mm = strain["gauge_mm"]
     window = strain["window"]
     return [
-        Item("strain", "Strain formulation", (Value(_TENSORS.get(strain["tensor"], strain["tensor"]), None, SETTINGS),),
-             "", "in the reference's tangent plane; shear is the tensor's, half of the engineering shear"),
-        Item("strain.window", "Strain window", (Value(f"{window} x {window} points, polynomial of order "
-             f"{strain['order']} through their displacements", float(window), SETTINGS),)),
-        Item("strain.gauge", "Virtual strain gauge size", (Value(f"{strain['gauge_px']:g} px"
-             + ("" if mm is None else f" = {mm:.4g} mm"), float(strain["gauge_px"]), SETTINGS),), "",
-             "(window - 1) x step + subset; the smoothing's window where displacements were smoothed"),
+        Item(
+            "strain",
+            "Strain formulation",
+            (Value(_TENSORS.get(strain["tensor"], strain["tensor"]), None, SETTINGS),),
+            "",
+            "in the reference's tangent plane; shear is the tensor's, half of the engineering shear",
+        ),
+        Item(
+            "strain.window",
+            "Strain window",
+            (
+                Value(
+                    f"{window} x {window} points, polynomial of order {strain['order']} through their displacements",
+                    float(window),
+                    SETTINGS,
+                ),
+            ),
+        ),
+        Item(
+            "strain.gauge",
+            "Virtual strain gauge size",
+            (
+                Value(
+                    f"{strain['gauge_px']:g} px" + ("" if mm is None else f" = {mm:.4g} mm"),
+                    float(strain["gauge_px"]),
+                    SETTINGS,
+                ),
+            ),
+            "",
+            "(window - 1) x step + subset; the smoothing's window where displacements were smoothed",
+        ),
         Item("strain.filter", "Post-filtering of strain", (Value("none", None, "of this program"),)),
-    ]  # fmt: skip
+    ]

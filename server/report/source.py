@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError, StereorigError
-from server.errors import NotFoundError
+from server.base.errors import NotFoundError
 from server.exports.source import results_in
-from server.facts import TestFacts, parse_facts
-from server.io.calibration_any import LoadedCalibration, load_calibration
-from server.io.files import known_sha256
-from server.io.images import read_image
-from server.io.netcdf_reading import read_attributes
-from server.staleness import stale_results
+from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.formats.files import known_sha256
+from server.formats.images import read_image
+from server.formats.results.reading import read_attributes
+from server.results.metadata import TestFacts, parse_facts
+from server.results.staleness import stale_results
 from server.store.durable import known_json
 
 CAMERAS = ("cam1", "cam2")
@@ -33,7 +33,7 @@ class Source:
     files
         Result files by step, ascending.
     heads
-        Their attributes, as :func:`server.io.netcdf_reading.read_attributes` gives them.
+        Their attributes, as :func:`server.formats.results.reading.read_attributes` gives them.
     test
         The test's folder, None where the results lie alone; ``test_document`` is its ``test.json``.
     analysis
@@ -132,8 +132,11 @@ def find_source(
     folder = _results_folder(place, test, analysis)
     files = {int(path.stem[5:]): path for path in results_in(folder)}
     if not files:
-        raise InputError(f"There is no step_0000.nc or another step's result in {folder}.", code="results_missing",
-                         remedy="Measure first, or give the folder that stereorig measure --out wrote.")  # fmt: skip
+        raise InputError(
+            f"There is no step_0000.nc or another step's result in {folder}.",
+            code="results_missing",
+            remedy="Measure first, or give the folder that stereorig measure --out wrote.",
+        )
     folder = folder.absolute()
     heads = {n: read_attributes(path) for n, path in sorted(files.items())}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
@@ -146,10 +149,18 @@ def find_source(
         told = parse_facts(document.get("facts") or {}, name="the facts of the test")
     steps = {} if home is None else {n: known_json(home / "steps" / f"{n:04d}" / "step.json") for n in files}
     return Source(
-        files=dict(sorted(files.items())), heads=heads, test=home, test_document=document, analysis=made,
-        steps={n: step for n, step in steps.items() if step}, calibration=loaded, calibration_file=file, facts=told,
-        stale=stale_results(list(files.values()), heads.values()), doubts=doubts,
-    )  # fmt: skip
+        files=dict(sorted(files.items())),
+        heads=heads,
+        test=home,
+        test_document=document,
+        analysis=made,
+        steps={n: step for n, step in steps.items() if step},
+        calibration=loaded,
+        calibration_file=file,
+        facts=told,
+        stale=stale_results(list(files.values()), heads.values()),
+        doubts=doubts,
+    )
 
 
 def _results_folder(place: Path, test: str | None, analysis: str | None) -> Path:
@@ -158,13 +169,19 @@ def _results_folder(place: Path, test: str | None, analysis: str | None) -> Path
     if (place / "tests").is_dir():
         place = _one_test(place / "tests", test)
     elif test is not None:
-        raise InputError(f"{place} is no data folder, so it has no test {test}.", code="option_conflict",
-                         remedy="Give the data folder, or leave the test out.")  # fmt: skip
+        raise InputError(
+            f"{place} is no data folder, so it has no test {test}.",
+            code="option_conflict",
+            remedy="Give the data folder, or leave the test out.",
+        )
     if (place / "steps").is_dir():
         return _one_analysis(place, analysis)
     if analysis is not None and place.name != analysis:
-        raise InputError(f"{place} is no test's folder, so it has no analysis {analysis}.", code="option_conflict",
-                         remedy="Give the test's folder, or leave the analysis out.")  # fmt: skip
+        raise InputError(
+            f"{place} is no test's folder, so it has no analysis {analysis}.",
+            code="option_conflict",
+            remedy="Give the test's folder, or leave the analysis out.",
+        )
     return place
 
 
@@ -175,8 +192,12 @@ def _one_test(tests: Path, wanted: str | None) -> Path:
             raise NotFoundError(f"There is no test {wanted[:40]!r} in {tests.parent}.", what="test")
         return there[wanted]
     if len(there) != 1:
-        raise InputError(f"{tests.parent} holds {len(there)} tests.", code="test_unclear",
-                         remedy="Name one with --test, or give the test's own folder.", tests=list(there))  # fmt: skip
+        raise InputError(
+            f"{tests.parent} holds {len(there)} tests.",
+            code="test_unclear",
+            remedy="Name one with --test, or give the test's own folder.",
+            tests=list(there),
+        )
     return next(iter(there.values()))
 
 
@@ -213,8 +234,11 @@ def _calibration(
         if sha256 is None or loaded.sha256 == sha256:
             return loaded, path
         if given is not None:
-            raise InputError(f"{given} is not the calibration that the results were measured with.",
-                             code="calibration_changed", remedy="Give the other one.")  # fmt: skip
+            raise InputError(
+                f"{given} is not the calibration that the results were measured with.",
+                code="calibration_changed",
+                remedy="Give the other one.",
+            )
         doubts.append(f"{path.name} is not the calibration that was measured with; nothing is told from it.")
     if given is not None:
         load_calibration(given)  # says what is wrong with it

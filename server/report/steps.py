@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from core.field.result import Field
+from core.field.points.result import Field
 from core.strain import StrainField
-from server.io.calibration_volume import rbe_of
-from server.io.netcdf_reading import read_field
-from server.io.strain_netcdf import read_strain
-from server.io.summary import summarise
+from server.compute.strain import summarise_strain
+from server.formats.calibrations.volume import rbe_of
+from server.formats.results.reading import read_field
+from server.formats.results.strain import read_strain
+from server.formats.results.summary import summarise
 from server.report.floor import Floor, FloorKeeper, static_steps, told_sigma
 from server.report.source import Source
-from server.results import library
-from server.straining import summarise_strain
+from server.results.reader import library
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class StepFigures:
     seconds
         Since the reference; None where no times are known.
     summary, strain
-        As :func:`server.io.summary.summarise` and :func:`server.straining.summarise_strain` make them.
+        As :func:`summarise` and :func:`summarise_strain` make them.
     skew_ms, quality
         Of the pair of images; None where nobody recorded them.
     static
@@ -144,9 +144,16 @@ def read_steps(source: Source) -> Measured:
     grey = reference.noise_grey[reference.valid]
     grey = grey[np.isfinite(grey)]
     return Measured(
-        steps=figures, reference=reference, shown=shown, floor=keeper.result(), static=keeper.steps, static_how=how,
-        static_left_out=keeper.left_out, told=told, noise_grey=float(np.median(grey)) if grey.size else None,
-    )  # fmt: skip
+        steps=figures,
+        reference=reference,
+        shown=shown,
+        floor=keeper.result(),
+        static=keeper.steps,
+        static_how=how,
+        static_left_out=keeper.left_out,
+        told=told,
+        noise_grey=float(np.median(grey)) if grey.size else None,
+    )
 
 
 def _read(path: Path) -> tuple[Field, StrainField | None]:

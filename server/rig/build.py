@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import CameraError, StageError
-from drivers.frames import CameraOptions, CameraSettings, FrameGrabber
+from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber
 from drivers.registry import make_camera, open_stage
-from drivers.stage import AxisOptions, Stage
-from server.config import CameraName, RigConfig
+from drivers.stages.protocol import AxisOptions, Stage
+from server.config.rig_file import CameraName, RigConfig
 from server.rig.cameras import CAMERAS, Cam, CameraPair, CameraUnit
 from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
 from sim.controllers.esp301 import SimESP301

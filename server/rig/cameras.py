@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CameraError, StateError
-from drivers.frames import CameraSettings, Frame, Pixels
-from drivers.pairing import Pair, PairingAccount
-from server.config import SKEW_PX
+from drivers.acquisition.pairing import Pair, PairingAccount
+from drivers.cameras.protocol import CameraSettings, Frame, Pixels
+from server.config.rig_file import SKEW_PX
 from server.rig.image_speed import ImageMotion, image_motion
 from server.rig.pairs import PairSource
 from server.rig.unit import CAMERAS, Cam, CameraUnit

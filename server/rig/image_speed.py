@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frames import Frame, Pixels
+from drivers.cameras.protocol import Frame, Pixels
 
 _WINDOW_PX = 512
 # Below it the peak of the correlation is one of many

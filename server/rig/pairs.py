@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from typing import Literal, Protocol
 
 from core.errors import CameraError
-from drivers.aligned import AlignedPairing
-from drivers.frames import Frame, FrameStatus
-from drivers.pairing import NumberPairing, Pair, PairingAccount, TimePairing
+from drivers.acquisition.counter_offset import AlignedPairing
+from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
+from drivers.cameras.protocol import Frame, FrameStatus
 from server.rig.unit import CAMERAS, Cam, CameraUnit
 
 Check = Callable[[], None]

@@ -1,6 +1,6 @@
 """The rig as the service uses it: captures, moves, settings, state.
 
-Everything that makes the hardware do something runs on its one owner thread (:class:`server.hardware.HardwareGate`);
+Everything that makes the hardware do something runs on its one owner thread (:class:`HardwareGate`);
 reading the stage's state and stopping it do not.
 """
 
@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import CameraError, DeviceError, InputError, StageError, StateError, StereorigError
-from drivers.frames import CameraSettings
-from drivers.stage import MoveResult
-from server.config import CameraName, RigConfig
-from server.hardware import HardwareGate
-from server.problem import problem_of
+from drivers.cameras.protocol import CameraSettings
+from drivers.stages.protocol import MoveResult
+from server.base.problem import problem_of
+from server.config.rig_file import CameraName, RigConfig
+from server.jobs.hardware import HardwareGate
 from server.rig.build import Devices, first_settings, open_devices
 from server.rig.cameras import CAMERAS, Cam, CameraPair, PairShot
 from server.rig.reconnect import ReconnectWatch
@@ -73,11 +73,7 @@ class Rig:
         """Open cameras and stage; a fault is kept and shown, and :meth:`reconnect` tries again."""
         try:
             self._devices = open_devices(
-                self.config,
-                self._settings,
-                record=self._record,
-                dynamics=self.controls.dynamics,
-                on_lost=self._lost,
+                self.config, self._settings, record=self._record, dynamics=self.controls.dynamics, on_lost=self._lost
             )
             self._fault = None
             self.controls.collect(self._devices.stage)
@@ -143,8 +139,11 @@ class Rig:
         devices = self._devices
         if devices is None:
             cause = self._fault["cause"] if self._fault else "The rig is closed."
-            raise DeviceError(f"The rig is not connected: {cause}", code="not_connected",
-                              remedy="Put the fault right, then POST /rig/reconnect.")  # fmt: skip
+            raise DeviceError(
+                f"The rig is not connected: {cause}",
+                code="not_connected",
+                remedy="Put the fault right, then POST /rig/reconnect.",
+            )
         return devices
 
     @property
@@ -202,15 +201,21 @@ class Rig:
         for cam in CAMERAS:
             has = self.pair.units[cam].settings
             cameras[cam] = {
-                "exposure_ms": has.exposure_ms, "gain_db": has.gain_db, "frame_rate_hz": has.frame_rate_hz,
+                "exposure_ms": has.exposure_ms,
+                "gain_db": has.gain_db,
+                "frame_rate_hz": has.frame_rate_hz,
                 "pixel_format": has.pixel_format,
                 **self.config.camera(cam).facts().model_dump(mode="json", exclude_none=True),
-            }  # fmt: skip
+            }
         return {
-            "name": section.name, "simulated": section.kind == "simulated", "trigger": section.trigger,
-            "frame_rate_hz": section.frame_rate_hz, "max_skew_ms": section.skew_bound_ms, "lighting": section.lighting,
+            "name": section.name,
+            "simulated": section.kind == "simulated",
+            "trigger": section.trigger,
+            "frame_rate_hz": section.frame_rate_hz,
+            "max_skew_ms": section.skew_bound_ms,
+            "lighting": section.lighting,
             "cameras": cameras,
-        }  # fmt: skip
+        }
 
     def _describe_stage_or_fault(self) -> dict[str, Any]:
         # a silent stage must not hide the cameras
@@ -232,19 +237,29 @@ class Rig:
 
     def _read_stage(self) -> dict[str, Any]:
         section = self.config.stage
-        shown: dict[str, Any] = {"driver": section.driver, "identity": None, "axes": [], "zero_mm": section.zero_mm,
-                                 "fault": None}  # fmt: skip
+        shown: dict[str, Any] = {
+            "driver": section.driver,
+            "identity": None,
+            "axes": [],
+            "zero_mm": section.zero_mm,
+            "fault": None,
+        }
         devices = self._devices
         if devices is None:
             return shown | {"fault": self._fault}
         shown["identity"] = asdict(devices.stage.identify())
         for axis in devices.stage.axes:
             status = devices.stage.state(axis)
-            shown["axes"].append({
-                **asdict(status), "state": status.state.value, "limits": asdict(devices.stage.limits(axis)),
-                "dynamics": asdict(devices.stage.dynamics(axis)), "zero_mm": section.of_axis(axis).zero_mm,
-                "cameras": [cam for cam in CAMERAS if self.config.camera(cam).stage_axis == axis],
-            })  # fmt: skip
+            shown["axes"].append(
+                {
+                    **asdict(status),
+                    "state": status.state.value,
+                    "limits": asdict(devices.stage.limits(axis)),
+                    "dynamics": asdict(devices.stage.dynamics(axis)),
+                    "zero_mm": section.of_axis(axis).zero_mm,
+                    "cameras": [cam for cam in CAMERAS if self.config.camera(cam).stage_axis == axis],
+                }
+            )
         return shown
 
     # cameras ----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 from core.errors import DeviceError
-from drivers.stage import AxisState, Stage
+from drivers.stages.protocol import AxisState, Stage
 from server.store.folder import now_utc
 
 _log = logging.getLogger("stereorig.rig")

@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 from typing import Any, Literal
 
 from core.errors import CameraError
-from drivers.frames import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, TriggerMode
-from drivers.reader import CameraReader
-from drivers.sequence import SequenceReader
+from drivers.acquisition.frame_counter import SequenceReader
+from drivers.acquisition.reader import CameraReader
+from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, TriggerMode
 
 Cam = Literal["cam1", "cam2"]
 CAMERAS: tuple[Cam, Cam] = ("cam1", "cam2")

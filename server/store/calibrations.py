@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from server.errors import NotFoundError
-from server.io.files import known_sha256, mismatch, require_recorded, sha256_of
-from server.io.images import GrayImage, encode_tiff
+from server.base.errors import NotFoundError
+from server.formats.files import known_sha256, mismatch, require_recorded, sha256_of
+from server.formats.images import GrayImage, encode_tiff
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 

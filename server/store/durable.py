@@ -1,21 +1,21 @@
 """Files that survive a kill at any instant.
 
 Every document of the data folder comes into being here: written aside in its own folder, fsynced, renamed, and the
-folder fsynced (:mod:`server.io.files`). Whoever finds a file under its real name finds all of it.
+folder fsynced (:mod:`server.formats.files`). Whoever finds a file under its real name finds all of it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError
-from server.io import disk as _disk
-from server.io import files
-from server.io.files import fsync_path, storage_error
+from server.base.json_values import without_nan
+from server.formats import disk as _disk
+from server.formats import files
+from server.formats.files import fsync_path, storage_error
 
 
 def make_folder(folder: Path) -> None:
@@ -70,14 +70,3 @@ def known_json(path: Path) -> dict[str, Any]:
         return read_json(path)
     except FileFormatError:
         return {}
-
-
-def without_nan(value: Any) -> Any:
-    """Replace NaN and infinities by None, tuples by lists, in nested JSON-like data."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(k): without_nan(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(v) for v in value]
-    return value

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from core.errors import FileFormatError, StateError, StorageError
-from server.io.files import storage_error
+from server.formats.files import storage_error
 from server.store.durable import read_json, write_bytes, write_json
 
 FORMAT = 1

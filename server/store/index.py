@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 from core.errors import FileFormatError
-from server.errors import NotFoundError
-from server.problem import RESTART, problem_of
+from server.base.errors import NotFoundError
+from server.base.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder, is_id

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from server.problem import RESTART, problem_of
+from server.base.problem import RESTART, problem_of
 from server.store.catalog import Catalog
 from server.store.folder import IdMaker, is_id
 
@@ -65,35 +65,56 @@ class LostJobs:
             steps = known.get("steps", [])
             result = {**ids, "steps_finished": [s["n"] for s in steps], "steps": steps}
             self._job(
-                run["job_id"], "analysis", ids, state, run.get("created_utc", document["created_utc"]), result,
+                run["job_id"],
+                "analysis",
+                ids,
+                state,
+                run.get("created_utc", document["created_utc"]),
+                result,
                 known.get("problem"),
-            )  # fmt: skip
+            )
             self.made(run, {**ids, "job_id": run["job_id"]})
 
     def _job(
-        self, job_id: str, kind: str, subject: dict[str, Any], state: str, created_utc: str,
-        result: dict[str, Any] | None, problem: dict[str, Any] | None,
-    ) -> None:  # fmt: skip
+        self,
+        job_id: str,
+        kind: str,
+        subject: dict[str, Any],
+        state: str,
+        created_utc: str,
+        result: dict[str, Any] | None,
+        problem: dict[str, Any] | None,
+    ) -> None:
         if not is_id(job_id, "j"):  # a folder from elsewhere may say anything
             return
         if state != "succeeded" and problem is None:
             problem = problem_of(RESTART)
         self._jobs[job_id] = {
-            "id": job_id, "kind": kind, "state": state, "subject": subject,
+            "id": job_id,
+            "kind": kind,
+            "state": state,
+            "subject": subject,
             "progress": {"stage": "done" if state == "succeeded" else "ended", "done": 0, "total": 0, "eta_s": None},
-            "created_utc": created_utc, "started_utc": None, "finished_utc": None, "result": result,
+            "created_utc": created_utc,
+            "started_utc": None,
+            "finished_utc": None,
+            "result": result,
             "problem": problem,
-        }  # fmt: skip
+        }
 
     def _end_bursts(self) -> None:
         for job_id, steps in self._bursts.items():
             burst = steps[0]["burst"]
             subject = {"test_id": steps[0]["test_id"]}
             taken = [
-                {"index": s["burst"]["index"], "n": s["n"], "quality": s.get("quality", {}).get("code"),
-                 "sha256": s["sha256"]}
+                {
+                    "index": s["burst"]["index"],
+                    "n": s["n"],
+                    "quality": s.get("quality", {}).get("code"),
+                    "sha256": s["sha256"],
+                }
                 for s in steps
-            ]  # fmt: skip
+            ]
             result = {**subject, "count": burst["count"], "steps": taken, "failures": []}
             state = "succeeded" if len(steps) == burst["count"] else "interrupted"
             self._job(job_id, "burst", subject, state, steps[0]["captured_utc"], result, None)

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError, StateError
-from server.errors import NotFoundError
-from server.io.files import require_recorded
-from server.io.images import GrayImage, encode_tiff
-from server.problem import RESTART, problem_of
+from server.base.errors import NotFoundError
+from server.base.problem import RESTART, problem_of
+from server.formats.files import require_recorded
+from server.formats.images import GrayImage, encode_tiff
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError, StateError, StorageError
-from server.errors import NotFoundError
-from server.io import disk as _disk
-from server.io.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
+from server.base.errors import NotFoundError
+from server.formats import disk as _disk
+from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -390,7 +390,7 @@ class TestStore:
         return path
 
     def drop_starts(self, test_id: str, analysis_id: str) -> None:
-        """Remove what only an unfinished analysis needs, see :mod:`server.io.starts`."""
+        """Remove what only an unfinished analysis needs, see :mod:`server.formats.results.starts`."""
         for path in self.analysis_path(test_id, analysis_id).glob("starts_[0-9]*.npz"):
             path.unlink(missing_ok=True)
 

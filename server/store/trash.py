@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import FileFormatError, StateError, StorageError
-from server.errors import NotFoundError
-from server.io import disk as _disk
-from server.io.files import fsync_path, storage_error
+from server.base.errors import NotFoundError
+from server.formats import disk as _disk
+from server.formats.files import fsync_path, storage_error
 from server.store.durable import make_folder, read_json, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 from server.store.tests import MAX_STEPS, deleted_mark

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import FileFormatError, StorageError
-from server.io.files import recorded_sha256, sha256_of, storage_error
+from server.formats.files import recorded_sha256, sha256_of, storage_error
 from server.store.durable import read_json
 from server.store.folder import check_format, is_id, is_in_use
 from server.store.tests import CAMERAS, number_of
@@ -225,9 +225,12 @@ class _Walk:
         """What was deleted can come back: looked at like the rest, after the catalogue, which does not know it."""
         document = self.document(path / "trash.json")
         look: dict[str, Callable[[Path], None]] = {
-            "calibration": self.calibration, "noise": self.noise, "test": self.test, "step": self.step_files,
+            "calibration": self.calibration,
+            "noise": self.noise,
+            "test": self.test,
+            "step": self.step_files,
             "analysis": lambda content: self.analysis("", content),
-        }  # fmt: skip
+        }
         if document is not None and (found := look.get(str(document.get("kind")))) is not None:
             found(path / "content")
 

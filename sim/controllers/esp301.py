@@ -126,10 +126,7 @@ class SimESP301(WireController):
         self._axes = {
             number: _Axis(
                 SimAxis(
-                    self.clock,
-                    velocity_mm_s=velocity_mm_s,
-                    acceleration_mm_s2=acceleration_mm_s2,
-                    start_mm=start_mm,
+                    self.clock, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2, start_mm=start_mm
                 ),
                 travel_mm[0],
                 travel_mm[1],

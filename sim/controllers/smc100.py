@@ -136,10 +136,7 @@ class SimSMC100(WireController):
         self._units = {
             address: _Unit(
                 SimAxis(
-                    self.clock,
-                    velocity_mm_s=velocity_mm_s,
-                    acceleration_mm_s2=acceleration_mm_s2,
-                    start_mm=start_mm,
+                    self.clock, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2, start_mm=start_mm
                 ),
                 travel_mm[0],
                 travel_mm[1],

@@ -48,17 +48,48 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], ...]:
 
     @entry
     def run_plane_motion(
-        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
-        space, out, status, iterations,
-    ):  # fmt: skip
+        first,
+        last,
+        reference,
+        visible,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        start_w,
+        start_g,
+        setting,
+        space,
+        out,
+        status,
+        iterations,
+    ):
         if stamp < 0:
             return
         patches, which = visible
         for i in range(first, last):
             status[i], iterations[i] = _plane_motion(
-                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i],
-                start_g[i], setting, space, out[i],
-            )  # fmt: skip
+                reference,
+                patches,
+                which[i],
+                image2,
+                image1t,
+                image2t,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                start_w[i],
+                start_g[i],
+                setting,
+                space,
+                out[i],
+            )
 
     @entry
     def run_curved_shape(
@@ -74,73 +105,240 @@ def _wrappers(stamp: int) -> tuple[dict[int, Any], ...]:
 
     @entry
     def run_curved_motion(
-        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, start_w, start_g, setting,
-        space, out, status, iterations,
-    ):  # fmt: skip
+        first,
+        last,
+        reference,
+        visible,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        start_w,
+        start_g,
+        setting,
+        space,
+        out,
+        status,
+        iterations,
+    ):
         if stamp < 0:
             return
         patches, which = visible
         for i in range(first, last):
             status[i], iterations[i] = _curved_motion(
-                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], start_w[i],
-                start_g[i], setting, space, out[i],
-            )  # fmt: skip
+                reference,
+                patches,
+                which[i],
+                image2,
+                image1t,
+                image2t,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                start_w[i],
+                start_g[i],
+                setting,
+                space,
+                out[i],
+            )
 
     @entry
     def observe_plane_shape(
-        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
-        space, out, status,
-    ):  # fmt: skip
+        first,
+        last,
+        reference,
+        visible,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        w,
+        g,
+        e,
+        setting,
+        rigid,
+        space,
+        out,
+        status,
+    ):
         if stamp < 0:
             return
         patches, which = visible
         for i in range(first, last):
             status[i] = _observed_plane_shape(
-                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
-                setting, rigid, space, out[i],
-            )  # fmt: skip
+                reference,
+                patches,
+                which[i],
+                image2,
+                image1t,
+                image2t,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                w[i],
+                g[i],
+                e[i],
+                setting,
+                rigid,
+                space,
+                out[i],
+            )
 
     @entry
     def observe_plane_motion(
-        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
-        space, out, status,
-    ):  # fmt: skip
+        first,
+        last,
+        reference,
+        visible,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        w,
+        g,
+        e,
+        setting,
+        rigid,
+        space,
+        out,
+        status,
+    ):
         if stamp < 0:
             return
         patches, which = visible
         for i in range(first, last):
             status[i] = _observed_plane_motion(
-                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
-                setting, rigid, space, out[i],
-            )  # fmt: skip
+                reference,
+                patches,
+                which[i],
+                image2,
+                image1t,
+                image2t,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                w[i],
+                g[i],
+                e[i],
+                setting,
+                rigid,
+                space,
+                out[i],
+            )
 
     @entry
     def observe_curved_shape(
-        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
-        space, out, status,
-    ):  # fmt: skip
+        first,
+        last,
+        reference,
+        visible,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        w,
+        g,
+        e,
+        setting,
+        rigid,
+        space,
+        out,
+        status,
+    ):
         if stamp < 0:
             return
         patches, which = visible
         for i in range(first, last):
             status[i] = _observed_curved_shape(
-                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
-                setting, rigid, space, out[i],
-            )  # fmt: skip
+                reference,
+                patches,
+                which[i],
+                image2,
+                image1t,
+                image2t,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                w[i],
+                g[i],
+                e[i],
+                setting,
+                rigid,
+                space,
+                out[i],
+            )
 
     @entry
     def observe_curved_motion(
-        first, last, reference, visible, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid,
-        space, out, status,
-    ):  # fmt: skip
+        first,
+        last,
+        reference,
+        visible,
+        image2,
+        image1t,
+        image2t,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        w,
+        g,
+        e,
+        setting,
+        rigid,
+        space,
+        out,
+        status,
+    ):
         if stamp < 0:
             return
         patches, which = visible
         for i in range(first, last):
             status[i] = _observed_curved_motion(
-                reference, patches, which[i], image2, image1t, image2t, lens1, lens2, R, t, xy[i], w[i], g[i], e[i],
-                setting, rigid, space, out[i],
-            )  # fmt: skip
+                reference,
+                patches,
+                which[i],
+                image2,
+                image1t,
+                image2t,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                w[i],
+                g[i],
+                e[i],
+                setting,
+                rigid,
+                space,
+                out[i],
+            )
 
     return (
         {1: run_plane_shape, 2: run_curved_shape},

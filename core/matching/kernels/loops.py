@@ -62,8 +62,9 @@ def _four_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec
         total = None
         for row, weight in zip(rows, wy, strict=True):
             builder = weight.builder
-            taps = join(load(builder, at(builder, row, first[j]), 4), load(builder, at(builder, row, first[j + 4]), 4),
-                        range(8))  # fmt: skip
+            taps = join(
+                load(builder, at(builder, row, first[j]), 4), load(builder, at(builder, row, first[j + 4]), 4), range(8)
+            )
             term = weight.pick([j] * 4 + [j + 4] * 4) * taps
             total = term if total is None else total + term
         assert total is not None
@@ -284,9 +285,12 @@ def _reference_sums(degree: int) -> Any:
             few, many = len(monomials(degree)), len(monomials(2 * degree))
             place = 0
             for terms, n in (
-                (with_grey, 4 + 2 * few), (columns_alone, 2 * few), (products(GX, GX), many), (products(GX, GY), many),
+                (with_grey, 4 + 2 * few),
+                (columns_alone, 2 * few),
+                (products(GX, GX), many),
+                (products(GX, GY), many),
                 (products(GY, GY), many),
-            ):  # fmt: skip
+            ):
                 _sum_up(builder, args[1], n, terms, out, place)
                 place += n
             return context.get_dummy_value()

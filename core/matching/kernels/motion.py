@@ -54,8 +54,20 @@ def n_motion_out(terms: int) -> int:
 def make_motion(degree: int) -> Any:
     """Compile the fit for plane (degree 1, stretch or rigid) or curved (2) patches."""
     parts = make_point(degree, 3)
-    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
-     texture, few) = parts  # fmt: skip
+    (
+        set_up_reference,
+        work_space,
+        compare,
+        image_matrices,
+        jacobian,
+        assemble,
+        factor,
+        gradient,
+        moves_of,
+        predict,
+        texture,
+        few,
+    ) = parts
     unknowns = 4 * few + 1
 
     @kernel(f"{degree}")
@@ -114,8 +126,22 @@ def make_motion(degree: int) -> Any:
     ):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
         subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise, rigid = setting
-        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain,
-         work) = space  # fmt: skip
+        (
+            ref,
+            of_reference,
+            warp_space,
+            rhs,
+            levels,
+            M,
+            equations,
+            moves,
+            vectors,
+            inverse,
+            G,
+            rotation,
+            chain,
+            work,
+        ) = space
         gram, columns, normal = of_reference[7], equations[2], equations[5]
         inside, xc, yc, p, offset, f2, white, count = set_up_reference(
             reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference

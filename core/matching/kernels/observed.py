@@ -100,9 +100,14 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
         for a in range(across):
             for b in range(across):
                 blocks, texture = cut_out(
-                    ref, subset, a * subset // across, (a + 1) * subset // across, b * subset // across,
-                    (b + 1) * subset // across, part,
-                )  # fmt: skip
+                    ref,
+                    subset,
+                    a * subset // across,
+                    (a + 1) * subset // across,
+                    b * subset // across,
+                    (b + 1) * subset // across,
+                    part,
+                )
                 total += texture
                 squares += texture * texture
                 sum_pixels(coefficients, order, base, stride, warp, part, blocks, sums)
@@ -117,8 +122,9 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
         """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status."""
         subset, order, _, _, _, _, slope, variances, known_noise = setting
         fit_space, (part, scores, pull, z, sums) = space
-        (ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain,
-         _) = fit_space  # fmt: skip
+        (ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _) = (
+            fit_space
+        )
         inside, xc, yc, p, offset, f2, _, count = set_up_reference(
             reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
         )

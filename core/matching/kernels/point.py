@@ -365,5 +365,17 @@ def make_point(degree: int, images: int) -> Any:
         mean = 0.5 * (xx + yy)
         return mean, mean - math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
 
-    return (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of,
-            predict, texture, few)  # fmt: skip
+    return (
+        set_up_reference,
+        work_space,
+        compare,
+        image_matrices,
+        jacobian,
+        assemble,
+        factor,
+        gradient,
+        moves_of,
+        predict,
+        texture,
+        few,
+    )

@@ -46,8 +46,20 @@ def n_shape_out(terms: int) -> int:
 def make_shape(degree: int) -> Any:
     """Compile the fit for plane (degree 1) or curved (2) patches."""
     parts = make_point(degree, 1)
-    (set_up_reference, work_space, compare, image_matrices, jacobian, assemble, factor, gradient, moves_of, predict,
-     texture, few) = parts  # fmt: skip
+    (
+        set_up_reference,
+        work_space,
+        compare,
+        image_matrices,
+        jacobian,
+        assemble,
+        factor,
+        gradient,
+        moves_of,
+        predict,
+        texture,
+        few,
+    ) = parts
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @kernel(f"{degree}")

@@ -15,7 +15,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.lens import SEIDEL
+from core.cameras.lens import SEIDEL
 from core.matching.image import PAD
 from core.matching.kernels.loops import data, monomials
 from core.matching.kernels.naming import inner

@@ -14,20 +14,6 @@ from server.api.models.analyses import (
     Region,
     StrainRequest,
 )
-from server.api.models.base import (
-    CameraName,
-    Channels,
-    JobState,
-    Label,
-    Number,
-    Pixel,
-    Real,
-    Reply,
-    Request,
-    Timestamp,
-    Whole,
-    utc_text,
-)
 from server.api.models.calibrations import (
     CalibrationAccepted,
     CalibrationList,
@@ -75,6 +61,20 @@ from server.api.models.tests import (
     TestRequest,
     WatchReply,
     WatchRequest,
+)
+from server.base.models import (
+    CameraName,
+    Channels,
+    JobState,
+    Label,
+    Number,
+    Pixel,
+    Real,
+    Reply,
+    Request,
+    Timestamp,
+    Whole,
+    utc_text,
 )
 
 __all__ = [

@@ -6,12 +6,14 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
-from core.field.patch import DEFAULT_PATCH, PatchSetting
+from core.field.points.patch import DEFAULT_PATCH, PatchSetting
+from core.field.points.smoothing_record import WIDEST_SMOOTHING
 from core.field.prefilter import MOST_OF_SUBSET
 from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
-from core.field.smoothing import WIDEST_SMOOTHING
 from core.strain.options import DEFAULT_WINDOW, WIDEST_WINDOW, StrainTensor
-from server.api.models.base import (
+from server.api.models.jobs import Accepted, JobProblem
+from server.api.models.tests import AnalysisEntry
+from server.base.models import (
     ODD,
     JobState,
     Label,
@@ -27,8 +29,6 @@ from server.api.models.base import (
     disagreement,
     not_both,
 )
-from server.api.models.jobs import Accepted, JobProblem
-from server.api.models.tests import AnalysisEntry
 
 
 class Region(Request):
@@ -145,8 +145,7 @@ class AnalysisRequest(Request):
         json_schema_extra=ODD,
     )
     follow: Switch = Field(
-        False,
-        description="Go on with each step of the test as it lands, until the analysis is finished or cancelled.",
+        False, description="Go on with each step of the test as it lands, until the analysis is finished or cancelled."
     )
     label: Label = Field("", description="Free text.")
 
@@ -181,8 +180,7 @@ class ContinueRequest(Request):
     """How to go on with an analysis."""
 
     other_version: Switch = Field(
-        False,
-        description="Go on although another version of the program began it: its steps might not agree.",
+        False, description="Go on although another version of the program began it: its steps might not agree."
     )
 
 

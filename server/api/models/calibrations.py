@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from server.api.models.base import Label, Listing, Number, Real, Reply, Request, Whole
 from server.api.models.jobs import Accepted, JobProblem
+from server.base.models import Label, Listing, Number, Real, Reply, Request, Whole
 
 
 class CalibrationRequest(Request):

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
-from server.api.models.base import JobState, Listing, Reply
+from server.base.models import JobState, Listing, Reply
 
 
 class Progress(Reply):

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from server.api.models.base import Label, Listing, Reply, Request, Whole
 from server.api.models.jobs import Accepted
+from server.base.models import Label, Listing, Reply, Request, Whole
 
 
 class NoiseRequest(Request):

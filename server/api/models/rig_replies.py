@@ -6,11 +6,11 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from drivers.stage import AxisState
-from server.api.models.base import CameraName, Reply
+from drivers.stages.protocol import AxisState
 from server.api.models.jobs import JobProblem
 from server.api.models.rig import DynamicsReply
-from server.config import CalibrationSection, CameraSection, TargetSection
+from server.base.models import CameraName, Reply
+from server.config.rig_file import CalibrationSection, CameraSection, TargetSection
 
 Range = tuple[float, float]
 

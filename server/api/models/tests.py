@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
-from server.api.models.base import Channels, Label, Listing, Number, Real, Reply, Request, Timestamp, Whole
 from server.api.models.jobs import Accepted
+from server.base.models import Channels, Label, Listing, Number, Real, Reply, Request, Timestamp, Whole
 
 
 class TestRequest(Request):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from server.api.models.base import Listing, Reply, Request, Whole
+from server.base.models import Listing, Reply, Request, Whole
 
 
 class TrashEntry(Reply):

@@ -1,0 +1,1 @@
+"""Checks of a calibration that do not rest on its own fit."""

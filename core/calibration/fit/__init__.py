@@ -1,0 +1,1 @@
+"""The least-squares fit: predicted positions and derivatives, start values, one camera, both together."""

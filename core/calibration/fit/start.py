@@ -1,0 +1,37 @@
+"""Start values from nominal lens data; only alpha and the target's place are read off the image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.calibration.inputs import CalibrationView, NominalCamera
+from core.cameras.lens import Float
+
+
+def affine_of_view(view: CalibrationView, nodes_mm: Float, aspect: float) -> tuple[Float, Float]:
+    """Fit ``image = A (X, Y) + b`` with the rows scaled back by the aspect ratio.
+
+    Returns
+    -------
+    A (2, 2) in px/mm, and b (2,) in px (rows still divided by the aspect ratio).
+    """
+    found = view.found
+    xy = view.xy_px[found] / [1.0, aspect]
+    design = np.column_stack([nodes_mm[found], np.ones(int(found.sum()))])
+    solution = np.asarray(np.linalg.lstsq(design, xy, rcond=None)[0], dtype=np.float64)
+    return solution[:2].T, solution[2]
+
+
+def start_values(view: CalibrationView, nodes_mm: Float, nominal: NominalCamera, gamma_rad: float) -> Float:
+    """Return the ten parameters to start from, in the order of :data:`core.cameras.camera.TEN_PARAMETER_NAMES`.
+
+    With beta = 0 the rows of Eq. (1) give, whatever gamma is, the rows' direction of the image of X_sys as sin(alpha)
+    and that of Y_sys as cos(alpha).
+    """
+    A, b = affine_of_view(view, nodes_mm, nominal.aspect)
+    alpha = float(np.arctan2(A[1, 0], A[1, 1]))
+    cx, cy = nominal.centre_px
+    depth = nominal.standoff_mm + view.dz_mm
+    x0 = (b[0] - cx) * depth / nominal.phd_px
+    y0 = (b[1] - cy / nominal.aspect) * depth / nominal.phd_px
+    return np.array([nominal.phd_px, cx, cy, 0.0, alpha, 0.0, gamma_rad, x0, y0, nominal.standoff_mm])

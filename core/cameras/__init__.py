@@ -1,0 +1,1 @@
+"""Cameras, lenses and the calibrated pair, Eqs. (1) to (8)."""

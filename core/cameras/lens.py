@@ -1,0 +1,308 @@
+"""Lens models: from normalised camera coordinates to the image and back.
+
+A lens model maps the normalised point ``(X_cam / Z_cam, Y_cam / Z_cam)`` to image pixels. Two models share one small
+interface: the paper's Seidel term, Eqs. (5) to (8), and OpenCV's ``k1 k2 p1 p2 k3`` for imported rigs.
+
+Conventions: pixel centres at integers, x = column to the right, y = row down. A point outside a model's domain is
+marked in ``valid``; its coordinates are then NaN and must not be used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+SEIDEL = 0.0
+OPENCV = 1.0
+N_KERNEL_PARAMETERS = 12
+_NEWTON_STEPS = 30
+
+
+class MappedPoints(NamedTuple):
+    """Points after a mapping with a limited domain.
+
+    Attributes
+    ----------
+    xy
+        (..., 2) coordinates; NaN where ``valid`` is False.
+    valid
+        (...) bool, False where the point has no image (or no ray).
+    """
+
+    xy: Float
+    valid: Bool
+
+
+@runtime_checkable
+class LensModel(Protocol):
+    """What every lens model offers.
+
+    >>> lens = SeidelLens(phd_px=12000.0, cx_px=256.0, cy_px=240.0, kappa_per_px2=1e-9, aspect=0.9617)
+    >>> lens.image_from_normalised([[0.0, 0.0]]).xy
+    array([[256., 240.]])
+    """
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names, with units, of the numbers in :meth:`parameter_jacobian`'s last axis."""
+        ...
+
+    def image_from_normalised(self, xy_norm: ArrayLike) -> MappedPoints:
+        """Map normalised points (..., 2) to image pixels (..., 2)."""
+        ...
+
+    def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
+        """Map image pixels (..., 2) to normalised points (..., 2)."""
+        ...
+
+    def image_jacobian(self, xy_norm: ArrayLike) -> Float:
+        """d(image px) / d(normalised), (..., 2, 2), at normalised points (..., 2)."""
+        ...
+
+    def parameter_jacobian(self, xy_norm: ArrayLike) -> Float:
+        """d(image px) / d(parameters), (..., 2, n), at normalised points (..., 2)."""
+        ...
+
+    def kernel_parameters(self) -> Float:
+        """Flat (12,) float64 form for compiled kernels.
+
+        ``[kind, fx, fy, skew, cx, cy, d0, d1, d2, d3, d4, r2_max]`` with kind 0 = Seidel (d0 = kappa phd^2) or
+        1 = OpenCV (d = k1 k2 p1 p2 k3), and r2_max the largest normalised radius squared inside the domain.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SeidelLens:
+    """The paper's lens and sensor: five intrinsic parameters, Eqs. (5) to (8).
+
+    Parameters
+    ----------
+    phd_px
+        Pinhole distance in column pitches.
+    cx_px, cy_px
+        Image centre.
+    kappa_per_px2
+        Seidel distortion. ``x_bar = x_sen / (1 + kappa r^2)`` (6), corrected form.
+    aspect
+        Rows' scale over columns' scale (lambda).
+    """
+
+    phd_px: float
+    cx_px: float
+    cy_px: float
+    kappa_per_px2: float
+    aspect: float = 1.0
+
+    parameter_names: ClassVar[tuple[str, ...]] = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect")
+
+    def image_from_normalised(self, xy_norm: ArrayLike) -> MappedPoints:
+        """Apply Eqs. (5), (6), (8). Valid where |kappa| r^2 < 1, beyond which (6) cannot be inverted."""
+        s = np.asarray(xy_norm, dtype=np.float64) * self.phd_px
+        kr2 = self.kappa_per_px2 * (s[..., 0] ** 2 + s[..., 1] ** 2)
+        valid = np.abs(kr2) < 1.0  # also False for NaN input
+        bar = s / np.where(valid, 1.0 + kr2, np.nan)[..., None]
+        bar[..., 0] += self.cx_px
+        bar[..., 1] = self.aspect * bar[..., 1] + self.cy_px
+        return MappedPoints(bar, valid)
+
+    def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
+        """Apply Eqs. (8), (7), (5) backwards. Valid where 4 kappa rbar^2 < 1."""
+        xy = np.asarray(xy_px, dtype=np.float64)
+        bar = np.stack([xy[..., 0] - self.cx_px, (xy[..., 1] - self.cy_px) / self.aspect], axis=-1)
+        q = 4.0 * self.kappa_per_px2 * (bar[..., 0] ** 2 + bar[..., 1] ** 2)
+        valid = q < 1.0
+        root = np.sqrt(np.where(valid, 1.0 - q, np.nan))
+        return MappedPoints(bar * (2.0 / (1.0 + root) / self.phd_px)[..., None], valid)
+
+    def image_jacobian(self, xy_norm: ArrayLike) -> Float:
+        """Differentiate (5), (6), (8) with respect to the normalised point."""
+        s = np.asarray(xy_norm, dtype=np.float64) * self.phd_px
+        k = self.kappa_per_px2
+        d = 1.0 + k * (s[..., 0] ** 2 + s[..., 1] ** 2)
+        jac = -2.0 * k * s[..., :, None] * s[..., None, :] / (d**2)[..., None, None]
+        jac[..., 0, 0] += 1.0 / d
+        jac[..., 1, 1] += 1.0 / d
+        jac *= self.phd_px
+        jac[..., 1, :] *= self.aspect
+        return jac
+
+    def parameter_jacobian(self, xy_norm: ArrayLike) -> Float:
+        """Differentiate (5), (6), (8) with respect to phd, cx, cy, kappa, aspect."""
+        n = np.asarray(xy_norm, dtype=np.float64)
+        s = n * self.phd_px
+        r2 = s[..., 0] ** 2 + s[..., 1] ** 2
+        d = 1.0 + self.kappa_per_px2 * r2
+        jac = np.zeros((*n.shape[:-1], 2, 5))
+        # along a ray x_sen grows with phd, and r^2 with it
+        jac[..., :, 0] = n * ((1.0 - self.kappa_per_px2 * r2) / d**2)[..., None]
+        jac[..., 0, 1] = 1.0
+        jac[..., 1, 2] = 1.0
+        jac[..., :, 3] = -s * (r2 / d**2)[..., None]
+        jac[..., 1, 0] *= self.aspect
+        jac[..., 1, 3] *= self.aspect
+        jac[..., 1, 4] = s[..., 1] / d
+        return jac
+
+    def kernel_parameters(self) -> Float:
+        """Flat form, see :class:`LensModel`."""
+        k = self.kappa_per_px2 * self.phd_px**2
+        r2_max = 1.0 / abs(k) if k != 0.0 else np.inf
+        return np.array(
+            [SEIDEL, self.phd_px, self.phd_px * self.aspect, 0.0, self.cx_px, self.cy_px, k, 0, 0, 0, 0, r2_max]
+        )
+
+
+@dataclass(frozen=True)
+class OpenCVLens:
+    """OpenCV's pinhole and distortion model with five coefficients and a skew.
+
+    ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)``, likewise y;
+    ``x_img = fx x_d + skew y_d + cx``, ``y_img = fy y_d + cy``.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    skew_px: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    parameter_names: ClassVar[tuple[str, ...]] = (
+        "fx_px",
+        "fy_px",
+        "cx_px",
+        "cy_px",
+        "skew_px",
+        "k1",
+        "k2",
+        "p1",
+        "p2",
+        "k3",
+    )
+
+    @cached_property
+    def _r2_max(self) -> float:
+        # the radial polynomial folds back where d/dr [r (1 + k1 r^2 + k2 r^4 + k3 r^6)] = 0
+        roots = np.roots([7.0 * self.k3, 5.0 * self.k2, 3.0 * self.k1, 1.0])
+        real = roots[np.abs(roots.imag) < 1e-12 * np.maximum(1.0, np.abs(roots))].real
+        real = real[real > 0.0]
+        return float(real.min()) if real.size else float("inf")
+
+    def _distorted(self, n: Float) -> Float:
+        x, y = n[..., 0], n[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        xd = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
+        yd = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
+        return np.stack([xd, yd], axis=-1)
+
+    def _distorted_jacobian(self, n: Float) -> Float:
+        x, y = n[..., 0], n[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3))  # d radial / d(r^2) * 2
+        jac = np.empty((*n.shape[:-1], 2, 2))
+        jac[..., 0, 0] = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
+        jac[..., 0, 1] = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
+        jac[..., 1, 0] = jac[..., 0, 1]
+        jac[..., 1, 1] = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
+        return jac
+
+    def _image(self, d: Float) -> Float:
+        return np.stack(
+            [self.fx_px * d[..., 0] + self.skew_px * d[..., 1] + self.cx_px, self.fy_px * d[..., 1] + self.cy_px],
+            axis=-1,
+        )
+
+    def image_from_normalised(self, xy_norm: ArrayLike) -> MappedPoints:
+        """Distort and map to pixels. Valid where the radial polynomial still grows."""
+        n = np.asarray(xy_norm, dtype=np.float64)
+        valid = n[..., 0] ** 2 + n[..., 1] ** 2 < self._r2_max
+        return MappedPoints(self._image(self._distorted(np.where(valid[..., None], n, np.nan))), valid)
+
+    def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
+        """Invert by Newton's method; not valid where it does not come back to the pixel within 1e-9."""
+        xy = np.asarray(xy_px, dtype=np.float64)
+        yd = (xy[..., 1] - self.cy_px) / self.fy_px
+        d = np.stack([(xy[..., 0] - self.cx_px - self.skew_px * yd) / self.fx_px, yd], axis=-1)
+        n = d.copy()
+        r_max = np.sqrt(self._r2_max)
+        with np.errstate(all="ignore"):  # points that run away are refused below
+            for _ in range(_NEWTON_STEPS):
+                residual = self._distorted(n) - d
+                jac = self._distorted_jacobian(n)
+                det = jac[..., 0, 0] * jac[..., 1, 1] - jac[..., 0, 1] * jac[..., 1, 0]
+                step_x = (jac[..., 1, 1] * residual[..., 0] - jac[..., 0, 1] * residual[..., 1]) / det
+                step_y = (jac[..., 0, 0] * residual[..., 1] - jac[..., 1, 0] * residual[..., 0]) / det
+                n = n - np.stack([step_x, step_y], axis=-1)
+                if np.isfinite(r_max):  # keep Newton on the branch that contains the centre
+                    r = np.hypot(n[..., 0], n[..., 1])
+                    n = n * np.where(r > r_max, 0.999 * r_max / r, 1.0)[..., None]
+                if not np.any(np.maximum(np.abs(step_x), np.abs(step_y)) > 1e-14):
+                    break
+            error = np.abs(self._distorted(n) - d).max(axis=-1) * max(abs(self.fx_px), abs(self.fy_px))
+            valid = error < 1e-9 * np.maximum(1.0, np.abs(xy).max(axis=-1))
+        return MappedPoints(np.where(valid[..., None], n, np.nan), valid)
+
+    def image_jacobian(self, xy_norm: ArrayLike) -> Float:
+        """Differentiate the distortion and the pixel map."""
+        jac = self._distorted_jacobian(np.asarray(xy_norm, dtype=np.float64))
+        out = np.empty_like(jac)
+        out[..., 0, :] = self.fx_px * jac[..., 0, :] + self.skew_px * jac[..., 1, :]
+        out[..., 1, :] = self.fy_px * jac[..., 1, :]
+        return out
+
+    def parameter_jacobian(self, xy_norm: ArrayLike) -> Float:
+        """Differentiate with respect to fx, fy, cx, cy, skew, k1, k2, p1, p2, k3."""
+        n = np.asarray(xy_norm, dtype=np.float64)
+        x, y = n[..., 0], n[..., 1]
+        r2 = x * x + y * y
+        d = self._distorted(n)
+        jac = np.zeros((*n.shape[:-1], 2, 10))
+        jac[..., 0, 0] = d[..., 0]
+        jac[..., 1, 1] = d[..., 1]
+        jac[..., 0, 2] = 1.0
+        jac[..., 1, 3] = 1.0
+        jac[..., 0, 4] = d[..., 1]
+        terms = (
+            (5, x * r2, y * r2),
+            (6, x * r2**2, y * r2**2),
+            (7, 2.0 * x * y, r2 + 2.0 * y * y),
+            (8, r2 + 2.0 * x * x, 2.0 * x * y),
+            (9, x * r2**3, y * r2**3),
+        )
+        for column, dx, dy in terms:
+            jac[..., 0, column] = self.fx_px * dx + self.skew_px * dy
+            jac[..., 1, column] = self.fy_px * dy
+        return jac
+
+    def kernel_parameters(self) -> Float:
+        """Flat form, see :class:`LensModel`."""
+        return np.array(
+            [
+                OPENCV,
+                self.fx_px,
+                self.fy_px,
+                self.skew_px,
+                self.cx_px,
+                self.cy_px,
+                self.k1,
+                self.k2,
+                self.p1,
+                self.p2,
+                self.k3,
+                self._r2_max,
+            ]
+        )

@@ -1,0 +1,73 @@
+"""The calibrated pair: relative pose, epipolar lines, triangulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
+from core.cameras.lens import Float
+
+
+@dataclass(frozen=True)
+class StereoPair:
+    """Camera 1 (reference) and camera 2 in one system frame."""
+
+    cam1: Camera
+    cam2: Camera
+
+    @cached_property
+    def cam2_from_cam1(self) -> RigidTransform:
+        """The relative pose that the matching works with."""
+        return self.cam2.cam_from_sys @ self.cam1.sys_from_cam
+
+    @property
+    def baseline_mm(self) -> float:
+        """Distance of the two pinholes."""
+        return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
+
+    @property
+    def stereo_angle_rad(self) -> float:
+        """Angle between the two optical axes."""
+        return float(np.arccos(np.clip(self.cam2_from_cam1.rotation[2, 2], -1.0, 1.0)))
+
+    def epipolar_residual_px(self, xy1_px: ArrayLike, xy2_px: ArrayLike) -> Float:
+        """Signed distance (...) in camera 2 pixels from ``xy2_px`` to the epipolar line of ``xy1_px``.
+
+        To first order, through camera 2's lens Jacobian; NaN where a pixel has no ray.
+        """
+        ray1 = self.cam1.rays_cam(xy1_px)
+        ray2 = self.cam2.rays_cam(xy2_px)
+        R, t = self.cam2_from_cam1.rotation, self.cam2_from_cam1.translation_mm
+        line = np.cross(t, ray1.xyz_mm @ R.T)  # plane through both pinholes and ray 1, in camera 2
+        algebraic = np.sum(line * ray2.xyz_mm, axis=-1)
+        # d(algebraic)/d(px) = line_xy J^-1
+        jac = self.cam2.lens.image_jacobian(ray2.xyz_mm[..., :2])
+        gradient = np.linalg.solve(np.swapaxes(jac, -1, -2), line[..., :2, None])[..., 0]
+        return np.asarray(algebraic / np.linalg.norm(gradient, axis=-1))
+
+    def triangulate(self, xy1_px: ArrayLike, xy2_px: ArrayLike) -> SpacePoints:
+        """Mid-point of the shortest segment between the two rays, in the system frame."""
+        ray1 = self.cam1.rays_cam(xy1_px)
+        ray2 = self.cam2.rays_cam(xy2_px)
+        d1 = ray1.xyz_mm @ self.cam1.cam_from_sys.rotation
+        d2 = ray2.xyz_mm @ self.cam2.cam_from_sys.rotation
+        c1, c2 = self.cam1.centre_sys_mm, self.cam2.centre_sys_mm
+        a, b, c = (d1 * d1).sum(-1), (d1 * d2).sum(-1), (d2 * d2).sum(-1)
+        base = c2 - c1
+        e, f = d1 @ base, d2 @ base
+        with np.errstate(divide="ignore", invalid="ignore"):
+            det = a * c - b * b
+            s1 = (c * e - b * f) / det
+            s2 = (b * e - a * f) / det
+        valid = ray1.valid & ray2.valid & (det > 0.0) & (s1 > 0.0) & (s2 > 0.0)
+        mid = 0.5 * (c1 + d1 * s1[..., None] + c2 + d2 * s2[..., None])
+        return SpacePoints(np.where(valid[..., None], mid, np.nan), valid)
+
+    def image2_at_depth(self, xy1_px: ArrayLike, z_cam1_mm: ArrayLike) -> Float:
+        """Where camera 2 sees the point on camera 1's ray at depth ``z_cam1_mm``; NaN where it does not."""
+        p = self.cam1.rays_cam(xy1_px).xyz_mm * np.asarray(z_cam1_mm, dtype=np.float64)[..., None]
+        return project_cam(self.cam2.lens, self.cam2_from_cam1.apply(p)).xy

@@ -1,0 +1,1 @@
+"""Checks of measured points: validity, residuals, patch error, image edges, calibrated volume."""

@@ -1,0 +1,44 @@
+"""A Gaussian prefilter at the images' edges: there it lacks neighbours, and mirrors what it has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.cameras.lens import Bool, Float
+from core.errors import RegionError
+from core.field.checks.unreached import leaves_an_image
+from core.field.points.fitter import Fitter, PointFits
+from core.field.region.region import PointGrid
+from core.matching.blur import Blur
+from core.status import PointStatus
+
+
+def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], subset_px: int, blur: Blur) -> Bool:
+    """Return (r, c) which points' subsets see nothing of camera 1's image but what was blurred with its own neighbours.
+
+    Raises
+    ------
+    RegionError
+        ``region_too_small`` if no point is left.
+    """
+    margin = subset_px // 2 + blur.edge_px
+    rows, cols = shape
+    x, y = grid.x_px, grid.y_px
+    clear = fits_image & (x >= margin) & (y >= margin) & (x <= cols - 1 - margin) & (y <= rows - 1 - margin)
+    if not clear.any():
+        raise RegionError(
+            f"all points lie nearer than {margin} px to the border of camera 1's image, where the prefilter of "
+            f"{blur.sd_px:g} px has no neighbours.",
+            code="region_too_small",
+            remedy="Give a region further from the image's border, a smaller subset or a smaller prefilter.",
+        )
+    return np.asarray(clear)
+
+
+def refuse_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
+    """Give points the status OUTSIDE_IMAGE whose patch comes so near to an image's border that the blur lacks some."""
+    ok = np.flatnonzero(points.ok)
+    off = leaves_an_image(fitter, xy_px[ok], xy_px[ok], points.take(ok), margin_px=blur.edge_px)
+    gone = np.zeros(len(points.status), bool)
+    gone[ok[off]] = True
+    points.refuse(gone, PointStatus.OUTSIDE_IMAGE)

@@ -1,0 +1,85 @@
+"""Whether the cameras still stand as they were calibrated: the field's offset across the epipolar lines tells.
+
+A camera that was touched since sees all points off their lines by an offset that varies slowly over the image. A
+quadratic surface through the points' offsets has little noise left, so hundredths of a pixel show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from core.field.points.result import Field
+from core.field.region.trend import smooth_terms
+
+Level = Literal["ok", "warning", "failed"]
+
+WARNING_PX, FAILED_PX = 0.05, 0.1
+_FEWEST_FOR_SURFACE = 60
+_FEWEST = 4
+
+
+@dataclass(frozen=True)
+class EpipolarCheck:
+    """A field's offset across the epipolar lines beside the calibration's own.
+
+    Attributes
+    ----------
+    level
+        ``ok``; ``warning`` from 0.05 px above the calibration's own on; ``failed`` from 0.1 px on: nothing that is made
+        of this field should be reported before the cameras were calibrated again.
+    offset_px
+        Root mean square of the smooth part of the offset in camera 2, over the valid points.
+    own_px
+        The calibration's own, from the residuals of its grid; None where it is not known (it counts as zero).
+    reason
+        One sentence.
+    """
+
+    level: Level
+    offset_px: float
+    own_px: float | None
+    reason: str
+
+    def document(self) -> dict[str, Any]:
+        """As plain numbers and texts."""
+        return {"level": self.level, "offset_px": self.offset_px, "own_px": self.own_px, "reason": self.reason}
+
+
+def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
+    """Judge a field.
+
+    Parameters
+    ----------
+    field
+        As measured.
+    rbe_px
+        The calibration's reprojection error (RBE), of held-out positions where there are any. It is one image's, both
+        have it, and the offset is told in one: so the calibration's own offset is up to its sum over both.
+
+    Returns
+    -------
+    EpipolarCheck or None
+        None if too few points stand.
+    """
+    valid = field.valid & np.isfinite(field.epipolar_px)
+    offset = field.epipolar_px[valid]
+    if len(offset) < _FEWEST:
+        return None
+    terms = smooth_terms(np.column_stack([field.x_px[valid], field.y_px[valid]]))
+    design = terms if len(offset) >= _FEWEST_FOR_SURFACE else terms[:, :1]
+    smooth = design @ np.linalg.lstsq(design, offset, rcond=1e-9)[0]
+    left = float(np.sum((offset - smooth) ** 2)) / max(len(offset) - design.shape[1], 1)
+    # what noise alone lets a surface of so many terms explain is taken out
+    square = float(np.mean(smooth**2)) - left * design.shape[1] / len(offset)
+    found = float(np.sqrt(max(square, 0.0)))
+    own = None if rbe_px is None else 2.0 * rbe_px
+    excess = found - (own or 0.0)
+    level: Level = "ok" if excess < WARNING_PX else "warning" if excess < FAILED_PX else "failed"
+    known = "unknown" if own is None else f"at most {own:.3f} px"
+    text = f"camera 2 sees the points {found:.3f} px off their epipolar lines, the calibration's own is {known}"
+    if level != "ok":
+        text += "; a camera was moved since, or the calibration belongs to another set-up: calibrate again"
+    return EpipolarCheck(level, found, own, text)

@@ -1,0 +1,40 @@
+"""Points outside the volume in which the cameras were calibrated: flagged, with the calibration's part of the error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from core.calibration.volume import CalibratedVolume
+from core.field.points.result import Field
+from core.status import PointStatus
+
+
+def mark_extrapolated(field: Field, volume: CalibratedVolume | None) -> Field:
+    """Return the field with the points that lie, or lay at the reference, outside the calibrated volume marked.
+
+    Their status becomes EXTRAPOLATED, and their covariance gets what the calibration's own covariance adds there.
+    Inside the volume that part is common to neighbouring points and left out; outside it grows without bound.
+
+    Parameters
+    ----------
+    field
+        As it was measured. A step's starts and the shape that later steps are measured with are taken from the
+        unmarked field.
+    volume
+        Where the cameras were calibrated; where it is not known, nothing is marked.
+    """
+    if volume is None:
+        return field
+    outside = field.status == PointStatus.OK
+    outside &= ~volume.contains(field.xyz_mm)
+    now = None if field.uvw_mm is None else field.xyz_mm + field.uvw_mm
+    if now is not None:
+        outside |= (field.status == PointStatus.OK) & ~volume.contains(now)
+    if not outside.any():
+        return field
+    status, covariance = field.status.copy(), field.covariance.copy()
+    status[outside] = PointStatus.EXTRAPOLATED
+    covariance[outside] += volume.covariance_mm2(field.xyz_mm[outside], None if now is None else now[outside])
+    return replace(field, status=status, covariance=np.asarray(covariance))

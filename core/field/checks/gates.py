@@ -1,0 +1,280 @@
+"""Every point that is shipped is checked again, against what the field itself says a right match looks like.
+
+Four checks: correlation in each comparison, offset across the epipolar line, agreement with the neighbours' patches,
+and support by other points at all. Limits are multiples of the field's own robust scatter, so they follow noise,
+texture and lens; the floors keep a nearly perfect field from throwing away its second-best points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from core.cameras.lens import Bool, Float
+from core.cameras.stereo import StereoPair
+from core.field.points.fitter import PointFits
+from core.field.points.starts import depth_per_px
+from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
+from core.field.region.trend import smooth_terms
+from core.field.region.visibility import Sight
+from core.status import PointStatus
+from core.threads import run_ranges
+
+_MAD_TO_SIGMA = 1.4826
+_FEW = 12
+_NETWORK = sorting_network(24)
+_ROWS_AT_ONCE = 4
+_SETTLED = 0.01  # of the scatter: a robust fit that moves less has converged, far below what a limit of 5 sigma feels
+_TREND_POINTS = 3000  # carry a trend of seven terms: it then scatters by a twentieth of the points' own scatter
+_GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateOptions:
+    """Limits of the checks.
+
+    Parameters
+    ----------
+    epipolar_sigmas
+        Allowed distance from the field's smooth epipolar offset, in its robust standard deviations.
+    epipolar_floor_px
+        Added to it, so that a noise-free field keeps its second-best points.
+    correlation_sigmas
+        Allowed excess of log(1 - zncc) over what texture and place predict, in robust standard deviations.
+    correlation_least_factor, correlation_most_factor
+        1 - zncc up to the first times its expectation is never refused; above the second always.
+    neighbour_sigmas
+        Allowed disagreement with the neighbours' patches, in robust standard deviations.
+    neighbour_floor_px
+        Added to it, as a distance in the images: curvature between neighbouring points must fit in.
+    least_cluster
+        Groups of fewer connected points are not trusted.
+    largest_sigma_px
+        Scatter of a point's place in camera 1, px, as its residuals show it, beyond which a point whose residuals are
+        not noise is refused: five times as much is half a pixel.
+    largest_depth_sigma_px
+        The same of what its depth is told by, in camera 2: it counts several times in depth.
+    """
+
+    epipolar_sigmas: float = 5.0
+    epipolar_floor_px: float = 0.005
+    correlation_sigmas: float = 6.0
+    correlation_least_factor: float = 1.35
+    correlation_most_factor: float = 12.0
+    neighbour_sigmas: float = 6.0
+    neighbour_floor_px: float = 0.05
+    least_cluster: int = 4
+    largest_sigma_px: float = 0.1
+    largest_depth_sigma_px: float = 0.05
+
+
+def apply_gates(
+    points: PointFits,
+    *,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    xy_px: Float,
+    rays: Float,
+    texture: Float,
+    options: GateOptions,
+    sight: Sight | None = None,
+) -> int:
+    """Refuse points in place; returns how many.
+
+    Parameters
+    ----------
+    points
+        n = rows x columns points of the grid, row by row.
+    pair
+        The calibrated cameras.
+    shape
+        Rows and columns of the grid.
+    xy_px, rays
+        (n, 2) px and (n, 3) normalised, of the points.
+    texture
+        (n,) grey-level variance of camera 1's subset.
+    options
+        Limits.
+    sight
+        Which points see each other; all of them when left out.
+    """
+    before = int(points.ok.sum())
+    few = before < _FEW
+    terms = smooth_terms(xy_px)
+    if not few:
+        _gate_correlation(points, terms, texture, options)
+    for _ in range(2):
+        if _gate_neighbours(points, pair, shape, rays, options, sight, few=few) == 0:
+            break
+    if not few:
+        _gate_epipolar(points, terms, options)
+        _gate_clusters(points, shape, options, sight)
+    return before - int(points.ok.sum())
+
+
+def _gate_correlation(points: PointFits, terms: Float, texture: Float, options: GateOptions) -> None:
+    ok = np.flatnonzero(points.ok)
+    if len(ok) < _FEW:
+        return
+    trend = np.column_stack([_at_points(terms, ok), np.log(np.maximum(texture[ok], 1e-6))])
+    worst = np.full(len(ok), -np.inf)
+    for k in range(points.zncc.shape[1]):
+        y = np.log(np.maximum(1.0 - points.zncc[ok, k], 1e-7))
+        r, sigma = _robust_residual(trend, y)
+        limit = np.clip(
+            options.correlation_sigmas * sigma,
+            np.log(options.correlation_least_factor),
+            np.log(options.correlation_most_factor),
+        )
+        worst = np.maximum(worst, r - limit)
+    points.refuse(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
+
+
+def _gate_epipolar(points: PointFits, terms: Float, options: GateOptions) -> None:
+    for _ in range(4):
+        ok = np.flatnonzero(points.ok)
+        if len(ok) < _FEW:
+            return
+        e = points.epipolar_px[ok]
+        r, sigma = _robust_residual(_at_points(terms, ok), e)
+        # plain and robust scatter about the field's middle too: the figures that a reader recomputes from the file
+        about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
+        plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
+        scatter = _MAD_TO_SIGMA * float(np.median(about_median))
+        middle = (about_median > options.epipolar_sigmas * scatter) & (about_median > options.epipolar_floor_px)
+        bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
+        if not bad.any():
+            return
+        points.refuse(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
+
+
+def neighbour_disagreement(
+    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, sight: Sight | None = None
+) -> tuple[Float, Float, NDArray[np.int32]]:
+    """Return (n, 4) disagreement with the neighbours and its local spread in px, and how many neighbours spoke.
+
+    The four are depth as camera 2 sees it, and displacement along x, y and (as camera 2 sees it) depth.
+    """
+    rows, cols = shape
+    n = rows * cols
+    difference = np.full((rows, cols, N_QUANTITIES), np.nan)
+    spread = np.full((rows, cols, N_QUANTITIES), np.nan)
+    count = np.zeros((rows, cols), np.int32)
+    motion = points.zncc.shape[1] == 3
+    parted = np.zeros((0, 0), np.uint32) if sight is None else sight.parted
+    arrays = (
+        _NETWORK,
+        points.ok.reshape(shape),
+        parted,
+        np.ascontiguousarray(rays.reshape(rows, cols, 3)),
+        np.ascontiguousarray(points.w.reshape(rows, cols, -1)),
+        np.ascontiguousarray(points.G.reshape(rows, cols, 3, -1)),
+        motion,
+        difference,
+        spread,
+        count,
+    )
+    run_ranges(lambda first, last: compare_with_neighbours(first, last, *arrays), rows, _ROWS_AT_ONCE)
+    scale = np.full((n, N_QUANTITIES), np.nan)
+    ok = np.flatnonzero(points.ok)
+    if len(ok):
+        w0 = points.w[ok, 0]
+        scale[ok, 0] = scale[ok, 3] = w0 / depth_per_px(pair, rays[ok], w0)
+        J = pair.cam1.lens.image_jacobian(rays[ok, :2])
+        scale[ok, 1], scale[ok, 2] = np.linalg.norm(J[:, :, 0], axis=1), np.linalg.norm(J[:, :, 1], axis=1)
+    return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
+
+
+def _gate_neighbours(
+    points: PointFits,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    rays: Float,
+    options: GateOptions,
+    sight: Sight | None,
+    *,
+    few: bool,
+) -> int:
+    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, sight)
+    ok = points.ok
+    bad = np.zeros(len(ok), bool)
+    heard = ok & (count >= 2)
+    for q in range(N_QUANTITIES if points.zncc.shape[1] == 3 else 1):
+        d = np.abs(difference[heard, q])
+        if len(d) == 0:
+            continue
+        sigma = _MAD_TO_SIGMA * float(np.median(d))
+        limit = (
+            options.neighbour_sigmas * np.hypot(sigma, _MAD_TO_SIGMA * spread[heard, q]) + options.neighbour_floor_px
+        )
+        bad[np.flatnonzero(heard)[d > limit]] = True
+    if not few:
+        bad |= ok & (count < 2)  # nothing near it that could confirm it
+    points.refuse(bad, PointStatus.NEIGHBOUR_MISMATCH)
+    return int(bad.sum())
+
+
+def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions, sight: Sight | None) -> None:
+    if sight is not None:
+        group = _connected(points.ok, shape, sight)
+        points.refuse(points.ok & (np.bincount(group)[group] < options.least_cluster), PointStatus.NEIGHBOUR_MISMATCH)
+        return
+    n, labels, facts, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
+    if n < 2:
+        return
+    size = facts[:, cv2.CC_STAT_AREA].copy()
+    size[0] = options.least_cluster
+    points.refuse((size[labels] < options.least_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
+
+
+def _connected(ok: Bool, shape: tuple[int, int], sight: Sight) -> NDArray[np.int32]:
+    """Label (n,) the groups of points that are connected through neighbours that see each other."""
+    rows, cols = shape
+    place = np.arange(rows * cols).reshape(shape)
+    ends = []
+    for dr, dc in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        here = place[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
+        there = here + dr * cols + dc
+        together = ok[here] & ok[there] & ~sight.parted_at(dr, dc)[here]
+        ends.append(np.stack([here[together], there[together]]))
+    a, b = np.concatenate(ends, axis=1)
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+
+
+def _at_points(terms: Float, ok: NDArray[np.intp]) -> Float:
+    return terms[ok] if len(ok) > 60 else terms[ok, :1]
+
+
+def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
+    """Return residuals about a robust linear fit (Tukey's biweight) and their robust standard deviation.
+
+    Of many points a few thousand carry the fit, spread over all of them by multiples of the golden section.
+    """
+    n = len(values)
+    some = slice(None) if n <= _TREND_POINTS else np.sort((n * (_GOLDEN * np.arange(_TREND_POINTS) % 1.0)).astype(int))
+    terms, wanted = design[some], values[some]
+    part = wanted - np.median(wanted)
+    for _ in range(6):
+        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(part - np.median(part)))), 1e-12)
+        u = part / (4.685 * sigma)
+        weight = np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
+        weighted = terms * weight[:, None]
+        solution = np.linalg.lstsq(weighted.T @ terms, weighted.T @ wanted, rcond=1e-9)[0]
+        last, part = part, wanted - terms @ solution
+        if np.abs(part - last).max() < _SETTLED * sigma:
+            break
+    residual = values - design @ solution
+    sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-12)
+    return residual, sigma
+
+
+def _at(points: PointFits, index: NDArray[np.intp]) -> Bool:
+    mask = np.zeros(len(points.status), bool)
+    mask[index] = True
+    return mask

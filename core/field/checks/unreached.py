@@ -1,0 +1,79 @@
+"""Points that growth did not reach because their patch lies outside an image: said so, rather than 'not seeded'."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from core.cameras.lens import Bool, Float
+from core.field.points.fitter import Fitter, PointFits
+from core.field.points.starts import move_matrix, move_w
+from core.status import PointStatus
+
+_REACH_SUBSETS = 4.0
+
+
+def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) -> None:
+    """Give unreached points the status OUTSIDE_IMAGE where the nearest standing patch, extended, leaves an image.
+
+    Parameters
+    ----------
+    fitter
+        The matcher with its images.
+    points
+        (n) points, changed in place.
+    xy_px, usable
+        (n, 2) and (n,).
+    """
+    open_ = np.flatnonzero(usable & (points.status == PointStatus.NOT_SEEDED))
+    standing = np.flatnonzero(points.ok)
+    if len(open_) == 0 or len(standing) == 0:
+        return
+    subset = fitter.options.subset_px
+    distance, nearest = cKDTree(xy_px[standing]).query(xy_px[open_])
+    near = np.asarray(distance) < _REACH_SUBSETS * subset
+    open_, parent = open_[near], standing[np.asarray(nearest)[near]]
+    outside = leaves_an_image(fitter, xy_px[open_], xy_px[parent], points.take(parent))
+    points.status[open_[outside]] = PointStatus.OUTSIDE_IMAGE
+
+
+def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: PointFits, margin_px: float = 0.0) -> Bool:
+    """Return (n,) whether subsets about places (n, 2), on patches that stand at other places, leave an image.
+
+    Parameters
+    ----------
+    fitter
+        The matcher with its images.
+    xy_px, from_px
+        (n, 2) the subsets' centres and the patches' own places.
+    patches
+        (n) fits that stand.
+    margin_px
+        How far inside the images they are to stay.
+    """
+    outside = np.zeros(len(xy_px), bool)
+    half = fitter.options.subset_px // 2
+    centre = fitter.pair.cam1.rays_cam(from_px).xyz_mm
+    for corner in ((-half, -half), (half, -half), (-half, half), (half, half)):
+        ray = fitter.pair.cam1.rays_cam(xy_px + corner).xyz_mm
+        offset = ray[:, :2] - centre[:, :2]
+        w = move_w(patches.w, offset)[:, :1]
+        G = None if fitter.cur1 is None else move_matrix(patches.G, offset)
+        outside |= _outside(fitter, ray / w, None if G is None else G[:, :, 0] / w, margin_px)
+    return outside
+
+
+def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float) -> Bool:
+    """Return (n,) whether a point (n, 3) of camera 1's frame leaves an image, or its inner part, at t0 or at t."""
+    pose, lens1, lens2 = fitter.pair.cam2_from_cam1, fitter.pair.cam1.lens, fitter.pair.cam2.lens
+    views = [(pose.apply(before), lens2, fitter.ref2.shape)]
+    if now is not None:
+        views += [(now, lens1, fitter.ref1.shape), (pose.apply(now), lens2, fitter.ref2.shape)]
+    out = np.zeros(len(before), bool)
+    for p, lens, (rows, cols) in views:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = lens.image_from_normalised(p[:, :2] / p[:, 2:]).xy
+            last = np.array([cols, rows]) - 1 - margin_px
+            inside = (p[:, 2] > 0) & ((xy >= margin_px) & (xy <= last)).all(axis=1)
+        out |= ~inside
+    return out

@@ -1,0 +1,1 @@
+"""Growth of a field from its seeds over the region."""

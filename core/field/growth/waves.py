@@ -1,0 +1,200 @@
+"""Growth: from points that stand to their neighbours, best first, in waves that keep the kernels busy.
+
+A neighbour's patch, extended to the new point's ray, is its start value. A point that fails is tried again from other
+neighbours. Nothing is ever filled in: what does not match stays empty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.lens import Bool, Float
+from core.field.points.fitter import PointFits
+from core.field.points.starts import move_matrix, move_w
+from core.field.region.visibility import Sight
+from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
+from core.status import PointStatus
+
+_OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
+_ALL_AT_ONCE = 512
+_MOST_A_BATCH = 4096  # a cancel is heard within a second even on a slow machine
+_FAR_PX = 3.0
+_COUNT_AGAIN = 1.05
+ATTEMPTS = 4
+"""How often a point is started, each time from another neighbour."""
+
+
+class FitsPoints(Protocol):
+    """What growth needs of a matcher; :class:`core.field.points.fitter.Fitter` is one."""
+
+    @property
+    def comparisons(self) -> int:
+        """1 for a shape, 3 for a motion."""
+
+    @property
+    def terms(self) -> int:
+        """Numbers in a point's ``w``."""
+
+    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
+        """Refine points from start values."""
+
+    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
+        """Return (n,) whether a fit has left the place it was started at."""
+
+
+def fit_in_batches(
+    fitter: FitsPoints,
+    points: PointFits,
+    index: NDArray[np.intp],
+    xy_px: Float,
+    w: Float,
+    G: Float | None,
+    *,
+    far_px: float,
+    cancel: CancelToken | None = None,
+) -> NDArray[np.bool_]:
+    """Fit the points ``index`` from starts and write down what came; returns which stand.
+
+    A fit that ends further than ``far_px`` from its start has left the basin it was started in.
+    """
+    good = np.zeros(len(index), bool)
+    for start in range(0, len(index), _MOST_A_BATCH):
+        raise_if_cancelled(cancel)
+        part = slice(start, start + _MOST_A_BATCH)
+        xy = xy_px[index[part]]
+        part_G = None if G is None else G[part]
+        fits = fitter.fit(xy, w[part], part_G)
+        fits.refuse(fits.ok & fitter.far_from_start(xy, fits, w[part], part_G, far_px), PointStatus.NOT_CONVERGED)
+        points.put(index[part], fits)
+        good[part] = fits.ok
+    return good
+
+
+@dataclass(eq=False)
+class Attempts:
+    """What growth has tried on a grid of n points, so that nothing is tried twice.
+
+    Attributes
+    ----------
+    neighbours
+        (n, 8) index of each point's neighbours, -1 outside the grid and where a cut lies between.
+    tried
+        (n, 8) from which of them the point was started before.
+    left
+        (n,) how often it may still be started.
+    """
+
+    neighbours: NDArray[np.int32]
+    tried: Bool
+    left: NDArray[np.int8]
+
+    @staticmethod
+    def on(shape: tuple[int, int], sight: Sight | None = None) -> Attempts:
+        """Return the attempts of a grid of (rows, cols) on which nothing was tried."""
+        n = shape[0] * shape[1]
+        places = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
+        places[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
+        rows, cols = slice(1, -1), slice(1, -1)
+        neighbours = np.stack([np.roll(places, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1)
+        if sight is not None:
+            for k, (dr, dc) in enumerate(_OFFSETS):
+                neighbours[sight.parted_at(int(dr), int(dc)), k] = -1
+        return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
+
+
+def grow(
+    fitter: FitsPoints,
+    points: PointFits,
+    *,
+    attempts: Attempts,
+    xy_px: Float,
+    rays: Float,
+    usable: Bool,
+    stage: str = "grow",
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> int:
+    """Grow from the points that stand over all usable ones; returns how many were added.
+
+    Parameters
+    ----------
+    fitter
+        The matcher.
+    points
+        n points of a grid; changed in place.
+    attempts
+        What was tried before; changed in place.
+    xy_px, rays
+        (n, 2) px, (n, 3) normalised.
+    usable
+        (n,) which points may be measured.
+    stage, progress, cancel
+        Reports and stop.
+
+    Notes
+    -----
+    A wave looks at the front only: points that are open and may have a standing neighbour. So the work grows with the
+    number of points, not with points times waves.
+    """
+    total = int(usable.sum())
+    quality = points.quality
+    standing, counted, added = int((quality > 0.0).sum()), 0, 0
+    least, front = 0.0, np.zeros(len(quality), bool)
+    while standing > 0:
+        raise_if_cancelled(cancel)
+        progress(stage, standing, total)
+        if standing > _COUNT_AGAIN * counted:  # what is normal for the field changes with its size
+            least, counted = _least_parent(quality), standing
+            front = usable & (quality <= 0.0) & (attempts.left > 0)
+        todo = np.flatnonzero(front)
+        near = attempts.neighbours[todo]
+        score = np.where((near >= 0) & ~attempts.tried[todo], quality[near], -1.0)
+        score[score < least] = -1.0
+        choice = np.argmax(score, axis=1)
+        best = np.take_along_axis(score, choice[:, None], axis=1)[:, 0]
+        reachable = best > 0.0
+        front[todo[~reachable]] = False  # until a neighbour comes to stand
+        if not reachable.any():
+            if standing == counted:
+                break
+            counted = 0
+            continue
+        todo, choice, best = todo[reachable], choice[reachable], best[reachable]
+        if len(todo) > _ALL_AT_ONCE:
+            leading = best >= np.quantile(best, 0.5)
+            todo, choice = todo[leading], choice[leading]
+        parent = attempts.neighbours[todo, choice]
+        attempts.tried[todo, choice] = True
+        attempts.left[todo] -= 1
+        offset = rays[todo, :2] - rays[parent, :2]
+        parent_w, parent_G = points.w[parent], points.G[parent]
+        if fitter.terms > 3:
+            # second-order terms reach further, their noise too: every other attempt goes without
+            flat = attempts.left[todo] % 2 == 0
+            parent_w[flat, 3:], parent_G[flat, :, 3:] = 0.0, 0.0
+        w = move_w(parent_w, offset)
+        G = move_matrix(parent_G, offset) if fitter.comparisons == 3 else None
+        good = fit_in_batches(fitter, points, todo, xy_px, w, G, far_px=_FAR_PX, cancel=cancel)
+        front[todo[good | (attempts.left[todo] <= 0)]] = False
+        new = todo[good]
+        quality[new] = points.zncc[new].min(axis=1)
+        beside, side = attempts.neighbours[new], np.arange(len(_OFFSETS)) ^ 2  # as the neighbour sees the new point
+        inside = beside >= 0
+        beside, side = beside[inside], np.broadcast_to(side, inside.shape)[inside]
+        attempts.tried[beside, side] = False  # a point that stood there before, and fell, had other values
+        front[beside[usable[beside] & (quality[beside] <= 0.0) & (attempts.left[beside] > 0)]] = True
+        added += len(new)
+        standing += len(new)
+    return added
+
+
+def _least_parent(quality: Float) -> float:
+    """Correlation of a point that may hand its values on: not far below the field's own."""
+    standing = quality[quality > 0.0]
+    middle = float(np.median(standing))
+    scatter = 1.4826 * float(np.median(np.abs(standing - middle)))
+    return middle - max(0.15, 8.0 * scatter)

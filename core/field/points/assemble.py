@@ -1,0 +1,103 @@
+"""From the matcher's unknowns at the points to the field that is shipped."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.cameras.lens import Bool, Float
+from core.cameras.stereo import StereoPair
+from core.field.points.fitter import PointFits
+from core.field.points.patch import PatchChoice
+from core.field.points.result import Field
+from core.field.points.starts import Starts
+from core.field.region.region import PointGrid
+from core.matching.geometry import (
+    covariance_xyz,
+    covariance_xyzuvw,
+    motion_geometry,
+    principal_curvatures,
+    shape_geometry,
+)
+from core.status import PointStatus
+
+
+def assemble(
+    points: PointFits,
+    *,
+    pair: StereoPair,
+    grid: PointGrid,
+    fits_image: Bool,
+    shape: Field | None,
+    patch: PatchChoice | None = None,
+) -> Field:
+    """Return the field in the system frame.
+
+    Parameters
+    ----------
+    points
+        n = rows x columns points.
+    pair
+        The calibrated cameras.
+    grid
+        Their places.
+    fits_image
+        (r, c) where a point is allowed and its subset lies in the image.
+    shape
+        The reference's shape, whose positions every step shows; None for a shape.
+    patch
+        What the points were measured with.
+    """
+    rows, cols = grid.shape
+    motion = points.zncc.shape[1] == 3
+    status = points.status.reshape(rows, cols).copy()
+    status[~fits_image] = PointStatus.OUTSIDE_IMAGE
+    status[~grid.allowed] = PointStatus.MASKED
+    valid = status == PointStatus.OK
+    index = np.flatnonzero(valid.ravel())
+    xy, w, G = grid.xy_px.reshape(-1, 2)[index], points.w[index], points.G[index]
+
+    def scatter(values: Float, *tail: int) -> Float:
+        out = np.full((rows * cols, *tail), np.nan)
+        out[index] = values
+        return out.reshape(rows, cols, *tail)
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        g = shape_geometry(pair, xy, w)
+        xyz = scatter(g.xyz_mm, 3)
+        if motion:
+            m = motion_geometry(pair, xy, w, G)
+            covariance = scatter(covariance_xyzuvw(pair, xy, w, G, points.covariance[index]), 6, 6)
+        else:
+            covariance = scatter(covariance_xyz(pair, xy, w, points.covariance[index]), 3, 3)
+    if shape is not None:
+        # a material point's reference position is the same in every step. Its covariance goes with it; that with the
+        # displacement stays, since the shape alone is the joint estimate plus an error independent of it
+        known = valid & shape.valid
+        xyz = np.where(known[..., None], shape.xyz_mm, xyz)
+        larger = known & (
+            np.trace(shape.covariance[..., :3, :3], axis1=-2, axis2=-1)
+            > np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1)
+        )
+        covariance[larger, :3, :3] = shape.covariance[larger][:, :3, :3]
+    return Field(
+        x_px=grid.x_px,
+        y_px=grid.y_px,
+        status=status,
+        xyz_mm=xyz,
+        normal_sys=scatter(g.normal_sys, 3),
+        theta_rad=scatter(g.theta_rad),
+        phi_rad=scatter(g.phi_rad),
+        zp_mm=scatter(g.zp_mm),
+        zncc=scatter(points.zncc[index], points.zncc.shape[1]),
+        epipolar_px=scatter(points.epipolar_px[index]),
+        iterations=np.where(valid, points.iterations.reshape(rows, cols), 0).astype(np.int32),
+        noise_grey=scatter(points.noise[index]),
+        covariance=covariance,
+        uvw_mm=scatter(m.uvw_mm, 3) if motion else None,
+        rotation_rad=scatter(m.rotation_rad, 3) if motion else None,
+        stretch=scatter(m.stretch, 3) if motion else None,
+        curvature_per_mm=scatter(principal_curvatures(pair, xy, w), 2) if w.shape[1] == 6 else None,
+        patch=patch,
+        cuts=grid.cuts,
+        starts=Starts(scatter(w, w.shape[1]), scatter(G, 3, w.shape[1]) if motion else None),
+    )

@@ -1,0 +1,208 @@
+"""The matcher bound to its images, with the checks that hold for one point alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.lens import Bool, Float
+from core.cameras.stereo import StereoPair
+from core.field.points.starts import depth_per_px, faces_both_cameras
+from core.field.region.visibility import Sight
+from core.matching.fit import fit_motion, fit_shape
+from core.matching.image import ImageData
+from core.matching.options import MatchOptions
+from core.status import PointStatus
+
+_MOST_EPIPOLAR_PX = 3.0
+_MOST_SHEAR = 4.0
+
+
+@dataclass(eq=False)
+class PointFits:
+    """Unknowns and figures at n points, writable; numbers are NaN where ``status`` is not OK.
+
+    Attributes
+    ----------
+    w, G
+        (n, 3), (n, 3, 3), or (n, 6), (n, 3, 6) of curved patches; G of NaN for a shape.
+    zncc
+        (n, k) with k = 1 (shape) or 3 (motion).
+    epipolar_px, epipolar_sigma_px, noise
+        (n,).
+    covariance
+        (n, 2, 2) or (n, 5, 5), as the matching gives it.
+    iterations
+        (n,) int32.
+    status
+        (n,) int8.
+    """
+
+    w: Float
+    G: Float
+    zncc: Float
+    epipolar_px: Float
+    epipolar_sigma_px: Float
+    noise: Float
+    covariance: Float
+    iterations: NDArray[np.int32]
+    status: NDArray[np.int8]
+
+    @staticmethod
+    def empty(n: int, comparisons: int, terms: int = 3) -> PointFits:
+        """Return n points that nothing has reached yet; ``terms`` is 6 for curved patches."""
+        q = 2 if comparisons == 1 else 5
+        return PointFits(
+            w=np.full((n, terms), np.nan),
+            G=np.full((n, 3, terms), np.nan),
+            zncc=np.full((n, comparisons), np.nan),
+            epipolar_px=np.full(n, np.nan),
+            epipolar_sigma_px=np.full(n, np.nan),
+            noise=np.full(n, np.nan),
+            covariance=np.full((n, q, q), np.nan),
+            iterations=np.zeros(n, np.int32),
+            status=np.full(n, PointStatus.NOT_SEEDED, np.int8),
+        )
+
+    @property
+    def ok(self) -> Bool:
+        """(n,) which points have numbers."""
+        return np.asarray(self.status == PointStatus.OK)
+
+    @property
+    def quality(self) -> Float:
+        """(n,) the worst comparison's correlation, -1 where there is none."""
+        return np.where(self.ok, np.nan_to_num(self.zncc, nan=-1.0).min(axis=1), -1.0)
+
+    def put(self, index: NDArray[np.intp], other: PointFits) -> None:
+        """Write ``other``'s points to the places ``index``."""
+        for f in fields(self):
+            getattr(self, f.name)[index] = getattr(other, f.name)
+
+    def take(self, index: NDArray[np.intp]) -> PointFits:
+        """Return a copy of the points ``index``."""
+        return PointFits(**{f.name: getattr(self, f.name)[index].copy() for f in fields(self)})
+
+    def refuse(self, which: Bool, status: PointStatus) -> None:
+        """Take the numbers of points away and say why."""
+        self.status[which] = status
+        for name in ("w", "G", "epipolar_px", "epipolar_sigma_px", "covariance"):
+            getattr(self, name)[which] = np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """Four prepared images (two for a shape), a calibrated pair, options: fits batches of points.
+
+    Attributes
+    ----------
+    least_zncc
+        Correlation below which no comparison counts as a match, whatever the field looks like.
+    sight
+        What the points see of their subsets; None: all of it.
+    """
+
+    pair: StereoPair
+    ref1: ImageData
+    ref2: ImageData
+    cur1: ImageData | None
+    cur2: ImageData | None
+    options: MatchOptions
+    least_zncc: float
+    sight: Sight | None = None
+
+    @property
+    def comparisons(self) -> int:
+        """1 for a shape, 3 for a motion."""
+        return 1 if self.cur1 is None else 3
+
+    @property
+    def terms(self) -> int:
+        """Numbers in a point's ``w`` and in each row of its ``G``: 3 for a plane patch, 6 for a curved one."""
+        return 6 if self.options.patch == "curved" else 3
+
+    def empty(self, n: int) -> PointFits:
+        """Return n points that nothing has reached yet."""
+        return PointFits.empty(n, self.comparisons, self.terms)
+
+    def shape_only(self) -> Fitter:
+        """Return the fitter of the reference's shape."""
+        return replace(self, cur1=None, cur2=None)
+
+    def curved(self) -> Fitter:
+        """Return the same matcher with curved patches."""
+        return replace(self, options=replace(self.options, patch="curved"))
+
+    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
+        """Refine points from start values and refuse those that cannot be right on their own."""
+        n = len(xy_px)
+        visible = None if self.sight is None else self.sight.at(xy_px)
+        w, G = self._terms_of(w), None if G is None else self._terms_of(G)
+        if self.cur1 is None or self.cur2 is None:
+            s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options, visible)
+            fits = PointFits(
+                s.w,
+                np.full((n, 3, self.terms), np.nan),
+                s.zncc,
+                s.epipolar_px,
+                s.epipolar_sigma_px,
+                s.noise,
+                s.covariance,
+                s.iterations,
+                s.status,
+            )
+        else:
+            m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options, visible)
+            fits = PointFits(
+                m.w, m.G, m.zncc, m.epipolar_px, m.epipolar_sigma_px, m.noise, m.covariance, m.iterations, m.status
+            )
+        with np.errstate(invalid="ignore"):
+            low = fits.ok & ~(fits.zncc.min(axis=1) >= self.least_zncc)
+            fits.refuse(low, PointStatus.LOW_CORRELATION)
+            off = fits.ok & ~(np.abs(fits.epipolar_px) <= _MOST_EPIPOLAR_PX)
+            fits.refuse(off, PointStatus.EPIPOLAR_MISMATCH)
+        ok = np.flatnonzero(fits.ok)
+        fits.refuse(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
+        return fits
+
+    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
+        """Return (n,) whether a fit ended further than ``limit_px`` from its start in any image."""
+        rays = self.pair.cam1.rays_cam(xy_px).xyz_mm
+        with np.errstate(invalid="ignore", divide="ignore"):
+            px = np.abs(fits.w[:, 0] - w[:, 0]) / depth_per_px(self.pair, rays, w[:, 0])
+            far = ~(px < limit_px)
+            if G is not None and self.cur1 is not None:
+                J = self.pair.cam1.lens.image_jacobian(rays[:, :2])
+                scale = np.sqrt(np.abs(np.linalg.det(J)))
+                a, b = fits.G[:, :2, 0] / fits.G[:, 2:, 0], G[:, :2, 0] / G[:, 2:, 0]
+                far |= ~(np.linalg.norm(a - b, axis=1) * scale < limit_px)
+        return np.asarray(far)
+
+    def _terms_of(self, start: Float) -> Float:
+        """A start without the terms that the patch does not have, zeros for those that the start does not have."""
+        if start.shape[-1] >= self.terms:
+            return start[..., : self.terms]
+        return np.concatenate([start, np.zeros((*start.shape[:-1], self.terms - start.shape[-1]))], axis=-1)
+
+    def _plausible(self, xy_px: Float, w: Float, G: Float) -> Bool:
+        rays = self.pair.cam1.rays_cam(xy_px).xyz_mm
+        good = faces_both_cameras(self.pair, rays, w)
+        if self.cur1 is None or len(w) == 0:
+            return np.asarray(good)
+        # at t: in front of the camera, not mirrored, and no stretch that a patch could not bear
+        depth = G[:, 2, 0]
+        columns = G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth[:, None, None])
+        affine = columns / depth[:, None, None]  # camera 1's image at t over its image at t0, normalised
+        det = np.linalg.det(affine)
+        size = np.linalg.norm(affine, axis=(1, 2)) / np.sqrt(2.0)
+        with np.errstate(invalid="ignore"):
+            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < _MOST_SHEAR) & (det > size**2 / _MOST_SHEAR)
+        return np.asarray(good)
+
+
+def _mask(n: int, index: NDArray[np.intp]) -> Bool:
+    mask = np.zeros(n, bool)
+    mask[index] = True
+    return mask

@@ -1,0 +1,134 @@
+"""The result over the grid of measurement points of one step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.field.points.patch import PatchChoice
+from core.field.points.smoothing_record import Smoothing
+from core.field.points.starts import Starts
+from core.field.region.cuts import Cuts
+from core.status import PointStatus
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """What a step was matched against, where that was not the first reference alone.
+
+    Attributes
+    ----------
+    step
+        Number of the step whose images the step was matched against.
+    steps
+        (r, c) int32, the same for each point: it may be an older one for a point that was found again. Of a point
+        without numbers, the newest reference that shows it.
+    noise_px2, pattern_px2
+        (r, c, 2, 2) covariance, px^2, of where camera 1 sees the points in this step, as far as the noise of this
+        step's images does not cancel it if later steps are matched against them: by the cameras' noise, and by changes
+        of the surface's pattern.
+    """
+
+    step: int
+    steps: NDArray[np.int32]
+    noise_px2: Float
+    pattern_px2: Float
+
+
+@dataclass(frozen=True)
+class Field:
+    """Shape, and where a motion was measured displacement, at (r, c) points.
+
+    A point whose status is neither ``OK`` nor ``EXTRAPOLATED`` has NaN in every number but ``x_px, y_px``.
+
+    Attributes
+    ----------
+    x_px, y_px
+        (r, c) where the points lie in camera 1's reference image.
+    status
+        (r, c) int8, :class:`core.status.PointStatus`.
+    xyz_mm
+        (r, c, 3) surface point at the reference, system frame.
+    normal_sys
+        (r, c, 3) unit normal of the patch, system frame.
+    theta_rad, phi_rad, zp_mm
+        (r, c) the plane of Eq. (12), camera 1's frame.
+    zncc
+        (r, c, k) zero-mean normalised correlation; k = 1 for shape (camera 2 at t0), k = 3 for motion (camera 2 at t0,
+        camera 1 at t, camera 2 at t).
+    epipolar_px
+        (r, c) offset across the epipolar line in camera 2.
+    iterations
+        (r, c) int32.
+    noise_grey
+        (r, c) noise sd in grey levels of the reference image, estimated from the point's own residuals.
+    covariance
+        (r, c, 3, 3) of X, Y, Z, or (r, c, 6, 6) of X, Y, Z, U, V, W; mm^2, system frame.
+    uvw_mm
+        (r, c, 3) displacement since the reference, or None for a shape.
+    rotation_rad
+        (r, c, 3) rotation vector of the patch, system frame, or None.
+    stretch
+        (r, c, 3) in-plane stretch e11, e22, e12 in the patch's tangent frame, or None.
+    curvature_per_mm
+        (r, c, 2) principal curvatures of the reference's surface, the larger first, positive where it bulges towards
+        the cameras; None unless the patches were curved.
+    patch
+        What patch the field was measured with, and why; None in a field from an older file.
+    references
+        What the step was matched against; None where that is the first reference, for all points.
+    smoothing
+        How the displacement was smoothed; None: it is as measured.
+    cuts
+        Cracks and borders of holes over which nothing reaches; None where there are none.
+    starts
+        The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
+        file, None in a field that was read from one.
+    """
+
+    x_px: Float
+    y_px: Float
+    status: NDArray[np.int8]
+    xyz_mm: Float
+    normal_sys: Float
+    theta_rad: Float
+    phi_rad: Float
+    zp_mm: Float
+    zncc: Float
+    epipolar_px: Float
+    iterations: NDArray[np.int32]
+    noise_grey: Float
+    covariance: Float
+    uvw_mm: Float | None = None
+    rotation_rad: Float | None = None
+    stretch: Float | None = None
+    curvature_per_mm: Float | None = None
+    patch: PatchChoice | None = None
+    references: References | None = None
+    smoothing: Smoothing | None = None
+    cuts: Cuts | None = None
+    starts: Starts | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid of points."""
+        return self.x_px.shape[0], self.x_px.shape[1]
+
+    @property
+    def has_motion(self) -> bool:
+        """True if displacements were measured."""
+        return self.uvw_mm is not None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(r, c) True where the point has numbers."""
+        return np.isin(self.status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
+
+    @property
+    def sigma_mm(self) -> Float:
+        """(r, c, 3 or 6) standard deviations, the root of the covariance's diagonal."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))

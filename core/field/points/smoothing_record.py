@@ -1,0 +1,112 @@
+"""Smoothing of a displacement: what was asked for, what it did, and what it makes of the points' errors.
+
+A smoothed value is a weighted sum of the values of a window. So are its errors, and neighbours share more of them than
+their subsets' pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+
+from core.cameras.lens import Float
+from core.errors import InputError
+from core.field.region.window import fit_terms, window_offsets
+
+WIDEST_SMOOTHING = 51
+Order = Literal[1, 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smoothing:
+    """How a displacement was smoothed.
+
+    Attributes
+    ----------
+    window
+        Points across the square window, odd.
+    order
+        Of the polynomial: 1 plane, 2 quadratic.
+    step_px, subset_px
+        Of the field.
+    resolution_px
+        Width of what goes into one value, (window - 1) step + subset.
+    resolution_mm
+        The same on the surface, median of the field; None where nothing was measured.
+    whole, reduced, raw
+        How many points have values of whole windows; of windows that edges, holes or cuts have reduced; and their own
+        value, because a fit over what is left would be noisier than it.
+    """
+
+    window: int
+    order: Order = 2
+    step_px: float
+    subset_px: float
+    resolution_px: float
+    resolution_mm: float | None
+    whole: int
+    reduced: int
+    raw: int
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return asdict(self)
+
+    @staticmethod
+    def from_document(document: Mapping[str, Any]) -> Smoothing:
+        """Return what :meth:`document` made; unknown entries are left out."""
+        known = {f.name for f in fields(Smoothing)}
+        return Smoothing(**{name: value for name, value in document.items() if name in known})
+
+
+def check_smoothing(window: int, order: int = 2) -> None:
+    """Refuse a window or an order that cannot be.
+
+    Raises
+    ------
+    InputError
+        ``smoothing_window_invalid``, ``option_out_of_range``.
+    """
+    if isinstance(window, bool) or int(window) != window or not 3 <= window <= WIDEST_SMOOTHING or window % 2 == 0:
+        raise InputError(
+            f"the smoothing window is {window} points wide; it must be an odd whole number, 3 to {WIDEST_SMOOTHING}.",
+            code="smoothing_window_invalid",
+            remedy="Give 5, for example, or switch smoothing off.",
+        )
+    if order not in (1, 2):
+        raise InputError(
+            f"the smoothing's order is {order}, it must be 1 or 2.",
+            code="option_out_of_range",
+            remedy="Give 1 for planes or 2 for quadratics.",
+        )
+
+
+@lru_cache(maxsize=8)
+def whole_weights(window: int, order: int) -> Float:
+    """Return (window^2,) weights of a whole window's points, in the order of ``window_offsets``; they sum to 1."""
+    half = window // 2
+    A = fit_terms(window_offsets(half)[0], half, order)
+    return np.asarray(np.linalg.solve(A.T @ A, A.T)[0])
+
+
+@lru_cache(maxsize=8)
+def weight_square(window: int, order: int) -> Float:
+    """Return the same weights as a square (window, window) of rows and columns."""
+    half = window // 2
+    out = np.zeros((window, window))
+    row, col = window_offsets(half)[0].T
+    out[row + half, col + half] = whole_weights(window, order)
+    return out
+
+
+@lru_cache(maxsize=8)
+def weight_products(window: int, order: int) -> Float:
+    """Return (2 window - 1, 2 window - 1) sums over a window's pairs of points so many rows and columns apart."""
+    from scipy.signal import correlate  # slow to load, and not every start needs it
+
+    square = weight_square(window, order)
+    return np.asarray(correlate(square, square, mode="full", method="direct"))

@@ -1,0 +1,90 @@
+"""Start values: what a point needs before the matching can refine it, and how they move to another point.
+
+The unknowns are those of the matching: inverse depth and its slopes ``w = (w0, w1, w2)`` over camera 1's normalised
+ray offsets (X, Y) from the point's own ray, and the 3 x 3 matrix ``G`` through which camera 1 sees the patch at t. The
+point on the patch at offset (X, Y) lies at ``(Xc + X, Yc + Y, 1) / w(X, Y)`` at t0 and at ``G (1, X, Y) / w(X, Y)`` at
+t, both in camera 1's frame. Both are linear for a plane patch, so a patch's own unknowns give a neighbour's on the same
+plane exactly. A curved patch has the terms X^2, X Y and Y^2 besides: ``w`` has 6 numbers, ``G`` 3 x 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Unknowns at n points (leading axes free).
+
+    Attributes
+    ----------
+    w
+        (..., 3) inverse depth 1/mm, and slopes; (..., 6) with a curved patch's second-order terms.
+    G
+        (..., 3, 3) or (..., 3, 6), or None for a shape.
+    """
+
+    w: Float
+    G: Float | None = None
+
+
+def move_w(w: Float, offset: Float) -> Float:
+    """Return ``w`` (n, 3 or 6) about points ``offset`` (n, 2) further on in normalised coordinates."""
+    return move_matrix(w[:, None, :], offset)[:, 0]
+
+
+def move_matrix(G: Float, offset: Float) -> Float:
+    """Return ``G`` (n, 3, 3 or 6) about points ``offset`` (n, 2) further on."""
+    x, y = offset[:, :1], offset[:, 1:]
+    moved = G.copy()
+    moved[:, :, 0] += G[:, :, 1] * x + G[:, :, 2] * y
+    if G.shape[2] == 6:
+        xx, xy, yy = G[:, :, 3], G[:, :, 4], G[:, :, 5]
+        moved[:, :, 0] += xx * x**2 + xy * x * y + yy * y**2
+        moved[:, :, 1] += 2.0 * xx * x + xy * y
+        moved[:, :, 2] += xy * x + 2.0 * yy * y
+    return moved
+
+
+def position_now(w: Float, G: Float) -> Float:
+    """Return where the points are at t, (n, 3) mm in camera 1's frame."""
+    return np.asarray(G[..., :, 0] / w[..., :1])
+
+
+def image_shift_px(pair: StereoPair, rays: Float, w_a: Float, w_b: Float) -> Float:
+    """Return how far (n,) camera 2's image moves, px, when the inverse depth on camera 1's rays goes from a to b."""
+    pose = pair.cam2_from_cam1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        images = [
+            pair.cam2.lens.image_from_normalised(p[..., :2] / p[..., 2:]).xy
+            for p in (pose.apply(rays / w[..., None]) for w in (w_a, w_b))
+        ]
+    return np.asarray(np.linalg.norm(images[0] - images[1], axis=-1))
+
+
+def depth_per_px(pair: StereoPair, rays: Float, w0: Float) -> Float:
+    """Return |d w0| (n,) that moves camera 2's image by one pixel: the scale of every depth gate."""
+    step = 1e-6 * np.abs(w0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(step / np.maximum(image_shift_px(pair, rays, w0, w0 + step), 1e-12))
+
+
+def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, least_cosine: float = 0.1) -> np.ndarray:
+    """Return (n,) whether the patch shows its front to both cameras, no steeper than ``least_cosine``.
+
+    The plane w0 + w1 X + w2 Y = 1/Z has the camera-1 normal (w1, w2, w0 - w1 Xc - w2 Yc).
+    """
+    normal = np.stack([w[:, 1], w[:, 2], w[:, 0] - w[:, 1] * rays[:, 0] - w[:, 2] * rays[:, 1]], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        point = rays / w[:, :1]
+        centre2 = pair.cam2_from_cam1.inverse().translation_mm
+        view1 = point / np.linalg.norm(point, axis=-1, keepdims=True)
+        view2 = (point - centre2) / np.linalg.norm(point - centre2, axis=-1, keepdims=True)
+        c1, c2 = np.sum(normal * view1, axis=-1), np.sum(normal * view2, axis=-1)
+        return np.asarray((w[:, 0] > 0) & (c1 > least_cosine) & (c2 > least_cosine))

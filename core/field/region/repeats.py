@@ -1,0 +1,61 @@
+"""Texture that repeats itself: a start on it may be wrong by a period.
+
+Growth from a right start follows such a texture, since neighbours tell which period is meant. A start of its own must
+not be put on it: neither search nor features tell its periods apart, though noise and sampling may pretend to.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from core.cameras.lens import Bool, Float
+
+_ALIKE = 0.85  # correlation of a square, twice a subset wide, with another place; random speckles reach half of it
+_OWN_PEAK = 0.5  # what hangs together with the square's own place above this is its own peak
+_LEAST_HALF_PX = 12
+_TRIED = 24
+_GOLDEN = 0.6180339887498949
+
+
+def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
+    """Return (n,) where camera 1's texture repeats itself within two subsets.
+
+    Parameters
+    ----------
+    pixels
+        (rows, cols) image.
+    xy_px
+        (n, 2) places; two dozen spread over them are looked at, each of the others follows the nearest of these.
+    subset_px
+        Width of a subset.
+    """
+    n = len(xy_px)
+    if n == 0:
+        return np.zeros(0, bool)
+    tried = np.unique((n * (_GOLDEN * np.arange(min(_TRIED, n)) % 1.0)).astype(int))
+    found = np.array([_second_peak(pixels, xy_px[i], subset_px) > _ALIKE for i in tried])
+    nearest = np.asarray(cKDTree(xy_px[tried]).query(xy_px)[1])
+    return np.asarray(found[nearest])
+
+
+def _second_peak(pixels: NDArray[Any], xy_px: Float, subset_px: int) -> float:
+    """Highest correlation of the square about a place with another one; -1 where there is no room."""
+    rows, cols = pixels.shape
+    x, y = (round(float(v)) for v in xy_px)
+    half = min(max(subset_px, _LEAST_HALF_PX), x, y, cols - 1 - x, rows - 1 - y)
+    if half < _LEAST_HALF_PX:
+        return -1.0
+    reach = half + 2 * subset_px
+    left, top = max(x - reach, 0), max(y - reach, 0)
+    window = np.ascontiguousarray(pixels[top : y + reach + 1, left : x + reach + 1], dtype=np.float32)
+    square = np.ascontiguousarray(pixels[y - half : y + half + 1, x - half : x + half + 1], dtype=np.float32)
+    score = np.array(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED))
+    _, label = cv2.connectedComponents((score > _OWN_PEAK).astype(np.uint8), connectivity=8)
+    own = label[y - half - top, x - half - left]
+    score[label == own] = -1.0
+    return float(score.max())

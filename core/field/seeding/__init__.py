@@ -1,0 +1,1 @@
+"""First points of a field, without start values from a user."""

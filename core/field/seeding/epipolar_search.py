@@ -1,0 +1,174 @@
+"""Search along the epipolar line: a start for one point where no feature match helps.
+
+For every depth at which camera 2 sees the point, and for a few tilts about the normal that both cameras see best,
+camera 1's subset is compared with camera 2's grey levels by zero-mean normalised correlation.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
+
+_TILTS_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
+_SAMPLES = 17  # per side: enough to tell matches apart, a quarter of the work of all pixels
+DEPTH_SPAN = 8.0
+"""Depths from an eighth of the nominal one to eight times it are searched."""
+_BLOCK = 512
+
+
+def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int], *, step_px: float = 1.0) -> Float:
+    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,) that camera 2 sees, ``step_px`` apart there."""
+    ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
+    if not np.isfinite(ray).all():
+        return np.zeros(0)
+    nominal = nominal_depth(pair)
+    w = np.geomspace(1.0 / (nominal * DEPTH_SPAN), DEPTH_SPAN / nominal, 4000)
+    xy2 = pair.image2_at_depth(np.broadcast_to(xy_px, (len(w), 2)), 1.0 / w)
+    rows, cols = image2_shape
+    with np.errstate(invalid="ignore"):
+        seen = (xy2[:, 0] >= 0) & (xy2[:, 1] >= 0) & (xy2[:, 0] <= cols - 1) & (xy2[:, 1] <= rows - 1)
+    if seen.sum() < 2:
+        return np.zeros(0)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy2[seen], axis=0), axis=1))])
+    count = max(int(length[-1] / step_px), 2)
+    return np.interp(np.linspace(0.0, length[-1], count), length, w[seen])
+
+
+def sweep(
+    pair: StereoPair, image1: NDArray[Any], image2: NDArray[Any], xy_px: Float, *, subset_px: int, candidates: int = 6
+) -> tuple[Float, Float]:
+    """Search the depth of one point.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    image1, image2
+        (rows, cols) grey levels.
+    xy_px
+        (2,) the point in camera 1.
+    subset_px
+        Width of the patch that is compared.
+    candidates
+        How many distinct places come back.
+
+    Returns
+    -------
+    w
+        (m, 3) start values, best first; m may be 0.
+    zncc
+        (m,) their correlations.
+    """
+    depths = visible_depths(pair, xy_px, (image2.shape[0], image2.shape[1]))
+    half = subset_px // 2
+    offsets = np.linspace(-half, half, _SAMPLES)
+    ox, oy = (a.ravel() for a in np.meshgrid(offsets, offsets))
+    pixels = xy_px + np.stack([ox, oy], axis=-1)
+    rows, cols = image1.shape
+    inside = (pixels.min() >= 0) and pixels[:, 0].max() <= cols - 1 and pixels[:, 1].max() <= rows - 1
+    if len(depths) == 0 or not inside:
+        return np.zeros((0, 3)), np.zeros(0)
+    smooth1, smooth2 = (
+        np.asarray(cv2.GaussianBlur(i.astype(np.float32), (0, 0), 1.0), np.float32) for i in (image1, image2)
+    )
+    ref = _normalise(_sample(smooth1, pixels[None]))[0]
+    ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
+    rays = pair.cam1.rays_cam(pixels).xyz_mm
+    d = rays[:, :2] - ray[:2]
+    pose = pair.cam2_from_cam1
+    all_w: list[Float] = []
+    all_z: list[Float] = []
+    for w in _tilted(pair, ray, depths):
+        zncc = np.full(len(w), -1.0)
+        for start in range(0, len(w), _BLOCK):
+            part = w[start : start + _BLOCK]
+            inverse = part[:, :1] + part[:, 1:] @ d.T  # (b, s)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                p = (
+                    pose.rotation @ rays.T + pose.translation_mm[:, None] * inverse[:, None, :]
+                )  # (b, 3, s), scaled by w
+                n = np.moveaxis(p[:, :2] / p[:, 2:], 1, -1)
+            xy2 = pair.cam2.lens.image_from_normalised(n).xy
+            with np.errstate(invalid="ignore"):
+                whole = (inverse > 0).all(axis=1) & (p[:, 2] > 0).all(axis=1) & np.isfinite(xy2).all(axis=(1, 2))
+            whole[whole] &= (
+                (xy2[whole].min(axis=(1, 2)) >= 0)
+                & (xy2[whole, :, 0].max(axis=1) <= image2.shape[1] - 1)
+                & (xy2[whole, :, 1].max(axis=1) <= image2.shape[0] - 1)
+            )
+            if whole.any():
+                block = zncc[start : start + _BLOCK]
+                block[whole] = _normalise(_sample(smooth2, xy2[whole])) @ ref
+        all_w.append(w)
+        all_z.append(zncc)
+    w, z = np.concatenate(all_w), np.concatenate(all_z)
+    return _distinct(w, z, depths, candidates)
+
+
+def _distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Float, Float]:
+    """Best first, leaving out what lies within three steps of a better one."""
+    order = np.argsort(-zncc)
+    place = np.searchsorted(depths, w[:, 0]) if depths[0] < depths[-1] else np.searchsorted(-depths, -w[:, 0])
+    taken: list[int] = []
+    for i in order[: 40 * candidates]:
+        if zncc[i] > 0.0 and all(abs(int(place[i]) - int(place[j])) > 3 for j in taken):
+            taken.append(int(i))
+            if len(taken) == candidates:
+                break
+    return w[taken], zncc[taken]
+
+
+def _tilted(pair: StereoPair, ray: Float, depths: Float) -> list[Float]:
+    """Start values (m, 3) for each tilt about the bisector of the two cameras' lines of sight."""
+    pose = pair.cam2_from_cam1
+    centre2 = pose.inverse().translation_mm
+    axis = np.cross(centre2, ray)  # normal of the epipolar plane: tilts that change the foreshortening
+    axis /= np.linalg.norm(axis)
+    out = []
+    view1 = ray / np.linalg.norm(ray)
+    for tilt in _TILTS_RAD:
+        point = ray[None] / depths[:, None]
+        view2 = point - centre2
+        view2 /= np.linalg.norm(view2, axis=1, keepdims=True)
+        normal = view1 + view2
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        across = np.cross(axis, normal)
+        normal = np.cos(tilt) * normal + np.sin(tilt) * across
+        # plane n . P = n . point gives 1/Z = n . (x, y, 1) / (n . point)
+        constant = np.sum(normal * point, axis=1)
+        good = (constant > 0.05 * np.linalg.norm(point, axis=1)) & (np.sum(normal * view2, axis=1) > 0.05)
+        out.append(np.stack([depths, normal[:, 0] / constant, normal[:, 1] / constant], axis=1)[good])
+    return out
+
+
+def nominal_depth(pair: StereoPair) -> float:
+    """Depth in camera 1 where the two optical axes come closest, or ten baselines if they run apart."""
+    back = pair.cam2_from_cam1.inverse()
+    c, a = back.translation_mm, back.rotation[:, 2]
+    b = a[2]
+    det = 1.0 - b * b
+    if det > 1e-6:
+        s = (c[2] - b * float(c @ a)) / det
+        if s > 0.0:
+            return float(s)
+    return 10.0 * pair.baseline_mm
+
+
+def _sample(image: NDArray[np.float32], xy: Float) -> Float:
+    """Bilinear grey levels at (b, s, 2)."""
+    maps = xy.astype(np.float32)
+    return np.asarray(
+        cv2.remap(image, np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]), cv2.INTER_LINEAR),
+        dtype=np.float64,
+    )
+
+
+def _normalise(values: Float) -> Float:
+    v = values - values.mean(axis=1, keepdims=True)
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9))

@@ -1,0 +1,120 @@
+"""Robust local linear fits to scattered matches, many places at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from core.cameras.lens import Bool, Float
+from core.field.region.neighbours import least_median
+from core.threads import run_ranges
+
+_TRIPLETS = 48
+_FLAT = 1e-2
+_AT_ONCE = 256
+_WIDER = 4  # times the neighbours are looked through for those that a place sees
+_ENOUGH = 0.7  # of the neighbours wanted
+
+Apart = Callable[[Float, Float], Bool]
+
+
+class LocalFits(NamedTuple):
+    """Linear maps about M places.
+
+    Attributes
+    ----------
+    value
+        (M, d) the map at the place itself.
+    slope
+        (M, d, 2) its derivatives over x and y.
+    spread
+        (M,) median residual of the neighbours used, in units of the values; inf where no fit was possible.
+    inliers
+        (M,) how many neighbours agreed.
+    distance
+        (M,) how far the neighbours reach.
+    """
+
+    value: Float
+    slope: Float
+    spread: Float
+    inliers: Float
+    distance: Float
+
+
+def robust_local_fits(
+    places: Float,
+    points: Float,
+    values: Float,
+    *,
+    neighbours: int = 14,
+    tolerance: float,
+    seed: int = 0,
+    apart: Apart | None = None,
+) -> LocalFits:
+    """Fit value = a + B (x - place) to the nearest points by least median of squares, then least squares on inliers.
+
+    Parameters
+    ----------
+    places
+        (M, 2) where the fits are wanted.
+    points, values
+        (N, 2) and (N, d) scattered samples, some of them wrong.
+    neighbours
+        How many nearest points take part.
+    tolerance
+        Residual up to which a neighbour counts as an inlier, in the values' unit.
+    seed
+        Of the random triplets: equal input gives equal output.
+    apart
+        Tells of places (n, 2) and (n, 2) which do not see each other; only samples that a place sees take part.
+    """
+    m, d = len(places), values.shape[1]
+    k = min(neighbours, len(points))
+    empty = LocalFits(np.full((m, d), np.nan), np.full((m, d, 2), np.nan), np.full(m, np.inf), np.zeros(m), np.zeros(m))
+    if k < 4 or m == 0:
+        return empty
+    wide = k if apart is None else min(_WIDER * k, len(points))
+    found, index = cKDTree(points).query(places, k=wide)
+    distance, seen = np.asarray(found), np.ones(m, bool)
+    if apart is not None:
+        over = apart(np.repeat(places, wide, axis=0), points[index.ravel()]).reshape(m, wide)
+        nearest = np.argsort(over, axis=1, kind="stable")[:, :k]
+        distance, index, over = (np.take_along_axis(a, nearest, axis=1) for a in (distance, index, over))
+        seen = (~over).sum(axis=1) >= _ENOUGH * k
+        # in the place of those that are missing the nearest one again, which says nothing new
+        distance, index = np.where(over, distance[:, :1], distance), np.where(over, index[:, :1], index)
+    x = points[index] - places[:, None, :]  # (M, K, 2)
+    v = values[index]
+    scale = np.maximum(distance.max(axis=1), 1e-12)
+    A = np.concatenate([np.ones((m, k, 1)), x / scale[:, None, None]], axis=2)
+
+    rng = np.random.default_rng(seed)
+    triplets = np.argsort(rng.random((_TRIPLETS, k)), axis=1)[:, :3]
+    r, median = np.empty((m, k)), np.empty(m)
+    arrays = (np.ascontiguousarray(A[:, :, 1:]), np.ascontiguousarray(v), triplets, _FLAT, r, median)
+    run_ranges(lambda first, last: least_median(first, last, *arrays), m, _AT_ONCE)
+    for _ in range(2):
+        weight = (r < tolerance).astype(float)
+        normal = np.einsum("mki,mk,mkj->mij", A, weight, A)
+        enough = (weight.sum(axis=1) >= 4) & (np.abs(np.linalg.det(normal)) > 1e-3) & np.isfinite(median) & seen
+        normal = np.where(enough[:, None, None], normal, np.eye(3))
+        solution = np.linalg.solve(normal, np.einsum("mki,mk,mkd->mid", A, weight, v))
+        r = np.linalg.norm(np.einsum("mki,mid->mkd", A, solution) - v, axis=2)
+    spread = np.where(enough, np.median(np.where(weight > 0, r, np.nan_to_num(r.max())), axis=1), np.inf)
+    solution = np.where(enough[:, None, None], solution, np.nan)
+    slope = np.swapaxes(solution[:, 1:], 1, 2) / scale[:, None, None]
+    return LocalFits(solution[:, 0], slope, spread, np.where(enough, weight.sum(axis=1), 0.0), distance.max(axis=1))
+
+
+def consistent(points: Float, values: Float, *, tolerance: float, neighbours: int = 14) -> np.ndarray:
+    """Return (N,) bool: which samples agree with the robust fit of their own neighbourhood."""
+    if len(points) < 8:
+        return np.zeros(len(points), bool)
+    fits = robust_local_fits(points, points, values, neighbours=neighbours, tolerance=tolerance)
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(fits.value - values, axis=1) < tolerance
+    return np.asarray(near & (fits.inliers >= 0.5 * min(neighbours, len(points))))

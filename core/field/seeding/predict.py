@@ -1,0 +1,68 @@
+"""Better starts for a step of a sequence: what a sample of points did since the last step, the others did too.
+
+A sample spread over the field is fitted from the last step's values. How its unknowns changed is fitted by a smooth
+surface over the image, and all other points start from their last values plus that. They then need half the iterations;
+where the motion is not smooth they start no worse than a step's own motion away, and find their way as before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
+from core.field.points.starts import position_now
+from core.field.region.trend import smooth_terms
+
+_QUADRATIC_FROM, _LINEAR_FROM = 36, 12
+_ROUNDS = 4
+_WORTH = 0.5  # of the sample's own motion may be left unexplained
+
+
+def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], w_now: Float, G_now: Float) -> Float:
+    """Return start values of G (n, 3, k): the last step's, moved on as the sample moved.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    xy_px
+        (n, 2) all points.
+    G
+        (n, 3, k) at the last step, NaN where it is not known.
+    sample
+        (m,) which points were fitted.
+    w_now, G_now
+        (m, 3 or more), (m, 3, k) what they were found to be.
+    """
+    if len(sample) < _LINEAR_FROM:
+        return G
+    terms = smooth_terms(xy_px)[:, : 6 if len(sample) >= _QUADRATIC_FROM else 3]
+    design, change = terms[sample], G_now - G[sample]
+    weight = np.ones(len(sample))
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq(design * root, change.reshape(len(sample), -1) * root, rcond=None)[0]
+        left = np.linalg.norm(
+            (change.reshape(len(sample), -1) - design @ solution).reshape(change.shape)[..., 0], axis=1
+        )
+        reach = 4.685 * 1.4826 * max(float(np.median(left)), 1e-15)
+        weight = np.where(left < reach, (1.0 - (left / reach) ** 2) ** 2, 0.0)
+    moved = G + (terms @ solution).reshape(G.shape)
+    seen = [_images(pair, w_now, g) for g in (G_now, G[sample], moved[sample])]
+    before, after = (float(np.median(np.linalg.norm(seen[0] - s, axis=-1).max(axis=0))) for s in seen[1:])
+    return moved if after < _WORTH * before else G
+
+
+def _images(pair: StereoPair, w: Float, G: Float) -> Float:
+    """Where both cameras see the points at t, (2, m, 2) px."""
+    here = position_now(w, G)
+    there = pair.cam2_from_cam1.apply(here)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack(
+            [
+                camera.lens.image_from_normalised(p[:, :2] / p[:, 2:]).xy
+                for camera, p in ((pair.cam1, here), (pair.cam2, there))
+            ]
+        )

@@ -1,0 +1,1 @@
+"""Long sequences: later references, composed motions, propagated covariance."""

@@ -1,0 +1,133 @@
+"""What a leg's points see of their subsets: what they saw at the first reference, carried along with the surface.
+
+A crack opens and turns, and its lips part: lines drawn at the first reference say nothing of where they are later. So
+each pixel of a leg's subset is taken back to the first reference through the point's own motion, and counts if the
+point sees it there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from core.cameras.lens import Bool, Float
+from core.field.region.region import PointGrid
+from core.field.region.visibility import MARGIN_PX, Sight, keep_sight, patches_seen, sight_of
+from core.matching.arguments import VisiblePixels
+
+_WIDEST = 4  # times a subset: what a leg's subset may cover of the first reference
+_AT_ONCE = 512
+
+
+@dataclass(frozen=True, eq=False)
+class LegSight(Sight):
+    """What each of the n points sees of its subset in a later image.
+
+    Attributes
+    ----------
+    first
+        The same at the first reference.
+    place_px, back
+        (m, 2), (m, 2, 2) of the points that the leg has: where they are in the later image, and the derivative of the
+        first reference's image over the later one.
+    first_px
+        (m, 2) where they were at the first reference.
+    """
+
+    first: Sight
+    place_px: Float
+    back: Float
+    first_px: Float
+
+    def at(self, xy_px: Float) -> VisiblePixels:
+        """Return what points (m, 2) see, by the pixels that their subsets are centred on.
+
+        Raises
+        ------
+        ValueError
+            If a place is not one of the leg's pixels.
+        """
+        keys = _keys(self.xy_px)
+        order = np.argsort(keys, kind="stable")
+        wanted = _keys(xy_px)
+        index = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
+        if (keys[index] != wanted).any():
+            raise ValueError("a place that is not a pixel of the leg")
+        return VisiblePixels(self.visible.patches, self.visible.of_point[index])
+
+    def apart(self, a_px: Float, b_px: Float) -> Bool:
+        """Return (n,) whether places a and b (n, 2) of the later image do not see each other."""
+        return self.first.apart(self._at_first(a_px), self._at_first(b_px))
+
+    def _at_first(self, xy_px: Float) -> Float:
+        """Take places (n, 2) back to the first reference with the nearest point."""
+        nearest = np.asarray(cKDTree(self.place_px).query(xy_px)[1])
+        away = np.einsum("nij,nj->ni", self.back[nearest], xy_px - self.place_px[nearest])
+        return np.asarray(self.first_px[nearest] + away)
+
+
+def _keys(xy_px: Float) -> NDArray[np.int64]:
+    x, y = np.rint(xy_px).astype(np.int64).T
+    return np.asarray(y * 1_000_003 + x)
+
+
+def carry_sight(leg_grid: PointGrid, grid: PointGrid, subset_px: int, place_px: Float, slopes_px: Float) -> None:
+    """Find what a leg's points see, and keep it with the leg's grid; nothing where nothing is in the way.
+
+    Parameters
+    ----------
+    leg_grid, grid
+        The leg's pixels and the first reference's points, (r, c) both.
+    subset_px
+        Width of the subset.
+    place_px, slopes_px
+        (n, 2) where camera 1 sees the points in the later image, (n, 2, 2) derivative of that image over the first.
+    """
+    first = sight_of(grid, subset_px)
+    if first is None:
+        return
+    has = np.flatnonzero(leg_grid.allowed)
+    back = np.full(slopes_px.shape, np.nan)
+    back[has] = np.linalg.inv(slopes_px[has])
+    pixel, xy = leg_grid.xy_px.reshape(-1, 2), grid.xy_px.reshape(-1, 2)
+    reach = np.abs(back[has]).sum(axis=2).max() if len(has) else 1.0
+    wide = 2 * int(np.ceil(0.5 * subset_px * min(max(float(reach), 1.0), _WIDEST))) + 3
+    margin = MARGIN_PX * max(1.0, float(np.median(np.linalg.norm(back[has], 2, axis=(1, 2)))) if len(has) else 1.0)
+    n = len(pixel)
+    share, of_point = np.ones(n), np.full(n, -1, np.int32)
+    kept: list[NDArray[np.uint8]] = []
+    offsets = np.arange(subset_px) - subset_px // 2
+    v, u = (a.ravel() for a in np.meshgrid(offsets, offsets, indexing="ij"))
+    square = np.stack([u, v], axis=-1).astype(np.float64)
+    for index, seen in patches_seen(grid, has, wide, margin, _AT_ONCE):
+        d = square + (pixel[index] - place_px[index])[:, None]
+        at = xy[index][:, None] + np.einsum("nij,nkj->nki", back[index], d)
+        corner = np.floor(xy[index] - 0.5 * (wide - 1) + 0.5)
+        col, row = np.moveaxis(np.floor(at + 0.5) - corner[:, None], -1, 0).astype(np.int64)
+        inside = (col >= 0) & (row >= 0) & (col < wide) & (row < wide)
+        k = np.arange(len(index))[:, None]
+        found = np.where(inside, seen[k, np.clip(row, 0, wide - 1), np.clip(col, 0, wide - 1)], 0)
+        counts = found.sum(axis=1)
+        share[index] = counts / float(subset_px**2)
+        cut = counts < subset_px**2
+        of_point[index[cut]] = sum(map(len, kept)) + np.arange(int(cut.sum()), dtype=np.int32)
+        kept.append(found[cut].reshape(-1, subset_px, subset_px).astype(np.uint8))
+    patches = np.concatenate(kept) if kept else np.zeros((0, subset_px, subset_px), np.uint8)
+    sight = LegSight(
+        xy_px=pixel,
+        shape=leg_grid.shape,
+        step_px=leg_grid.step_px,
+        pieces_px=first.pieces_px,
+        white=first.white,
+        visible=VisiblePixels(patches, of_point),
+        share=share,
+        parted=first.parted,
+        first=first,
+        place_px=place_px[has],
+        back=back[has],
+        first_px=xy[has],
+    )
+    keep_sight(leg_grid, subset_px, sight)

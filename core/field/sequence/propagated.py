@@ -1,0 +1,145 @@
+"""What a leg of a sequence inherits of the error of the legs before it.
+
+The noise of the image in which one leg ends and the next begins moves the point one way, then the other, and cancels.
+What does not cancel goes on: the pixels that the two subsets do not share, the noise of the gradients, and a pattern
+that changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.lens import Float
+from core.cameras.stereo import StereoPair
+from core.field.points.result import Field
+from core.field.sequence.compose import Totals, common_share, image_slopes, in_step
+
+_SMOOTHED = 5  # points across, over which the noise of a field is averaged
+_SURELY = 1.1  # times the noise between the cameras: what is above is not noise
+
+
+@dataclass(frozen=True, eq=False)
+class HandedOn:
+    """Covariances (n, 2, 2) of n points' places in an image that a leg beginning there inherits.
+
+    Attributes
+    ----------
+    noise
+        Of errors that are independent from leg to leg.
+    pattern
+        Of errors by a changed pattern, which go the same way in each leg.
+    """
+
+    noise: Float
+    pattern: Float
+
+    @staticmethod
+    def nothing(n: int) -> HandedOn:
+        """Return what the first reference inherits."""
+        return HandedOn(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
+
+    def at(self, index: NDArray[np.intp]) -> HandedOn:
+        """Return those of some points."""
+        return HandedOn(self.noise[index], self.pattern[index])
+
+    def through(self, J: Float) -> HandedOn:
+        """Return them in other coordinates, whose derivatives are J (n, 2, 2)."""
+        turned = np.swapaxes(J, 1, 2)
+        return HandedOn(J @ self.noise @ turned, J @ self.pattern @ turned)
+
+
+def handed_on(
+    pair: StereoPair,
+    place_px: Float,
+    offset: Float,
+    G: Float,
+    own: Float,
+    before: HandedOn,
+    pattern: Float,
+    subset_px: int,
+    slope_share: float,
+) -> HandedOn:
+    """Return what of the places' covariance at t a leg beginning there inherits, px^2.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    place_px, offset
+        (n, 2) where camera 1 saw the points at the match's reference, and from the pixel in the middle of the subset to
+        there, normalised.
+    G
+        (n, 3, 3) of the match, about the points' own rays.
+    own, before
+        (n, 2, 2) covariance of the places at t by the match, and what it has inherited, carried on; normalised.
+    pattern
+        (n,) share of the variance that is a change of the surface's pattern. It adds up; the rest is camera noise,
+        which the next leg's reference takes back.
+    subset_px
+        Width of the subset.
+    slope_share
+        Share of noise in the squares of the reference's gradients: each leg has its own.
+    """
+    seen, slopes = G[:, :2, 0] / G[:, 2:, 0], image_slopes(G)
+    to_px = pair.cam1.lens.image_jacobian(seen)
+    from_px = np.linalg.inv(pair.cam1.lens.image_jacobian(pair.cam1.rays_cam(place_px).xyz_mm[:, :2]))
+    now_px = pair.cam1.lens.image_from_normalised(seen).xy
+    middle_px = now_px - np.einsum("nij,nj->ni", to_px @ slopes, offset)
+    common, samples = common_share(to_px @ slopes @ from_px, np.rint(now_px) - middle_px, subset_px)
+    left = np.maximum(0.5 * (1.0 + samples) - common + slope_share, 0.0) * (1.0 - pattern)
+    return HandedOn(
+        before.noise + left[:, None, None] * own, in_step(before.pattern, pattern[:, None, None] * own)
+    ).through(to_px)
+
+
+def pattern_share(zncc: Float) -> Float:
+    """Return the share (...) of the noise variance that is a change of the surface's pattern, not the cameras' noise.
+
+    Parameters
+    ----------
+    zncc
+        (n, 3), or (r, c, 3), then averaged over neighbours.
+
+    Notes
+    -----
+    The two cameras' images of one instant differ by noise and view; what two images of one camera differ by beyond that
+    is not noise.
+    """
+    lost = 1.0 - np.asarray(zncc[..., :2], dtype=np.float32).astype(np.float64)
+    if lost.ndim == 3:
+        known = np.isfinite(lost.sum(axis=2, keepdims=True))
+        cells = (_SMOOTHED, _SMOOTHED)
+        lost[:] = cv2.blur(np.where(known, lost, 0.0), cells, borderType=cv2.BORDER_CONSTANT)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = 1.0 - _SURELY * lost[..., 0] / lost[..., 1]
+    return np.where(np.isfinite(share), np.maximum(share, 0.0), 0.0)
+
+
+def first_handed_on(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> HandedOn:
+    """Return what a leg inherits that begins at a field matched against the first reference itself, px^2."""
+    n = len(totals.w)
+    C = field.covariance.reshape(n, 6, 6).astype(np.float32).astype(np.float64)
+    R = pair.cam1.cam_from_sys.rotation
+    mm = R @ (C[:, :3, :3] + C[:, :3, 3:] + C[:, 3:, :3] + C[:, 3:, 3:]) @ R.T
+    P, seen = totals.now_cam1_mm, totals.seen
+    J = np.zeros((n, 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, :, 2] = -seen
+    J /= P[:, 2, None, None]
+    own = J @ mm @ np.swapaxes(J, 1, 2)
+    xy = np.stack([field.x_px, field.y_px], axis=-1).reshape(n, 2)
+    return handed_on(
+        pair,
+        xy,
+        np.zeros((n, 2)),
+        totals.G,
+        own,
+        HandedOn.nothing(n),
+        pattern_share(field.zncc).ravel(),
+        subset_px,
+        slope_share,
+    )

@@ -1,0 +1,310 @@
+"""A leg: the part of a sequence that is matched against one later step's images.
+
+The material points stay those of the first reference's grid. Camera 1 sees them between the pixels at the leg's
+reference; a leg's subset is centred on the nearest whole pixel, so that no reference is interpolated, and the point is
+the patch evaluated at most half a pixel off its middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.lens import Bool, Float
+from core.cameras.stereo import StereoPair
+from core.errors import RegionError, SeedError
+from core.field.growth.run import Run
+from core.field.points.assemble import assemble
+from core.field.points.fitter import Fitter, PointFits
+from core.field.points.images import MeasureImage
+from core.field.points.result import Field
+from core.field.points.starts import Starts, move_matrix, move_w
+from core.field.region.region import PointGrid
+from core.field.sequence.carried_visibility import carry_sight
+from core.field.sequence.compose import (
+    Totals,
+    follow,
+    follow_covariance,
+    image_slopes,
+    in_step,
+    place_covariance,
+    since,
+    totals_of,
+)
+from core.field.sequence.propagated import HandedOn, first_handed_on, handed_on
+from core.field.settings import MeasureOptions
+from core.progress import CancelToken, Progress
+from core.status import PointStatus
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """The state of n points at the step whose images they are matched against.
+
+    Attributes
+    ----------
+    step
+        Number of that step.
+    image1, image2
+        Its images.
+    grid
+        The pixels nearest to where camera 1 sees the points; ``allowed`` says which points the leg has.
+    place_px
+        (n, 2) where camera 1 sees them.
+    offset
+        (n, 2) from the pixel's ray to the point's, normalised.
+    totals
+        Their totals at that step.
+    plane
+        (n, 3) inverse depth and slopes about the point's own ray at that step.
+    inherited
+        Covariances of the places that the noise of the leg's reference does not cancel, normalised.
+    shape
+        What the matching needs of the shape at that step.
+    status
+        (n,) int8: OK, or why the leg does not have a point.
+    steps
+        (n,) int32: the newest reference that shows each point, of those up to this one.
+    slope_share
+        As in :func:`handed_on`.
+    """
+
+    step: int
+    image1: MeasureImage
+    image2: MeasureImage
+    grid: PointGrid
+    place_px: Float
+    offset: Float
+    totals: Totals
+    plane: Float
+    inherited: HandedOn
+    shape: Field
+    status: NDArray[np.int8]
+    steps: NDArray[np.int32]
+    slope_share: float
+
+    @property
+    def has(self) -> Bool:
+        """(n,) which points the leg has."""
+        return np.asarray(self.grid.allowed.ravel())
+
+    @property
+    def pixel_px(self) -> Float:
+        """(n, 2) the pixels that the subsets are centred on."""
+        return self.grid.xy_px.reshape(-1, 2)
+
+    def starts(self, now: Totals) -> tuple[Float, Float]:
+        """Return the leg's unknowns about its pixels that lead to totals of all n points."""
+        G = since(self.totals, now, self.plane)
+        return move_w(self.plane, -self.offset), move_matrix(G, -self.offset)
+
+    def total(
+        self, fits: PointFits, index: NDArray[np.intp], pattern: Float, *, pair: StereoPair, subset_px: int
+    ) -> tuple[PointFits, HandedOn]:
+        """Return the totals of points ``index`` that a fitter of this leg has measured, and what they hand on, px^2.
+
+        ``pattern`` (m,) is their :func:`pattern_share`.
+        """
+        start = self._at(index)
+        w, G = self._own(fits, index)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            after = follow(start, w, G)
+            slopes, own = image_slopes(G), place_covariance(G, fits.covariance)
+            known = self.inherited.at(index).through(slopes)
+            changed = pattern[:, None, None] * own
+            together = in_step(known.pattern, changed)
+            covariance = follow_covariance(start, w, G, fits.covariance, known.noise + together - changed)
+            handed = handed_on(
+                pair, self.place_px[index], self.offset[index], G, own, known, pattern, subset_px, self.slope_share
+            )
+        return replace(fits, w=after.w.copy(), G=after.G, covariance=covariance), handed
+
+    def _at(self, index: NDArray[np.intp]) -> Totals:
+        return Totals(self.totals.rays[index], self.totals.w[index], self.totals.G[index])
+
+    def _own(self, fits: PointFits, index: NDArray[np.intp]) -> tuple[Float, Float]:
+        """A leg's plane terms (m, 3), (m, 3, 3) about the points' own rays."""
+        w, G = move_w(fits.w, self.offset[index]), move_matrix(fits.G, self.offset[index])
+        return w[:, :3], G[:, :, :3]
+
+
+def begin_leg(
+    step: int,
+    field: Field,
+    image1: MeasureImage,
+    image2: MeasureImage,
+    *,
+    pair: StereoPair,
+    grid: PointGrid,
+    options: MeasureOptions,
+    slope_share: float,
+    first: int,
+) -> Leg:
+    """Return the leg whose reference is a step that was measured.
+
+    Parameters
+    ----------
+    step, field
+        The step's number and its field, with a motion; as it was measured, or as its file gives it back.
+    image1, image2
+        The step's images.
+    pair, grid, options
+        The cameras, and points and settings of the first reference.
+    slope_share
+        As in :func:`handed_on`.
+    first
+        Number of the first reference.
+
+    Raises
+    ------
+    SeedError
+        If no point's subset lies in camera 1's image at that step.
+    """
+    totals = totals_of(field, pair)
+    n = len(totals.w)
+    subset = options.subset_px
+    with np.errstate(invalid="ignore", divide="ignore"):
+        place = pair.cam1.lens.image_from_normalised(totals.seen).xy
+        has = field.valid.ravel() & np.isfinite(place).all(axis=1) & np.isfinite(totals.G).all(axis=(1, 2))
+        pixel = np.rint(place)
+        half = subset // 2
+        rows, cols = image1.shape
+        has &= ((pixel >= half) & (pixel <= np.array([cols, rows]) - 1 - half)).all(axis=1)
+        if not has.any():
+            raise SeedError(f"no point of step {step} is left to match a later step against.")
+        r = field.references
+        if r is None:
+            inherited_px = first_handed_on(field, pair, totals, subset, slope_share)
+        else:
+            inherited_px = HandedOn(r.noise_px2.reshape(n, 2, 2), r.pattern_px2.reshape(n, 2, 2))
+    middle = np.median(pixel[has], axis=0)
+    # points that the leg does not have lie anywhere inside, where they disturb no scale
+    pixel, place = (np.where(has[:, None], a, middle) for a in (pixel, place))
+    rays, own = (pair.cam1.rays_cam(a).xyz_mm for a in (pixel, place))
+    J = np.linalg.inv(pair.cam1.lens.image_jacobian(own[:, :2]))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inherited = inherited_px.through(np.asarray(J))
+        steep = totals.plane
+        plane = np.concatenate([np.sum(steep * own, axis=1)[:, None], steep[:, :2]], axis=1)
+        slopes_px = (
+            np.linalg.inv(J) @ totals.image_slopes @ np.linalg.inv(pair.cam1.lens.image_jacobian(totals.rays[:, :2]))
+        )
+    offset = own[:, :2] - rays[:, :2]
+    has &= np.isfinite(plane).all(axis=1) & np.isfinite(inherited.noise + inherited.pattern).all(axis=(1, 2))
+    spread = float(np.median(np.sqrt(np.abs(np.linalg.det(slopes_px[has])))))
+    leg_grid = PointGrid(
+        x_px=pixel[:, 0].reshape(grid.shape),
+        y_px=pixel[:, 1].reshape(grid.shape),
+        allowed=has.reshape(grid.shape),
+        step_px=max(grid.step_px * spread, 1.0),
+        extent_px=(0.0, 0.0, cols - 1.0, rows - 1.0),
+    )
+    carry_sight(leg_grid, grid, subset, place, slopes_px)
+    points = PointFits.empty(n, 1)
+    points.w[has] = move_w(plane, -offset)[has]
+    points.status[has] = PointStatus.OK
+    flat = assemble(points, pair=pair, grid=leg_grid, fits_image=leg_grid.allowed, shape=None)
+    # a point that stood at that step and is not in the leg lay too near to the image's border
+    why = np.where(field.valid, PointStatus.OUTSIDE_IMAGE, field.status).ravel()
+    status = np.where(has, PointStatus.OK, why).astype(np.int8)
+    older = np.full(n, first, np.int32) if field.references is None else field.references.steps.ravel()
+    return Leg(
+        step=step,
+        image1=image1,
+        image2=image2,
+        grid=leg_grid,
+        place_px=place,
+        offset=offset,
+        totals=totals,
+        plane=plane,
+        inherited=inherited,
+        shape=flat,
+        status=status,
+        steps=np.where(has, step, older).astype(np.int32),
+        slope_share=slope_share,
+    )
+
+
+def measure_leg(
+    leg: Leg,
+    cur1: MeasureImage,
+    cur2: MeasureImage,
+    *,
+    pair: StereoPair,
+    options: MeasureOptions,
+    previous: Field,
+    previous_step: int,
+    progress: Progress | None,
+    cancel: CancelToken | None,
+) -> Run:
+    """Match a pair of images against a leg's reference; return the run, its points about the leg's pixels.
+
+    ``previous`` is the field of the step before, in totals; it gives the start unless it is the leg's own reference.
+
+    Raises
+    ------
+    SeedError, ImageError, Cancelled
+        As :func:`core.measure.measure_motion`.
+    """
+    try:
+        run = Run(pair, leg.image1, leg.image2, cur1, cur2, leg.grid, options, progress, cancel)
+    except RegionError as error:
+        raise SeedError(f"no point of step {leg.step} is left to match a later step against.") from error
+    run.keep_patch(previous)
+    run.seed_motion(leg.shape, None if previous_step == leg.step else _started(leg, previous, pair), None)
+    run.fill_field(True, leg.shape)
+    return run
+
+
+def _started(leg: Leg, previous: Field, pair: StereoPair) -> Field:
+    """The last step's field about the leg's pixels, as far as a start needs it."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        starts = leg.starts(totals_of(previous, pair))
+    w, G = starts
+    known = previous.valid & leg.grid.allowed
+    known &= np.isfinite(G).all(axis=(1, 2)).reshape(known.shape)
+    status = np.where(known, PointStatus.OK, np.where(previous.valid, PointStatus.MASKED, previous.status))
+    shape = previous.shape
+    return replace(
+        leg.shape,
+        status=status.astype(np.int8),
+        uvw_mm=np.where(known[..., None], 0.0, np.nan),
+        patch=previous.patch,
+        starts=Starts(w.reshape(*shape, 3), G.reshape(*shape, 3, 3)),
+    )
+
+
+class LegFitter:
+    """Fits points of the first reference's grid against a leg's images: totals in, totals out.
+
+    Attributes
+    ----------
+    own
+        (n,) the points as they were fitted last, about the leg's pixels.
+    """
+
+    def __init__(self, leg: Leg, fitter: Fitter, grid: PointGrid) -> None:
+        self._leg, self._fitter, self._subset_px = leg, fitter, fitter.options.subset_px
+        self.own = fitter.empty(grid.x_px.size)
+        self._corner, self._step_px, self._cols = grid.xy_px[0, 0], grid.step_px, grid.shape[1]
+        self.comparisons, self.terms = 3, 3
+
+    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
+        """Refine totals from totals; as :meth:`core.field.points.fitter.Fitter.fit`."""
+        if G is None:
+            raise ValueError("a leg measures motions")
+        leg = self._leg
+        col, row = np.rint((xy_px - self._corner) / self._step_px).astype(np.int64).T
+        index = row * self._cols + col
+        start = Totals(leg.totals.rays[index], leg.totals.w[index], leg.totals.G[index])
+        own = since(start, Totals(start.rays, w, G), leg.plane[index])
+        offset = leg.offset[index]
+        fits = self._fitter.fit(leg.pixel_px[index], move_w(leg.plane[index], -offset), move_matrix(own, -offset))
+        self.own.put(index, fits)
+        return leg.total(fits, index, np.zeros(len(index)), pair=self._fitter.pair, subset_px=self._subset_px)[0]
+
+    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
+        """As :meth:`core.field.points.fitter.Fitter.far_from_start`."""
+        return self._fitter.far_from_start(xy_px, fits, w, G, limit_px)

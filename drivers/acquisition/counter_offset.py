@@ -1,0 +1,75 @@
+"""Pairing by frame number for cameras on one trigger line whose counters did not start together.
+
+Both cameras count their frames, but one may have been armed a pulse earlier. The first two frames that began within
+half a period fix how the numbers belong together; from then on numbers decide, and late or jittering arrivals do no
+harm. A camera that missed a pulse does not count it: from there its numbers are off by one, which shows as a skew of a
+whole period. Such a pair is refused, and the numbers are aligned anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from drivers.acquisition.pairing import Cam, NumberPairing, Pair, PairingAccount, TimePairing
+from drivers.cameras.protocol import Frame
+
+
+class AlignedPairing:
+    """Frame numbers, aligned by time.
+
+    Parameters
+    ----------
+    period_ms
+        Period of the pulses.
+    max_skew_ms, common_clock
+        As in `drivers.acquisition.pairing.NumberPairing`; more than half a period is never accepted.
+    """
+
+    def __init__(self, *, period_ms: float, max_skew_ms: float, common_clock: bool) -> None:
+        self._period_ms = period_ms
+        self._max_skew_ms = min(max_skew_ms, period_ms / 2)
+        self._common_clock = common_clock
+        self._earlier = PairingAccount()
+        self._numbers: NumberPairing | None = None
+        self._finder = self._new_finder()
+        self.slips = 0
+
+    def _new_finder(self) -> TimePairing:
+        return TimePairing(period_ms=self._period_ms, max_skew_ms=self._max_skew_ms, common_clock=self._common_clock)
+
+    @property
+    def account(self) -> PairingAccount:
+        """What became of the pulses whose fate is known."""
+        now = self._finder.account if self._numbers is None else self._numbers.account
+        return _sum(self._earlier, now)
+
+    def feed(self, cam: Cam, frame: Frame) -> Pair | None:
+        """Take a frame, complete or not, in the order of its camera; returns a pair when it makes one."""
+        if self._numbers is None:
+            pair = self._finder.feed(cam, frame)
+            if pair is not None:
+                self._earlier = _sum(self._earlier, self._finder.finish())
+                self._numbers = NumberPairing(
+                    by="frame",
+                    max_skew_ms=self._max_skew_ms,
+                    common_clock=self._common_clock,
+                    origin={"cam1": pair.cam1.sequence + 1, "cam2": pair.cam2.sequence + 1},
+                )
+            return pair
+        pair = self._numbers.feed(cam, frame)
+        if pair is not None and abs(pair.skew_ms) > self._period_ms / 2:
+            self.slips += 1
+            self._earlier = _sum(self._earlier, self._numbers.finish())
+            self._numbers = None
+            self._finder = self._new_finder()
+            return None  # two frames of two pulses: counted as paired and refused, and nobody's pair
+        return pair
+
+    def finish(self) -> PairingAccount:
+        """Close all and return what became of each pulse."""
+        (self._finder if self._numbers is None else self._numbers).finish()
+        return self.account
+
+
+def _sum(one: PairingAccount, two: PairingAccount) -> PairingAccount:
+    return PairingAccount(**{f.name: getattr(one, f.name) + getattr(two, f.name) for f in fields(PairingAccount)})

@@ -1,0 +1,1 @@
+"""Frame grabbers: the protocol and one adapter a device family."""

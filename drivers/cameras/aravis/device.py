@@ -1,0 +1,196 @@
+"""The only holder of a camera's handle, so that letting go of it surely ends the connection.
+
+Aravis keeps a camera under control as long as its object lives. An error that somebody keeps also keeps the local
+variables of the functions it came through: none of ours has the handle among them, only this class's attributes have.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from core.errors import CameraError
+from drivers.cameras.aravis.library import aravis, glib_error
+from drivers.cameras.protocol import CameraOptions
+
+_RECONNECT = "Check its cable and power, then reconnect."
+
+
+class Device:
+    """A camera that is under our control.
+
+    Every call that asks the camera takes about a millisecond, or 2.5 s when it does not answer.
+
+    Parameters
+    ----------
+    options
+        Which camera.
+    check
+        Called before each question; raises when the camera was closed in the meantime.
+    """
+
+    def __init__(self, options: CameraOptions, check: Callable[[], None]) -> None:
+        self.name = options.device
+        self._check = check
+        self._camera: Any = None
+        self._handle: Any = None
+        self._handler: int | None = None
+
+    def connect(self, device_id: str, on_lost: Callable[[], None]) -> None:
+        """Take control of the camera; ``on_lost`` is called from a thread of Aravis when a USB3 camera is lost.
+
+        Raises
+        ------
+        CameraError
+            ``camera_lost`` when there is none of this id, ``camera_busy`` when another program controls it.
+        """
+        try:
+            self._camera = aravis().Camera.new(device_id)
+        except glib_error() as error:
+            raise self.translated(error) from None
+        self._handle = self._camera.get_device()
+        if self.is_gige and not self._handle.is_controller():
+            # without control Aravis opens it all the same, for reading only; letting go of that may take 2.5 s
+            threading.Thread(target=self.drop, name=f"release {self.name}", daemon=True).start()
+            raise self.busy()
+        self._camera.set_range_check_policy(aravis().RangeCheckPolicy.ENABLE)
+        if not self.is_gige:
+            # Of a GigE camera it would come from a thread of Aravis that the handle's end waits for: letting go of the
+            # handle during the signal would let that thread wait for itself, which ends the program.
+            self._handler = self._handle.connect("control-lost", lambda _device: on_lost())
+        self.stop()  # what a program that crashed, or a connection that broke, has left running
+
+    def in_control(self) -> bool:
+        """Whether the camera is still ours, as far as Aravis knows; does not ask it."""
+        handle = self._handle
+        return handle is not None and (not self.is_gige or bool(handle.is_controller()))
+
+    def drop(self) -> None:
+        """Let go of the camera, and give up its control; takes 2.5 s where it does not answer."""
+        if self._handle is not None and self._handler is not None:
+            self._handle.disconnect(self._handler)
+            self._handler = None
+        self._handle = None
+        self._camera = None
+
+    @property
+    def is_gige(self) -> bool:
+        """Whether it is a GigE Vision camera."""
+        return isinstance(self._handle, aravis().GvDevice)
+
+    @property
+    def protocol(self) -> str:
+        """What it speaks, as far as it is one of these."""
+        if self.is_gige:
+            return "GigE Vision"
+        # a library that was built without USB has no such class
+        usb = getattr(aravis(), "UvDevice", None)
+        return "USB3 Vision" if usb is not None and isinstance(self._handle, usb) else ""
+
+    def node(self, name: str) -> Any:
+        """Node of the camera's description, or None; does not keep the connection."""
+        return None if self._handle is None else self._handle.get_feature(name)
+
+    def ask(self, method: str, *args: Any) -> Any:
+        """Call a method of the device (``ArvDevice``)."""
+        self._check()
+        try:
+            return getattr(self._handle, method)(*args)
+        except glib_error() as error:
+            raise self.translated(error, *args) from None
+
+    def ask_camera(self, method: str, *args: Any) -> Any:
+        """Call a method of the camera (``ArvCamera``)."""
+        self._check()
+        try:
+            return getattr(self._camera, method)(*args)
+        except glib_error() as error:
+            raise self.translated(error, *args) from None
+
+    def ask_node(self, name: str, method: str) -> Any:
+        """Call a method of a node of the camera's description (``ArvGcNode``)."""
+        self._check()
+        try:
+            return getattr(self._handle.get_feature(name), method)()
+        except glib_error() as error:
+            raise self.translated(error, name) from None
+
+    def stop(self) -> None:
+        """Ask the camera to stop sending, even when it was closed; raises nothing."""
+        if self._camera is not None:
+            try:
+                self._camera.stop_acquisition()
+            except glib_error():  # it is not there, or not ours any more
+                return
+
+    def say(self, method: str) -> str:
+        """Return a text about the camera, empty where it has none."""
+        self._check()
+        try:
+            return str(getattr(self._camera, method)() or "")
+        except glib_error() as error:
+            lost = self.translated(error)
+            if lost.code != "camera_lost":
+                return ""
+            raise lost from None
+
+    def start_stream(self) -> tuple[Any, int]:
+        """Return a new stream (``ArvStream``) and the size of its buffers."""
+        return self.ask_camera("create_stream", None, None), int(self.ask_camera("get_payload"))
+
+    def address(self) -> str:
+        """IP address of a GigE Vision camera, or an empty string."""
+        if not self.is_gige:
+            return ""
+        return str(self._handle.get_device_address().get_address().to_string())
+
+    def translated(self, error: Any, name: object = None, value: object = None) -> CameraError:
+        """An error of Aravis as one of ours."""
+        text = str(error.message)
+        if error.domain == "arv-gc-error-quark":
+            codes = aravis().GcError
+            if error.code in (codes.OUT_OF_RANGE, codes.ENUM_ENTRY_NOT_FOUND):
+                return self.out_of_range(name, value, f"what the camera accepts: {text}")
+            return self.unknown(name, f"cannot be used: {text}")
+        codes = aravis().DeviceError
+        if error.code in (codes.FEATURE_NOT_FOUND, codes.WRONG_FEATURE):
+            return self.unknown(name, f"is not there: {text}")
+        if error.code == codes.PROTOCOL_ERROR_ACCESS_DENIED:
+            return self.busy() if name is None else self.unknown(name, f"is locked now: {text}")
+        if error.code in (codes.PROTOCOL_ERROR_INVALID_PARAMETER, codes.PROTOCOL_ERROR_WRITE_PROTECT):
+            return self.out_of_range(name, value, f"what the camera accepts: {text}")
+        return CameraError(f"{self.name}: {text}.", code="camera_lost", remedy=_RECONNECT, camera=self.name)
+
+    def busy(self) -> CameraError:
+        """The error of a camera that another program controls."""
+        return CameraError(
+            f"Another program controls {self.name}.",
+            code="camera_busy",
+            remedy="Close the other program, then reconnect; a program that crashed holds a camera for 3 s more.",
+            camera=self.name,
+        )
+
+    def lost(self, why: str) -> CameraError:
+        """The error of a camera that cannot be used any more."""
+        return CameraError(f"{self.name} {why}.", code="camera_lost", remedy=_RECONNECT, camera=self.name)
+
+    def out_of_range(self, name: object, value: object, allowed: str) -> CameraError:
+        """The refusal of a value, saying what would do."""
+        return CameraError(
+            f"{self.name} cannot set {name} to {value!r}, only {allowed}.",
+            code="out_of_range",
+            remedy="Give a value as named above.",
+            camera=self.name,
+            setting=str(name),
+        )
+
+    def unknown(self, name: object, why: str) -> CameraError:
+        """The refusal of a feature or setting that the camera does not have."""
+        return CameraError(
+            f"{self.name}: {name} {why}.",
+            code="unknown_feature",
+            remedy="Take one of the names in the camera's description (feature_names), or leave it out.",
+            camera=self.name,
+            setting=str(name),
+        )

@@ -1,0 +1,96 @@
+"""The cameras that Aravis sees, and finding the one that a rig file names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from core.errors import CameraError
+from drivers.cameras.aravis.gvcp import ControlState, control_state
+from drivers.cameras.aravis.library import aravis
+from drivers.cameras.protocol import FoundDevice
+
+DRIVER = "aravis"
+_GIGE = "GigEVision"
+_PROBLEMS = {
+    ControlState.HELD: "Another program or the running service uses it: close that first.",
+    ControlState.SILENT: "It does not answer at its address: give it one in the network of this machine's interface.",
+}
+_EXTRA = ("vendor", "protocol", "physical_id", "manufacturer_info")
+
+
+@dataclass(frozen=True)
+class ListedCamera:
+    """A line of Aravis' list; ``address`` is empty but for GigE Vision cameras."""
+
+    id: str
+    physical_id: str
+    model: str
+    serial: str
+    address: str
+    extra: dict[str, str]
+
+
+def _listed() -> Iterator[ListedCamera]:
+    for index in range(int(aravis().get_n_devices())):
+
+        def of(name: str, index: int = index) -> str:
+            return str(getattr(aravis(), f"get_device_{name}")(index) or "")
+
+        yield ListedCamera(
+            of("id"),
+            of("physical_id"),
+            of("model"),
+            of("serial_nbr"),
+            of("address") if of("protocol") == _GIGE else "",
+            {name: value for name in _EXTRA if (value := of(name))},
+        )
+
+
+def discover() -> list[FoundDevice]:
+    """List the GigE Vision and USB3 Vision cameras that answer; takes a second.
+
+    ``problem`` says of a GigE Vision camera that it is in use or that its address cannot be reached; of a USB3 Vision
+    camera neither can be told without opening it.
+
+    Raises
+    ------
+    CameraError
+        ``driver_missing`` when Aravis is not installed.
+    """
+    aravis().update_device_list()
+    return [
+        FoundDevice(
+            kind="camera",
+            driver=DRIVER,
+            device=one.id,
+            model=one.model,
+            serial=one.serial,
+            address=one.address,
+            problem=_PROBLEMS.get(control_state(one.address)) if one.address else None,
+            extra=one.extra,
+        )
+        for one in _listed()
+    ]
+
+
+def find(name: str) -> ListedCamera | None:
+    """Return the camera of this id, serial number or MAC address in Aravis' present list; None where there is none.
+
+    Raises
+    ------
+    CameraError
+        ``camera_lost`` when several cameras have the serial number or MAC address.
+    """
+    cameras = list(_listed())
+    found = [one for one in cameras if one.id == name] or [
+        one for one in cameras if name in (one.serial, one.physical_id)
+    ]
+    if len(found) > 1:
+        raise CameraError(
+            f"Several cameras answer to {name}: {', '.join(one.id for one in found)}.",
+            code="camera_lost",
+            remedy="Name the camera by one of these ids.",
+            camera=name,
+        )
+    return found[0] if found else None

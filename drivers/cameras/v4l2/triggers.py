@@ -1,0 +1,98 @@
+"""Trigger modes of devices that have no standard way: the rig file names the controls that bring them there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from core.errors import CameraError
+from drivers.cameras.protocol import CameraOptions, FeatureValue, TriggerMode
+from drivers.cameras.v4l2.controls import Control, Controls, Raw
+
+
+class Triggers:
+    """Trigger modes of one device.
+
+    Of the features of ``software``, the one button among them is what `press` presses; the others are set.
+    """
+
+    def __init__(self, controls: Controls, options: CameraOptions) -> None:
+        self._controls = controls
+        self._path = options.device
+        self._features = options.trigger_features
+        self._asked: TriggerMode = "free"
+
+    @property
+    def modes(self) -> tuple[TriggerMode, ...]:
+        """Free run, and what the options say how to reach."""
+        modes: tuple[TriggerMode, ...] = ("software", "hardware")
+        return ("free", *(mode for mode in modes if mode in self._features))
+
+    def checked(self, mode: TriggerMode | None) -> list[tuple[Control, Raw]]:
+        """Return what to set for a mode, without touching it; nothing for ``None``."""
+        if mode is None:
+            return []
+        if mode not in self.modes:
+            raise self._controls.out_of_range(
+                "trigger", mode, f"{', '.join(self.modes)}; others need trigger_features in the rig file"
+            )
+        wanted = self._features_of(mode)
+        found = [self._controls.check(name, value) for name, value in wanted.items()]
+        if mode == "software":
+            self._button()
+        return [(control, raw) for control, raw in found if not control.is_button]
+
+    def _features_of(self, mode: TriggerMode) -> Mapping[str, FeatureValue]:
+        return self._features.get(mode, {})
+
+    def _button(self) -> Control:
+        buttons = [self._controls.find(name) for name in self._features_of("software")]
+        buttons = [control for control in buttons if control.is_button]
+        if len(buttons) != 1:
+            raise CameraError(
+                f"The software trigger of {self._path} names {len(buttons)} controls to press, not one.",
+                code="unknown_feature",
+                remedy="Name the one button that fires it in trigger_features for 'software', with the value true.",
+                device=self._path,
+            )
+        return buttons[0]
+
+    def mode(self) -> TriggerMode | None:
+        """The mode whose controls stand as its features say; of several, the one that names most of them."""
+        standing: list[tuple[int, bool, TriggerMode]] = []
+        for mode in self.modes:
+            wanted = [self._controls.check(name, value) for name, value in self._features_of(mode).items()]
+            wanted = [(control, raw) for control, raw in wanted if not control.is_button]
+            if all(self._controls.get(control) == raw for control, raw in wanted):
+                standing.append((len(wanted), mode == self._asked, mode))
+        return max(standing, key=lambda one: one[:2])[2] if standing else None
+
+    def settle(self, mode: TriggerMode) -> None:
+        """Say that its controls were set; code ``setting_not_taken`` when they say otherwise."""
+        self._asked = mode
+        now = self.mode()
+        if now != mode:
+            raise CameraError(
+                f"{self._path} was asked for trigger mode {mode!r}, and its controls still say {now!r}.",
+                code="setting_not_taken",
+                remedy=f"Name in trigger_features for {mode!r} the controls that bring it there.",
+                device=self._path,
+                setting="trigger",
+            )
+
+    def press(self, *, armed: bool) -> None:
+        """Press the button of the software trigger; codes ``wrong_trigger``, ``not_armed``."""
+        if self.mode() != "software":
+            raise CameraError(
+                f"{self._path} is in trigger mode {self.mode()!r}, not 'software'.",
+                code="wrong_trigger",
+                remedy="Set trigger to 'software' first.",
+                device=self._path,
+            )
+        if not armed:
+            raise CameraError(
+                f"{self._path} is not armed.",
+                code="not_armed",
+                remedy="Arm it before it is triggered.",
+                device=self._path,
+            )
+        self._controls.put(self._button(), 0)

@@ -1,0 +1,1 @@
+"""Motion stages: the protocol, serial lines, and one driver a controller family."""

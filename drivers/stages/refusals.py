@@ -1,0 +1,133 @@
+"""What every stage driver refuses in the same words: wrong states, and values at which no byte goes out."""
+
+from __future__ import annotations
+
+import math
+
+from core.errors import StageError
+from drivers.stages.protocol import AxisLimits, AxisOptions
+
+
+def configuration_state(axis: int) -> StageError:
+    """Say that an axis was left in the SMC100's configuration state."""
+    return StageError(
+        f"Axis {axis} is in CONFIGURATION state, in which a program left it (PW1): it refuses every motion.",
+        code="configuration_state",
+        remedy="Finish what that program began, or leave the state on purpose, which writes the controller's flash "
+        "memory (it bears about a hundred writes): POST /stage/axes/N/leave-configuration.",
+        axis=axis,
+    )
+
+
+def not_in_configuration(axis: int) -> StageError:
+    """Say that there is no configuration state to leave."""
+    return StageError(
+        f"Axis {axis} is not in CONFIGURATION state.",
+        code="not_in_configuration",
+        remedy="There is nothing to leave; read the axis' state.",
+        axis=axis,
+    )
+
+
+def check_dynamic(axis: int, what: str, value: object, most: float | None) -> None:
+    """Refuse a velocity or an acceleration that is no positive number or above the controller's greatest.
+
+    Raises
+    ------
+    StageError
+        ``out_of_range``.
+    """
+    fine = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    if fine and (most is None or value <= most):  # type: ignore[operator]
+        return
+    limit = "" if most is None else f" up to {most:g}"
+    raise StageError(
+        f"Axis {axis} cannot have the {what} {value!r}: not a number above 0{limit} (mm, s).",
+        code="out_of_range",
+        remedy="Give a value that the stage can do.",
+        axis=axis,
+    )
+
+
+def not_homed(axis: int) -> StageError:
+    """Say that nobody knows where an axis stands."""
+    return StageError(
+        f"Axis {axis} was not homed, its position means nothing.",
+        code="not_homed",
+        remedy="Home the axis first.",
+        axis=axis,
+    )
+
+
+def motor_off(axis: int) -> StageError:
+    """Say that an axis has no power."""
+    return StageError(f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis)
+
+
+def motion_fault(axis: int, what: str) -> StageError:
+    """Say what became of a motion."""
+    return StageError(
+        f"Axis {axis} {what}.",
+        code="motion_fault",
+        remedy="Check the stage for an obstacle or a limit switch, enable and home it, then move again.",
+        axis=axis,
+    )
+
+
+def check_number(axis: int, value: object) -> float:
+    """Return a position or a distance, or raise ``out_of_limits`` at what is no finite number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise StageError(
+            f"Axis {axis} cannot move to {value!r}: not a finite number.",
+            code="out_of_limits",
+            remedy="Give a target in millimetres inside the limits.",
+            axis=axis,
+        )
+    return float(value)
+
+
+def check_target(axis: int, target: object, limits: AxisLimits) -> float:
+    """Return a target, or raise ``out_of_limits`` at one where the axis may not go."""
+    goal = check_number(axis, target)
+    if not limits.low_mm <= goal <= limits.high_mm:
+        raise StageError(
+            f"Axis {axis} cannot move to {goal:g} mm: outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+            code="out_of_limits",
+            remedy="Give a target inside the limits, or widen the soft limits in the rig file.",
+            axis=axis,
+            target_mm=goal,
+            low_mm=limits.low_mm,
+            high_mm=limits.high_mm,
+        )
+    return goal
+
+
+def detour(axis: int, option: AxisOptions, limits: AxisLimits, here_mm: float, goal_mm: float) -> float | None:
+    """Where to go first so that the last stretch takes up the backlash; ``None`` when the way there does it."""
+    sign = 1.0 if option.approach_from == "below" else -1.0
+    if option.backlash_mm == 0 or sign * (goal_mm - here_mm) >= option.backlash_mm:
+        return None
+    turn = goal_mm - sign * option.backlash_mm
+    if not limits.low_mm <= turn <= limits.high_mm:
+        raise StageError(
+            f"Axis {axis} cannot arrive at {goal_mm:g} mm from {option.approach_from}: it would have to turn at "
+            f"{turn:g} mm, outside {limits.low_mm:g} to {limits.high_mm:g} mm.",
+            code="out_of_limits",
+            remedy=f"Stay at least the backlash ({option.backlash_mm:g} mm) inside the limit.",
+            axis=axis,
+            target_mm=goal_mm,
+        )
+    return turn
+
+
+def tighten(axis: int, soft: tuple[float, float] | None, low_mm: float, high_mm: float) -> AxisLimits:
+    """Return the limits that controller and rig file leave, or raise ``out_of_limits`` when that is nothing."""
+    low, high = (low_mm, high_mm) if soft is None else (max(low_mm, soft[0]), min(high_mm, soft[1]))
+    if not low < high:
+        raise StageError(
+            f"The soft limits {soft} mm of axis {axis} leave nothing of its travel {low_mm:g} to {high_mm:g} mm.",
+            code="out_of_limits",
+            remedy="Correct soft_limits_mm in the rig file.",
+            axis=axis,
+        )
+    return AxisLimits(low, high, low_mm, high_mm)

@@ -1,0 +1,76 @@
+"""The words that a stage driver must know of its controller; `SerialStage` builds everything on them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from drivers.stages.protocol import AxisStatus, ControllerMessage, StageIdentity
+
+
+class ControllerWords(ABC):
+    """What one family of controllers is told, and what it answers."""
+
+    def _check_unit(self, axis: int) -> None:  # noqa: B027 - few controllers need it
+        """Make sure that positions still mean what they did at opening, where a controller can change that."""
+
+    def _check_settable(self, axis: int) -> None:  # noqa: B027
+        """Refuse new velocities in a state in which the controller takes none."""
+
+    def _distrust(self, axis: int) -> None:  # noqa: B027
+        """Forget that an axis was taken for homed."""
+
+    def _greatest(self, axis: int) -> tuple[float | None, float | None]:  # noqa: ARG002
+        """Give the greatest velocity and acceleration that the controller allows, where it tells them."""
+        return None, None
+
+    @abstractmethod
+    def _connect(self) -> StageIdentity:
+        """Find out who answers; called with the line open."""
+
+    @abstractmethod
+    def _read_travel_mm(self, axis: int) -> tuple[float, float]:
+        """Read the controller's own software limits."""
+
+    @abstractmethod
+    def _set_dynamics(self, axis: int) -> tuple[float, float]:
+        """Set velocity and acceleration where the options give them; return both as read back."""
+
+    @abstractmethod
+    def _read_position_mm(self, axis: int) -> float:
+        """Read where the axis is."""
+
+    @abstractmethod
+    def _read_status(self, axis: int) -> AxisStatus:
+        """Read what the axis does."""
+
+    @abstractmethod
+    def _switch_motor(self, axis: int, *, on: bool) -> None:
+        """Switch the motor, and check that it is."""
+
+    @abstractmethod
+    def _start_homing(self, axis: int) -> None:
+        """Write the homing command, once, and raise what the controller has against it."""
+
+    @abstractmethod
+    def _finish_homing(self, axis: int) -> None:
+        """Check that homing ended well; called when the axis rests."""
+
+    @abstractmethod
+    def _send_move(self, axis: int, position_mm: float) -> None:
+        """Write the motion command, once."""
+
+    @abstractmethod
+    def _stop_text(self, axis: int | None) -> str:
+        """Give the stop command for one axis or all."""
+
+    @abstractmethod
+    def _abort_text(self) -> str:
+        """Give the command for an emergency stop of everything."""
+
+    @abstractmethod
+    def _drain_errors(self, axis: int | None = None) -> list[ControllerMessage]:
+        """Read and clear the controller's errors (of one axis where it keeps them apart)."""
+
+    @abstractmethod
+    def _code_of(self, message: ControllerMessage) -> str | None:
+        """Map a controller's error to one of the codes of `Stage`, if one fits."""

@@ -1,0 +1,103 @@
+"""At the door: Host and Origin, and the size of bodies."""
+
+from __future__ import annotations
+
+import re
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.api.protocol.problems import problem_response
+from server.base.errors import TooLargeError
+
+LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+BODY_LIMIT = 32 * 2**20
+UPLOAD_LIMIT = 1024 * 2**20
+
+
+#: a scheme only where it is an origin; a name or an address, and a port: nothing that two readers may read in two ways
+_PLACE = re.compile(r"(?:[a-z][a-z0-9+.-]*://)?(\[[0-9a-f:.%]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?", re.IGNORECASE)
+
+
+def host_name(value: str) -> str | None:
+    """Return the host of a Host header or an origin, without port; None if it is not one."""
+    found = _PLACE.fullmatch(value)
+    return None if found is None else found[1].strip("[]").lower()
+
+
+class Guard:
+    """Refuse requests that come by a foreign name or from a foreign page, and bodies without end.
+
+    A page of another site can reach a service on loopback through the user's browser; its Origin (or, after DNS
+    rebinding, the Host) gives it away.
+    """
+
+    def __init__(self, app: ASGIApp, allowed: frozenset[str] = LOOPBACK_NAMES) -> None:
+        self._app = app
+        self._allowed = allowed
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Check, then pass on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = {k.lower(): v.decode("latin-1") for k, v in scope["headers"]}
+        for header, code in ((b"host", "foreign_host"), (b"origin", "foreign_origin")):
+            value = headers.get(header)
+            if value is None and header == b"origin":
+                continue
+            if value is None or host_name(value) not in self._allowed:
+                response = problem_response(
+                    403,
+                    code,
+                    f"Requests with this {header.decode().title()} are not served.",
+                    "Use the address that the service printed when it started.",
+                )
+                await response(scope, receive, send)
+                return
+        if b"transfer-encoding" in headers and b"content-length" in headers:
+            # two lengths: a proxy in front may believe the other one, and see another request than we do
+            response = problem_response(
+                400,
+                "malformed_request",
+                "A body has one length, and this one is given two.",
+                "Send Content-Length or Transfer-Encoding.",
+                headers={"Connection": "close"},
+            )
+            await response(scope, receive, send)
+            return
+        limit = UPLOAD_LIMIT if scope["path"].endswith("/steps:import") else BODY_LIMIT
+        length = headers.get(b"content-length", "0")
+        if not length.isdigit() or int(length) > limit:
+            response = problem_response(413, "body_too_large", f"The body is larger than {limit} bytes.", "Send less.")
+            await response(scope, receive, send)
+            return
+        await _counted(self._app, limit, scope, receive, send)
+
+
+async def _counted(app: ASGIApp, limit: int, scope: Scope, receive: Receive, send: Send) -> None:
+    """Pass on, and cut off a body that does not say beforehand how long it is."""
+    seen, answered, cut_off = 0, False, False
+
+    async def counted() -> Message:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > limit:
+            raise TooLargeError(f"The body is larger than {limit} bytes.")
+        return message
+
+    async def told(message: Message) -> None:
+        nonlocal answered, cut_off
+        if cut_off:
+            return
+        if seen > limit and not answered:
+            # whatever the reader of the body made of it
+            cut_off = True
+            cause = f"The body is larger than {limit} bytes."
+            response = problem_response(413, "body_too_large", cause, "Send less.", headers={"Connection": "close"})
+            await response(scope, receive, send)
+            return
+        answered = True
+        await send(message)
+
+    await app(scope, counted, told)

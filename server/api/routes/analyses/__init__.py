@@ -1,0 +1,1 @@
+"""Routes: analyses, results, gauges, exports, reports, previews."""

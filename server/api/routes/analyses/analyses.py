@@ -1,0 +1,191 @@
+"""Analyses of a test."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+from fastapi import APIRouter
+
+from core.errors import RegionError
+from server.api.models import AnalysisAccepted, AnalysisList, AnalysisReply, AnalysisRequest, ContinueRequest, Region
+from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
+from server.api.protocol.paging import PageDep
+from server.api.protocol.problems import errors
+from server.base.errors import NotFoundError
+from server.compute.seeds import check_seeds
+from server.formats.images import read_image
+from server.formats.noise_json import load_noise
+from server.formats.version import software_version
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import Job
+from server.workflows import analysis_start
+from server.workflows.camera_identity import check_same_cameras
+from server.workflows.service import Service
+
+router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
+
+
+@router.post(
+    "",
+    summary="Measure a test's steps",
+    response_model=AnalysisAccepted,
+    status_code=202,
+    responses=errors(404, 409, 422, 503, 507),
+)
+def create_analysis(
+    service: ServiceDep, test_id: TestId, body: AnalysisRequest, key: KeyHeader = None
+) -> dict[str, Any]:
+    """Compute shape and displacement over a region; results can be read step by step as they are finished."""
+    request = mark(f"tests/{test_id}/analyses", key, body)
+    made, _ = service.once(request.scope, key, request.body_sha256, lambda: _begin(service, test_id, body, request))
+    return {"job": service.jobs.document(made["job_id"]), "analysis_id": made["analysis_id"]}
+
+
+def _begin(service: Service, test_id: str, body: AnalysisRequest, request: RequestMark) -> dict[str, Any]:
+    """Check everything that can be checked now, make the analysis and its job; return both ids."""
+    calibration = service.tests.calibration_file(test_id)
+    analysis_start.check_calibration(service, test_id, calibration)
+    steps = analysis_start.steps_to_measure(service, test_id, body.reference, body.steps)
+    for n in steps:
+        check_same_cameras(calibration, service.tests.step(test_id, n).document.get("cameras"), f"Step {n}")
+    mask = mask_of(body.region)
+    settings = body.model_dump(exclude={"kind", "label", "steps", "noise_id", "follow"})
+    noise = None if body.noise_id is None else service.noise.file(body.noise_id)
+    settings["noise"] = None if noise is None else {"noise_id": body.noise_id, **load_noise(noise).record()}
+    settings["region"].pop("mask_png_base64")
+    analysis_start.check_region(service, test_id, steps[0], settings, mask)
+    if body.seeds_cam2 is not None:
+        rows, cols = read_image(service.tests.step(test_id, steps[0]).cam2).shape
+        check_seeds(calibration, settings, (cols, rows))
+    service.require_room()
+    document = {
+        "kind": body.kind,
+        "label": body.label,
+        "settings": settings,
+        "steps": steps,
+        "follow": body.follow,
+        "software": software_version(),
+        "inputs": analysis_start.inputs_of(service, test_id, steps, calibration),
+        **request.document(),
+    }
+
+    def prepare(job: Job) -> dict[str, Any]:
+        run = {"job_id": job.id, **request.document()}
+        stored = service.tests.create_analysis(test_id, document, mask, noise, run)
+        return {"analysis_id": stored["id"]}
+
+    job = analysis_start.submit(service, test_id, prepare, request, follow=body.follow)
+    return {"analysis_id": job.subject["analysis_id"], "job_id": job.id}
+
+
+def mask_of(region: Region) -> bytes | None:
+    """Return the PNG of a region's mask, or None.
+
+    Raises
+    ------
+    RegionError
+        ``mask_unreadable``.
+    """
+    text = region.mask_png_base64
+    if text is None:
+        return None
+    try:
+        return base64.b64decode(text, validate=True)
+    except ValueError as error:  # binascii.Error, or letters beyond ASCII
+        raise RegionError(
+            f"The mask is no base64: {error}.", code="mask_unreadable", remedy="Send a PNG in base64."
+        ) from error
+
+
+def analysis_reply(service: Service, test_id: str, analysis_id: str) -> dict[str, Any]:
+    """Return an analysis as the API shows it."""
+    document = service.tests.analysis(test_id, analysis_id)
+    summary = service.tests.summary(test_id, analysis_id)
+    entries = service.catalog.entries("analysis", test_id)
+    job_id = next((e.get("job_id") for e in entries if e["id"] == analysis_id), None)
+    state = summary["state"] if summary else "interrupted"
+    if summary is None or summary.get("job_id", job_id) != job_id:  # killed, or at work, perhaps once more
+        known = service.tests.step_summaries(test_id, analysis_id)
+        steps = [known[n] for n in document["steps"] if n in known]
+        summary = {"analysis_id": analysis_id, "state": state, "job_id": job_id, "steps": steps} if steps else None
+    job: dict[str, Any] | None = None
+    if job_id is not None:
+        try:
+            job = service.jobs.document(job_id)
+            state = job["state"]
+        except NotFoundError:
+            job_id = None  # the catalogue was lost with its jobs; the files tell the rest
+    stale = analysis_start.stale_reasons(service, test_id, document)
+    problem = job["problem"] if job else (summary or {}).get("problem")
+    return {
+        **{k: v for k, v in document.items() if k != "request"},
+        "state": state,
+        "job_id": job_id,
+        "problem": problem,
+        "steps_finished": service.tests.finished_steps(test_id, analysis_id),
+        "summary": summary,
+        "stale": bool(stale),
+        "stale_reasons": stale,
+    }
+
+
+@router.get("", summary="A test's analyses, oldest first", response_model=AnalysisList, responses=errors(404, 422))
+def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> dict[str, Any]:
+    """Return the analyses of a test."""
+    service.tests.path(test_id)
+    analyses_page = page.of(service.catalog.entries("analysis", test_id), lambda a: str(a["id"]))
+    return {"analyses": analyses_page, "next_cursor": page.next_cursor}
+
+
+@router.get("/{analysis_id:plain_id}", summary="One analysis", response_model=AnalysisReply, responses=errors(404))
+def get_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> dict[str, Any]:
+    """Return settings, state and summary."""
+    return analysis_reply(service, test_id, analysis_id)
+
+
+@router.post(
+    "/{analysis_id}:continue",
+    summary="Go on with an analysis that stopped",
+    response_model=AnalysisAccepted,
+    status_code=202,
+    responses=errors(404, 409, 422, 503, 507),
+)
+def continue_analysis(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    body: ContinueRequest | None = None,
+    key: KeyHeader = None,
+) -> dict[str, Any]:
+    """Measure what an interrupted, cancelled or failed analysis has not measured yet, in a new job.
+
+    Finished steps are kept, and the others are measured from them as they would have been: the results are the same as
+    without the interruption. Steps that failed are tried again.
+    """
+    body = body or ContinueRequest.model_validate({})
+    service.tests.analysis_path(test_id, analysis_id)
+    request = mark(f"tests/{test_id}/analyses/{analysis_id}:continue", key, body)
+
+    def make() -> dict[str, Any]:
+        service.require_room()
+        job = analysis_start.continue_analysis(service, test_id, analysis_id, request, other_version=body.other_version)
+        return {"analysis_id": analysis_id, "job_id": job.id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"]), "analysis_id": analysis_id}
+
+
+@router.post(
+    "/{analysis_id}:finish",
+    summary="Let an analysis that follows its test come to its end",
+    response_model=AnalysisAccepted,
+    status_code=202,
+    responses=errors(404, 409),
+)
+def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> dict[str, Any]:
+    """Measure the steps that have landed so far, then end the job; cancelling it instead ends it at once."""
+    service.tests.analysis_path(test_id, analysis_id)
+    runs = service.tests.analysis_jobs(test_id, analysis_id)
+    job_id = runs[-1]["job_id"] if runs else ""
+    return {"job": service.jobs.finish(job_id), "analysis_id": analysis_id}

@@ -1,0 +1,184 @@
+"""Exports: an analysis in the forms that other programs read."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import FileResponse, Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from core.errors import Cancelled
+from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from server.api.protocol.problems import errors
+from server.base.errors import NotFoundError
+from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
+from server.formats.figure_options import COLOURS, WIDTHS_PX, Look
+from server.worker.executor import TaskFuture
+from server.workflows import analysis_start
+from server.workflows.service import Service
+
+router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
+_PAIR = r"^-?[0-9.]+([eE][-+]?[0-9]+)?,-?[0-9.]+([eE][-+]?[0-9]+)?$"
+_CHUNK_BYTES = 1 << 20
+_POLL_S = 0.05
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """How figures and films look."""
+
+    look: Look
+    over_image: bool
+    fps: float
+
+
+def _drawn(
+    limits: Annotated[
+        str | None,
+        Query(
+            max_length=60,
+            pattern=_PAIR,
+            description="Ends of the colour scale, in the variable's unit.",
+            examples=["-0.05,0.05"],
+        ),
+    ] = None,
+    percentiles: Annotated[
+        str, Query(max_length=40, pattern=_PAIR, description="Else the percentiles of the values where it ends.")
+    ] = "1,99",
+    colours: Annotated[str, Query(pattern=f"^({'|'.join(COLOURS)})$", description="Colour map.")] = "viridis",
+    width_px: Annotated[int, Query(ge=WIDTHS_PX[0], le=WIDTHS_PX[1], description="Width of the picture.")] = 900,
+    over_image: Annotated[bool, Query(description="Draw over camera 1's reference image.")] = False,
+    fps: Annotated[float, Query(ge=0.1, le=60.0, description="Steps a second in a film.")] = 2.0,
+) -> _Drawn:
+    look = Look(
+        limits=None if limits is None else _pair(limits),
+        percentiles=_pair(percentiles),
+        colours=colours,
+        width_px=width_px,
+    )
+    return _Drawn(look, over_image, fps)
+
+
+def _pair(text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:  # several points in a number
+        return float("nan"), float("nan")
+    return low, high
+
+
+@router.get(
+    "/export",
+    summary="Results in the forms that other programs read",
+    response_class=FileResponse,
+    responses=errors(404, 409, 422, 503, 507)
+    | {
+        200: {
+            "description": "The file; several are one ZIP archive.",
+            "content": {media.split(";")[0]: {} for media in MEDIA_TYPES.values()},
+        }
+    },
+)
+async def export(
+    request: Request,
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    drawn: Annotated[_Drawn, Depends(_drawn)],
+    format: Annotated[  # noqa: A002
+        ExportFormat,
+        Query(
+            description="nc: NetCDF-4 as stored; csv; vtu: ParaView, with a PVD time series; mat: MATLAB; h5: HDF5, "
+            "all steps stacked; png, svg: figures; gif, mp4: films over the steps."
+        ),
+    ] = "nc",
+    step: Annotated[int | None, Query(ge=0, le=9999, description="One step; all finished ones if left out.")] = None,
+    steps: Annotated[
+        str | None,
+        Query(
+            max_length=500,
+            pattern=r"^\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*$",
+            description="Several steps.",
+            examples=["0,3-7"],
+        ),
+    ] = None,
+    variables: Annotated[
+        str | None,
+        Query(
+            max_length=1000,
+            pattern=r"^[a-z][a-z0-9_]{0,63}(,[a-z][a-z0-9_]{0,63})*$",
+            examples=["w_mm,exx"],
+            description="Variables of the result files; all if left out, of figures and films w_mm or z_mm.",
+        ),
+    ] = None,
+) -> Response:
+    """Answer with the file once it is made; several files are one ZIP archive.
+
+    Every form says units, frame, settings, calibration and version; docs/exports.md describes each. The header X-Stale
+    says what is gone or was replaced since the analysis. A client that goes away ends its export.
+    """
+    wanted = [step] if step is not None else None if steps is None else steps_in(steps)
+    files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, wanted)
+    if format == "nc" and len(files) == 1 and variables is None:
+        return FileResponse(
+            files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
+        )
+    names = None if variables is None else variables.split(",")
+    wish = ExportRequest(format, None, names, drawn.look, drawn.over_image, drawn.fps)
+    folder = await run_in_threadpool(service.exports.new_folder)
+    try:
+        made = Path(await _made(request, service, files, wish, folder))
+        file = made.open("rb")
+    finally:
+        # the opened file stays until it is sent, whatever becomes of the client or the service
+        await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
+    media = "application/zip" if made.suffix == ".zip" else MEDIA_TYPES[format]
+    headers |= {"Content-Disposition": f'attachment; filename="{made.name}"', "Content-Length": str(file.seek(0, 2))}
+    return StreamingResponse(_chunks(file), media_type=media, headers=headers)
+
+
+def _prepared(
+    service: Service, test_id: str, analysis_id: str, wanted: list[int] | None
+) -> tuple[list[Path], dict[str, str]]:
+    document = service.tests.analysis(test_id, analysis_id)
+    there = service.tests.finished_steps(test_id, analysis_id)
+    files = [service.tests.result_file(test_id, analysis_id, n) for n in (there if wanted is None else wanted)]
+    if not files:
+        raise NotFoundError(
+            f"Analysis {analysis_id} has no finished step.",
+            code="no_results",
+            remedy="Wait for its job, or measure again.",
+        )
+    stale = analysis_start.stale_reasons(service, test_id, document)
+    return files, {"X-Stale": "; ".join(stale)} if stale else {}
+
+
+async def _made(request: Request, service: Service, files: list[Path], wish: ExportRequest, folder: Path) -> str:
+    service.require_room()
+    return str(await finished(request, service.exports.submit(files[0].parent, files, wish, folder)))
+
+
+async def finished(request: Request, future: TaskFuture) -> Any:
+    """Wait for a task without holding anybody up; return its result. A client that goes away ends it."""
+    try:
+        while not future.done():
+            await asyncio.sleep(_POLL_S)
+            if await request.is_disconnected():
+                raise Cancelled("The client went away.")
+    except BaseException:
+        future.request_stop()
+        raise
+    return future.result()
+
+
+def _chunks(file: IO[bytes]) -> Iterator[bytes]:
+    with file:
+        file.seek(0)
+        while chunk := file.read(_CHUNK_BYTES):
+            yield chunk

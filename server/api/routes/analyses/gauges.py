@@ -1,0 +1,83 @@
+"""Gauges: extensometers, lines, areas, rigid motion and frames over an analysis' results."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query
+from fastapi.responses import Response
+
+from core.errors import MeasurementError
+from server.api.models import GaugesReply
+from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from server.api.protocol.problems import errors
+from server.formats.results.gauge_csv import gauges_csv
+from server.formats.results.gauge_mat import gauges_mat
+from server.results.gauges.fields import FieldWriter
+from server.results.gauges.readings import read_gauges
+from server.results.gauges.request import GaugeRequest
+
+router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
+_MATLAB = "application/x-matlab-data"
+_TABLES = ("text/csv", _MATLAB)
+
+
+@router.post(
+    "/gauges/field",
+    operation_id="make_gauge_field",
+    summary="One step's field in another frame, or without its rigid motion",
+    response_class=Response,
+    responses=errors(404, 409, 422) | {200: {"content": {"application/x-netcdf": {}}}},
+)
+def field(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    body: GaugeRequest,
+    step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")],
+) -> Response:
+    """Answer with a result file (NetCDF-4) of the step as `align` and `remove_rigid` ask for; nothing is stored."""
+    source = service.tests.result_file(test_id, analysis_id, step)
+    reference = service.tests.analysis(test_id, analysis_id)["steps"][0]
+    # a frame is laid through the reference's shape
+    steps = {reference, step} if reference in service.tests.finished_steps(test_id, analysis_id) else {step}
+    files = [service.tests.result_file(test_id, analysis_id, n) for n in sorted(steps)]
+    with tempfile.TemporaryDirectory() as folder:
+        writer = FieldWriter(Path(folder), source.parent, body)
+        document = read_gauges(files, body.model_copy(update={"steps": None}), writer)
+        asked = next(s for s in document["steps"] if s["n"] == step)
+        if "problem" in asked:
+            problem = asked["problem"]
+            raise MeasurementError(problem["cause"], code=problem["code"], remedy=problem["remedy"])
+        content = (Path(folder) / source.name).read_bytes()
+    headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_{source.name}"'}
+    return Response(content, media_type="application/x-netcdf", headers=headers)
+
+
+@router.post(
+    "/gauges",
+    operation_id="read_gauges",
+    summary="Read gauges in every step",
+    response_model=GaugesReply,
+    responses=errors(404, 409, 422) | {200: {"content": {media: {} for media in _TABLES}}},
+)
+def read(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    body: GaugeRequest,
+    format: Annotated[  # noqa: A002
+        Literal["json", "csv", "mat"], Query(description="mat: a MATLAB file; its columns are those of the CSV table.")
+    ] = "json",
+) -> dict[str, Any] | Response:
+    """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored."""
+    steps = service.tests.finished_steps(test_id, analysis_id)
+    document = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
+    if format == "json":
+        return document
+    headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_gauges.{format}"'}
+    if format == "csv":
+        return Response(gauges_csv(document), media_type="text/csv; charset=utf-8", headers=headers)
+    return Response(gauges_mat(document), media_type=_MATLAB, headers=headers)

@@ -1,0 +1,137 @@
+"""Before an analysis: does the texture carry the subsets, and are a seed's two places one point."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+from fastapi import APIRouter
+from pydantic import Field, StringConstraints
+
+from core.errors import InputError
+from core.field.seeding.seeds import Seed
+from server.api.models import Pixel, Real, Region, Reply, Request, Whole
+from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
+from server.api.protocol.problems import errors
+from server.api.routes.analyses.analyses import mask_of
+from server.api.routes.analyses.looks import step_image
+from server.compute.region import make_grid
+from server.compute.seeds import distances_px, epipolar_line
+from server.formats.calibrations.recognise import load_calibration
+from server.formats.images import decode_mask, read_image
+from server.formats.noise_json import load_noise
+from server.results.texture import texture_verdict
+
+router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
+
+
+class TextureRequest(Request):
+    """A region of camera 1's image, and the subsets that are to lie in it."""
+
+    region: Region = Field(description="Where points may lie.")
+    subset_px: Annotated[Whole, Field(ge=9, le=255)] = Field(33, description="Subset size, odd.")
+    step_px: Annotated[Whole, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
+    noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
+        None, description="Noise measurement that tells camera 1's noise; 1 % of full scale is assumed without it."
+    )
+    noise_grey: Annotated[Real, Field(gt=0.0, le=65535.0)] | None = Field(
+        None, description="Standard deviation of the noise, grey levels, in place of the above."
+    )
+
+
+class TextureSize(Reply):
+    """What subsets of another width would give."""
+
+    subset_px: int = Field(description="Width.", examples=[27])
+    good_share: float = Field(description="Share of subsets with an expected error up to `good_px`.", examples=[0.97])
+    usable_share: float = Field(description="Up to `usable_px`.", examples=[1.0])
+
+
+class TextureReply(Reply):
+    """Random error that the texture lets expect."""
+
+    subset_px: int = Field(description="Width that was asked about.", examples=[33])
+    subsets: int = Field(description="Subsets that were looked at: the region's points.", examples=[841])
+    noise_grey: float = Field(description="Noise that was taken.", examples=[2.55])
+    level: str = Field(description="`good`, `usable` or `poor`: what 95 % of the subsets reach.", examples=["good"])
+    median_error_px: float | None = Field(None, description="Median of the expected error; null: no texture.")
+    good_share: float = Field(description="Share of subsets with an expected error up to `good_px`.", examples=[0.99])
+    usable_share: float = Field(description="Up to `usable_px`.", examples=[1.0])
+    good_px: float = Field(description="Error up to which texture is called good.", examples=[0.01])
+    usable_px: float = Field(description="Error up to which it is called usable.", examples=[0.05])
+    proposed_subset_px: int | None = Field(
+        None, description="Smallest width that is good, else usable, for 95 % of the subsets; null: none up to 91 px."
+    )
+    sizes: list[TextureSize] = Field(description="Other widths.")
+
+
+class SeedsRequest(Request):
+    """Places of seeds."""
+
+    seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] = Field(
+        description="Places in camera 1's reference image.", examples=[[[250, 240]]]
+    )
+    seeds_cam2: Annotated[list[tuple[Pixel, Pixel] | None], Field(max_length=100)] | None = Field(
+        None, description="The same points in camera 2's, where known: as many, null where not."
+    )
+    reference: Annotated[Whole, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
+
+
+class SeedPlace(Reply):
+    """Where camera 2 may see a seed."""
+
+    line_px: list[list[float]] = Field(description="Points along the epipolar line in camera 2; empty: unseen there.")
+    distance_px: float | None = Field(None, description="Distance of the place in camera 2 from that line.")
+
+
+class SeedsReply(Reply):
+    """What the calibration says of the seeds."""
+
+    seeds: list[SeedPlace] = Field(description="One each.")
+
+
+@router.post(
+    "/steps/{n}/texture",
+    summary="Whether a region's texture carries subsets of a size",
+    response_model=TextureReply,
+    responses=errors(404, 409, 422),
+)
+def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> dict[str, Any]:
+    """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""
+    if body.subset_px % 2 == 0:
+        raise InputError(
+            f"subset_px must be odd, got {body.subset_px}.", code="subset_invalid", remedy="Give 33, for example."
+        )
+    pixels, full_scale = step_image(service, test_id, n, "cam1")
+    mask = mask_of(body.region)
+    settings = {"region": body.region.model_dump(), "step_px": body.step_px, "subset_px": body.subset_px, "seeds": None}
+    grid = make_grid(settings, None if mask is None else decode_mask(mask), (pixels.shape[0], pixels.shape[1]))
+    noise = body.noise_grey
+    if noise is None and body.noise_id is not None:
+        model = load_noise(service.noise.file(body.noise_id)).models[0]
+        noise = None if model is None else math.sqrt(float(model.variance(float(pixels.mean()))))
+    return texture_verdict(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise)
+
+
+@router.post(
+    "/seeds:check", summary="Where camera 2 may see a seed", response_model=SeedsReply, responses=errors(404, 409, 422)
+)
+def check_seed_places(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> dict[str, Any]:
+    """Return each seed's epipolar line in camera 2, and how far the place named there lies from it."""
+    two = [None] * len(body.seeds) if body.seeds_cam2 is None else body.seeds_cam2
+    if len(two) != len(body.seeds):
+        raise InputError(
+            f"There are {len(body.seeds)} seeds, but {len(two)} places in camera 2.",
+            code="seeds_do_not_match",
+            remedy="Give as many, null where a place is not known.",
+        )
+    pair = load_calibration(service.tests.calibration_file(test_id)).pair
+    rows, cols = read_image(service.tests.step(test_id, body.reference).cam2).shape
+    seeds = [Seed(one, other) for one, other in zip(body.seeds, two, strict=True)]
+    off = distances_px(pair, seeds)
+    return {
+        "seeds": [
+            {"line_px": epipolar_line(pair, s.xy_px, (cols, rows)), "distance_px": None if d != d else float(d)}
+            for s, d in zip(seeds, off, strict=True)
+        ]
+    }

@@ -1,0 +1,64 @@
+"""The report of an analysis."""
+
+from __future__ import annotations
+
+import shutil
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, Response
+from starlette.concurrency import run_in_threadpool
+
+from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from server.api.protocol.problems import errors
+from server.api.routes.analyses.exports import finished
+from server.base.errors import NotFoundError
+from server.report.task import NAME, report_task
+from server.workflows import analysis_start
+from server.workflows.service import Service
+
+router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
+
+
+@router.get(
+    "/report",
+    summary="A report that a laboratory can file",
+    response_class=HTMLResponse,
+    responses=errors(404, 409, 422, 503, 507)
+    | {
+        200: {
+            "description": "One HTML file that needs nothing else; X-Not-Stated: how many items nobody stated.",
+            "content": {"text/html": {"example": '<!doctype html><html lang="en">...'}},
+        }
+    },
+)
+async def get_report(request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> Response:
+    """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
+
+    What no device knows comes from `PUT /tests/{test_id}/facts`; what nobody stated is listed as such.
+    """
+    results, stale = await run_in_threadpool(_prepared, service, test_id, analysis_id)
+    service.require_room()
+    folder = await run_in_threadpool(service.exports.new_folder)
+    try:
+        policy, missing = await finished(request, service.exports.run(report_task, results, str(folder)))
+        page = await run_in_threadpool((folder / NAME).read_bytes)
+    finally:
+        await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
+    headers = {"Content-Security-Policy": policy, "X-Not-Stated": str(missing)}
+    return HTMLResponse(page, headers=headers | ({"X-Stale": "; ".join(stale)} if stale else {}))
+
+
+def _prepared(service: Service, test_id: str, analysis_id: str) -> tuple[str, list[str]]:
+    document = service.tests.analysis(test_id, analysis_id)
+    there = service.tests.finished_steps(test_id, analysis_id)
+    if not there:
+        raise NotFoundError(
+            f"Analysis {analysis_id} has no finished step.",
+            code="no_results",
+            remedy="Wait for its job, or measure again.",
+        )
+    for n in there:
+        service.tests.result_file(test_id, analysis_id, n)  # whose checksum is compared
+    return str(service.tests.analysis_path(test_id, analysis_id)), analysis_start.stale_reasons(
+        service, test_id, document
+    )

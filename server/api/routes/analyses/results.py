@@ -1,0 +1,152 @@
+"""Results: fields, probe, files."""
+
+from __future__ import annotations
+
+import io
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.responses import Response
+from pydantic_core import to_json
+
+from server.api.models import FieldList, FieldReply, ProbeReply
+from server.api.protocol.conditional import etag_of, tags_in
+from server.api.protocol.dependencies import AnalysisId, Camera, ServiceDep, StepNumber, TestId
+from server.api.protocol.problems import errors
+from server.formats.files import known_sha256
+from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
+from server.results.positions import image_places
+from server.results.reader import list_variables, probe_result, read_cut_pieces, read_variable
+
+router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
+FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
+
+
+RangeText = Annotated[
+    str | None,
+    Query(
+        max_length=13,
+        pattern=RANGE_PATTERN,
+        examples=["10:50"],
+        description=("Part of the grid, start:stop from 0, stop not included; either can be left out."),
+    ),
+]
+
+
+@router.get(
+    "/steps/{n}/fields/{name}",
+    summary="One variable of one step",
+    response_model=FieldReply,
+    responses=errors(404, 409, 422)
+    | {
+        200: {
+            "description": "The values; the headers X-Shape, X-Units, X-Rows and X-Cols say what plain bytes do not.",
+            "content": {media: {} for form, media in MEDIA_TYPES.items() if form != "json"},
+        }
+    },
+)
+def get_field(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    n: StepNumber,
+    name: FieldName,
+    request: Request,
+    format: Annotated[  # noqa: A002
+        FieldForm,
+        Query(
+            description="json; npy; csv, one line a point; nc, NetCDF-4; f32, little-endian float32 row by row; png, "
+            "a colour map with its bar."
+        ),
+    ] = "json",
+    rows: RangeText = None,
+    cols: RangeText = None,
+    stride: Annotated[int, Query(ge=1, le=10000, description="Each so many-th row and column.")] = 1,
+) -> Response:
+    """Return values over the grid of points, or a part of it; null, NaN or nothing where a point failed."""
+    path = service.tests.result_file(test_id, analysis_id, n)
+    # a result never changes: what was asked for, and of which file, name the answer
+    etag = etag_of([known_sha256(path), name, format, rows, cols, stride])
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
+    if etag in tags_in(request.headers.get("if-none-match", "")):
+        return Response(status_code=304, headers=headers)
+    part = take(name, lambda wanted: read_variable(path, wanted), Part(rows, cols, stride))
+    headers |= part.headers
+    if format != "json":
+        return Response(encode(part, format), media_type=MEDIA_TYPES[format], headers=headers)
+    document = {
+        "name": name,
+        "units": part.variable.units,
+        "long_name": part.variable.long_name,
+        "shape": list(part.values.shape),
+        "rows": headers["X-Rows"],
+        "cols": headers["X-Cols"],
+        "values": nested(part.values),
+    }
+    return _json(document, headers)
+
+
+def _json(document: dict[str, Any], headers: dict[str, str] | None = None) -> Response:
+    # a hundred thousand numbers in a tenth of the time that the standard library takes
+    return Response(to_json(document, inf_nan_mode="null"), media_type="application/json", headers=headers)
+
+
+@router.get(
+    "/steps/{n}/fields",
+    summary="The variables of one step",
+    response_model=FieldList,
+    response_model_exclude_unset=True,
+    responses=errors(404, 422),
+)
+def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> dict[str, Any]:
+    """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
+    path = service.tests.result_file(test_id, analysis_id, n)
+    return {"fields": list_variables(path), "cuts_px": read_cut_pieces(path)}
+
+
+@router.get(
+    "/steps/{n}/places/{cam}",
+    summary="Where the points lie in a step's image",
+    response_model=FieldReply,
+    responses=errors(404, 409, 422) | {200: {"content": {"application/x-npy": {}}}},
+)
+def get_places(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    n: StepNumber,
+    cam: Camera,
+    format: Annotated[Literal["json", "npy"], Query(description="Form of the answer.")] = "json",  # noqa: A002
+) -> Response:
+    """Return column and row of each point, where it is at that step, by the calibration; null where it has none."""
+    result = service.tests.result_file(test_id, analysis_id, n)
+    places = image_places(result, service.tests.calibration_file(test_id), cam)
+    if format == "npy":
+        buffer = io.BytesIO()
+        np.save(buffer, places, allow_pickle=False)
+        return Response(buffer.getvalue(), media_type="application/x-npy", headers={"X-Units": "pixel"})
+    return _json(
+        {
+            "name": cam,
+            "units": "pixel",
+            "long_name": f"column and row of the point in {cam}'s image of step {n}",
+            "shape": list(places.shape),
+            "values": nested(places),
+        }
+    )
+
+
+@router.get(
+    "/probe", summary="The measurement point nearest to a pixel", response_model=ProbeReply, responses=errors(404, 422)
+)
+def get_probe(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    x_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Column in camera 1's image.")],
+    y_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Row in camera 1's image.")],
+    step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")] = 0,
+) -> dict[str, Any]:
+    """Return every number of the nearest point."""
+    return {"step": step, **probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px)}

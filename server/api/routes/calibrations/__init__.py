@@ -1,0 +1,1 @@
+"""Routes: calibrations, exports, reviews, noise models."""

@@ -1,0 +1,240 @@
+"""Calibrations: begin, list, look, residuals, views."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal
+
+import cv2
+from fastapi import APIRouter, File, Form, Path, Query, UploadFile
+from fastapi.responses import FileResponse, Response
+
+from core.errors import StateError
+from server.api.models import (
+    CalibrationAccepted,
+    CalibrationList,
+    CalibrationReply,
+    CalibrationRequest,
+    Label,
+    ResidualsReply,
+    ViewList,
+)
+from server.api.models.calibrations import CalibrationFile
+from server.api.protocol.conditional import tagged
+from server.api.protocol.dependencies import CalibrationId, Camera, KeyHeader, ServiceDep, mark
+from server.api.protocol.paging import PageDep
+from server.api.protocol.problems import errors
+from server.base.errors import NotFoundError
+from server.base.json_values import without_nan
+from server.formats.calibrations.plausibility import check_calibration
+from server.formats.calibrations.recognise import imported_content, parse_calibration
+from server.formats.images import read_image
+from server.jobs.job import Job, Phase
+from server.results.reader import read_residuals
+from server.store.calibrations import REJECTED
+from server.store.index import calibration_entry
+from server.workflows.calibration_sequence import (
+    CalibrationPlan,
+    check_plan,
+    close,
+    fit,
+    plan_document,
+    take_views,
+    targets_of,
+)
+
+router = APIRouter(prefix="/calibrations", tags=["calibrations"])
+
+
+@router.post(
+    "",
+    summary="Calibrate the pair",
+    response_model=CalibrationAccepted,
+    status_code=202,
+    responses=errors(409, 422, 503, 507),
+)
+def create_calibration(
+    service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None
+) -> dict[str, Any]:
+    """Move both cameras through the plan before the grid, then fit; the rig file gives what the body leaves out."""
+    body = body or CalibrationRequest.model_validate({})
+    usual = service.config.calibration
+    plan = CalibrationPlan(
+        positions_mm=tuple(usual.positions_mm if body.positions_mm is None else body.positions_mm),
+        held_out_mm=tuple(usual.held_out_mm if body.held_out_mm is None else body.held_out_mm),
+        frames=body.frames or usual.frames,
+        localiser=body.localiser or usual.localiser,
+        label=body.label,
+    )
+    request = mark("calibrations", key, body)
+
+    def make() -> dict[str, Any]:
+        service.require_room()
+        check_plan(plan)
+        targets_of(service, plan)
+        made: dict[str, Any] = {}
+
+        def prepare(job: Job) -> dict[str, Any]:
+            document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
+            made["calibration_id"] = service.calibrations.create(
+                document, service.config.target.model_dump(mode="json")
+            )
+            return dict(made)
+
+        def hardware(job: Job) -> dict[str, Any]:
+            return take_views(service, job, made["calibration_id"], plan)
+
+        def compute(job: Job) -> dict[str, Any]:
+            return fit(service, job, made["calibration_id"])
+
+        job = service.jobs.submit(
+            "calibration",
+            "a calibration",
+            {},
+            [Phase("hardware", hardware), Phase("compute", compute)],
+            prepare=prepare,
+            request=request,
+            on_end=lambda job, state: close(service, job, made["calibration_id"], state),
+            on_cancel=service.stop_job,
+        )
+        return {**made, "job_id": job.id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"]), "calibration_id": made["calibration_id"]}
+
+
+@router.get("", summary="Calibrations, oldest first", response_model=CalibrationList, responses=errors(422))
+def list_calibrations(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+    """Return every calibration that was begun, with its state and verdict."""
+    calibrations = page.of(service.catalog.entries("calibration"), lambda c: str(c["id"]))
+    return {"calibrations": calibrations, "next_cursor": page.next_cursor}
+
+
+@router.get("/{calibration_id}", summary="One calibration", response_model=CalibrationReply, responses=errors(404, 409))
+def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> dict[str, Any]:
+    """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it.
+
+    One that failed its verdict has what was refused in the same places, to be looked at; `state` stays `failed`.
+    """
+    return tagged(response, service.calibrations.read(calibration_id))
+
+
+@router.post(
+    ":import",
+    summary="Import a calibration made elsewhere",
+    response_model=CalibrationReply,
+    status_code=201,
+    responses=errors(409, 413, 422, 507),
+)
+def import_calibration(
+    service: ServiceDep,
+    file: Annotated[
+        UploadFile,
+        File(description="calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML of a stereo pair."),
+    ],
+    label: Annotated[Label, Form(description="Free text.")] = "",
+    key: KeyHeader = None,
+) -> dict[str, Any]:
+    """Store another program's stereo calibration, or one of another data folder, to measure imported steps with.
+
+    `plan.check` says what both cameras make of points that both see (epipolar residual), and what to doubt.
+    """
+    data = file.file.read()
+    request = mark("calibrations:import", key, None, data, label.encode())
+
+    def make() -> dict[str, Any]:
+        content = imported_content(data, name="The file")
+        checked = without_nan(check_calibration(parse_calibration(data, name="The file")))
+        plan = {"source": "import", "label": label, "check": checked, **request.document()}
+        calibration_id = service.calibrations.add_imported(plan, content)
+        entry = calibration_entry(service.calibrations, calibration_id)
+        service.catalog.put_entry("calibration", "", calibration_id, entry)
+        service.hub.publish("calibration", {"calibration_id": calibration_id})
+        return {"calibration_id": calibration_id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return service.calibrations.read(made["calibration_id"])
+
+
+def complete(service: ServiceDep, calibration_id: str) -> FilePath:
+    """Return a complete calibration's folder.
+
+    Raises
+    ------
+    StateError
+        ``calibration_not_complete``.
+    """
+    path = service.calibrations.path(calibration_id)
+    if not (path / "calibration.json").exists():
+        state = service.calibrations.read(calibration_id)["state"]
+        raise StateError(
+            f"Calibration {calibration_id} is {state}.",
+            code="calibration_not_complete",
+            remedy="Wait for its job, or calibrate again.",
+            state=state,
+        )
+    return path
+
+
+@router.get(
+    "/{calibration_id}/views",
+    summary="Views that were taken",
+    response_model=ViewList,
+    response_model_exclude_unset=True,
+    responses=errors(404, 409),
+)
+def list_views(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+    """Return camera, role, read-back dZ and checksum of every view; empty until all are taken."""
+    return {"views": service.calibrations.read(calibration_id)["taken"] or []}
+
+
+@router.get(
+    "/{calibration_id}/residuals",
+    summary="Residuals of every view",
+    response_model=ResidualsReply,
+    responses=errors(404, 409),
+)
+def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+    """Return, for each view, where every intersection was found and by how much the model misses it.
+
+    A calibration that failed its verdict has them too: they tell what was wrong.
+    """
+    path = service.calibrations.path(calibration_id)
+    if not (path / REJECTED).exists():
+        complete(service, calibration_id)
+    path /= "residuals.nc"
+    if not path.is_file():
+        raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
+    return read_residuals(path)
+
+
+@router.get(
+    "/{calibration_id}/file",
+    summary="calibration.json as stored",
+    response_class=FileResponse,
+    responses=errors(404, 409) | {200: {"model": CalibrationFile, "description": "The file"}},
+)
+def get_calibration_file(service: ServiceDep, calibration_id: CalibrationId) -> FileResponse:
+    """Return the file, which `stereorig measure` reads."""
+    return FileResponse(complete(service, calibration_id) / "calibration.json", media_type="application/json")
+
+
+@router.get(
+    "/{calibration_id}/views/{index}/{cam}",
+    summary="One view's image",
+    response_class=Response,
+    responses=errors(404, 409, 422) | {200: {"content": {"image/tiff": {}, "image/png": {}}}},
+)
+def get_view(
+    service: ServiceDep,
+    calibration_id: CalibrationId,
+    index: Annotated[int, Path(ge=0, le=999, description="Number of the view.")],
+    cam: Camera,
+    format: Annotated[Literal["tiff", "png"], Query(description="As stored, or for looking at.")] = "tiff",  # noqa: A002
+) -> Response:
+    """Return the image as stored (TIFF), or as PNG for looking at."""
+    path = service.calibrations.view_file(calibration_id, index, cam)
+    if format == "tiff":
+        return Response(path.read_bytes(), media_type="image/tiff")
+    _, data = cv2.imencode(".png", read_image(path))
+    return Response(data.tobytes(), media_type="image/png")

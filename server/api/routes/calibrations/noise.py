@@ -1,0 +1,96 @@
+"""The cameras' noise: measure, list, look."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path
+from fastapi.responses import FileResponse
+
+from core.errors import FileFormatError
+from server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
+from server.api.models.noise import NoiseFile
+from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
+from server.api.protocol.paging import PageDep
+from server.api.protocol.problems import errors
+from server.jobs.job import Job, Phase
+from server.workflows import noise_sequence
+
+router = APIRouter(prefix="/noise", tags=["noise"])
+NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurement.")]
+
+
+@router.post(
+    "",
+    summary="Measure both cameras' noise",
+    response_model=NoiseAccepted,
+    status_code=202,
+    responses=errors(409, 422, 503, 507),
+)
+def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: KeyHeader = None) -> dict[str, Any]:
+    """Take frames of what stands still before the cameras, as they are set now; fit variance against grey level."""
+    body = body or NoiseRequest.model_validate({})
+    request = mark("noise", key, body)
+
+    def make() -> dict[str, Any]:
+        service.require_room()
+        made: dict[str, Any] = {}
+
+        def prepare(job: Job) -> dict[str, Any]:
+            facts = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name}
+            plan = {**facts, **request.document(), "job_id": job.id}
+            made["noise_id"] = service.noise.create(plan)
+            return dict(made)
+
+        def hardware(job: Job) -> dict[str, Any]:
+            return noise_sequence.take_frames(service, job, made["noise_id"], body.frames)
+
+        def compute(job: Job) -> dict[str, Any]:
+            return noise_sequence.fit(service, job, made["noise_id"])
+
+        job = service.jobs.submit(
+            "noise",
+            "a noise measurement",
+            {},
+            [Phase("hardware", hardware), Phase("compute", compute)],
+            prepare=prepare,
+            request=request,
+            on_end=lambda job, state: noise_sequence.close(service, job, made["noise_id"], state),
+        )
+        return {**made, "job_id": job.id}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"]), "noise_id": made["noise_id"]}
+
+
+@router.get("", summary="Noise measurements, oldest first", response_model=NoiseList, responses=errors(422))
+def list_noise(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+    """Return every noise measurement that was begun, with its state."""
+    found = []
+    for noise_id in page.of(service.noise.ids(), str):
+        with contextlib.suppress(FileFormatError):  # what is damaged says so when it is asked for
+            found.append(_shown(service.noise.read(noise_id)))
+    return {"noise": found, "next_cursor": page.next_cursor}
+
+
+@router.get("/{noise_id}", summary="One noise measurement", response_model=NoiseReply, responses=errors(404, 409))
+def get_noise(service: ServiceDep, noise_id: NoiseId) -> dict[str, Any]:
+    """Return plan, state and, once complete, both cameras' models."""
+    return _shown(service.noise.read(noise_id))
+
+
+@router.get(
+    "/{noise_id}/file",
+    summary="noise.json as stored",
+    response_class=FileResponse,
+    responses=errors(404, 409) | {200: {"model": NoiseFile, "description": "The file"}},
+)
+def get_noise_file(service: ServiceDep, noise_id: NoiseId) -> FileResponse:
+    """Return the file, which `stereorig measure --noise` reads."""
+    return FileResponse(service.noise.file(noise_id), media_type="application/json")
+
+
+def _shown(document: dict[str, Any]) -> dict[str, Any]:
+    plan = {k: v for k, v in document["plan"].items() if k != "request"}
+    return {**document, "plan": plan}

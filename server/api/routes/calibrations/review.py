@@ -1,0 +1,66 @@
+"""Calibrations before and after: what a plan may be expected to leave, and what somebody decides."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from server.api.models import CalibrationReply
+from server.api.models.calibrations import ExpectReply, ExpectRequest, JudgementRequest
+from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from server.api.protocol.dependencies import CalibrationId, ServiceDep, person_name
+from server.api.protocol.problems import errors
+from server.workflows import calibration_review
+from server.workflows.calibration_sequence import CalibrationPlan
+
+router = APIRouter(prefix="/calibrations", tags=["calibrations"])
+
+
+@router.post(
+    ":expect",
+    summary="What a plan may be expected to leave uncertain",
+    response_model=ExpectReply,
+    responses=errors(409, 422, 503),
+)
+def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> dict[str, Any]:
+    """Predict each parameter's standard deviation, and what they do to points; nothing moves, nothing is kept.
+
+    The rig file's nominal cameras look at the target; the adjustment's own derivatives there give the covariance.
+    """
+    body = body or ExpectRequest.model_validate({})
+    usual = service.config.calibration
+    plan = CalibrationPlan(
+        positions_mm=tuple(usual.positions_mm if body.positions_mm is None else body.positions_mm),
+        held_out_mm=tuple(usual.held_out_mm if body.held_out_mm is None else body.held_out_mm),
+        frames=usual.frames,
+        localiser=body.localiser or usual.localiser,
+    )
+    return calibration_review.expectation(service, plan, body.noise_px, body.roll_deg)
+
+
+@router.put(
+    "/{calibration_id}/judgement",
+    summary="Accept or discard a calibration",
+    response_model=CalibrationReply,
+    responses=errors(404, 409, 412, 422, 507),
+)
+def put_judgement(
+    service: ServiceDep,
+    request: Request,
+    calibration_id: CalibrationId,
+    body: JudgementRequest,
+    response: Response,
+    if_match: IfMatch = None,
+) -> dict[str, Any]:
+    """Keep a decision: tests that name `accepted` take the newest accepted; none can be made with a discarded one.
+
+    If-Match, with the ETag of the calibration, refuses if somebody else decided meanwhile.
+    """
+    service.calibrations.path(calibration_id)
+    with service.changes:  # nobody else's decision comes between the look and ours
+        if if_match is not None:
+            now = etag_of(service.calibrations.read(calibration_id))
+            require_match(if_match, now, f"calibration {calibration_id}")
+        calibration_review.decide(service, calibration_id, body.decision, body.note, person_name(request))
+    return tagged(response, service.calibrations.read(calibration_id))

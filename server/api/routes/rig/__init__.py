@@ -1,0 +1,1 @@
+"""Routes: cameras, stage, devices."""

@@ -1,0 +1,226 @@
+"""The rig and its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+import anyio
+import cv2
+import numpy as np
+from anyio import CapacityLimiter
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import Response, StreamingResponse
+
+from core.errors import StereorigError
+from drivers.cameras.protocol import CameraSettings, Frame
+from server.api.models import (
+    Accepted,
+    CameraReply,
+    CameraSet,
+    CamerasReply,
+    CameraStats,
+    RigReply,
+    SceneReply,
+    SceneRequest,
+    SettingsPatch,
+)
+from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
+from server.api.protocol.problems import errors
+from server.formats.images import encode_tiff
+from server.jobs.job import Job, Phase
+from server.results.quality import image_quality
+
+router = APIRouter(tags=["rig"])
+_BOUNDARY = "frame"
+
+
+@router.get(
+    "/rig",
+    summary="The rig: cameras, stage, target, who holds it",
+    response_model=RigReply,
+    response_model_exclude_unset=True,
+)
+def get_rig(service: ServiceDep) -> dict[str, Any]:
+    """Return everything a client wants to know before it does anything."""
+    return service.rig.describe()
+
+
+@router.post(
+    "/rig/reconnect",
+    summary="Open cameras and stage again",
+    response_model=Accepted,
+    status_code=202,
+    responses=errors(409, 503, 507),
+)
+def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
+    """Close and open every device; settings are pushed and read back."""
+
+    def run(job: Job) -> dict[str, Any]:
+        job.progress("reconnecting", 0, 1)
+        service.rig.reconnect()
+        return {"rig": service.rig.describe()["name"]}
+
+    def make() -> dict[str, Any]:
+        job = service.jobs.submit(
+            "reconnect", "a reconnection of the rig", {}, [Phase("hardware", run)], request=request
+        )
+        return {"job_id": job.id}
+
+    request = mark("reconnect", key, None)
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"])}
+
+
+@router.put(
+    "/sim/scene",
+    summary="Choose what a simulated rig sees",
+    response_model=SceneReply,
+    response_model_exclude_unset=True,
+    responses=errors(409, 422, 503),
+)
+def put_scene(service: ServiceDep, body: SceneRequest) -> dict[str, Any]:
+    """Put the grid, a plate, a panel ... before the cameras; only on simulated rigs."""
+    with service.gate.hold("a change of the scene"):
+        scene = service.rig.set_scene(body.scene, load=body.load, **body.params)
+    service.hub.publish("scene", scene)
+    return scene
+
+
+@router.get("/cameras", summary="Both cameras", response_model=CamerasReply, response_model_exclude_unset=True)
+def get_cameras(service: ServiceDep) -> dict[str, Any]:
+    """Return nominal data, the devices' own descriptions and their settings."""
+    return {"cameras": [service.rig.describe_camera(cam) for cam in ("cam1", "cam2")]}
+
+
+@router.get(
+    "/cameras/{cam}",
+    summary="One camera",
+    response_model=CameraReply,
+    response_model_exclude_unset=True,
+    responses=errors(422),
+)
+def get_camera(service: ServiceDep, cam: Camera, response: Response) -> dict[str, Any]:
+    """Return nominal data, the device's own description and its settings."""
+    return tagged(response, service.rig.describe_camera(cam))
+
+
+@router.patch(
+    "/cameras/{cam}",
+    summary="Change a camera's settings",
+    response_model=CameraSet,
+    responses=errors(409, 412, 422, 503),
+)
+def patch_camera(
+    service: ServiceDep, cam: Camera, body: SettingsPatch, response: Response, if_match: IfMatch = None
+) -> dict[str, Any]:
+    """Set what is given; the answer holds every setting as read back. If-Match refuses if others changed them."""
+    with service.gate.hold(f"new settings of {cam}"):
+        require_match(if_match, etag_of(service.rig.describe_camera(cam)), f"the settings of {cam}", required=False)
+        taken = service.rig.configure(cam, CameraSettings(**body.model_dump()))
+        response.headers["ETag"] = etag_of(service.rig.describe_camera(cam))
+    return {"name": cam, "settings": asdict(taken)}
+
+
+@router.get(
+    "/cameras/{cam}/frame",
+    summary="A frame, as PNG or TIFF",
+    response_class=Response,
+    responses=errors(409, 422, 503) | {200: {"content": {"image/png": {}, "image/tiff": {}}}},
+)
+def get_frame(
+    service: ServiceDep,
+    cam: Camera,
+    format: Annotated[Literal["png", "tiff"], Query(description="File format.")] = "png",  # noqa: A002
+) -> Response:
+    """Return the newest frame, with every grey level as the camera gave it."""
+    frame = service.rig.pair.live(cam, max_age_s=0.1)
+    headers = {
+        "X-Frame-Sequence": str(frame.sequence),
+        "X-Bit-Depth": str(frame.bit_depth),
+        "Cache-Control": "no-store",
+    }
+    if format == "tiff":
+        return Response(encode_tiff(frame.pixels), media_type="image/tiff", headers=headers)
+    _, data = cv2.imencode(".png", frame.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return Response(data.tobytes(), media_type="image/png", headers=headers)
+
+
+@router.get(
+    "/cameras/{cam}/stats",
+    summary="What became of a camera's frames, and the newest one's quality",
+    response_model=CameraStats,
+    responses=errors(409, 422, 503),
+)
+def get_stats(service: ServiceDep, cam: Camera) -> dict[str, Any]:
+    """Return counters, mean grey level, saturation, texture, focus and histogram."""
+    frame = service.rig.pair.live(cam, max_age_s=0.2)
+    shift = max(frame.bit_depth - 8, 0)
+    histogram = np.bincount((frame.pixels >> shift).ravel().astype(np.uint8), minlength=256)
+    return {
+        "name": cam,
+        "frames": service.rig.pair.units[cam].counters(),
+        "driver": service.rig.pair.units[cam].statistics(),
+        "pairs": service.rig.pair.account(),
+        "sequence": frame.sequence,
+        "quality": image_quality(frame.pixels, frame.bit_depth).as_dict(),
+        "histogram": histogram.tolist(),
+    }
+
+
+def _jpeg(frame: Frame) -> bytes:
+    pixels = (frame.pixels >> max(frame.bit_depth - 8, 0)).astype(np.uint8)
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return data.tobytes()
+
+
+@router.get(
+    "/cameras/{cam}/stream.mjpg",
+    summary="Live view",
+    response_class=StreamingResponse,
+    responses=errors(409, 422, 503) | {200: {"content": {"multipart/x-mixed-replace": {}}}},
+)
+async def get_stream(
+    request: Request,
+    cam: Camera,
+    rate_hz: Annotated[float, Query(gt=0.0, le=30.0, description="Frames a second at most.")] = 10.0,
+) -> StreamingResponse:
+    """Stream JPEG frames for an `<img>`; a slow reader gets fewer of them, and recording comes first."""
+    service = get_service(request)
+    pair = service.rig.pair
+    service.streams.check("live_view")
+    # live views have few threads of their own, and can never take those of other requests
+    limiter: CapacityLimiter = request.app.state.view_limiter
+
+    def newer(last: int | None) -> tuple[int, bytes | None]:
+        frame = pair.live(cam, max_age_s=0.9 / rate_hz, after=last)
+        return frame.sequence, None if frame.sequence == last else _jpeg(frame)
+
+    async def parts() -> AsyncIterator[bytes]:
+        last: int | None = None
+        due = anyio.current_time()
+        with service.streams.counted("live_view"):
+            while not service.closing:
+                try:
+                    sequence, data = await anyio.to_thread.run_sync(
+                        newer, last, limiter=limiter, abandon_on_cancel=True
+                    )
+                except StereorigError as error:
+                    if error.code == "camera_busy":  # a capture goes on, and nothing older is there to show
+                        continue
+                    return  # the stream ends; GET /rig says why
+                # by a timetable, since pauses are each a little too long; where there is no frame yet, it is not waited
+                # for a whole period, which would halve the rate
+                due += (0.25 if data is None else 1.0) / rate_hz
+                if data is not None:
+                    last = sequence
+                    head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                    yield head.encode() + data + b"\r\n"
+                due = max(due, anyio.current_time())  # what was missed is not made up for
+                await anyio.sleep_until(due)
+
+    return StreamingResponse(
+        parts(), media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}", headers={"Cache-Control": "no-store"}
+    )

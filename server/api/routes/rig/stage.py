@@ -1,0 +1,267 @@
+"""The stage: where it is, moves, homing, stop."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.concurrency import run_in_threadpool
+
+from drivers.stages.refusals import configuration_state
+from server.api.models import (
+    Accepted,
+    AxesRequest,
+    DynamicsPatch,
+    DynamicsReply,
+    FlashConsent,
+    HomeRequest,
+    MoveRequest,
+    StageMessages,
+    StageReply,
+    StopReply,
+)
+from server.api.protocol.attached import Attached, job_reply
+from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from server.api.protocol.dependencies import KeyHeader, ServiceDep, get_service, mark
+from server.api.protocol.problems import errors
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import Job, Phase
+from server.workflows.service import Service
+
+router = APIRouter(prefix="/stage", tags=["stage"])
+AxisNumber = Annotated[int, Path(ge=1, le=31, description="Number of an axis.")]
+
+
+@router.get(
+    "",
+    summary="Identity, limits and state of every axis",
+    response_model=StageReply,
+    response_model_exclude_unset=True,
+    responses=errors(503),
+)
+def get_stage(service: ServiceDep) -> dict[str, Any]:
+    """Read the controller; works while a move runs."""
+    return service.rig.describe_stage()
+
+
+@router.post(
+    "/moves", summary="Move axes", response_model=Accepted, status_code=202, responses=errors(409, 422, 503, 507)
+)
+async def move(
+    request: Request, body: MoveRequest, attached: Attached = False, key: KeyHeader = None
+) -> dict[str, Any]:
+    """Start a move; its job's result holds positions read back. Targets are checked before any byte goes out."""
+    service = get_service(request)
+    job_id = await run_in_threadpool(_start_move, service, body, key)
+    return await job_reply(request, service, job_id, attached)
+
+
+def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
+    rig = service.rig
+
+    def targets() -> dict[int, float]:
+        if body.positions_mm is not None:
+            return dict(body.positions_mm)
+        if body.dz_mm is not None:
+            return rig.targets_for_dz(dict(body.dz_mm))
+        by = body.by_mm or {}
+        rig.check_axes(tuple(by))
+        here = rig.positions_mm(tuple(by))
+        return {axis: here[axis] + distance for axis, distance in by.items()}
+
+    def make() -> dict[str, Any]:
+        wanted = targets()
+        rig.check_targets(wanted)
+
+        def run(job: Job) -> dict[str, Any]:
+            job.progress("moving", 0, 1)
+            job.check()
+            moved = rig.move(wanted)
+            job.progress("moving", 1, 1)
+            return {
+                "axes": {str(a): {"target_mm": r.target_mm, "position_mm": r.position_mm} for a, r in moved.items()}
+            }
+
+        subject = {"targets_mm": {str(a): t for a, t in wanted.items()}}
+        return {"job_id": _motion(service, sent, "move", f"a move to {wanted}", subject, run)}
+
+    sent = mark("moves", key, body)
+    made, _ = service.once(sent.scope, key, sent.body_sha256, make)
+    return str(made["job_id"])
+
+
+@router.post(
+    "/home", summary="Home axes", response_model=Accepted, status_code=202, responses=errors(409, 422, 503, 507)
+)
+async def home(
+    request: Request, body: HomeRequest | None = None, attached: Attached = False, key: KeyHeader = None
+) -> dict[str, Any]:
+    """Switch motors on and search home."""
+    service = get_service(request)
+    job_id = await run_in_threadpool(_start_home, service, body, key)
+    return await job_reply(request, service, job_id, attached)
+
+
+def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> str:
+    axes = tuple(body.axes) if body is not None and body.axes else service.config.axes
+
+    def make() -> dict[str, Any]:
+        service.rig.check_axes(axes)
+        for axis in service.rig.controls.in_configuration(axes):
+            raise configuration_state(axis)
+
+        def run(job: Job) -> dict[str, Any]:
+            found = {}
+            for index, axis in enumerate(axes):
+                job.progress("homing", index, len(axes))
+                job.check()
+                found.update(service.rig.home((axis,)))
+            return {"axes": {str(a): {"position_mm": p} for a, p in found.items()}}
+
+        return {"job_id": _motion(service, sent, "home", f"homing of axes {list(axes)}", {"axes": list(axes)}, run)}
+
+    sent = mark("home", key, body)
+    made, _ = service.once(sent.scope, key, sent.body_sha256, make)
+    return str(made["job_id"])
+
+
+def _motion(service: Service, sent: RequestMark, kind: str, what: str, subject: dict[str, Any], run: Any) -> str:
+    job = service.jobs.submit(kind, what, subject, [Phase("hardware", run)], on_cancel=service.stop_job, request=sent)
+    return job.id
+
+
+@router.post("/stop", summary="Stop every axis, always", response_model=StopReply, responses=errors(503))
+async def stop(request: Request) -> dict[str, Any]:
+    """Stop at once: waits for no job and no lock, and cancels the hardware job if one runs."""
+    service = get_service(request)
+    answer = await _halt(service, service.stop_thread, service.rig.stop)
+    service.metrics.stop_s.observe(answer["elapsed_ms"] / 1e3)
+    return answer
+
+
+@router.post(
+    "/abort",
+    summary="Stop every axis and switch the motors off, always",
+    response_model=StopReply,
+    responses=errors(503),
+)
+async def abort(request: Request) -> dict[str, Any]:
+    """Stop as in an emergency: as `/stage/stop`, with the controller's emergency stop, and without power afterwards."""
+    service = get_service(request)
+    # it waits until the motors are off, behind which no stop must wait
+    return await _halt(service, service.abort_thread, service.rig.controls.abort)
+
+
+async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[], None]) -> dict[str, Any]:
+    arrived = time.perf_counter()
+    cancelled = service.jobs.cancel_hardware()
+    await asyncio.get_running_loop().run_in_executor(thread, halt)
+    elapsed_ms = (time.perf_counter() - arrived) * 1e3
+    if cancelled is not None:
+        service.stop_until_released(cancelled)
+    service.hub.publish("stage", {"stopped": True, "cancelled_job": cancelled})
+    return {"stopped": True, "elapsed_ms": round(elapsed_ms, 3), "cancelled_job": cancelled}
+
+
+@router.post(
+    "/enable",
+    summary="Switch motors on",
+    response_model=StageReply,
+    response_model_exclude_unset=True,
+    responses=errors(409, 422, 503),
+)
+def enable(service: ServiceDep, body: AxesRequest | None = None) -> dict[str, Any]:
+    """Switch motors on, and return the stage as it is then. An SMC100's are switched on by homing the first time."""
+    return _switch(service, body, on=True)
+
+
+@router.post(
+    "/disable",
+    summary="Switch motors off",
+    response_model=StageReply,
+    response_model_exclude_unset=True,
+    responses=errors(409, 422, 503),
+)
+def disable(service: ServiceDep, body: AxesRequest | None = None) -> dict[str, Any]:
+    """Switch motors off, and return the stage as it is then; refused while a job uses it."""
+    return _switch(service, body, on=False)
+
+
+def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> dict[str, Any]:
+    axes = tuple(body.axes) if body is not None and body.axes else service.config.axes
+    service.rig.check_axes(axes)
+    with service.gate.hold(f"the switching of motors {list(axes)}"):
+        service.gate.call(lambda: service.rig.controls.switch(axes, on=on))
+    return service.rig.describe_stage()
+
+
+@router.get(
+    "/axes/{axis}",
+    summary="An axis' velocity and acceleration",
+    response_model=DynamicsReply,
+    responses=errors(422, 503),
+)
+def get_axis(service: ServiceDep, axis: AxisNumber, response: Response) -> dict[str, Any]:
+    """Read both back from the controller; the header ETag names this state of them."""
+    service.rig.check_axes((axis,))
+    return tagged(response, service.rig.controls.read_dynamics(axis))
+
+
+@router.patch(
+    "/axes/{axis}",
+    summary="Set an axis' velocity and acceleration",
+    response_model=DynamicsReply,
+    responses=errors(409, 412, 422, 503),
+)
+def patch_axis(
+    service: ServiceDep, axis: AxisNumber, body: DynamicsPatch, response: Response, if_match: IfMatch = None
+) -> dict[str, Any]:
+    """Set what is given; the answer is what the controller took. It lasts until the service ends.
+
+    If-Match, with the ETag of GET, refuses if others changed them.
+    """
+    controls = service.rig.controls
+    service.rig.check_axes((axis,))
+    with service.gate.hold(f"a new velocity of axis {axis}"):
+        if if_match is not None:
+            now = etag_of(service.gate.call(lambda: controls.read_dynamics(axis)))
+            require_match(if_match, now, f"axis {axis}")
+        taken = service.gate.call(lambda: controls.set_dynamics(axis, body.velocity_mm_s, body.acceleration_mm_s2))
+        return tagged(response, taken)
+
+
+@router.post(
+    "/axes/{axis}/leave-configuration",
+    summary="Leave an SMC100's configuration state",
+    response_model=Accepted,
+    status_code=202,
+    responses=errors(409, 422, 503, 507),
+)
+def leave_configuration(
+    service: ServiceDep, axis: AxisNumber, body: FlashConsent, key: KeyHeader = None
+) -> dict[str, Any]:
+    """Leave the state in which it refuses every motion. This writes its flash memory, and `write_flash` consents."""
+
+    def run(job: Job) -> dict[str, Any]:
+        job.progress("leaving the configuration state", 0, 1)
+        service.rig.controls.leave_configuration(axis)
+        return {"axis": axis}
+
+    def make() -> dict[str, Any]:
+        service.rig.check_axes((axis,))
+        what = f"the leaving of the configuration state of axis {axis}"
+        return {"job_id": _motion(service, request, "leave_configuration", what, {"axis": axis}, run)}
+
+    request = mark(f"leave-configuration/{axis}", key, body)
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return {"job": service.jobs.document(made["job_id"])}
+
+
+@router.get("/messages", summary="What the controller had to say", response_model=StageMessages)
+def get_messages(service: ServiceDep) -> dict[str, Any]:
+    """Empty the controller's error queue and return the last 200 messages with their texts; reading loses none."""
+    return {"messages": service.rig.controls.messages()}

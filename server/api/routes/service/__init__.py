@@ -1,0 +1,1 @@
+"""Routes: jobs, sessions of the page, health and metrics."""

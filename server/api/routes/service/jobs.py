@@ -1,0 +1,101 @@
+"""Jobs: list, look, follow, cancel."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from server.api.models import JobList, JobReply
+from server.api.protocol.dependencies import JobId, ServiceDep
+from server.api.protocol.paging import ShortPageDep
+from server.api.protocol.problems import errors
+from server.api.routes.service.system import EventStream, LastEventId
+from server.jobs.events import Event
+from server.jobs.job import FINAL
+
+router = APIRouter(prefix="/jobs", tags=["jobs"])
+
+
+def known_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
+    """Return the job, or 404 before a stream begins."""
+    return service.jobs.document(job_id)
+
+
+@router.get("", summary="Jobs, newest first", response_model=JobList, responses=errors(422))
+def list_jobs(service: ServiceDep, page: ShortPageDep) -> dict[str, Any]:
+    """Return a page of the jobs of this and earlier runs of the service."""
+    jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after), lambda j: str(j["id"]))
+    return {"jobs": jobs, "next_cursor": page.next_cursor}
+
+
+@router.get("/{job_id}", summary="One job", response_model=JobReply, responses=errors(404))
+def get_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
+    """Return state, progress, and result or problem."""
+    return service.jobs.document(job_id)
+
+
+@router.post(
+    "/{job_id}/cancel", summary="Cancel a job", response_model=JobReply, status_code=202, responses=errors(404, 409)
+)
+def cancel_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
+    """Ask the job to stop; it does within a second, and keeps what was finished."""
+    return service.jobs.cancel(job_id)
+
+
+@router.get(
+    "/{job_id}/events",
+    summary="Progress of a job, as server-sent events",
+    response_class=EventSourceResponse,
+    responses=errors(404, 503),
+    dependencies=[EventStream],
+)
+async def job_events(
+    service: ServiceDep, job: Annotated[dict[str, Any], Depends(known_job)], last_event_id: LastEventId = None
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow a job; the stream ends with the job. It begins with the job as it is, or resumes after `Last-Event-ID`.
+
+    What came after that event is sent again. Where it is no longer kept, the job as it is now is sent instead.
+    """
+    hub, job_id = service.hub, job["id"]
+    after = hub.last_number if last_event_id is None else last_event_id
+
+    def shown() -> ServerSentEvent:
+        # the number first: what happens meanwhile is told twice, and never not at all
+        number = hub.last_number
+        return ServerSentEvent(data=service.jobs.document(job_id), event="job", id=str(number))
+
+    if last_event_id is None:
+        begin = shown()
+        yield begin
+        if begin.data["state"] in FINAL:
+            return
+    elif service.jobs.document(job_id)["state"] in FINAL:
+        left = [] if hub.gap(after) else [e for e in hub.after(after) if _of_job(e, job_id)]
+        for event in left:
+            yield ServerSentEvent(data=event.data, event=event.name, id=str(event.number))
+        if not left or not _is_end(left[-1]):
+            yield shown()
+        return
+    with service.streams.counted("events"):
+        async for event in hub.follow(after):
+            if event.name == "gap":
+                now = shown()
+                yield now
+                if now.data["state"] in FINAL:
+                    return
+            elif _of_job(event, job_id):
+                yield ServerSentEvent(data=event.data, event=event.name, id=str(event.number))
+                if _is_end(event):
+                    return
+
+
+def _of_job(event: Event, job_id: str) -> bool:
+    """Whether an event is the job's own, or tells what it made."""
+    return bool(event.data.get("id" if event.name == "job" else "job_id") == job_id)
+
+
+def _is_end(event: Event) -> bool:
+    return event.name == "job" and event.data["state"] in FINAL

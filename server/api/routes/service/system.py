@@ -1,0 +1,104 @@
+"""Health, metrics, events."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Header
+from fastapi.responses import PlainTextResponse, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import BaseModel, Field
+
+from server.api.protocol.dependencies import ServiceDep
+from server.api.protocol.problems import RETRY_AFTER_S, errors, problem_response
+from server.base.metrics import CONTENT_TYPE
+from server.formats.version import software_version
+
+router = APIRouter(tags=["system"])
+LastEventId = Annotated[
+    int | None,
+    Header(alias="Last-Event-ID", ge=0, description="Number of the last event seen; what came after it is sent again."),
+]
+
+
+class ReadyReply(BaseModel):
+    """Whether the service can do its work."""
+
+    ready: bool = Field(description="True.")
+
+
+class HealthReply(BaseModel):
+    """What is well, and what is not."""
+
+    status: Literal["ok"] = Field(description="The service answers.")
+    version: str = Field(description="Version of the program.")
+    uptime_s: float = Field(description="For how long it has been running.")
+    rig: Literal["ok", "fault"] = Field(description="Whether cameras and stage are open; GET /rig says why not.")
+    worker: Literal["ready", "starting"] = Field(description="Whether it can compute yet.")
+
+
+@router.get("/healthz", summary="Whether the service is up", response_model=HealthReply)
+def healthz(service: ServiceDep) -> dict[str, Any]:
+    """Answer quickly, whatever else is going on; says what is not well."""
+    return {
+        "status": "ok",
+        "version": software_version(),
+        "uptime_s": round(time.monotonic() - service.started_monotonic, 1),
+        "rig": "fault" if service.rig.fault else "ok",
+        "worker": "ready" if service.worker.ready.is_set() else "starting",
+    }
+
+
+@router.get(
+    "/readyz", summary="Whether it can capture and compute now", response_model=ReadyReply, responses=errors(503)
+)
+def readyz(service: ServiceDep) -> object:
+    """Answer 200 when rig, worker and disk are ready; else a problem whose `reasons` hold code and cause each."""
+    reasons = service.not_ready()
+    if not reasons:
+        return ReadyReply(ready=True)
+    return problem_response(
+        503,
+        "not_ready",
+        " ".join(reason["cause"] for reason in reasons),
+        "Wait where something is starting; else see what GET /rig says, and the room on the disk.",
+        headers={"Retry-After": str(RETRY_AFTER_S)},
+        ready=False,
+        reasons=reasons,
+    )
+
+
+@router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)
+def metrics(service: ServiceDep) -> Response:
+    """Return the text format of Prometheus: requests, captures, jobs, queue, cameras, disk, worker, stage, process."""
+    return Response(service.metrics.text(), media_type=CONTENT_TYPE)
+
+
+def _event_stream(service: ServiceDep) -> None:
+    """Refuse one too many before its answer begins."""
+    service.streams.check("events")
+
+
+#: for every operation that streams events
+EventStream = Depends(_event_stream)
+
+
+@router.get(
+    "/events",
+    summary="Everything that happens, as server-sent events",
+    response_class=EventSourceResponse,
+    responses=errors(503),
+    dependencies=[EventStream],
+)
+async def events(service: ServiceDep, last_event_id: LastEventId = None) -> AsyncIterator[ServerSentEvent]:
+    """Follow jobs, steps, results, scene and stage; resumes after `Last-Event-ID`, also over a restart.
+
+    Where events are lost to the reader, because it was away for long, too slow, or the service was started again, an
+    event `gap` comes first: `next` is the first number that can be told. What the reader shows must be asked anew.
+    """
+    after = service.hub.last_number if last_event_id is None else last_event_id
+    with service.streams.counted("events"):
+        async for event in service.hub.follow(after):
+            yield ServerSentEvent(data=event.data, event=event.name, id=str(event.number))

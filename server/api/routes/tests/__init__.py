@@ -1,0 +1,1 @@
+"""Routes: tests, steps, metadata, watch mode, trash."""

@@ -1,0 +1,59 @@
+"""What only people know about a test: read and replaced as a whole."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Response
+
+from core.errors import StateError
+from server.api.protocol.conditional import etag_of, tagged
+from server.api.protocol.dependencies import ServiceDep, TestId
+from server.api.protocol.problems import errors
+from server.results.metadata import TestFacts
+
+router = APIRouter(prefix="/tests/{test_id}/facts", tags=["tests"])
+
+
+@router.get(
+    "",
+    summary="What was told about a test",
+    response_model=TestFacts,
+    response_model_exclude_none=True,
+    responses=errors(404),
+)
+def get_facts(service: ServiceDep, test_id: TestId, response: Response) -> dict[str, Any]:
+    """Return the facts, empty where nothing was told; the header ETag names this state of them."""
+    return tagged(response, service.tests.facts(test_id))
+
+
+@router.put(
+    "",
+    summary="Tell what no device can say about a test",
+    response_model=TestFacts,
+    response_model_exclude_none=True,
+    responses=errors(404, 412, 422, 507),
+)
+def put_facts(
+    service: ServiceDep,
+    test_id: TestId,
+    body: TestFacts,
+    response: Response,
+    if_match: Annotated[
+        str | None, Header(max_length=200, description="ETag of the state that is replaced; another one is refused.")
+    ] = None,
+) -> dict[str, Any]:
+    """Replace all facts of the test: lens, light, pattern, specimen, static steps and the like; a report shows them."""
+    expected = None
+    if if_match is not None and if_match.strip() != "*":
+        expected = service.tests.facts(test_id)
+        if etag_of(expected) not in [tag.strip() for tag in if_match.split(",")]:
+            raise StateError(
+                f"The facts of test {test_id} are not those that If-Match names.",
+                code="facts_changed",
+                remedy="Read them again, then send the change.",
+                etag=etag_of(expected),
+            )
+    document = body.document()
+    service.tests.put_facts(test_id, document, expected)
+    return tagged(response, document)

@@ -1,0 +1,305 @@
+"""Tests and their steps."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import cv2
+from fastapi import APIRouter, File, Form, Query, Request, UploadFile
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import JSONResponse, Response
+from pydantic import TypeAdapter, ValidationError
+
+from core.errors import InputError, StateError
+from server.api.models import (
+    BurstAccepted,
+    Channels,
+    Label,
+    StepList,
+    StepPatch,
+    StepReply,
+    StepRequest,
+    TestList,
+    TestPatch,
+    TestReply,
+    TestRequest,
+    Timestamp,
+    utc_text,
+)
+from server.api.protocol.attached import Attached, job_reply
+from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, StepNumber, TestId, get_service, mark
+from server.api.protocol.paging import PageDep
+from server.api.protocol.problems import errors
+from server.base.models import FormNumber
+from server.formats.images import read_image
+from server.jobs.idempotency import RequestMark
+from server.store.index import step_entry, test_entry
+from server.workflows.burst import start_burst
+from server.workflows.calibration_review import check_not_discarded, newest_accepted
+from server.workflows.capture import capture_step, import_step
+from server.workflows.service import Service
+
+router = APIRouter(prefix="/tests", tags=["tests"])
+_CHANNELS: TypeAdapter[dict[str, float]] = TypeAdapter(Channels)
+
+
+def _reply(service: Service, test_id: str) -> dict[str, Any]:
+    document = {k: v for k, v in service.tests.read(test_id).items() if k != "request"}
+    return {
+        **document,
+        "steps": service.catalog.entries("step", test_id),
+        "incomplete_steps": service.tests.incomplete_steps(test_id),
+        "analyses": service.catalog.entries("analysis", test_id),
+    }
+
+
+@router.post("", summary="Make a test", response_model=TestReply, status_code=201, responses=errors(404, 409, 422, 507))
+def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -> dict[str, Any]:
+    """Make a test; it gets its own copy of the calibration."""
+    request = mark("tests", key, body)
+
+    def make() -> dict[str, Any]:
+        path = None
+        calibration_id = newest_accepted(service) if body.calibration_id == "accepted" else body.calibration_id
+        if calibration_id is not None:
+            path = service.calibrations.path(calibration_id) / "calibration.json"
+            state = service.calibrations.read(calibration_id)["state"]
+            if state != "complete":
+                raise StateError(
+                    f"Calibration {calibration_id} is {state}.",
+                    code="calibration_not_complete",
+                    remedy="Use a complete calibration.",
+                    state=state,
+                )
+            check_not_discarded(service, calibration_id)
+        document = service.tests.create(
+            {**body.model_dump(), "calibration_id": calibration_id, **request.document()}, path
+        )
+        service.catalog.put_entry("test", "", document["id"], test_entry(document))
+        service.hub.publish("test", {"test_id": document["id"]})
+        return {"test_id": document["id"]}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return _reply(service, made["test_id"])
+
+
+@router.get("", summary="Tests, oldest first", response_model=TestList, responses=errors(422))
+def list_tests(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+    """Return a page of the tests."""
+    return {"tests": page.of(service.catalog.entries("test"), lambda t: str(t["id"])), "next_cursor": page.next_cursor}
+
+
+@router.get("/{test_id}", summary="One test", response_model=TestReply, responses=errors(404))
+def get_test(service: ServiceDep, test_id: TestId, response: Response) -> dict[str, Any]:
+    """Return a test with its steps and analyses; the header ETag names this state of it."""
+    return tagged(response, _reply(service, test_id))
+
+
+@router.patch(
+    "/{test_id}",
+    summary="Change a test's name, specimen or notes",
+    response_model=TestReply,
+    responses=errors(404, 412, 422, 428, 507),
+)
+def patch_test(
+    service: ServiceDep, test_id: TestId, body: TestPatch, response: Response, if_match: IfMatch = None
+) -> dict[str, Any]:
+    """Change what is given; If-Match says which state of the test was meant."""
+    service.tests.path(test_id)
+    changes = {k: v for k, v in body.model_dump(exclude_unset=True).items() if v is not None}
+    with service.changes:  # nobody else's change comes between the look and ours
+        require_match(if_match, etag_of(_reply(service, test_id)), f"test {test_id}")
+        document = service.tests.update(test_id, changes)
+        service.catalog.put_entry("test", "", test_id, test_entry(document))
+        return tagged(response, _reply(service, test_id))
+
+
+@router.post(
+    "/{test_id}/steps",
+    summary="Capture a step, or a burst of steps",
+    response_model=StepReply,
+    status_code=201,
+    responses=errors(404, 409, 422, 503, 507)
+    | {
+        201: {"description": "One step, durable on disk"},
+        202: {"model": BurstAccepted, "description": "A burst was begun; follow its job"},
+    },
+)
+async def create_step(
+    request: Request, test_id: TestId, body: StepRequest, attached: Attached = False, key: KeyHeader = None
+) -> Any:
+    """Capture a synchronised pair. When this answers, both images and `step.json` are durable on disk.
+
+    With `count` above 1 the answer is 202 and a job, which takes a step every `interval_ms`. Its `result` lists each
+    step once it is durable, with number, checksums and quality code; a pair that is refused is listed under `failures`
+    and the burst goes on. `attached=true` answers when the burst has ended.
+    """
+    service = get_service(request)
+    if body.count > 1:
+        job_id = await run_in_threadpool(_start_burst, service, test_id, body, key)
+        reply = await job_reply(request, service, job_id, attached)
+        return JSONResponse(BurstAccepted.model_validate(reply).model_dump(mode="json"), status_code=202)
+    return await run_in_threadpool(_capture, service, test_id, body, key)
+
+
+def _facts(body: StepRequest, sent: RequestMark) -> dict[str, Any]:
+    """What the client said of a step, as its document keeps it."""
+    return {
+        "label": body.label,
+        "load_n": body.load_n,
+        "timestamp_utc": None if body.timestamp_utc is None else utc_text(body.timestamp_utc),
+        "channels": body.channels,
+        **sent.document(),
+    }
+
+
+def _capture(service: Service, test_id: str, body: StepRequest, key: str | None) -> dict[str, Any]:
+    service.tests.path(test_id)
+    sent = mark(f"tests/{test_id}/steps", key, body)
+
+    def make() -> dict[str, Any]:
+        return {"n": capture_step(service, test_id, _facts(body, sent), frames=body.frames)["n"]}
+
+    made, _ = service.once(sent.scope, key, sent.body_sha256, make)
+    return step_reply(service, test_id, made["n"])
+
+
+def _start_burst(service: Service, test_id: str, body: StepRequest, key: str | None) -> str:
+    service.tests.path(test_id)
+    sent = mark(f"tests/{test_id}/steps", key, body)
+
+    def make() -> dict[str, Any]:
+        job_id = start_burst(
+            service,
+            test_id,
+            _facts(body, sent),
+            count=body.count,
+            interval_ms=body.interval_ms,
+            frames=body.frames,
+            request=sent,
+        )
+        return {"job_id": job_id}
+
+    made, _ = service.once(sent.scope, key, sent.body_sha256, make)
+    return str(made["job_id"])
+
+
+def _readings(text: str | None) -> dict[str, float] | None:
+    """Read the channels of a form; a description of forms cannot say what is in a text."""
+    try:
+        return None if text is None else _CHANNELS.validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"channels{place and '.'}{place}: {first['msg']}.",
+            code="channels_unreadable",
+            remedy='Send a JSON object of numbers, as in {"stroke_mm": 0.42}.',
+        ) from error
+
+
+@router.post(
+    "/{test_id}/steps:import",
+    summary="Import a pair of image files as a step",
+    response_model=StepReply,
+    status_code=201,
+    responses=errors(404, 409, 413, 422, 507),
+)
+def import_images(
+    service: ServiceDep,
+    test_id: TestId,
+    cam1: Annotated[UploadFile, File(description="Image of camera 1: TIFF, PNG, BMP or JPEG, gray.")],
+    cam2: Annotated[UploadFile, File(description="Image of camera 2.")],
+    label: Annotated[Label, Form(description="Free text.")] = "",
+    load_n: Annotated[FormNumber | None, Form(description="Load in newton.")] = None,
+    timestamp_utc: Annotated[
+        Timestamp | None, Form(description="The client's own time of this load step, with its time zone.")
+    ] = None,
+    channels: Annotated[
+        str | None,
+        Form(
+            description="Any further scalar readings, as a JSON object of numbers.",
+            examples=['{"stroke_mm": 0.42}'],
+            max_length=20_000,
+            json_schema_extra={"contentMediaType": "application/json"},
+        ),
+    ] = None,
+    key: KeyHeader = None,
+) -> dict[str, Any]:
+    """Store two images as a step. File names are not used; the pixels are kept to the bit."""
+    service.tests.path(test_id)
+    data = {"cam1": cam1.file.read(), "cam2": cam2.file.read()}
+    stamp = None if timestamp_utc is None else utc_text(timestamp_utc)
+    readings = _readings(channels)
+    said = f"{label}\n{load_n}\n{stamp}\n{readings}".encode()
+    request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], said)
+
+    def make() -> dict[str, Any]:
+        facts = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
+        facts |= request.document()
+        return {"n": import_step(service, test_id, data, facts)["n"]}
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    return step_reply(service, test_id, made["n"])
+
+
+@router.get("/{test_id}/steps", summary="A test's steps, in order", response_model=StepList, responses=errors(404, 422))
+def list_steps(service: ServiceDep, test_id: TestId, page: PageDep) -> dict[str, Any]:
+    """Return the complete steps."""
+    service.tests.path(test_id)
+    steps = page.of(service.catalog.entries("step", test_id), lambda s: f"{s['n']:04d}")
+    return {"steps": steps, "next_cursor": page.next_cursor}
+
+
+def step_reply(service: Service, test_id: str, n: int) -> dict[str, Any]:
+    """Return a step as the API shows it."""
+    return {k: v for k, v in service.tests.step(test_id, n).document.items() if k != "request"}
+
+
+@router.get("/{test_id}/steps/{n}", summary="One step", response_model=StepReply, responses=errors(404, 422))
+def get_step(service: ServiceDep, test_id: TestId, n: StepNumber, response: Response) -> dict[str, Any]:
+    """Return a step's document; the header ETag names this state of it."""
+    return tagged(response, step_reply(service, test_id, n))
+
+
+@router.patch(
+    "/{test_id}/steps/{n}",
+    summary="Change a step's label",
+    response_model=StepReply,
+    responses=errors(404, 412, 422, 428, 507),
+)
+def patch_step(
+    service: ServiceDep, test_id: TestId, n: StepNumber, body: StepPatch, response: Response, if_match: IfMatch = None
+) -> dict[str, Any]:
+    """Change the label; what was taken stays as it is. If-Match says which state of the step was meant."""
+    service.tests.step(test_id, n)
+    with service.changes:
+        require_match(if_match, etag_of(step_reply(service, test_id, n)), f"step {n} of test {test_id}")
+        document = service.tests.update_step(test_id, n, {"label": body.label})
+        entry = step_entry(document)
+        service.catalog.put_entry("step", test_id, f"{n:04d}", entry)
+    service.hub.publish("step", {"test_id": test_id, **entry})
+    return tagged(response, step_reply(service, test_id, n))
+
+
+@router.get(
+    "/{test_id}/steps/{n}/{cam:camera}",
+    summary="One image of a step",
+    response_class=Response,
+    responses=errors(404, 409, 422) | {200: {"content": {"image/tiff": {}, "image/png": {}}}},
+)
+def get_step_image(
+    service: ServiceDep,
+    test_id: TestId,
+    n: StepNumber,
+    cam: Camera,
+    format: Annotated[Literal["tiff", "png"], Query(description="As stored, or for looking at.")] = "tiff",  # noqa: A002
+) -> Response:
+    """Return the image as stored, after checking its checksum."""
+    step = service.tests.verified_step(test_id, n)
+    path = step.cam1 if cam == "cam1" else step.cam2
+    if format == "tiff":
+        return Response(path.read_bytes(), media_type="image/tiff")
+    _, data = cv2.imencode(".png", read_image(path))
+    return Response(data.tobytes(), media_type="image/png")

@@ -1,0 +1,106 @@
+"""Deleting into the trash, the trash, and the acknowledgement that lets old tests go there by themselves."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+
+from server.api.models.trash import ExportedReply, ExportedRequest, TrashEntry, TrashList
+from server.api.protocol.dependencies import AnalysisId, CalibrationId, ServiceDep, StepNumber, TestId, person_name
+from server.api.protocol.paging import PageDep
+from server.api.protocol.problems import errors
+from server.api.routes.calibrations.noise import NoiseId
+from server.store.trash import Kind
+from server.workflows.deletion import delete, restore
+from server.workflows.retention import acknowledge_export
+from server.workflows.service import Service
+
+router = APIRouter(tags=["trash"])
+TrashId = Annotated[str, Path(max_length=40, description="Id in the trash.")]
+_ERRORS = errors(404, 409, 507)
+
+
+def _delete(service: Service, request: Request, kind: Kind, **ids: Any) -> dict[str, Any]:
+    deleted = delete(service, kind, ids, by=person_name(request))
+    assert deleted is not None
+    return deleted
+
+
+@router.delete("/tests/{test_id}", summary="Delete a test", response_model=TrashEntry, responses=_ERRORS)
+def delete_test(service: ServiceDep, request: Request, test_id: TestId) -> dict[str, Any]:
+    """Move a test with its steps and analyses into the trash; refused while a job or a capture uses it."""
+    return _delete(service, request, "test", test_id=test_id)
+
+
+@router.delete(
+    "/tests/{test_id}/steps/{n}", summary="Delete a step", response_model=TrashEntry, responses=_ERRORS | errors(422)
+)
+def delete_step(service: ServiceDep, request: Request, test_id: TestId, n: StepNumber) -> dict[str, Any]:
+    """Move a step into the trash; its number is not given again, and analyses that used it read `stale`."""
+    return _delete(service, request, "step", test_id=test_id, n=n)
+
+
+@router.delete(
+    "/tests/{test_id}/analyses/{analysis_id:plain_id}",
+    summary="Delete an analysis",
+    response_model=TrashEntry,
+    responses=_ERRORS,
+)
+def delete_analysis(service: ServiceDep, request: Request, test_id: TestId, analysis_id: AnalysisId) -> dict[str, Any]:
+    """Move an analysis with its results into the trash; refused while its job runs."""
+    return _delete(service, request, "analysis", test_id=test_id, analysis_id=analysis_id)
+
+
+@router.delete(
+    "/calibrations/{calibration_id}", summary="Delete a calibration", response_model=TrashEntry, responses=_ERRORS
+)
+def delete_calibration(service: ServiceDep, request: Request, calibration_id: CalibrationId) -> dict[str, Any]:
+    """Move a calibration into the trash; tests made with it keep their own copy."""
+    return _delete(service, request, "calibration", calibration_id=calibration_id)
+
+
+@router.delete("/noise/{noise_id}", summary="Delete a noise measurement", response_model=TrashEntry, responses=_ERRORS)
+def delete_noise(service: ServiceDep, request: Request, noise_id: NoiseId) -> dict[str, Any]:
+    """Move a noise measurement into the trash; analyses made with it keep their own copy."""
+    return _delete(service, request, "noise", noise_id=noise_id)
+
+
+@router.get("/trash", summary="What was deleted, oldest first", response_model=TrashList, responses=errors(422))
+def list_trash(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+    """Return what lies in the trash, with the room that it takes."""
+    trash = page.of(sorted(service.trash.entries(), key=lambda t: str(t["id"])), lambda t: str(t["id"]))
+    return {"trash": trash, "next_cursor": page.next_cursor}
+
+
+@router.post(
+    "/trash/{trash_id}/restore", summary="Restore from the trash", response_model=TrashEntry, responses=_ERRORS
+)
+def restore_trash(service: ServiceDep, trash_id: TrashId) -> dict[str, Any]:
+    """Move it back to where it was; refused if something lies there by now, or its test is in the trash too."""
+    return restore(service, trash_id)
+
+
+@router.delete(
+    "/trash/{trash_id}", summary="Remove for good", status_code=204, response_class=Response, responses=errors(404, 507)
+)
+def remove_trash(service: ServiceDep, trash_id: TrashId) -> None:
+    """Remove an entry of the trash from the disk; nothing brings it back."""
+    service.trash.remove(trash_id)
+
+
+@router.post(
+    "/tests/{test_id}/exported",
+    summary="Acknowledge that a copy lies elsewhere",
+    response_model=ExportedReply,
+    responses=errors(404, 409, 422, 507),
+)
+def acknowledge_exported(
+    service: ServiceDep, request: Request, test_id: TestId, body: ExportedRequest
+) -> dict[str, Any]:
+    """Say that all of the test was copied elsewhere; where `retention_days` is set, it may go to the trash then.
+
+    What the copy holds is compared with what is there: a test that has grown meanwhile is refused. What is added
+    afterwards ends the acknowledgement.
+    """
+    return acknowledge_export(service, test_id, steps=body.steps, results=body.results, by=person_name(request))

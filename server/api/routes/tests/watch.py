@@ -1,0 +1,110 @@
+"""Watch mode: what is watched, and the readings that are posted."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.responses import JSONResponse
+
+from server.api.models import ReadingReply, ReadingRequest, WatchReply, WatchRequest, utc_text
+from server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
+from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
+from server.api.protocol.problems import errors
+from server.api.routes.tests.tests import step_reply
+from server.workflows.watch import Watches
+
+
+def get_watches(request: Request) -> Watches:
+    """Return the watches of the app's service."""
+    watches: Watches = request.app.state.watches
+    return watches
+
+
+WatchesDep = Annotated[Watches, Depends(get_watches)]
+router = APIRouter(prefix="/tests/{test_id}", tags=["tests"])
+
+
+@router.put(
+    "/watch",
+    summary="Take a step at each change of a channel",
+    response_model=WatchReply,
+    responses=errors(404, 412, 422, 507),
+)
+def put_watch(
+    service: ServiceDep,
+    watches: WatchesDep,
+    test_id: TestId,
+    body: WatchRequest,
+    response: Response,
+    if_match: IfMatch = None,
+) -> dict[str, Any]:
+    """Watch a channel of the readings posted to `/tests/{id}/channels`, in place of what was watched before.
+
+    A reading takes a step when the channel differs from its value in the newest step that bears it by `threshold` or
+    more; the first reading always does. The watch outlives a restart of the service. If-Match, with the ETag of GET,
+    refuses if it was changed meanwhile, or a step was taken.
+    """
+    service.tests.path(test_id)
+
+    def allow(now: dict[str, Any] | None) -> None:
+        if now is None and if_match is not None:  # `*` too means something that is there
+            raise PreconditionFailedError(f"Nothing is watched in test {test_id}.")
+        require_match(if_match, etag_of(now), f"the watch of test {test_id}", required=False)
+
+    return tagged(response, watches.begin(test_id, body.model_dump(), allow))
+
+
+@router.get("/watch", summary="What is watched", response_model=WatchReply, responses=errors(404))
+def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> dict[str, Any]:
+    """Return channel and threshold, and the value that the next reading is compared with; ETag names this state."""
+    return tagged(response, watches.read(test_id))
+
+
+@router.post("/watch:end", summary="End the watch", response_model=WatchReply, responses=errors(404, 507))
+def end_watch(watches: WatchesDep, test_id: TestId) -> dict[str, Any]:
+    """Take no further steps; readings are refused from now on. Harmless when it has ended already."""
+    return watches.end(test_id)
+
+
+@router.post(
+    "/channels",
+    summary="Post a reading of the channels; a step is taken if the watched one changed",
+    response_model=ReadingReply,
+    responses=errors(404, 409, 422, 503, 507)
+    | {
+        200: {"description": "Read; no step was due"},
+        201: {"model": ReadingReply, "description": "A step was taken, durable on disk"},
+    },
+)
+def post_channels(
+    service: ServiceDep, watches: WatchesDep, test_id: TestId, body: ReadingRequest, key: KeyHeader = None
+) -> Any:
+    """Compare a reading with the last step, and capture a step if the watched channel has changed enough.
+
+    A step holds all channels of the reading that took it; readings that take none are not kept. When this answers with
+    an error, no step was taken: send the reading again.
+    """
+    service.tests.path(test_id)
+    sent = mark(f"tests/{test_id}/channels", key, body)
+
+    def make() -> dict[str, Any]:
+        facts = {
+            "label": body.label,
+            "load_n": body.load_n,
+            "timestamp_utc": None if body.timestamp_utc is None else utc_text(body.timestamp_utc),
+            "channels": body.channels,
+            **sent.document(),
+        }
+        outcome = watches.reading(test_id, facts)
+        return {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
+
+    made, _ = service.once(sent.scope, key, sent.body_sha256, make)
+    step = None if made["n"] is None else step_reply(service, test_id, made["n"])
+    if step is not None and "reason" not in made:  # told by the step, the catalogue was lost
+        watch = step.get("watch", {})
+        made = {**made, "reason": "first" if watch.get("last_value") is None else "changed", **watch}
+    reply = ReadingReply.model_validate(
+        {"taken": step is not None, "step": step, **{k: made.get(k) for k in ("reason", "value", "last_value")}}
+    )
+    return JSONResponse(reply.model_dump(mode="json"), status_code=200 if step is None else 201)

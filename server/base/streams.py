@@ -1,0 +1,61 @@
+"""How many streams are open: each holds a connection for hours, so each kind has its limit."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+from server.base.errors import QueueFullError
+
+StreamKind = Literal["live_view", "events"]
+_WORDS: dict[StreamKind, str] = {"live_view": "live views", "events": "event streams"}
+
+
+class Streams:
+    """Counts streams.
+
+    Parameters
+    ----------
+    live_view, events
+        How many of each may be open.
+    """
+
+    def __init__(self, *, live_view: int, events: int) -> None:
+        self._limits: dict[StreamKind, int] = {"live_view": live_view, "events": events}
+        self._open: dict[StreamKind, int] = {"live_view": 0, "events": 0}
+        self._lock = threading.Lock()
+
+    def counts(self) -> dict[StreamKind, int]:
+        """Return how many are open."""
+        with self._lock:
+            return dict(self._open)
+
+    def check(self, kind: StreamKind) -> None:
+        """Refuse before an answer begins.
+
+        Raises
+        ------
+        QueueFullError
+            ``too_many_streams``.
+        """
+        with self._lock:
+            limit, now = self._limits[kind], self._open[kind]
+        if now >= limit:
+            raise QueueFullError(
+                f"{limit} {_WORDS[kind]} are open already.",
+                code="too_many_streams",
+                remedy="Close one, or wait and try again.",
+            )
+
+    @contextmanager
+    def counted(self, kind: StreamKind) -> Iterator[None]:
+        """Count one for as long as the block lasts."""
+        with self._lock:
+            self._open[kind] += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._open[kind] -= 1

@@ -1,0 +1,1 @@
+"""Subcommands that measure, read and write files; no service."""

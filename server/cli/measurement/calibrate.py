@@ -1,0 +1,154 @@
+"""``stereorig calibrate``: from a folder of grid images to calibration.json."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from dataclasses import asdict
+from math import isfinite
+from pathlib import Path
+
+from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationResult, Measures
+from core.calibration.from_images import ImageOfTarget, calibrate_views
+from core.errors import CalibrationError, InputError
+from server.cli.terminal import ProgressLine
+from server.formats.calibrations.native import write_calibration
+from server.formats.calibrations.target_toml import read_rig, read_target
+from server.formats.files import make_folder, sha256_of
+from server.formats.images import read_image
+from server.formats.version import software_version
+from server.formats.views import find_views
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    # "-2,4" after --hold-out is a list of numbers, not an option
+    parser._negative_number_matcher = re.compile(r"^-[\d.][\d.,+\- ]*$")
+    parser.add_argument(
+        "views",
+        metavar="VIEWS",
+        type=Path,
+        help="folder with cam1_+0.000mm.tif, cam2_+5.000mm.tif and so on (dZ in the name)",
+    )
+    parser.add_argument(
+        "--target",
+        required=True,
+        metavar="TARGET.toml",
+        type=Path,
+        help="pitch_mm, lines, line_width_mm, node_tolerance_mm, dark_lines",
+    )
+    parser.add_argument(
+        "--rig",
+        required=True,
+        metavar="RIG.toml",
+        type=Path,
+        help="[cam1] and [cam2]: image_size_px, phd_px, standoff_mm, angle_deg, aspect",
+    )
+    parser.add_argument(
+        "--hold-out", default="", metavar="2,4", help="positions in mm to leave out of the fit and check with"
+    )
+    parser.add_argument(
+        "--localiser",
+        choices=("profile", "paper"),
+        default="profile",
+        help="how intersections are found (default: profile)",
+    )
+    parser.add_argument("--out", required=True, metavar="calibration.json", type=Path, help="file to write")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate; print a table; write the file unless the verdict is failed."""
+    held_out = parse_hold_out(args.hold_out)
+    target = read_target(args.target)
+    rig = read_rig(args.rig)
+    files = find_views(args.views)
+    if args.out.is_dir():
+        raise InputError(f"The output {args.out} is a folder.", code="output_unusable", remedy="Give a file's name.")
+    images = [ImageOfTarget(f.camera, f.dz_mm, read_image(f.path), f.path.name) for f in files]
+    options = CalibrationOptions(held_out_mm=held_out, axis_tilt_sigma_rad=rig.axis_tilt_sigma_rad)
+
+    line = ProgressLine()
+    try:
+        found = calibrate_views(
+            images,
+            target,
+            (rig.cam1, rig.cam2),
+            options,
+            localiser=args.localiser,
+            progress=lambda stage, done, total: line.show(stage, done / total),
+        )
+    finally:
+        line.close()
+    result = found.result
+    print(report(result))
+    if result.verdict.level == "failed":
+        raise CalibrationError(
+            f"The calibration is not usable, nothing was written: {' '.join(result.verdict.reasons)}",
+            code="calibration_rejected",
+        )
+    make_folder(args.out.absolute().parent)
+    provenance = {
+        "software": software_version(),
+        "localiser": args.localiser,
+        "line_model": found.grids[0].line_model,
+        "views_sha256": {f.path.name: sha256_of(f.path) for f in files},
+        "target_file": str(args.target),
+        "rig_file": str(args.rig),
+        "nominal_rig": asdict(rig),
+    }
+    write_calibration(args.out, result, target, provenance=provenance)
+    print(f"written: {args.out}")
+    return 0
+
+
+def parse_hold_out(text: str) -> tuple[float, ...]:
+    """Read ``2,4``.
+
+    Raises
+    ------
+    InputError
+        Code ``hold_out_malformed``.
+    """
+    try:
+        values = tuple(float(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        values = (float("nan"),)
+    if not all(isfinite(v) for v in values):
+        raise InputError(
+            f"--hold-out {text!r} is no list of positions.", code="hold_out_malformed", remedy="Write it as 2,4 (mm)."
+        )
+    return values
+
+
+def report(result: CalibrationResult) -> str:
+    """Write the calibration as a short table."""
+    sigma = result.sigma
+    one, two = result.pair.cam1.paper_parameters(), result.pair.cam2.paper_parameters()
+    lines = [f"{'':15}{'cam1':>24}{'cam2':>26}"]
+    for key in one:
+        cells = []
+        for name, values in (("cam1", one), ("cam2", two)):
+            full = f"{name}.{key}"
+            spread = f" +- {sigma[full]:.1g}" if full in COVARIANCE_NAMES else " given"
+            cells.append(f"{values[key]:14.6g}{spread:<11}")
+        lines.append(f"{key:15}" + " ".join(cells).rstrip())
+    lines.append("")
+    lines.append(f"{'':15}{'RBE px':>10}{'RAZ um':>10}{'NSCE':>10}")
+    for label, check in (("fitted", result.fitted), ("held out", result.held_out)):
+        if check is not None:
+            lines.append(_row(label, check.mean))
+            lines.extend(_row(f"  {n}", m) for n, m in zip(("cam1", "cam2"), check.per_camera, strict=True))
+            if result.node_corrections_mm is not None:
+                lines.append(_row("  nominal grid", check.nominal_mean))
+    lines.append("")
+    lines.append(
+        f"predicted shape uncertainty in the target's volume: {1e3 * result.uncertainty.shape_rms_mm:.3f} um rms"
+    )
+    lines.extend(f"{'checked' if c.made else 'NOT checked'}: {c.name}: {c.text}" for c in result.checks)
+    lines.append(f"verdict: {result.verdict.level}")
+    lines.extend(f"  {reason}" for reason in result.verdict.reasons)
+    return "\n".join(lines)
+
+
+def _row(label: str, m: Measures) -> str:
+    return f"{label:15}{m.rbe_px:10.4f}{1e3 * m.raz_mm:10.3f}{m.nsce:10.4f}"

@@ -1,0 +1,119 @@
+"""``stereorig calibration``: calibration files in other programs' forms, and a look at whether they make sense."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from core.errors import InputError
+from server.exports.source import results_in
+from server.formats.calibrations.export import FORMS, convert_calibration
+from server.formats.calibrations.plausibility import check_calibration
+from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.formats.files import make_folder, write_bytes
+from server.formats.images import read_file
+from server.results.epipolar_check import check_against
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    known = "calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML"
+    convert = actions.add_parser("convert", help="write a calibration in another form")
+    convert.add_argument("file", metavar="IN", type=Path, help=known)
+    convert.add_argument("out", metavar="OUT", type=Path, help="file to write; OUT.report.json goes beside it")
+    convert.add_argument(
+        "--to",
+        required=True,
+        choices=FORMS,
+        help="json: this program's; paper: its eleven "
+        "parameters a camera; opencv: YAML; dice: XML; matchid: caldat; vic3d: XML",
+    )
+    check = actions.add_parser("check", help="epipolar residuals: over the volume, and over measured points")
+    check.add_argument("file", metavar="FILE", type=Path, help=known)
+    for action in (convert, check):
+        action.add_argument(
+            "--points",
+            metavar="FOLDER",
+            type=Path,
+            help="results of stereorig measure or of an analysis: their points are looked at too",
+        )
+        action.add_argument(
+            "--measured-with", metavar="FILE", type=Path, help="the calibration of those results (that of their test)"
+        )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Convert or check; print what was found."""
+    loaded = load_calibration(args.file)
+    checked = check_calibration(loaded)
+    if args.points is not None:
+        checked["points"] = _against(loaded, args.points, args.measured_with)
+    elif args.measured_with is not None:
+        raise InputError("--measured-with is given without --points.", code="option_conflict", remedy="Give both.")
+    if args.action == "convert":
+        made = convert_calibration(loaded, args.to, read_file(args.file))
+        make_folder(args.out.absolute().parent)
+        write_bytes(args.out, made.data)
+        report = {**made.report, "import_check": checked}
+        write_bytes(args.out.with_name(f"{args.out.name}.report.json"), (json.dumps(report, indent=1) + "\n").encode())
+        _print_conversion(made.report)
+    _print_check(checked)
+    if args.action == "convert":
+        print(f"written: {args.out}")
+    return 0
+
+
+def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None) -> dict[str, Any]:
+    places = [folder, folder / "exports" / "measure", *sorted((folder / "analyses").glob("*"))]
+    files = next((found for place in places if (found := results_in(place))), None)
+    if files is None:
+        raise InputError(
+            f"There is no step_0000.nc or another step's result in {folder}.",
+            code="results_missing",
+            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
+        )
+    if measured_with is None:
+        measured_with = files[0].absolute().parent.parent.parent / "calibration.json"
+        if not measured_with.is_file():
+            raise InputError(
+                f"The calibration that {files[0]} was measured with is not known.",
+                code="option_missing",
+                remedy="Name it with --measured-with.",
+            )
+    return check_against(loaded, files, measured_with)
+
+
+def _print_conversion(report: dict[str, Any]) -> None:
+    for cam, fit in report["lens"].items():
+        left = f"fitted, residual {fit['rms_px']:.3g} px rms, {fit['max_px']:.3g} px at most"
+        print(f"{cam}: lens {'exact' if report['exact'] else left}")
+    back = report["read_back"]
+    if back["points"]:
+        print(f"read back: {_said(back)}; in space {back['rms_mm']:.3g} mm rms, {back['max_mm']:.3g} mm at most")
+    for note in report["notes"]:
+        print(f"note: {note}")
+
+
+def _said(residual: dict[str, Any]) -> str:
+    if not residual["points"]:
+        return "no points"
+    return (
+        f"{residual['points']} points, epipolar residual {residual['rms_px']:.3g} px rms, "
+        f"{residual['max_px']:.3g} px at most"
+    )
+
+
+def _print_check(checked: dict[str, Any]) -> None:
+    print(f"baseline {checked['baseline_mm']:.6g} mm, stereo angle {checked['stereo_angle_deg']:.4g} degrees")
+    print(f"volume that both cameras see: {_said(checked['volume'])}")
+    points = checked.get("points")
+    if points is not None:
+        print(
+            f"measured points of {points['results']}: {_said(points['this_calibration'])}; as they were measured: "
+            f"{_said(points['measured_with'])}"
+        )
+    for warning in checked["warnings"]:
+        print(f"warning: {warning}")

@@ -1,0 +1,92 @@
+"""``stereorig export``: results in the forms that other programs read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from core.errors import InputError
+from server.exports.request import FORMATS, ExportRequest, steps_in
+from server.exports.run import export
+from server.exports.source import find_source
+from server.formats.figure_options import COLOURS, Look
+from server.formats.files import make_folder
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add = parser.add_argument
+    add(
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        help="a test's folder, an analysis' folder, or results of stereorig measure",
+    )
+    add(
+        "--format",
+        required=True,
+        choices=FORMATS,
+        help="nc: as stored; csv; vtu with a pvd series for ParaView; mat: "
+        "MATLAB; h5: HDF5, all steps stacked; png, svg: figures; gif, mp4: films over the steps",
+    )
+    add("--out", required=True, type=Path, metavar="DIR", help="folder for the files; made if it is not there")
+    add("--analysis", metavar="ID", help="which of a test's analyses (its only one)")
+    add("--step", action="append", default=[], metavar="N[-M][,...]", help="these steps only; repeatable (all)")
+    add(
+        "--variable",
+        action="append",
+        default=[],
+        metavar="NAME[,...]",
+        help="these variables only; repeatable (all; of figures and films w_mm, or z_mm of a shape)",
+    )
+    add("--limits", metavar="LOW,HIGH", help="ends of the colour scale, in the variable's unit")
+    add("--percentiles", metavar="LOW,HIGH", default="1,99", help="else of the values, where the scale ends (1,99)")
+    add("--colours", choices=COLOURS, default="viridis", help="colour map (viridis)")
+    add("--width", type=int, default=900, metavar="PX", help="of figures and films (900)")
+    add("--over-image", action="store_true", help="draw over camera 1's reference image")
+    add("--image", type=Path, metavar="FILE", help="camera 1's reference image, where it lies elsewhere now")
+    add("--fps", type=float, default=2.0, metavar="N", help="steps a second in a film (2)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export; print the files' names."""
+    look = Look(
+        limits=None if args.limits is None else _pair("--limits", args.limits),
+        percentiles=_pair("--percentiles", args.percentiles),
+        colours=args.colours,
+        width_px=args.width,
+    )
+    request = ExportRequest(
+        format=args.format,
+        steps=steps_in(",".join(args.step)) if args.step else None,
+        look=look,
+        fps=args.fps,
+        variables=[name for text in args.variable for name in text.split(",")] or None,
+        over_image=args.over_image or args.image is not None,
+    )
+    source = find_source(args.folder, args.analysis)
+    if args.image is not None:
+        source = replace(source, image=args.image)
+    for reason in source.about.get("stale_reasons", ()):
+        print(f"STALE: {reason} since this was measured; measure again")
+    make_folder(args.out)
+    count = 0
+    for path in export(source, request, args.out):
+        print(path)
+        count += 1
+    print(f"written: {count} file{'s' if count != 1 else ''} in {args.out}")
+    return 0
+
+
+def _pair(option: str, text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise InputError(
+            f"{option} {text!r} is not two numbers.", code="look_invalid", remedy=f"Give {option} LOW,HIGH."
+        )
+    return low, high

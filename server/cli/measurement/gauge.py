@@ -1,0 +1,294 @@
+"""``stereorig gauge``: extensometers, lines, areas, rigid motion and frames, from result files."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from core.errors import InputError
+from server.formats.files import make_folder, write_bytes
+from server.formats.results.gauge_csv import gauges_csv
+from server.formats.results.gauge_mat import gauges_mat
+from server.formats.results.summary import to_json
+from server.results.gauges.fields import FieldWriter
+from server.results.gauges.readings import read_gauges
+from server.results.gauges.request import GaugeRequest
+
+_RESULT = re.compile(r"step_\d{4,}\.nc")
+_FORMS = {".csv": gauges_csv, ".json": to_json, ".mat": gauges_mat}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add = parser.add_argument
+    add("folder", metavar="FOLDER", type=Path, help="results of stereorig measure, or of an analysis: step_0000.nc ...")
+    many: dict[str, Any] = {"action": "append", "default": []}
+    add(
+        "--point",
+        **many,
+        metavar="X,Y",
+        help="values at a place; repeatable, as all gauges; places are px of camera "
+        "1's reference image; NAME= in front names a gauge",
+    )
+    add("--extensometer", **many, metavar="X0,Y0,X1,Y1", help="length, elongation, engineering and true strain")
+    add("--point-mm", **many, metavar="X,Y", help="a place by X and Y of the reference, in the frame asked for")
+    add("--extensometer-mm", **many, metavar="X0,Y0,X1,Y1", help="an extensometer between two such places")
+    add("--line", **many, metavar="X0,Y0,X1,Y1[,N]", help="values at N places along a line (one a grid step)")
+    add(
+        "--area",
+        **many,
+        metavar="X0,Y0,X1,Y1",
+        help="statistics over a rectangle; six or more numbers: a polygon; all: the whole field",
+    )
+    add(
+        "--variable",
+        **many,
+        metavar="NAME",
+        help="read this variable of the files at points, lines and areas (position and displacement)",
+    )
+    add(
+        "--align",
+        metavar="plane|3-2-1:X,Y,...",
+        help="frame: best-fit plane of the reference, or six places: three "
+        "on the plane, two on the X axis, one at X = 0",
+    )
+    add("--x-direction", metavar="X,Y,Z", help="of --align plane, system frame (1,0,0)")
+    add(
+        "--remove-rigid",
+        nargs="?",
+        const="all",
+        metavar="X0,Y0,X1,Y1",
+        help="take out the rigid motion of the whole field, or that of a rectangle or polygon",
+    )
+    add("--robust", action="store_true", help="let no outlier draw the rigid motion")
+    add("--step", **many, type=int, metavar="N", help="read this step only; repeatable (all)")
+    add(
+        "--field-out",
+        metavar="DIR",
+        type=Path,
+        help="write whole fields as result files, in the frame and without the motion asked for",
+    )
+    add(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="file.csv, file.json or file.mat for all readings, settings and inputs' hashes",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read; print tables; write the file."""
+    if args.out is not None and args.out.suffix.lower() not in _FORMS:
+        raise InputError(
+            f"--out {args.out} ends in none of .csv, .json and .mat.",
+            code="output_unusable",
+            remedy="Give file.csv, file.json or file.mat.",
+        )
+    request = _request(args)
+    files = result_files(args.folder)
+    fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
+    document = read_gauges(files, request, fields)
+    print("\n".join(report(document)))
+    if fields is not None:
+        print(f"fields written: {len(fields.written)} files in {args.field_out}")
+    if args.out is not None:
+        make_folder(args.out.absolute().parent)
+        write_bytes(args.out, _FORMS[args.out.suffix.lower()](document))
+        print(f"written: {args.out}")
+    return 0
+
+
+def result_files(folder: Path) -> list[Path]:
+    """Return the result files of a folder, or of a test's folder where ``stereorig measure`` put them.
+
+    Raises
+    ------
+    InputError
+        ``results_missing``.
+    """
+    for place in (folder, folder / "exports" / "measure"):
+        files = sorted(p for p in place.glob("step_*.nc") if _RESULT.fullmatch(p.name))
+        if files:
+            return files
+    raise InputError(
+        f"There is no step_0000.nc or another step's result in {folder}.",
+        code="results_missing",
+        remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
+    )
+
+
+def _request(args: argparse.Namespace) -> GaugeRequest:
+    body: dict[str, Any] = {
+        "points": [
+            *(_named("--point", t, lambda v: {"xy_px": v}, (2,)) for t in args.point),
+            *(_named("--point-mm", t, lambda v: {"xy_mm": v}, (2,)) for t in args.point_mm),
+        ],
+        "extensometers": [
+            *(_named("--extensometer", t, lambda v: {"a_px": v[:2], "b_px": v[2:]}, (4,)) for t in args.extensometer),
+            *(_named("--extensometer-mm", t, lambda v: {"ends_mm": _pairs(v)}, (4,)) for t in args.extensometer_mm),
+        ],
+        "lines": [_named("--line", t, _line, (4, 5)) for t in args.line],
+        "areas": [_named("--area", t, _area, None) for t in args.area],
+        "variables": args.variable or None,
+        "steps": args.step or None,
+    }
+    if args.remove_rigid is not None:
+        body["remove_rigid"] = {**_named("--remove-rigid", args.remove_rigid, _area, None), "robust": args.robust}
+    elif args.robust:
+        raise InputError("--robust is given without --remove-rigid.", code="option_conflict", remedy="Give both.")
+    if args.x_direction is not None and args.align != "plane":
+        raise InputError("--x-direction is given without --align plane.", code="option_conflict", remedy="Give both.")
+    if args.align is not None:
+        body["align"] = _align(args)
+    try:
+        return GaugeRequest.model_validate(body)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"] if part != "function-after")
+        text = str(first["msg"]).removeprefix("Value error, ")
+        raise InputError(
+            f"{place + ': ' if place else ''}{text}.", code="gauge_unusable", remedy="See stereorig gauge --help."
+        ) from error
+
+
+def _align(args: argparse.Namespace) -> dict[str, Any]:
+    if args.align == "plane":
+        direction = (
+            {} if args.x_direction is None else {"x_direction": _numbers("--x-direction", args.x_direction, (3,))}
+        )
+        return {"kind": "plane", **direction}
+    kind, _, places = args.align.partition(":")
+    if kind != "3-2-1":
+        raise InputError(
+            f"--align {args.align} is neither plane nor 3-2-1:X,Y,...",
+            code="gauge_unusable",
+            remedy="Give --align plane, or 3-2-1: and the six places' twelve numbers.",
+        )
+    return {"kind": "3-2-1", "places_px": _pairs(_numbers("--align 3-2-1", places, (12,)))}
+
+
+def _named(option: str, text: str, make: Any, counts: tuple[int, ...] | None) -> dict[str, Any]:
+    name, equals, rest = text.rpartition("=")
+    named = {"name": name} if equals else {}
+    if counts is None and rest == "all":
+        return named
+    return {**named, **make(_numbers(option, rest, counts))}
+
+
+def _line(v: list[float]) -> dict[str, Any]:
+    count = {} if len(v) == 4 else {"count": int(v[4]) if v[4].is_integer() else v[4]}
+    return {"vertices_px": _pairs(v[:4]), **count}
+
+
+def _area(v: list[float]) -> dict[str, Any]:
+    return {"rectangle_px": v} if len(v) == 4 else {"polygon_px": _pairs(v)}
+
+
+def _pairs(v: list[float]) -> list[list[float]]:
+    return [v[k : k + 2] for k in range(0, len(v), 2)]
+
+
+def _numbers(option: str, text: str, counts: tuple[int, ...] | None) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    n = len(numbers)
+    if not numbers or not all(math.isfinite(v) for v in numbers):
+        raise InputError(
+            f"{option} {text!r} is not a list of finite numbers.",
+            code="gauge_unusable",
+            remedy="See stereorig gauge --help.",
+        )
+    if n not in counts if counts is not None else n < 4 or n % 2:
+        wanted = "4, or an even count of 6 or more" if counts is None else " or ".join(map(str, counts))
+        raise InputError(
+            f"{option} {text!r} has {n} numbers; it takes {wanted}.",
+            code="gauge_unusable",
+            remedy="See stereorig gauge --help.",
+        )
+    return numbers
+
+
+def report(document: dict[str, Any]) -> list[str]:
+    """Return the readings as tables over the steps, one gauge after the other."""
+    lines = [f"STALE: {reason} since this was measured; measure again" for reason in document["stale_reasons"]]
+    lines.append(f"frame: {document['frame']}")
+    alignment = document["alignment"]
+    if alignment:
+        turns = ", ".join(f"{1e6 * s:.1f}" for s in alignment["sigma_rad"])
+        lines.append(
+            f"  from {alignment['points']} points, residual {1e3 * alignment['residual_rms_mm']:.2f} um rms; "
+            f"sd of its turns about X, Y, Z {turns} urad"
+        )
+    steps = document["steps"]
+    lines += [f"step {s['n']}: {s['problem']['code']}: {s['problem']['cause']}" for s in steps if "problem" in s]
+    steps = [s for s in steps if "problem" not in s]
+    moved = [s for s in steps if "rigid_motion" in s]
+    if moved:
+        lines += ["rigid motion taken out"]
+        lines += _table([(s, s["rigid_motion"]["values"], "") for s in moved])
+    for kind, title in (("points", "point"), ("extensometers", "extensometer"), ("areas", "area"), ("lines", "line")):
+        for k in range(len(steps[0][kind]) if steps else 0):
+            gauges = [(s, s[kind][k]) for s in steps]
+            lines.append(f"{title} {gauges[0][1]['name']}{_where(kind, gauges[0][1])}")
+            if kind == "areas":
+                lines += _table([(s, {n: _mean(v) for n, v in g["values"].items()}, g["missing"]) for s, g in gauges])
+            elif kind == "lines":
+                lines += [_line_summary(s, g) for s, g in gauges]
+            else:
+                lines += _table([(s, g["values"], g["missing"]) for s, g in gauges])
+    return lines
+
+
+def _where(kind: str, gauge: dict[str, Any]) -> str:
+    if kind == "points":
+        return " at ({:g}, {:g}) px".format(*gauge["xy_px"])
+    if kind == "extensometers":
+        return " from ({:g}, {:g}) to ({:g}, {:g}) px".format(*gauge["a_px"], *gauge["b_px"])
+    if kind == "areas":
+        return f", mean of {gauge['valid']} of {gauge['points']} points in the first step read"
+    return f", {len(gauge['x_px'])} places"
+
+
+def _mean(v: dict[str, Any]) -> dict[str, Any]:
+    return {"value": v["mean"], "sigma": v["mean_sigma"], "units": v["units"]}
+
+
+def _line_summary(step: dict[str, Any], line: dict[str, Any]) -> str:
+    lost = sum(bool(text) for text in line["missing"])
+    parts = []
+    for name, v in line["values"].items():
+        values = [x for x in v["value"] if x is not None]
+        parts.append(f"{name} {min(values):.6g} to {max(values):.6g}" if values else f"{name} missing")
+    return f"  step {step['n']}: {lost} missing; {', '.join(parts)}"
+
+
+def _table(rows: list[tuple[dict[str, Any], dict[str, Any], str]]) -> list[str]:
+    names = list(dict.fromkeys(name for _, values, _ in rows for name in values))
+    loaded = any(step["load_n"] is not None or step["label"] for step, _, _ in rows)
+    head = ["step", *(["load_n", "label"] if loaded else []), *names]
+    table = [head]
+    for step, values, missing in rows:
+        load = "" if step["load_n"] is None else f"{step['load_n']:g}"
+        row = [str(step["n"]), *([load, step["label"][:24]] if loaded else [])]
+        row += [f"missing ({missing})"] if missing else [_shown(values.get(name)) for name in names]
+        table.append(row)
+    width = [max(len(row[k]) for row in table if k < len(row) and len(row) == len(head)) for k in range(len(head))]
+    return ["  " + "  ".join(cell.rjust(w) for cell, w in zip(row, width, strict=False)) for row in table]
+
+
+def _shown(number: dict[str, Any] | None) -> str:
+    """A number to the second digit of its uncertainty."""
+    if number is None or number["value"] is None:
+        return "-"
+    value, sigma = number["value"], number["sigma"]
+    if sigma is None or sigma <= 0.0:
+        return f"{value:.6g}"
+    digits = min(max(1 - math.floor(math.log10(sigma)), 0), 12)
+    return f"{value:.{digits}f} +- {sigma:.{digits}f}"

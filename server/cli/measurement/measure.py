@@ -1,0 +1,286 @@
+"""``stereorig measure``: shape and displacement from image files, without a service."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+
+from core.errors import FileFormatError, ImageError, InputError
+from core.field.points.images import check_calibrated_size
+from core.field.points.patch import DEFAULT_PATCH, PATCH_SETTINGS
+from core.field.points.smoothing_record import WIDEST_SMOOTHING
+from core.field.prefilter import check_prefilter
+from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, REFERENCE_UPDATES
+from core.strain.options import DEFAULT_WINDOW, STRAIN_TENSORS, WIDEST_WINDOW, StrainOptions
+from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
+from server.cli.measurement.region import check_odd, check_region, parse_rectangle
+from server.cli.measurement.sequence import CheckedPair, MeasureJob, measure_sequence
+from server.cli.terminal import ProgressLine
+from server.compute.seeds import check_places
+from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.formats.images import decode_image, read_file
+from server.formats.noise_json import load_noise
+from server.store.durable import read_json
+from server.workflows.camera_identity import check_same_cameras
+
+SUBSET_RANGE_PX = (7, 301)
+STEP_RANGE_PX = (1, 1000)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add = parser.add_argument
+    add("folder", nargs="?", metavar="FOLDER", help="a test's folder: steps/<nnnn>/cam1.tif ..., calibration.json")
+    add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern or several paths")
+    add("--cam2", nargs="+", metavar="GLOB", help="camera 2's images; files are paired in sorted order")
+    add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
+    add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
+    add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
+    add(
+        "--crack",
+        action="append",
+        default=[],
+        metavar="X0,Y0,X1,Y1[,...]",
+        help="a line over which nothing reaches, through these places of camera 1's first image",
+    )
+    add(
+        "--hole",
+        action="append",
+        default=[],
+        metavar="X0,Y0,X1,Y1,X2,Y2[,...]",
+        help="a polygon inside which nothing is measured",
+    )
+    add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
+    add("--step", default="10", metavar="PX", help="distance of the points (10)")
+    add(
+        "--patch",
+        choices=PATCH_SETTINGS,
+        default=DEFAULT_PATCH,
+        help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: "
+        f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})",
+    )
+    add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
+    add(
+        "--prefilter",
+        default="0",
+        metavar="SD",
+        help="blur all images with a Gaussian of this sd in px: less bias, more noise (0: none)",
+    )
+    add(
+        "--seed",
+        action="append",
+        default=[],
+        metavar="X,Y[,X2,Y2]",
+        help="start here in camera 1's first image, and there in camera 2's; repeatable",
+    )
+    add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
+    add(
+        "--strain",
+        default=str(DEFAULT_WINDOW),
+        metavar="WINDOW|off",
+        help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide ({DEFAULT_WINDOW})",
+    )
+    add("--strain-order", choices=("1", "2"), default="1", help="fit planes (1) or quadratics (2) over the gauge (1)")
+    add(
+        "--strain-tensor",
+        choices=STRAIN_TENSORS,
+        default="green_lagrange",
+        help="which strain is told (green_lagrange)",
+    )
+    add(
+        "--smooth",
+        default="off",
+        metavar="WINDOW|off",
+        help="smooth displacements by a quadratic over WINDOW x WINDOW points (off)",
+    )
+    add(
+        "--reference-update",
+        choices=REFERENCE_UPDATES,
+        default=DEFAULT_REFERENCE_UPDATE,
+        help="never: match every step against the first (total); always: against the step before (incremental); auto: "
+        "against the first, or a later reference where that fails, and says so; displacements are totals in any case "
+        f"({DEFAULT_REFERENCE_UPDATE})",
+    )
+    add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; return the exit status."""
+    progress = ProgressLine()
+    try:
+        measure_sequence(_prepare(args, progress), progress)
+    finally:
+        progress.close()
+    return 0
+
+
+def _missing(option: str) -> InputError:
+    return InputError(f"{option} is missing.", code="option_missing", remedy="See stereorig measure --help.")
+
+
+def _strain_options(args: argparse.Namespace) -> StrainOptions | None:
+    if args.strain == "off":
+        return None
+    window = check_odd("--strain", args.strain, low=3, high=WIDEST_WINDOW, odd=True)
+    return StrainOptions(window=window, order=2 if args.strain_order == "2" else 1, tensor=args.strain_tensor)
+
+
+def _smoothing_window(args: argparse.Namespace) -> int | None:
+    return None if args.smooth == "off" else check_odd("--smooth", args.smooth, low=3, high=WIDEST_SMOOTHING, odd=True)
+
+
+def _prefilter_px(args: argparse.Namespace, subset_px: int) -> float:
+    try:
+        prefilter_px = float(args.prefilter)
+    except ValueError as error:
+        raise InputError(
+            f"--prefilter {args.prefilter} is not a number.",
+            code="prefilter_invalid",
+            remedy="Give a standard deviation in px, or 0 for none.",
+        ) from error
+    check_prefilter(prefilter_px, subset_px)
+    return prefilter_px
+
+
+def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
+    if args.folder is not None:
+        if args.cam1 or args.cam2:
+            raise InputError(
+                "Both a test folder and --cam1/--cam2 are given.",
+                code="option_conflict",
+                remedy="Give one or the other.",
+            )
+        return pairs_of_test_folder(Path(args.folder))
+    for option in ("cam1", "cam2", "calibration", "roi", "out"):
+        if getattr(args, option) is None:
+            raise _missing(f"--{option}")
+    lists = []
+    for option in ("cam1", "cam2"):
+        files, note = expand(f"--{option}", getattr(args, option))
+        lists.append(files)
+        if note:
+            progress.note(f"note: {note}")
+    return pair_up(*lists)
+
+
+def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
+    """Check everything that can be checked before anything is computed or written."""
+    subset = check_odd("--subset", args.subset, low=SUBSET_RANGE_PX[0], high=SUBSET_RANGE_PX[1], odd=True)
+    step = check_odd("--step", args.step, low=STEP_RANGE_PX[0], high=STEP_RANGE_PX[1], odd=False)
+    rectangle = None if args.roi is None else parse_rectangle(args.roi)
+    strain, prefilter_px = _strain_options(args), _prefilter_px(args, subset)
+    files = _pairs(args, progress)
+    folder = None if args.folder is None else Path(args.folder)
+    calibration_file = Path(args.calibration) if args.calibration or folder is None else folder / "calibration.json"
+    calibration = load_calibration(calibration_file)
+    if folder is not None and not args.calibration:
+        _check_calibration(folder, calibration)
+    for pair in files:
+        _check_cameras(pair, calibration_file)
+    out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
+    shapes = _checked_shapes(files[0], calibration)
+    if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
+        rows, cols = shapes[0]
+        margin = float(subset // 2 + 2)
+        rectangle = (margin, margin, cols - 1 - margin, rows - 1 - margin)
+    mask_file = None if args.mask is None else Path(args.mask)
+    noise = None if args.noise is None else load_noise(args.noise)
+    region = check_region(
+        rectangle,
+        image_shape=shapes[0],
+        subset_px=subset,
+        step_px=step,
+        mask_path=mask_file,
+        seeds=args.seed,
+        cracks=args.crack,
+        holes=args.hole,
+    )
+    check_places(calibration.pair, region.seeds or (), (shapes[1][1], shapes[1][0]))
+    pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    return MeasureJob(
+        calibration=calibration,
+        calibration_file=calibration_file,
+        pairs=pairs,
+        region=region,
+        subset_px=subset,
+        step_px=step,
+        patch=args.patch,
+        interpolation=args.interpolation,
+        mask_file=mask_file,
+        out=out,
+        noise=noise,
+        strain=strain,
+        prefilter_px=prefilter_px,
+        smoothing_window=_smoothing_window(args),
+        reference_update=args.reference_update,
+    )
+
+
+def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
+    """Refuse a test's calibration that is not the one its record names."""
+    try:
+        record = json.loads((folder / "test.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return  # a folder put together by hand has none
+    made_with = record.get("calibration_sha256") if isinstance(record, dict) else None
+    if made_with is not None and made_with != calibration.sha256:
+        raise FileFormatError(
+            f"{folder / 'calibration.json'} is not the calibration that test.json names.",
+            code="calibration_changed",
+            remedy="Restore the file, or name the calibration that is meant with --calibration.",
+        )
+
+
+def _check_cameras(pair: ImagePair, calibration_file: Path) -> None:
+    """Refuse a pair that its record says was taken with other cameras than were calibrated."""
+    record = pair.cam1.parent / "step.json"
+    if record.is_file() and calibration_file.suffix == ".json":
+        check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")
+
+
+def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
+    """(rows, cols) of both cameras' images, which the calibration must agree with where it says."""
+    shapes = []
+    for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
+        rows, cols = decode_image(read_file(path), name=str(path)).shape
+        check_calibrated_size(str(path), (rows, cols), size)
+        shapes.append((rows, cols))
+    return shapes[0], shapes[1]
+
+
+def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> CheckedPair:
+    """Read both images of a step once, so that a bad one is found before hours of work on the others."""
+    hashes, images = [], []
+    for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
+        data = read_file(path)
+        hashes.append(hashlib.sha256(data).hexdigest())
+        if recorded is not None and hashes[-1] != recorded:
+            raise FileFormatError(
+                f"{path} does not match the checksum in its step.json.",
+                code="checksum_mismatch",
+                remedy="Restore the file, or leave this step out.",
+            )
+        image = decode_image(data, name=str(path))
+        if image.shape != shape:
+            is_px, first_px = f"{image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px"
+            raise ImageError(
+                f"{path} (step {step}) is {is_px}, the first image {first_px}.",
+                code="image_size_mismatch",
+                remedy="All images of one camera must have one size.",
+            )
+        if int(image.max()) == int(image.min()):
+            raise ImageError(
+                f"{path} (step {step}) is blank: every pixel is {int(image.max())}.",
+                code="image_blank",
+                remedy="Check exposure, lens cap and trigger, then take the step again.",
+            )
+        images.append(image)
+    if hashes[0] == hashes[1]:
+        raise InputError(
+            f"{pair.cam1} and {pair.cam2} (step {step}) hold the same image.",
+            code="same_image",
+            remedy="Give each camera its own images.",
+        )
+    return CheckedPair(pair, (hashes[0], hashes[1]))

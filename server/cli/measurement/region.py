@@ -1,0 +1,175 @@
+"""The region to measure, the mask, the seeds: read from the command line and checked against the image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError, RegionError
+from core.field.region.region import PointGrid
+from core.field.region.region import check_region as check_points
+from core.field.seeding.seeds import Seed
+from server.formats.images import read_mask
+
+Rectangle = tuple[float, float, float, float]
+Line = list[list[float]]
+
+
+@dataclass(frozen=True)
+class RegionRequest:
+    """What ``--roi``, ``--mask``, ``--crack``, ``--hole`` and ``--seed`` say, checked.
+
+    Attributes
+    ----------
+    rectangle_px
+        (X0, Y0, X1, Y1), points lie at X0 + i step and Y0 + j step up to X1, Y1.
+    grid
+        The points, those on the mask's black not allowed.
+    seeds
+        Places in camera 1's reference image, and in camera 2's where told; None = found by the program.
+    cracks_px, holes_px
+        Lines and polygons, as given; the grid knows them.
+    """
+
+    rectangle_px: Rectangle
+    grid: PointGrid
+    seeds: tuple[Seed, ...] | None
+    cracks_px: tuple[Line, ...] = ()
+    holes_px: tuple[Line, ...] = ()
+
+
+def _numbers(option: str, text: str, count: int, form: str | None = None) -> list[float]:
+    parts = text.split(",")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError as error:
+        raise _bad(option, text, "is not a list of numbers", count, form) from error
+    if len(numbers) != count:
+        raise _bad(option, text, f"has {len(numbers)} numbers", count, form)
+    if not all(math.isfinite(v) for v in numbers):
+        raise _bad(option, text, "holds a number that is not finite", count, form)
+    return numbers
+
+
+def _bad(option: str, text: str, why: str, count: int, form: str | None) -> RegionError:
+    form = form or ("X0,Y0,X1,Y1" if count == 4 else "X,Y")
+    return RegionError(f"{option} {text!r} {why}.", remedy=f"Give {option} {form} in pixels of camera 1's image.")
+
+
+def parse_rectangle(text: str) -> Rectangle:
+    """Read ``X0,Y0,X1,Y1``.
+
+    Raises
+    ------
+    RegionError
+        If it is not four finite numbers in order.
+    """
+    x0, y0, x1, y1 = _numbers("--roi", text, 4)
+    if x1 <= x0 or y1 <= y0:
+        raise RegionError(
+            f"--roi {text} is empty: from {x0:g} to {x1:g} by {y0:g} to {y1:g}.",
+            remedy="Give the upper left corner first, then the lower right one.",
+        )
+    return x0, y0, x1, y1
+
+
+def parse_line(option: str, text: str, fewest: int) -> Line:
+    """Read ``X0,Y0,X1,Y1,...`` of ``fewest`` points or more; returns [x, y] each.
+
+    Raises
+    ------
+    RegionError
+        ``cut_invalid``.
+    """
+    form = ",".join(f"X{k},Y{k}" for k in range(fewest))
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) < 2 * fewest or len(numbers) % 2 or not all(math.isfinite(v) for v in numbers):
+        raise RegionError(
+            f"{option} {text!r} is no list of {fewest} points or more.",
+            code="cut_invalid",
+            remedy=f"Give {option} {form},... in pixels of camera 1's first image.",
+        )
+    return [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
+
+
+def check_odd(option: str, text: str, *, low: int, high: int, odd: bool) -> int:
+    """Read a whole number in a range, odd where it must be.
+
+    Raises
+    ------
+    InputError
+        ``option_out_of_range``.
+    """
+    kind = "an odd whole number" if odd else "a whole number"
+    try:
+        value = int(text)
+    except ValueError:
+        value = low - 1
+    if not low <= value <= high or (odd and value % 2 == 0):
+        raise InputError(
+            f"{option} is {text}; it must be {kind} from {low} to {high}.",
+            code="option_out_of_range",
+            remedy=f"Give {option} {33 if odd else 10}, for example.",
+        )
+    return value
+
+
+def check_region(
+    rectangle: Rectangle,
+    *,
+    image_shape: tuple[int, int],
+    subset_px: int,
+    step_px: int,
+    mask_path: Path | None,
+    seeds: Sequence[str],
+    cracks: Sequence[str] = (),
+    holes: Sequence[str] = (),
+) -> RegionRequest:
+    """Check region, mask, cracks, holes and seeds against camera 1's image, and lay the points.
+
+    Raises
+    ------
+    RegionError
+        Outside the image, smaller than a subset, no white under any point, a mask of another size, a seed outside,
+        a crack or hole that is none.
+    ImageError
+        If the mask cannot be read.
+    """
+    grid = PointGrid.rectangle(*rectangle, step_px=step_px)
+    mask = None if mask_path is None else read_mask(mask_path)
+    crack_lines = tuple(parse_line("--crack", text, 2) for text in cracks)
+    hole_lines = tuple(parse_line("--hole", text, 3) for text in holes)
+    checked = (grid if mask is None else grid.within_mask(mask)).without_holes(hole_lines).with_cracks(crack_lines)
+    mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
+    check_points(checked, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
+    return RegionRequest(rectangle, checked, _seeds(seeds, rectangle, mask), crack_lines, hole_lines)
+
+
+def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> tuple[Seed, ...] | None:
+    if not texts:
+        return None
+    x0, y0, x1, y1 = rectangle
+    seeds = []
+    for text in texts:
+        # with four numbers, the last two are the place in camera 2
+        count = 4 if text.count(",") == 3 else 2
+        x, y, *other = _numbers("--seed", text, count, "X,Y or X,Y,X2,Y2")
+        if not (x0 <= x <= x1 and y0 <= y <= y1):
+            cause = f"--seed {text} lies outside the region {x0:g},{y0:g},{x1:g},{y1:g}."
+            raise RegionError(cause, code="seed_outside", remedy="Give a seed inside the region, in camera 1's image.")
+        if mask is not None and not mask[min(round(y), mask.shape[0] - 1), min(round(x), mask.shape[1] - 1)]:
+            raise RegionError(
+                f"--seed {text} lies where the mask is black.",
+                code="seed_outside",
+                remedy="Give a seed where the mask is white.",
+            )
+        seeds.append(Seed((x, y), (other[0], other[1]) if other else None))
+    return tuple(seeds)

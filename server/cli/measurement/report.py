@@ -1,0 +1,56 @@
+"""``stereorig report``: one HTML file with everything that a reader of the results must know."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from core.errors import InputError
+from server.formats.files import make_folder, write_bytes
+from server.results.metadata import load_facts
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add = parser.add_argument
+    add(
+        "place",
+        metavar="DATA_OR_RESULTS",
+        type=Path,
+        help="a data folder, a test's, an analysis', or what stereorig measure --out wrote",
+    )
+    add("--test", metavar="ID", help="which test of a data folder (its only one)")
+    add("--analysis", metavar="ID", help="which analysis of a test (the newest with results)")
+    add("--calibration", metavar="FILE", type=Path, help="the calibration, where it is not beside the results")
+    add(
+        "--facts",
+        metavar="TOML",
+        type=Path,
+        help="lenses, light, pattern, specimen, static steps ...; what is kept with the test if left out",
+    )
+    add("--out", metavar="FILE", type=Path, default=Path("report.html"), help="the report (report.html)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the report; print what is not stated."""
+    # the drawing library takes a second to load
+    from server.report.build import make_report
+    from server.report.source import find_source
+
+    if args.out.suffix.lower() not in (".html", ".htm"):
+        raise InputError(
+            f"--out {args.out} does not end in .html.",
+            code="output_unusable",
+            remedy="Give file.html; a browser prints it as PDF.",
+        )
+    facts = None if args.facts is None else load_facts(args.facts)
+    source = find_source(args.place, test=args.test, analysis=args.analysis, calibration=args.calibration, facts=facts)
+    made = make_report(source)
+    make_folder(args.out.absolute().parent)
+    write_bytes(args.out, made.page)
+    for doubt in (*(f"{reason} since this was measured" for reason in source.stale), *source.doubts):
+        print(f"note: {doubt}")
+    print(f"written: {args.out}, {len(made.page) / 2**20:.1f} MiB; {len(made.missing)} items are not stated")
+    for name, remedy in made.missing:
+        print(f"  {name}: {remedy}")
+    return 0

@@ -1,0 +1,1 @@
+"""Subcommands that run, check and tidy a service and its devices."""

@@ -1,0 +1,186 @@
+"""The fit of a calibration, in the worker: grid in every view, adjustment, drift check, ``calibration.json``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration import CalibrationOptions, CalibrationResult, NominalCamera
+from core.calibration.from_images import ImageOfTarget, calibrate_views
+from core.calibration.inputs import CAMERAS
+from core.errors import CalibrationError
+from core.grid import GridOptions, GridView, detect_grid
+from core.target import GridTarget
+from server.formats.calibrations.native import calibration_content
+from server.formats.images import GrayImage, read_image
+from server.formats.results.writing import written_dataset
+from server.formats.version import software_version
+from server.store.calibrations import REJECTED
+from server.store.durable import write_json
+from server.worker.process import current_task
+from server.worker.tasks import FitTask
+
+#: mean shift of the grid between the first and the last view at zero: above the first a warning, above the second no
+#: calibration. The detector repeats to 0.002 px; 0.1 px of epipolar error shows as micrometres of false motion.
+DRIFT_WARNING_PX = 0.05
+DRIFT_REFUSED_PX = 0.1
+
+
+def fit_calibration(task: FitTask) -> dict[str, Any]:
+    """Find the grid in every view and fit both cameras.
+
+    Returns
+    -------
+    dict
+        Verdict and checks; everything else is in ``calibration.json``.
+
+    Raises
+    ------
+    TargetError
+        The grid was not found in a view; ``view`` and ``camera`` say where.
+    CalibrationError
+        No usable minimum, ``calibration_rejected`` by its verdict, or ``grid_moved`` while the views were taken.
+    """
+    channel = current_task()
+    folder = Path(task.folder)
+    rig, plan = task.plan["rig"], task.plan
+    target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
+    measured = [view for view in task.views if view["role"] in ("fitted", "held_out")]
+    # averages are scaled: the type's largest number is not where the sensor saturated
+    grid_options = GridOptions(saturation=float(min(view["full_scale"] for view in task.views)))
+    found = calibrate_views(
+        [
+            ImageOfTarget(view["camera"], view["dz_mm"], read_image(folder / view["file"]), Path(view["file"]).name)
+            for view in measured
+        ],
+        target,
+        nominals_of(rig),
+        CalibrationOptions(held_out_mm=tuple(plan["held_out_mm"]), axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"]),
+        localiser=plan["localiser"],
+        grid_options=grid_options,
+        progress=channel.progress,
+        cancel=channel,
+    )
+    known = {view["file"]: grid for view, grid in zip(measured, found.grids, strict=True)}
+    like = replace(grid_options, line_model=found.grids[0].line_model)
+    drift = _drift(
+        folder, task.views, known, lambda image: detect_grid(image, target, localiser=plan["localiser"], options=like)
+    )
+    provenance = {
+        "software_version": software_version(),
+        "rig": rig["name"],
+        "localiser": plan["localiser"],
+        "line_model": found.grids[0].line_model,
+        "frames": plan["frames"],
+        "views_sha256": {Path(v["file"]).name: v["sha256"] for v in task.views},
+        "cameras": {view["camera"]: view["device"] for view in task.views if "device" in view},
+    }
+    content = calibration_content(found.result, target, provenance=provenance)
+    _judge_drift(content, drift)
+    _write_residuals(folder / "residuals.nc", found.result, {Path(f).name: grid for f, grid in known.items()})
+    if content["verdict"]["level"] == "failed":
+        write_json(folder / REJECTED, content)
+        raise CalibrationError(
+            f"The calibration is not usable: {' '.join(content['verdict']['reasons'])}", code="calibration_rejected"
+        )
+    write_json(folder / "calibration.json", content, checksum=True)
+    return {
+        "verdict": content["verdict"],
+        "checks": {k: _three(content["checks"][k]) for k in ("fitted", "held_out")},
+        "drift_px": drift,
+    }
+
+
+def nominals_of(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
+    """Return the nominal cameras of a plan's rig."""
+    one, two = (
+        NominalCamera(
+            image_size_px=tuple(rig[cam]["image_size_px"]),
+            phd_px=rig[cam]["phd_px"],
+            standoff_mm=rig[cam]["standoff_mm"],
+            angle_deg=rig[cam]["angle_deg"],
+            aspect=rig[cam]["aspect"],
+        )
+        for cam in CAMERAS
+    )
+    return one, two
+
+
+def _drift(
+    folder: Path, views: list[dict[str, Any]], known: dict[str, GridView], detect: Callable[[GrayImage], GridView]
+) -> dict[str, float]:
+    """Mean shift of the intersections between the first and the last view at zero, per camera."""
+    drift: dict[str, float] = {}
+    for cam in CAMERAS:
+        at_zero = [v["file"] for v in views if v["camera"] == cam and v["dz_commanded_mm"] == 0.0]
+        first, last = (
+            known[file] if file in known else detect(read_image(folder / file)) for file in (at_zero[0], at_zero[-1])
+        )
+        shift = np.nanmean(last.xy_px - first.xy_px, axis=(0, 1))
+        drift[cam] = float(np.hypot(*shift))
+    return drift
+
+
+def _judge_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
+    """Add the drift to the content's checks and verdict.
+
+    Raises
+    ------
+    CalibrationError
+        ``grid_moved``.
+    """
+    worst = max(drift, key=lambda cam: drift[cam])
+    text = f"back at zero, the grid lies {drift[worst]:.4f} px from where {worst} first saw it"
+    if drift[worst] > DRIFT_REFUSED_PX:
+        raise CalibrationError(
+            f"The grid or a camera moved while the views were taken: {text}.",
+            code="grid_moved",
+            remedy="Fix grid and cameras, let them come to the room's temperature, then calibrate again.",
+            drift_px=drift,
+        )
+    content["checks"]["drift_px"] = drift
+    content["checks"]["made"].append({"name": "drift", "made": True, "text": text})
+    if drift[worst] > DRIFT_WARNING_PX:
+        verdict = content["verdict"]
+        verdict["level"] = "warning" if verdict["level"] == "good" else verdict["level"]
+        verdict["reasons"] = [*verdict["reasons"], f"{text}: something moved"]
+
+
+def _three(check: dict[str, Any] | None) -> dict[str, Any] | None:
+    return None if check is None else {k: check[k] for k in ("rbe_px", "raz_mm", "nsce")}
+
+
+def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, GridView]) -> None:
+    """Write where each intersection was found and by how much the model misses it, (view, i, j, xy)."""
+    residuals = np.stack([view.residual_px for view in result.views])
+    found = np.stack([grids[view.name].xy_px for view in result.views])
+    facts = [
+        {
+            "name": v.name,
+            "camera": v.camera,
+            "dz_mm": v.dz_mm,
+            "held_out": v.held_out,
+            "rbe_px": v.rbe_px,
+            "raz_mm": v.raz_mm,
+            "nsce": v.nsce,
+        }
+        for v in result.views
+    ]
+    with written_dataset(path, checksum=True) as data:
+        for name, size in zip(("view", "i", "j", "xy"), residuals.shape, strict=True):
+            data.createDimension(name, size)
+        _put(data, "found_px", found, "place of the intersection in the image")
+        _put(data, "residual_px", residuals, "measured minus projected place")
+        data.setncatts({"views": json.dumps(facts), "title": "residuals of a calibration"})
+
+
+def _put(data: Any, name: str, values: NDArray[np.float64], text: str) -> None:
+    variable = data.createVariable(name, "f8", ("view", "i", "j", "xy"), compression="zlib", fill_value=np.nan)
+    variable.setncatts({"units": "pixel", "long_name": text})
+    variable[...] = values

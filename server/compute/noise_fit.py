@@ -1,0 +1,40 @@
+"""The fit of both cameras' noise models, in the worker."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from core.errors import ImageError, InputError
+from core.noise import NoiseModel, measure_noise
+from server.formats.noise_frames import read_frames
+from server.formats.noise_json import CAMERAS, noise_content, write_noise
+from server.worker.tasks import NoiseTask
+
+
+def fit_noise(task: NoiseTask) -> dict[str, Any]:
+    """Measure both cameras' noise from a folder's frames and write ``noise.json``.
+
+    Raises
+    ------
+    InputError, ImageError
+        As :func:`core.noise.measure_noise`, with ``camera``.
+    """
+    folder = Path(task.folder)
+    document = json.loads((folder / "frames.json").read_text())
+    models: dict[str, NoiseModel] = {}
+    sources = {}
+    for cam in CAMERAS:
+        files = [entry for entry in document["frames"] if entry["camera"] == cam]
+        try:
+            models[cam] = measure_noise(
+                read_frames([folder / entry["file"] for entry in files]),
+                full_scale=float((1 << document["bit_depth"][cam]) - 1),
+            )
+        except (ImageError, InputError) as error:
+            raise type(error)(f"{cam}: {error.cause}", code=error.code, remedy=error.remedy, camera=cam) from error
+        sources[cam] = [{"file": entry["file"], "sha256": entry["sha256"]} for entry in files]
+    content = noise_content(models, sources=sources, settings=document["settings"])
+    write_noise(folder / "noise.json", content, checksum=True)
+    return {"noise_id": folder.name, **{cam: {"coefficients": list(m.coefficients)} for cam, m in models.items()}}

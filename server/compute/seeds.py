@@ -1,0 +1,107 @@
+"""Start points that a user names: in camera 1's reference image, and where known in camera 2's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.cameras.stereo import StereoPair
+from core.errors import RegionError
+from core.field.seeding.epipolar_search import visible_depths
+from core.field.seeding.seeds import Seed
+from server.formats.calibrations.recognise import load_calibration
+
+#: a click is good to some pixels; further from the epipolar line it is another point
+FARTHEST_PX = 8.0
+
+Place = Sequence[float]
+
+
+def seeds_of(settings: Mapping[str, Any]) -> list[Seed] | None:
+    """Return the seeds of an analysis's settings; None where they are to be found."""
+    one = settings["seeds"]
+    if one is None:
+        return None
+    # analyses from before camera 2's places could be told do not name them
+    two = settings.get("seeds_cam2") or [None] * len(one)
+    return [
+        Seed((float(a[0]), float(a[1])), None if b is None else (float(b[0]), float(b[1])))
+        for a, b in zip(one, two, strict=True)
+    ]
+
+
+def check_seeds(calibration: Path, settings: Mapping[str, Any], size2_px: tuple[int, int]) -> None:
+    """Refuse a seed whose two places cannot be one point.
+
+    Parameters
+    ----------
+    calibration
+        The test's calibration.
+    settings
+        ``seeds`` and ``seeds_cam2`` as the API takes them.
+    size2_px
+        (width, height) of camera 2's image.
+
+    Raises
+    ------
+    RegionError
+        ``seed_outside``, ``seed_off_epipolar``.
+    """
+    seeds = [s for s in seeds_of(settings) or [] if s.xy2_px is not None]
+    if seeds:
+        check_places(load_calibration(calibration).pair, seeds, size2_px)
+
+
+def check_places(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int, int]) -> None:
+    """Refuse seeds whose places in camera 2 lie outside its image, or cannot be the points of camera 1.
+
+    Raises
+    ------
+    RegionError
+        ``seed_outside``, ``seed_off_epipolar``.
+    """
+    seeds = [seed for seed in seeds if seed.xy2_px is not None]
+    if not seeds:
+        return
+    for seed in seeds:
+        assert seed.xy2_px is not None
+        if not (0.0 <= seed.xy2_px[0] <= size2_px[0] - 1 and 0.0 <= seed.xy2_px[1] <= size2_px[1] - 1):
+            raise RegionError(
+                f"The seed's place ({seed.xy2_px[0]:g}, {seed.xy2_px[1]:g}) lies outside camera 2's image of "
+                f"{size2_px[0]} x {size2_px[1]} px.",
+                code="seed_outside",
+                remedy="Give places inside camera 2's reference image.",
+            )
+    off = distances_px(pair, seeds)
+    worst = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
+    if not off[worst] <= FARTHEST_PX:
+        one, two = seeds[worst].xy_px, seeds[worst].xy2_px
+        assert two is not None
+        raise RegionError(
+            f"The seed ({one[0]:g}, {one[1]:g}) cannot be at ({two[0]:g}, {two[1]:g}) in camera 2: that lies "
+            f"{off[worst]:.1f} px from its epipolar line; {FARTHEST_PX:g} px are allowed.",
+            code="seed_off_epipolar",
+            remedy="Click the same point in both views, or leave camera 2's place out.",
+        )
+
+
+def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
+    """Return the distance (n,) of each seed's place in camera 2 from its epipolar line; NaN where there is none."""
+    out = np.full(len(seeds), np.nan)
+    for k, seed in enumerate(seeds):
+        if seed.xy2_px is not None:
+            out[k] = abs(float(pair.epipolar_residual_px(np.array([seed.xy_px]), np.array([seed.xy2_px]))[0]))
+    return out
+
+
+def epipolar_line(pair: StereoPair, xy_px: Place, size2_px: tuple[int, int]) -> list[list[float]]:
+    """Return where camera 2 may see a point of camera 1, about 32 places along the line; empty if nowhere."""
+    place = np.asarray(xy_px, dtype=np.float64)
+    depths = visible_depths(pair, place, (size2_px[1], size2_px[0]), step_px=max(*size2_px) / 32.0)
+    if not len(depths):
+        return []
+    line = pair.image2_at_depth(np.broadcast_to(place, (len(depths), 2)), 1.0 / depths)
+    return [[round(float(x), 3), round(float(y), 3)] for x, y in line if np.isfinite(x) and np.isfinite(y)]

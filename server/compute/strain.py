@@ -1,0 +1,94 @@
+"""Strain as a step after a displacement: its settings as files and requests hold them, and its summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.field.points.result import Field
+from core.field.points.smoothing_record import Smoothing
+from core.field.smoothed import smoothed_displacement
+from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+
+_NAMES = ("exx", "eyy", "exy")
+
+
+def strain_settings(options: StrainOptions | None) -> dict[str, Any] | None:
+    """Return the options as settings; None: no strain."""
+    if options is None:
+        return None
+    return {"window": options.window, "order": options.order, "tensor": options.tensor}
+
+
+def strain_options(settings: Mapping[str, Any] | None) -> StrainOptions | None:
+    """Return the options that :func:`strain_settings` wrote, or a request's."""
+    return None if settings is None else StrainOptions(**settings)
+
+
+def smoothed_step(field: Field, window: int | None, *, subset_px: float) -> Field:
+    """Return a step's field with its displacement smoothed; as it is where that was not asked for, or of a shape."""
+    if not window or not field.has_motion:
+        return field
+    return smoothed_displacement(field, window, subset_px=subset_px)
+
+
+def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_window: int | None) -> str:
+    """Say what a smoothed displacement, and strain from it, can still tell apart."""
+    mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
+    text = (
+        f"displacements are smoothed over {smoothing.window} points: what is told apart is "
+        f"{smoothing.resolution_px:g} px{mm} wide, {smoothing.subset_px:g} px without smoothing"
+    )
+    if gauge_px is None or strain_window is None:
+        return text
+    plain = (strain_window - 1) * smoothing.step_px + smoothing.subset_px
+    return f"{text}; the strain gauge grows from {plain:g} to {gauge_px:g} px"
+
+
+def strain_of_step(field: Field, options: StrainOptions | None, *, subset_px: int) -> StrainField | None:
+    """Strain of a step; None where it was not asked for, or the step is the reference."""
+    if options is None or not field.has_motion:
+        return None
+    return surface_strain(field, options, subset_px=subset_px)
+
+
+def summarise_strain(strain: StrainField) -> dict[str, Any]:
+    """Summarise one step's strain.
+
+    Returns
+    -------
+    dict
+        Options, ``gauge_px``, ``gauge_mm`` (of smoothed displacements with the smoothing's window), ``points`` with
+        strain and ``status`` (counts), and in microstrain of exx, eyy, exy: ``mean_microstrain``, ``sd_microstrain``
+        over the field, ``noise_floor_microstrain`` (median of the standard deviation that the points' covariances
+        predict); of the patches' own strain ``patch``: its mean, and mean and sd of what it differs by. What cannot be
+        told is None.
+    """
+    valid = strain.valid
+    summary: dict[str, Any] = {
+        **(strain_settings(strain.options) or {}),
+        "gauge_px": strain.gauge_px,
+        "gauge_mm": strain.gauge_mm if np.isfinite(strain.gauge_mm) else None,
+        "points": int(valid.sum()),
+        "status": {s.name.lower(): int((strain.status == s).sum()) for s in StrainStatus if (strain.status == s).any()},
+        "mean_microstrain": _figures(strain.strain[valid], np.mean),
+        "sd_microstrain": _figures(strain.strain[valid], np.std),
+        "noise_floor_microstrain": _figures(strain.sigma[valid], np.median),
+        "patch": None,
+    }
+    if strain.patch is not None:
+        both = valid & np.isfinite(strain.patch).all(axis=-1)
+        apart = strain.patch[both] - strain.strain[both]
+        summary["patch"] = {
+            "mean_microstrain": _figures(strain.patch[both], np.mean),
+            "difference_mean_microstrain": _figures(apart, np.mean),
+            "difference_sd_microstrain": _figures(apart, np.std),
+        }
+    return summary
+
+
+def _figures(values: NDArray[np.float64], figure: Any) -> dict[str, float | None]:
+    return {name: float(1e6 * figure(values[:, k])) if len(values) else None for k, name in enumerate(_NAMES)}

@@ -1,0 +1,370 @@
+"""The rig file: one closed model, with a description on every field.
+
+The same TOML file serves ``stereorig serve`` and, as far as the nominal camera data go, ``stereorig calibrate``. A
+key that is not known is an error, not a silent nothing; errors are one line that names the field.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from core.errors import FileFormatError
+from server.config.camera_facts import Above, CameraFacts, LensFacts, Text
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Whole = Annotated[int, Field(ge=0, le=65535)]
+CameraName = Literal["cam1", "cam2"]
+
+# Skew may shift one image against the other by this much, a third of what correlation scatters by
+SKEW_PX = 0.01
+DEFAULT_SKEW_MS = 5.0
+
+
+class _Closed(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class RigSection(_Closed):
+    """[rig]: the whole."""
+
+    name: str = Field(description="Name of the rig, shown to users and kept with every result.", max_length=200)
+    kind: Literal["simulated", "real"] = Field(description="`simulated` starts a simulated world with its controllers.")
+    trigger: Literal["software", "hardware", "free"] = Field(
+        "software", description="What starts the exposures of both cameras: a call, pulses on their lines, nothing."
+    )
+    frame_rate_hz: Positive | None = Field(
+        None, description="Rate of free-running cameras, or of the pulses of a hardware trigger where they are regular."
+    )
+    pairing: Literal["auto", "time", "frame"] = Field(
+        "auto",
+        description="How frames of two streams find each other: by time, or by frame number aligned by time. `auto`: "
+        "by frame number under a hardware trigger with a known rate, else by time.",
+    )
+    max_skew_ms: Positive | None = Field(
+        None,
+        description="A pair whose exposures began further apart is refused. Left out: 0.01 px at image_speed_px_s.",
+    )
+    image_speed_px_s: Positive | None = Field(
+        None,
+        description="How fast the image may move while a pair is taken; gives the skew limit if max_skew_ms is left "
+        "out. With neither, the limit is 5 ms, and 0.01 px at the speed seen where several frames are averaged.",
+    )
+    capture_timeout_s: Annotated[float, Field(gt=0.0, le=3600.0)] = Field(
+        10.0, description="How long a capture waits for a pulse of a hardware trigger that has no frame_rate_hz."
+    )
+    auto_reconnect: bool = Field(True, description="Connect a camera again by itself when it comes back after a loss.")
+    description: str = Field("", description="Free text for people.", max_length=2000)
+    lighting: Text | None = Field(None, description="Lamps and their arrangement; kept with every step, for reports.")
+
+    @model_validator(mode="after")
+    def _rate_known(self) -> Self:
+        if self.trigger == "free" and self.frame_rate_hz is None:
+            raise ValueError("frame_rate_hz is needed with trigger = 'free'")
+        if self.pairing == "frame" and (self.trigger != "hardware" or self.frame_rate_hz is None):
+            raise ValueError("pairing = 'frame' needs trigger = 'hardware' and frame_rate_hz")
+        return self
+
+    @property
+    def skew_bound_ms(self) -> float:
+        """Largest skew of a pair that may be measured with."""
+        if self.max_skew_ms is not None:
+            return self.max_skew_ms
+        return DEFAULT_SKEW_MS if self.image_speed_px_s is None else 1000.0 * SKEW_PX / self.image_speed_px_s
+
+
+class CameraSection(_Closed):
+    """[cam1], [cam2]: nominal data, driver and stage axis of one camera."""
+
+    image_size_px: tuple[Annotated[int, Field(ge=16, le=32767)], Annotated[int, Field(ge=16, le=32767)]] = Field(
+        description="Width and height of the image."
+    )
+    phd_px: Positive = Field(description="Nominal pinhole distance in column pitches (focal length over pixel pitch).")
+    standoff_mm: Positive = Field(description="Nominal distance from the pinhole to the target.")
+    angle_deg: Annotated[float, Field(gt=-90.0, lt=90.0)] = Field(description="Nominal gamma of Eq. (1).")
+    aspect: Positive = Field(1.0, description="Rows' scale over columns' scale (lambda).")
+    bit_depth: Literal[8, 10, 12, 14, 16] = Field(8, description="Significant bits per pixel.")
+    driver: Literal["sim", "aravis", "v4l2"] = Field("sim", description="Frame grabber driver.")
+    device: str | None = Field(
+        None,
+        description="The driver's name of the device, as `stereorig devices` lists it; the simulated rig needs none.",
+    )
+    serial: str | None = Field(
+        None, description="Serial number the camera must have; left out: any, checked after a loss."
+    )
+    stage_axis: int = Field(1, ge=1, le=31, description="Stage axis that moves this camera along its optical axis.")
+    stage_sign: Literal[-1, 1] = Field(
+        1, description="dZ = sign * (position - zero), dZ positive away from the target."
+    )
+    exposure_ms: Positive | None = Field(None, description="Exposure set when the camera is opened.")
+    gain_db: Finite | None = Field(None, description="Gain set when the camera is opened.")
+    region_px: tuple[Whole, Whole, Whole, Whole] | None = Field(
+        None, description="x0, y0, width, height read out of the sensor; width and height as in image_size_px."
+    )
+    pixel_format: str | None = Field(
+        None, description="The device's own name of a format (Mono12Packed, Y12); left out: the plainest of bit_depth."
+    )
+    features: dict[str, bool | int | float | str] = Field(
+        default_factory=dict,
+        description="Other settings by the device's own name (GenICam feature, V4L2 control), set in this order.",
+    )
+    buffers: int = Field(16, ge=2, le=1000, description="Frames that may be under way between camera and reader.")
+    packet_size_bytes: int | None = Field(
+        None, ge=576, le=16000, description="GigE Vision packets; left out: the largest that passes."
+    )
+    ptp: bool = Field(False, description="Switch the camera's IEEE 1588 clock on.")
+    trigger_source: str = Field("Line1", description="GenICam line of the hardware trigger.")
+    trigger_edge: Literal["rising", "falling"] = Field("rising", description="Edge that starts the exposure.")
+    trigger_features: dict[Literal["free", "software", "hardware"], dict[str, bool | int | float | str]] = Field(
+        default_factory=dict, description="V4L2: controls that bring the device into a trigger mode."
+    )
+    maker: Text | None = Field(None, description="Maker of the camera; kept with every step, for reports.")
+    sensor: Text | None = Field(None, description="The sensor; for reports.")
+    pixel_um: Above | None = Field(None, description="Width of a pixel on the sensor; for reports.")
+    lens: LensFacts | None = Field(None, description="The lens, as printed on it; for reports.")
+
+    @model_validator(mode="after")
+    def _device_named(self) -> Self:
+        if self.driver != "sim" and self.device is None:
+            raise ValueError(f"device is needed with driver = {self.driver!r}; `stereorig devices` lists what there is")
+        if self.region_px is not None and self.region_px[2:] != self.image_size_px:
+            raise ValueError(f"region_px is {self.region_px[2:]} px large, image_size_px is {self.image_size_px}")
+        return self
+
+    def facts(self) -> CameraFacts:
+        """What the file tells of camera and lens for reports."""
+        return CameraFacts(maker=self.maker, model=None, sensor=self.sensor, pixel_um=self.pixel_um, lens=self.lens)
+
+
+class StageAxisSection(_Closed):
+    """[stage.axes.N]: what differs on axis N from [stage]; what is left out is as there."""
+
+    soft_limits_mm: tuple[Finite, Finite] | None = Field(None, description="Lowest and highest position.")
+    velocity_mm_s: Positive | None = Field(None, description="Velocity set when the stage is opened.")
+    acceleration_mm_s2: Positive | None = Field(None, description="Acceleration set when the stage is opened.")
+    backlash_mm: Annotated[float, Field(ge=0.0)] | None = Field(None, description="Travel that every move ends with.")
+    approach_from: Literal["below", "above"] | None = Field(
+        None, description="Side that positions are arrived at from."
+    )
+    settle_ms: Annotated[float, Field(ge=0.0, le=60000.0)] | None = Field(None, description="Wait after motion.")
+    tolerance_mm: Positive | None = Field(None, description="A position read back further away is a fault.")
+    zero_mm: Finite | None = Field(None, description="Stage position of dZ = 0.")
+    assume_homed: bool | None = Field(None, description="Trust an ESP301's position although nobody homed it here.")
+    home_mode: Annotated[int, Field(ge=0, le=6)] | None = Field(None, description="ESP301: parameter of OR.")
+
+    @model_validator(mode="after")
+    def _limits_in_order(self) -> Self:
+        if self.soft_limits_mm is not None:
+            _check_order(self.soft_limits_mm)
+        return self
+
+
+def _check_order(limits_mm: tuple[float, float]) -> None:
+    if not limits_mm[0] < limits_mm[1]:
+        raise ValueError(f"soft_limits_mm must be [low, high] with low < high, got {list(limits_mm)}")
+
+
+class StageSection(_Closed):
+    """[stage]: the motion controller, and how its axes are used."""
+
+    driver: Literal["esp301", "smc100", "conex-cc"] = Field(description="Protocol of the controller.")
+    url: str = Field(description="pyserial URL or port; `sim` starts a simulated controller.", min_length=1)
+    baudrate: int | None = Field(None, ge=300, le=4_000_000, description="Where it is not the controller's usual one.")
+    flow_control: Literal["hardware", "software", "none"] | None = Field(
+        None, description="Where it is not the controller's usual one."
+    )
+    reply_timeout_ms: Annotated[float, Field(ge=50.0, le=10000.0)] = Field(
+        500.0, description="How long a reply may take; longer over a slow network."
+    )
+    soft_limits_mm: tuple[Finite, Finite] = Field(description="Lowest and highest position; tightens the controller's.")
+    velocity_mm_s: Positive | None = Field(None, description="Velocity set when the stage is opened.")
+    acceleration_mm_s2: Positive | None = Field(None, description="Acceleration set when the stage is opened.")
+    backlash_mm: Annotated[float, Field(ge=0.0)] = Field(0.0, description="Every move arrives with this much travel.")
+    approach_from: Literal["below", "above"] = Field(
+        "below", description="Side that every position is arrived at from."
+    )
+    settle_ms: Annotated[float, Field(ge=0.0, le=60000.0)] = Field(0.0, description="Wait after the end of motion.")
+    tolerance_mm: Positive = Field(0.002, description="A position read back further from its target is a fault.")
+    zero_mm: Finite = Field(0.0, description="Stage position of dZ = 0, where the cameras measure.")
+    assume_homed: bool = Field(False, description="Trust an ESP301's position although nobody homed it here.")
+    home_mode: Annotated[int, Field(ge=0, le=6)] | None = Field(None, description="ESP301: parameter of OR.")
+    home_at_start: bool | None = Field(None, description="Home when opened; only simulated stages do if left out.")
+    axes: dict[Annotated[int, Field(ge=1, le=31)], StageAxisSection] = Field(
+        default_factory=dict, description="What differs from axis to axis, by axis number."
+    )
+
+    @model_validator(mode="after")
+    def _limits_in_order(self) -> Self:
+        _check_order(self.soft_limits_mm)
+        return self
+
+    def of_axis(self, axis: int) -> StageSection:
+        """Return the section as it holds for one axis."""
+        own = self.axes.get(axis)
+        return self if own is None else self.model_copy(update=own.model_dump(exclude_none=True))
+
+
+class TargetSection(_Closed):
+    """[target]: the precision line grid."""
+
+    pitch_mm: Positive = Field(description="Distance of neighbouring lines.")
+    lines: tuple[Annotated[int, Field(ge=3, le=201)], Annotated[int, Field(ge=3, le=201)]] = Field(
+        description="Number of lines crossed when walking along X_sys and along Y_sys."
+    )
+    line_width_mm: Positive = Field(description="Width of a line.")
+    node_tolerance_mm: Annotated[float, Field(ge=0.0)] = Field(0.0, description="Maker's tolerance of the line places.")
+    dark_lines: bool = Field(True, description="Dark lines on a bright ground, or the other way round.")
+
+
+class CalibrationSection(_Closed):
+    """[calibration]: the usual plan; a request can give another one."""
+
+    positions_mm: tuple[Finite, ...] = Field(description="dZ of the fitted positions.", min_length=1, max_length=100)
+    held_out_mm: tuple[Finite, ...] = Field((), description="dZ of the positions kept for the check.", max_length=100)
+    frames: int = Field(4, ge=1, le=256, description="Frames averaged at each position.")
+    localiser: Literal["profile", "paper"] = Field("profile", description="Grid line localiser.")
+    axis_tilt_sigma_rad: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
+        0.0, description="Prior on the angle between stage axis and optical axis; carried into the covariance."
+    )
+
+
+class ServiceSection(_Closed):
+    """[service]: limits of the service itself."""
+
+    compute_queue: int = Field(16, ge=1, le=1000, description="Computations that may wait; beyond it 503.")
+    kernel_threads: int | None = Field(
+        None, ge=1, le=256, description="Kernel threads of the worker; all cores if left out."
+    )
+    free_reserve_mib: Annotated[float, Field(ge=0.0)] = Field(
+        256.0,
+        description="Room that is kept free on the data folder's disk: below it no step is taken and no job begun.",
+    )
+    live_views: int = Field(8, ge=1, le=100, description="Live views that may be open at once; beyond it 503.")
+    connections: int = Field(
+        1000, ge=10, le=20000, description="Connections at once; beyond it idle ones end, then live views."
+    )
+    event_streams: int = Field(
+        200, ge=1, le=2000, description="Streams of server-sent events that may be open at once; beyond it 503."
+    )
+    retention_days: Annotated[float, Field(ge=1.0, le=36500.0)] | None = Field(
+        None,
+        description="A test goes to the trash so many days after its export was acknowledged, if nothing was added to "
+        "it since; other tests stay. Left out: nothing goes by itself.",
+    )
+    require_key: bool = Field(
+        False, description="Ask for a key on loopback too; on other addresses one is always asked for."
+    )
+    allowed_hosts: tuple[str, ...] = Field(
+        (),
+        description="Names under which clients may address the service, beside loopback and its own address.",
+        max_length=100,
+    )
+    requests_per_s: Positive = Field(
+        500.0, description="Requests that one address may make for ever; ten times as many at once."
+    )
+
+
+class ComputeSection(_Closed):
+    """[compute]: where analyses are computed."""
+
+    scheduler: Annotated[str, Field(pattern=r"^tcp://[^\s/]+:\d+$")] | None = Field(
+        None,
+        description="Address of a Dask scheduler, tcp://host:8786; left out: one worker process of the service's own.",
+    )
+    images: Literal["path", "scatter"] = Field(
+        "path",
+        description="How a cluster's workers get images: by path, where they see the data folder under the same name, "
+        "or sent with each step.",
+    )
+    threads_per_worker: int = Field(1, ge=1, le=256, description="Kernel threads of each of the cluster's workers.")
+
+
+class RigConfig(_Closed):
+    """A rig file."""
+
+    rig: RigSection
+    cam1: CameraSection
+    cam2: CameraSection
+    stage: StageSection
+    target: TargetSection
+    calibration: CalibrationSection
+    service: ServiceSection = ServiceSection()  # type: ignore[call-arg]  # pydantic fills the defaults
+    compute: ComputeSection = ComputeSection()  # type: ignore[call-arg]
+    sim: dict[str, Any] | None = Field(None, description="The simulated world's truth; its own part reads it.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.rig.kind == "simulated":
+            if self.sim is None:
+                raise ValueError("a simulated rig needs a [sim] table")
+            if self.cam1.driver != "sim" or self.cam2.driver != "sim":
+                raise ValueError("a simulated rig needs driver = 'sim' for both cameras")
+            if self.rig.trigger == "hardware":
+                raise ValueError("a simulated rig has no pulses: rig.trigger is 'software' or 'free'")
+        elif "sim" in (self.cam1.driver, self.cam2.driver):
+            raise ValueError("driver = 'sim' needs rig.kind = 'simulated' and a [sim] table")
+        return self
+
+    def camera(self, cam: CameraName) -> CameraSection:
+        """Section of one camera."""
+        return self.cam1 if cam == "cam1" else self.cam2
+
+    @model_validator(mode="after")
+    def _axes_exist(self) -> Self:
+        if self.stage.driver == "esp301" and max(self.axes) > 3:
+            raise ValueError(f"an ESP301 has axes 1 to 3, the cameras name {list(self.axes)}")
+        unused = sorted(set(self.stage.axes) - set(self.axes))
+        if unused:
+            raise ValueError(f"stage.axes names {unused}, but the cameras' axes are {list(self.axes)}")
+        return self
+
+    @property
+    def home_at_start(self) -> bool:
+        """Whether opening homes the stage: nothing moves by itself unless it is simulated or the file says so."""
+        wanted = self.stage.home_at_start
+        return self.stage.url == "sim" if wanted is None else wanted
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Stage axes that the cameras use."""
+        return tuple(sorted({self.cam1.stage_axis, self.cam2.stage_axis}))
+
+
+def parse_config(text: str, *, name: str = "the rig file") -> RigConfig:
+    """Read a rig file's text.
+
+    Raises
+    ------
+    FileFormatError
+        ``config_invalid``, one line that names the first wrong field.
+    """
+    remedy = "Correct the rig file; config/sim_paper.toml is a complete example."
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FileFormatError(f"{name} is not TOML: {error}.", code="config_invalid", remedy=remedy) from error
+    try:
+        return RigConfig.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "file"
+        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        cause = f"{name}: {where}: {first['msg']}{more}."
+        raise FileFormatError(cause, code="config_invalid", remedy=remedy, field=where) from error
+
+
+def load_config(path: Path) -> RigConfig:
+    """Read a rig file, see :func:`parse_config`."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileFormatError(
+            f"The rig file {path} cannot be read: {error}.",
+            code="file_missing" if isinstance(error, FileNotFoundError) else "config_invalid",
+            remedy="Give an existing rig file with --config.",
+        ) from error
+    return parse_config(text, name=str(path))

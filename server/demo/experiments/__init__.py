@@ -1,0 +1,1 @@
+"""The paper's three experiments and their comparison with the truth."""

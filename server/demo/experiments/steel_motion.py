@@ -1,0 +1,303 @@
+"""The ground plate moved as a rigid body: what gauges and strain make of a motion without deformation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from core.calibration.volume import CalibratedVolume
+from core.field.points.result import Field
+from core.strain import StrainField
+from server.demo.session import Check, Outcome, Session, table
+from server.demo.strain import MICRO, chi_limit, fetched_strain
+from server.formats.calibrations.recognise import load_calibration
+from server.formats.calibrations.volume import volume_of
+
+Float = NDArray[np.float64]
+
+# name, translation (mm) and rotation (degrees about X_sys, Y_sys, Z_sys) of the plate, about the system's origin
+MOTIONS = (
+    ("shifted", (0.30, -0.20, 0.40), (0.0, 0.0, 0.0)),
+    ("tilted", (0.0, 0.0, 0.0), (1.0, -0.5, 0.0)),
+    ("turned and shifted", (-0.20, 0.10, 1.00), (0.5, 0.5, 2.0)),
+)
+STRAINS = ("exx", "eyy", "exy")
+FALSE_LIMIT = 20.0  # microstrain, mean of the worst component: what the project asks of itself
+FEW = 20  # every 20th point is enough to tell what the calibration does
+OF_MANY = 4.0  # standard deviations that chance is given in the worst of many
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """One motion as it was measured.
+
+    Attributes
+    ----------
+    name
+        Of the motion.
+    found, sigma, true
+        (6,) rotation vector in rad and translation of the points' middle in mm; sigma is the noise's.
+    sigma_calibration
+        (6,) what the calibration's own covariance adds.
+    noise_ratio
+        What is left after the motion, in units of its noise.
+    elongation_mm, elongation_sigma_mm
+        (n,) of extensometers over the plate.
+    false_mean, false_mean_sigma, false_mean_calibration
+        (3,) microstrain of exx, eyy, exy: mean of strain that is not there, as the service's area reads it, its sigma,
+        and what the calibration's covariance adds.
+    false_sd, told
+        (3,) its scatter over the field, and the scatter that is told.
+    chi
+        Root mean square of that strain in units of its own sigma.
+    left
+        Area statistics of u, v, w after the rigid motion and of strain, as the service gives them.
+    """
+
+    name: str
+    found: Float
+    sigma: Float
+    sigma_calibration: Float
+    true: Float
+    noise_ratio: float
+    elongation_mm: Float
+    elongation_sigma_mm: Float
+    false_mean: Float
+    false_mean_sigma: Float
+    false_mean_calibration: Float
+    false_sd: Float
+    told: Float
+    chi: float
+    left: dict[str, Any]
+
+
+def capture(session: Session, test: str) -> None:
+    """Capture the moved plate, one step a motion."""
+    for name, shift, degrees in MOTIONS:
+        turn = np.radians(degrees).tolist()
+        session.client.set_scene("steel", translation_mm=list(shift), rotation_rad=turn)
+        session.client.capture(test, f"the plate {name}")
+
+
+def measure(
+    session: Session, test: str, first: int, region: dict[str, Any], folder: str, **settings: Any
+) -> tuple[list[Moved], list[Field], list[StrainField]]:
+    """Measure the motions of the steps from ``first`` on, and read the gauges over HTTP.
+
+    Returns
+    -------
+    tuple
+        The motions, and the steps' fields and strains.
+    """
+    steps = list(range(first, first + len(MOTIONS)))
+    analysis = session.client.analyse(test, "displacement", region, steps=steps, **settings)
+    fields = session.fetch(analysis, steps, folder)
+    strains = fetched_strain(session, steps, folder)
+    x0, y0, x1, y1 = region["rectangle"]
+    dx, dy = 0.1 * (x1 - x0), 0.1 * (y1 - y0)
+    ends = [
+        ((x0 + dx, y0 + dy), (x1 - dx, y1 - dy)),
+        ((x0 + dx, y1 - dy), (x1 - dx, y0 + dy)),
+        ((x0 + dx, 0.5 * (y0 + y1)), (x1 - dx, 0.5 * (y0 + y1))),
+    ]
+    read = session.client.gauges(
+        analysis,
+        extensometers=[{"a_px": a, "b_px": b} for a, b in ends],
+        areas=[{"name": "all"}],
+        variables=["u_mm", "v_mm", "w_mm", *STRAINS],
+        remove_rigid={},
+        steps=steps,
+    )["steps"]
+    volume = volume_of(load_calibration(session.out / "calibration.json"))
+    moved = []
+    for motion, step, field, strain in zip(MOTIONS, read, fields, strains, strict=True):
+        places = field.xyz_mm[field.valid][::FEW]
+        calibration = np.zeros((9, 9)) if volume is None else calibration_covariance(volume, places, motion)
+        moved.append(_moved(motion, step, strain, calibration))
+    return moved, fields, strains
+
+
+def calibration_covariance(volume: CalibratedVolume, points_mm: Float, motion: tuple[str, Any, Any]) -> Float:
+    """Covariance (9, 9) that the calibration gives the rigid motion of points (n, 3) about their middle, and strain.
+
+    An error of the cameras' parameters moves every place before and after; the fit follows. Rotation, translation, and
+    the mean exx, eyy, exy of points that lie about in the plane of X_sys and Y_sys.
+    """
+    if volume.covariance is None:
+        return np.zeros((9, 9))
+    _, shift, degrees = motion
+    turn = Rotation.from_rotvec(degrees, degrees=True)
+    now = turn.apply(points_mm) + np.array(shift)
+    before, after = volume.slopes(points_mm), volume.slopes(now)
+    left = after - turn.as_matrix() @ before  # what the true rotation leaves of the errors
+    left -= left.mean(axis=0)
+    x, y, z = (now - now.mean(axis=0)).T
+    zero = np.zeros_like(x)
+    small = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), -1, 0)  # a small rotation's moves
+    rotation = np.linalg.lstsq(small.reshape(-1, 3), left.reshape(-1, left.shape[-1]), rcond=None)[0]
+    back = np.swapaxes(turn.as_matrix().T @ left, 0, 1)[:2]  # (2, n, 20) of U and V, the body turned back
+    arm = points_mm[:, :2] - points_mm[:, :2].mean(axis=0)
+    (ux, uy), (vx, vy) = (np.linalg.lstsq(arm, part, rcond=None)[0] for part in back)
+    gain = np.concatenate([rotation, (after - before).mean(axis=0), [ux, vy, 0.5 * (uy + vx)]])
+    return np.asarray(gain @ volume.covariance @ gain.T)
+
+
+def _moved(motion: tuple[str, Any, Any], step: dict[str, Any], strain: StrainField, calibration: Float) -> Moved:
+    name, shift, degrees = motion
+    rigid = step["rigid_motion"]
+    turn = Rotation.from_rotvec(degrees, degrees=True)
+    middle = np.array(rigid["centre_mm"])
+    true = np.concatenate([turn.as_rotvec(), turn.apply(middle) + np.array(shift) - middle])
+    values = [
+        rigid["values"][f"{what}_{axis}_{unit}"]
+        for what, unit in (("rotation", "rad"), ("translation", "mm"))
+        for axis in "xyz"
+    ]
+    elongation = [e["values"]["elongation_mm"] for e in step["extensometers"]]
+    area = step["areas"][0]["values"]
+    mean, mean_sigma = (
+        MICRO * np.array([area[name][k] for name in STRAINS], dtype=np.float64) for k in ("mean", "mean_sigma")
+    )
+    e, sigma = strain.strain[strain.valid], strain.sigma[strain.valid]
+    return Moved(
+        name=name,
+        found=np.array([v["value"] for v in values]),
+        sigma=np.array([v["sigma"] for v in values]),
+        sigma_calibration=np.sqrt(np.diag(calibration))[:6],
+        true=true,
+        noise_ratio=float(rigid["noise_ratio"]),
+        elongation_mm=np.array([v["value"] for v in elongation]),
+        elongation_sigma_mm=np.array([v["sigma"] for v in elongation]),
+        false_mean=mean,
+        false_mean_sigma=mean_sigma,
+        false_mean_calibration=MICRO * np.sqrt(np.diag(calibration))[6:],
+        false_sd=MICRO * e.std(axis=0),
+        told=MICRO * np.sqrt(np.mean(sigma**2, axis=0)),
+        chi=float(np.sqrt(np.mean((e / sigma) ** 2))),
+        left=area,
+    )
+
+
+def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> None:
+    """Add the motions' tables, figures and limits to the experiment's outcome."""
+    rows, false_rows = [], []
+    for one in moved:
+        off = one.found - one.true
+        for part, what, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
+            both = scale * np.stack([off[part], one.sigma[part], one.sigma_calibration[part]], axis=-1)
+            rows.append(
+                [
+                    one.name,
+                    what,
+                    unit,
+                    *(f"{scale * v:.2f}" for v in one.true[part]),
+                    *(f"{v:+.2f} +- {s:.2f} +- {c:.2f}" for v, s, c in both),
+                ]
+            )
+        worst = int(np.argmax(np.abs(one.false_mean)))
+        false = " +- ".join(
+            [
+                f"{one.false_mean[worst]:+.1f}",
+                f"{one.false_mean_sigma[worst]:.1f}",
+                f"{one.false_mean_calibration[worst]:.1f}",
+            ]
+        )
+        elongations = " ".join(f"{1e3 * e:+.2f}" for e in one.elongation_mm)
+        u, v, w = (1e3 * one.left[f"{c}_mm"]["sd"] for c in "uvw")
+        false_rows.append(
+            [
+                one.name,
+                f"{one.noise_ratio:.2f}",
+                f"{u:.2f} {v:.2f} {w:.2f}",
+                elongations,
+                f"{1e3 * float(np.max(one.elongation_sigma_mm)):.2f}",
+                false,
+                f"{one.false_sd[0]:.0f}",
+                f"{one.told[0]:.0f}",
+                f"{one.chi:.2f}",
+            ]
+        )
+    outcome.checks += [check for one, strain in zip(moved, strains, strict=True) for check in _checks(one, strain)]
+    outcome.lines += [
+        "",
+        f"the plate moved as a rigid body ({len(strains)} steps), as the service's gauges read it:",
+        *table(["motion", "", "", "true X", "Y", "Z", "off X", "Y", "Z"], rows),
+        "",
+        *table(
+            [
+                "motion",
+                "noise ratio",
+                "left: sd u v w, um",
+                "extensometers, um",
+                "sigma",
+                "false strain, mean",
+                "sd exx",
+                "told",
+                "chi",
+            ],
+            false_rows,
+        ),
+        "",
+        f"strain in microstrain over a gauge of {strains[0].gauge_mm:.2f} mm, the mean of the worst component; first "
+        "the noise's sigma, then what the calibration's covariance adds",
+    ]
+    outcome.data["rigid_motion"] = [
+        {
+            "name": one.name,
+            "found": one.found.tolist(),
+            "sigma": one.sigma.tolist(),
+            "true": one.true.tolist(),
+            "sigma_calibration": one.sigma_calibration.tolist(),
+            "noise_ratio": one.noise_ratio,
+            "elongation_mm": one.elongation_mm.tolist(),
+            "elongation_sigma_mm": one.elongation_sigma_mm.tolist(),
+            "left": one.left,
+            "false_strain_microstrain": {
+                "mean": one.false_mean.tolist(),
+                "mean_sigma": one.false_mean_sigma.tolist(),
+                "mean_sigma_calibration": one.false_mean_calibration.tolist(),
+                "sd": one.false_sd.tolist(),
+                "told": one.told.tolist(),
+                "chi": one.chi,
+            },
+        }
+        for one in moved
+    ]
+
+
+def _checks(one: Moved, strain: StrainField) -> list[Check]:
+    checks = []
+    for part, what, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
+        found, true = (scale * float(np.linalg.norm(v[part])) for v in (one.found, one.true))
+        off = scale * float(np.max(np.abs(one.found - one.true)[part]))
+        limit = OF_MANY * scale * float(np.max(np.hypot(one.sigma, one.sigma_calibration)[part]))
+        checks.append(Check(f"the plate {one.name}: {what}, worst component", unit, found, true, off, limit))
+    change = np.abs(one.elongation_mm) / one.elongation_sigma_mm
+    k = int(np.argmax(change))
+    elongation, worst = 1e3 * float(one.elongation_mm[k]), int(np.argmax(np.abs(one.false_mean)))
+    mean = float(abs(one.false_mean[worst]))
+    sigma = float(np.hypot(one.false_mean_sigma, one.false_mean_calibration)[worst])
+    return [
+        *checks,
+        Check(
+            f"the plate {one.name}: an extensometer that must not change",
+            "um",
+            elongation,
+            0.0,
+            elongation,
+            OF_MANY * 1e3 * float(one.elongation_sigma_mm[k]),
+        ),
+        Check(
+            f"the plate {one.name}: false strain, mean of the worst component",
+            "microstrain",
+            mean,
+            None,
+            mean,
+            min(FALSE_LIMIT, OF_MANY * sigma),
+        ),
+        Check(f"the plate {one.name}: chi of the false strain", "", one.chi, None, one.chi, chi_limit(strain)),
+    ]

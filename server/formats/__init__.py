@@ -1,0 +1,1 @@
+"""Files in and out: images, calibrations, results. Stands on `core` alone."""

@@ -1,0 +1,1 @@
+"""Calibration files: our own and those of other programs."""

@@ -1,0 +1,211 @@
+"""Calibrations in other programs' forms, each read back and compared before it is given away."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+
+from core.cameras.camera import Camera, RigidTransform
+from core.cameras.conversion import LensFit, fit_opencv, fit_seidel
+from core.cameras.lens import OpenCVLens
+from core.cameras.stereo import StereoPair
+from core.errors import CalibrationError
+from server.formats.calibrations.dice_xml import dice_text
+from server.formats.calibrations.matchid_caldat import caldat_text
+from server.formats.calibrations.opencv_yaml import opencv_text
+from server.formats.calibrations.plausibility import (
+    Residual,
+    image_sizes,
+    independent_projection,
+    middle_depth_mm,
+    shared_points,
+)
+from server.formats.calibrations.recognise import LoadedCalibration, imported_content, parse_calibration
+from server.formats.calibrations.vic3d_xml import vic3d_text
+from server.formats.version import software_version
+
+CalibrationForm = Literal["json", "paper", "opencv", "dice", "matchid", "vic3d"]
+FORMS: tuple[CalibrationForm, ...] = get_args(CalibrationForm)
+FILE_NAMES: dict[CalibrationForm, str] = {
+    "json": "calibration.json",
+    "paper": "calibration_paper.json",
+    "opencv": "calibration_opencv.yaml",
+    "dice": "calibration_dice.xml",
+    "matchid": "calibration.caldat",
+    "vic3d": "calibration_vic3d.xml",
+}
+MEDIA_TYPES: dict[CalibrationForm, str] = {
+    "json": "application/json",
+    "paper": "application/json",
+    "opencv": "text/x-opencv-storage",
+    "dice": "application/xml",
+    "matchid": "text/plain; charset=utf-8",
+    "vic3d": "application/xml",
+}
+_ROUNDING_PX = 1e-9
+_SKEW = {"opencv": False, "dice": False, "matchid": True, "vic3d": True}
+_TANGENTIAL = {"opencv": True, "dice": True, "matchid": True, "vic3d": False}
+_NOTES: dict[CalibrationForm, tuple[str, ...]] = {
+    "json": (),
+    "paper": ("covariance, checks and verdict are not carried over",),
+    "opencv": ("OpenCV's functions know no skew",),
+    "dice": ("camera 0 is camera 1 here; extrinsics relative from camera to camera",),
+    "matchid": ("the format is not published: angles taken as R = Rz(Psi) Ry(Phi) Rx(Theta) in degrees",),
+    "vic3d": (
+        "the lens polynomial is not published: 1 + k1 r^2 + k2 r^4 + k3 r^6 in normalised coordinates was taken",
+        "the world lies between the cameras, X along the baseline, Z towards the cameras",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class ConvertedCalibration:
+    """A calibration in another form.
+
+    Attributes
+    ----------
+    data
+        The file's bytes.
+    report
+        ``format``; ``source``, ``source_sha256``; ``frame``; ``exact``; ``lens`` (``rms_px``, ``max_px`` of the fit
+        over the image of each camera); ``read_back``: over a grid of points that both cameras see, by an independent
+        projection with the original, the epipolar residual of the file read back (``rms_px``, ``max_px``) and how far
+        off it triangulates them (``rms_mm``, ``max_mm``); ``notes``; ``software``.
+    """
+
+    data: bytes
+    report: dict[str, Any]
+
+
+def convert_calibration(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) -> ConvertedCalibration:
+    """Write a calibration in another form.
+
+    Parameters
+    ----------
+    loaded
+        What was read.
+    form
+        ``json``: as this program keeps it, another program's file whole within; ``paper``: the eleven parameters of
+        each camera; else another program's.
+    original
+        The bytes that were read.
+
+    Raises
+    ------
+    CalibrationError
+        ``lens_unfittable``.
+    FileFormatError
+        If what was written does not read back.
+    """
+    try:
+        with np.errstate(all="ignore"):  # numbers of any size may stand in a file
+            return _convert(loaded, form, original)
+    except (np.linalg.LinAlgError, cv2.error, ArithmeticError) as error:
+        raise CalibrationError(
+            f"The lenses cannot be fitted: {error}.", code="lens_unfittable", remedy="Check the calibration's numbers."
+        ) from error
+
+
+def _convert(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) -> ConvertedCalibration:
+    size1, size2, known = image_sizes(loaded)
+    cameras, sizes = (loaded.pair.cam1, loaded.pair.cam2), (size1, size2)
+    if form == "json":
+        content = imported_content(original, name="The calibration")
+        data = (json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+        fits = [LensFit(camera.lens, 0.0, 0.0, 1.0) for camera in cameras]
+    elif form == "paper":
+        fits = [fit_seidel(camera.lens, size) for camera, size in zip(cameras, sizes, strict=True)]
+        data = _paper(loaded, fits, sizes if known else None)
+    else:
+        fits = [
+            fit_opencv(camera.lens, size, skew=_SKEW[form], tangential=_TANGENTIAL[form])
+            for camera, size in zip(cameras, sizes, strict=True)
+        ]
+        data = _other(loaded, form, fits, sizes if known else None).encode()
+    exact = all(fit.max_px < _ROUNDING_PX for fit in fits)
+    own = loaded.source == "calibration_json"
+    report = {
+        "format": form,
+        "software": f"stereorig {software_version()}",
+        "source": loaded.source,
+        "source_sha256": loaded.sha256,
+        "units": "mm, px, pixel centres at integers",
+        "frame": "target" if own and form in ("json", "paper") else "camera 1",
+        "image_size_px": [list(s) for s in sizes] if known else None,
+        "exact": exact,
+        "lens": {f"cam{k + 1}": {"rms_px": f.rms_px, "max_px": f.max_px} for k, f in enumerate(fits)},
+        "read_back": read_back(loaded.pair, parse_calibration(data, name="The written file").pair, size1, size2),
+        "notes": list(_NOTES[form]) + ([] if known else ["image size not known: twice the principal point was taken"]),
+    }
+    return ConvertedCalibration(data, report)
+
+
+def read_back(pair: StereoPair, again: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> dict[str, Any]:
+    """Return what a pair makes of places that another projects points of the shared volume to."""
+    points = shared_points(pair, size1, size2)
+    if not len(points):
+        return {"points": 0, "rms_px": None, "max_px": None, "rms_mm": None, "max_mm": None}
+    xy1, xy2 = (independent_projection(camera, points) for camera in (pair.cam1, pair.cam2))
+    found = again.triangulate(xy1, xy2)
+    # each pair has its own system frame: both are compared in camera 1's
+    off = np.linalg.norm(again.cam1.cam_from_sys.apply(found.xyz_mm) - pair.cam1.cam_from_sys.apply(points), axis=1)
+    off = off[found.valid]
+    return {
+        **Residual.of(again.epipolar_residual_px(xy1, xy2)).document(),
+        "rms_mm": float(np.sqrt(np.mean(off**2))) if off.size else None,
+        "max_mm": float(off.max()) if off.size else None,
+    }
+
+
+def _paper(
+    loaded: LoadedCalibration, fits: list[LensFit], sizes: tuple[tuple[int, int], tuple[int, int]] | None
+) -> bytes:
+    content: dict[str, Any] = {"format": "stereorig calibration", "format_version": 1}
+    pair, size = loaded.pair, sizes or image_sizes(loaded)[:2]
+    to_sys = RigidTransform.identity()
+    if min(camera.cam_from_sys.translation_mm[2] for camera in (pair.cam1, pair.cam2)) <= 0.0:
+        # the paper's system frame lies before the cameras: where both look, with camera 1's axes
+        depth = middle_depth_mm(pair, *size)
+        if depth is None:
+            raise CalibrationError(
+                "Both cameras see nothing in common.",
+                code="lens_unfittable",
+                remedy="Check the calibration and the image sizes.",
+            )
+        to_sys = pair.cam1.sys_from_cam @ RigidTransform(np.eye(3), np.array([0.0, 0.0, depth]))
+    for name, camera, fit in zip(("cam1", "cam2"), (pair.cam1, pair.cam2), fits, strict=True):
+        content[name] = Camera(fit.lens, camera.cam_from_sys @ to_sys).paper_parameters()
+    if sizes is not None:
+        content["image_size_px"] = {f"cam{k + 1}": list(size) for k, size in enumerate(sizes)}
+    content["provenance"] = {
+        "converted_from": loaded.source,
+        "sha256": loaded.sha256,
+        "software": f"stereorig {software_version()}",
+    }
+    return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def _other(
+    loaded: LoadedCalibration,
+    form: CalibrationForm,
+    fits: list[LensFit],
+    sizes: tuple[tuple[int, int], tuple[int, int]] | None,
+) -> str:
+    one, two = (fit.lens for fit in fits)
+    assert isinstance(one, OpenCVLens)
+    assert isinstance(two, OpenCVLens)
+    comment = (
+        f"stereorig {software_version()}, from {loaded.source}, SHA-256 {loaded.sha256}; mm, px, degrees or radians as "
+        "the format has them; X_cam2 = R X_cam1 + T"
+    )
+    if form == "opencv":
+        return opencv_text(one, two, loaded.pair, sizes, comment)
+    if form == "dice":
+        return dice_text(one, two, loaded.pair, sizes, comment)
+    if form == "matchid":
+        return caldat_text(one, two, loaded.pair)
+    return vic3d_text(one, two, loaded.pair, comment)

@@ -1,0 +1,119 @@
+"""A stereo pair from another program's numbers, after they were looked at.
+
+Imported rigs keep their own lens model (OpenCV's k1 k2 p1 p2 k3); the system frame is camera 1's own frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.cameras.camera import Camera, RigidTransform
+from core.cameras.lens import OpenCVLens
+from core.cameras.stereo import StereoPair
+from core.errors import FileFormatError
+
+_ROTATION_TOLERANCE = 1e-4  # files carry six digits and more; a wrong axis order is off by far more
+
+
+def unreadable(name: str, why: str) -> FileFormatError:
+    """Return the error for a file that is not what it should be."""
+    return FileFormatError(
+        f"{name} cannot be read as a calibration: {why}.",
+        code="calibration_unreadable",
+        remedy="Give a calibration.json, a DICe XML camera system, an OpenCV YAML stereo calibration, a MatchID caldat "
+        "or a VIC-3D file.",
+    )
+
+
+def unsupported(name: str, why: str) -> FileFormatError:
+    """Return the error for a calibration that the camera models here cannot carry."""
+    return FileFormatError(
+        f"The calibration {name} cannot be carried over exactly: {why}.",
+        code="calibration_unsupported",
+        remedy="Calibrate again with OpenCV's k1 k2 p1 p2 k3 model, or with this program.",
+    )
+
+
+def invalid(name: str, why: str) -> FileFormatError:
+    """Return the error for numbers that describe no pair of cameras."""
+    return FileFormatError(
+        f"The calibration {name} describes no pair of cameras: {why}.",
+        code="calibration_invalid",
+        remedy="Export the calibration again from the program that made it.",
+    )
+
+
+def proper_rotation(name: str, what: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return the nearest rotation to a (3, 3) matrix, after checking that it is one to the digits of a text file."""
+    R = np.asarray(values, dtype=np.float64)
+    if R.shape != (3, 3):
+        raise unreadable(name, f"{what} has the shape {R.shape}, not (3, 3)")
+    if not np.isfinite(R).all():
+        raise invalid(name, f"{what} holds a number that is not finite")
+    off = float(np.abs(R @ R.T - np.eye(3)).max())
+    if off > _ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+        raise invalid(name, f"{what} is not a rotation (R R^T is off by {off:.2g}, det {np.linalg.det(R):+.3f})")
+    u, _, vt = np.linalg.svd(R)
+    return np.asarray(u @ vt)
+
+
+def opencv_lens(name: str, which: str, values: Mapping[str, float]) -> OpenCVLens:
+    """Build one lens from ``fx fy cx cy`` and, where given, ``skew k1 k2 p1 p2 k3``."""
+    for key, value in values.items():
+        if not np.isfinite(value):
+            raise invalid(name, f"{key} of {which} is {value}")
+    for key in ("fx", "fy"):
+        if not values[key] > 0.0:
+            raise invalid(name, f"{key} of {which} is {values[key]:g}, not positive")
+    return OpenCVLens(
+        values["fx"],
+        values["fy"],
+        values["cx"],
+        values["cy"],
+        values.get("skew", 0.0),
+        *(values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")),
+    )
+
+
+def pair_of(
+    name: str, lens1: OpenCVLens, lens2: OpenCVLens, rotation: ArrayLike, translation_mm: ArrayLike
+) -> StereoPair:
+    """Build the pair from ``X_cam2 = R X_cam1 + T``; the system frame is camera 1's.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_invalid`` if R is no rotation, T not finite, or the cameras stand at one place.
+    """
+    R = proper_rotation(name, "R", rotation)
+    t = np.asarray(translation_mm, dtype=np.float64).ravel()
+    if t.shape != (3,):
+        raise unreadable(name, f"T has {t.size} numbers, not 3")
+    if not np.isfinite(t).all():
+        raise invalid(name, "T holds a number that is not finite")
+    if not np.linalg.norm(t) > 0.0:
+        raise invalid(name, "both cameras stand at the same place (T is zero)")
+    return StereoPair(Camera(lens1, RigidTransform.identity()), Camera(lens2, RigidTransform(R, t)))
+
+
+def euler_zyx(alpha_deg: float, beta_deg: float, gamma_deg: float) -> NDArray[np.float64]:
+    """Return ``Rz(gamma) Ry(beta) Rx(alpha)``, angles in degrees."""
+    (ca, cb, cg), (sa, sb, sg) = (f(np.radians([alpha_deg, beta_deg, gamma_deg])) for f in (np.cos, np.sin))
+    rz = np.array([[cg, -sg, 0.0], [sg, cg, 0.0], [0.0, 0.0, 1.0]])
+    ry = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
+    rx = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+    return np.asarray(rz @ ry @ rx)
+
+
+def euler_zyx_deg(rotation: NDArray[np.float64]) -> list[float]:
+    """Return the angles alpha, beta, gamma of :func:`euler_zyx`; alpha is zero where beta is a right angle."""
+    beta = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    if np.hypot(rotation[2, 1], rotation[2, 2]) > 1e-9:
+        alpha = np.arctan2(rotation[2, 1], rotation[2, 2])
+        gamma = np.arctan2(rotation[1, 0], rotation[0, 0])
+    else:  # alpha and gamma turn about one axis then
+        alpha, gamma = 0.0, np.arctan2(-rotation[0, 1], rotation[1, 1])
+    return [float(v) for v in np.degrees([alpha, beta, gamma])]

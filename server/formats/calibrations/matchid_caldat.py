@@ -1,0 +1,113 @@
+"""MatchID's calibration files (``*.caldat``): one ``name;value`` a line.
+
+``Cam0_Fx [pixels]`` and so on for both cameras, Fs the skew in pixels, Kappa 1 to 3, P1, P2 as OpenCV's k1 k2 k3 p1
+p2; then ``Tx [mm]``, ``Theta [deg]``, ``Phi [deg]``, ``Psi [deg]`` of ``X_cam1 = R X_cam0 + T`` with
+``R = Rz(Psi) Ry(Phi) Rx(Theta)``. Some programs count the cameras from 1. The format is not published; this is how
+several public programs read and write it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from core.cameras.lens import OpenCVLens
+from core.cameras.stereo import StereoPair
+from server.formats.calibrations.imported_pair import (
+    euler_zyx,
+    euler_zyx_deg,
+    invalid,
+    opencv_lens,
+    pair_of,
+    unreadable,
+)
+
+_CAMERA = {
+    "fx": "Fx [pixels]",
+    "fy": "Fy [pixels]",
+    "skew": "Fs [pixels]",
+    "k1": "Kappa 1",
+    "k2": "Kappa 2",
+    "k3": "Kappa 3",
+    "p1": "P1",
+    "p2": "P2",
+    "cx": "Cx [pixels]",
+    "cy": "Cy [pixels]",
+}
+_ATTRIBUTES = {"fx": "fx_px", "fy": "fy_px", "skew": "skew_px", "cx": "cx_px", "cy": "cy_px"}
+_NEEDED = ("fx", "fy", "cx", "cy")
+_POSE = ("Tx [mm]", "Ty [mm]", "Tz [mm]", "Theta [deg]", "Phi [deg]", "Psi [deg]")
+_LINE = re.compile(r"\s*([^;=:]+?)\s*[;=:]\s*(\S+)\s*")
+
+
+def looks_like_caldat(data: bytes) -> bool:
+    """Tell whether the bytes are lines of MatchID's kind."""
+    return re.search(rb"^\s*Cam\d_F[xy]\b", data[:65536], re.MULTILINE | re.IGNORECASE) is not None
+
+
+def parse_caldat(data: bytes, *, name: str) -> StereoPair:
+    """Read a MatchID calibration; the system frame is its first camera's.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_unreadable`` or ``calibration_invalid``.
+    """
+    values = _values(data, name)
+    prefixes = sorted({key.split("_", 1)[0] for key in values if re.match(r"cam\d_", key)})
+    if len(prefixes) != 2:
+        raise unreadable(name, f"it names the cameras {', '.join(prefixes) or 'none'}; a pair has two")
+    lens1, lens2 = (_lens(values, prefix, name) for prefix in prefixes)
+    missing = [key for key in _POSE if _key(key) not in values]
+    if missing:
+        raise unreadable(name, f"it lacks {', '.join(missing)}")
+    x, y, z, theta, phi, psi = (values[_key(key)] for key in _POSE)
+    return pair_of(name, lens1, lens2, euler_zyx(theta, phi, psi), np.array([x, y, z]))
+
+
+def _key(text: str) -> str:
+    """A name without unit, blanks and case: programs differ in these."""
+    return re.sub(r"\[[^\]]*\]|\s+", "", text).lower()
+
+
+def _values(data: bytes, name: str) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
+        if not line.strip():
+            continue
+        found = _LINE.fullmatch(line)
+        if found is None:
+            raise unreadable(name, f"line {number} is no name and value")
+        key = _key(found[1])
+        if key in values:
+            raise unreadable(name, f"{found[1]} stands twice in it")
+        try:
+            values[key] = float(found[2])
+        except ValueError as error:
+            if re.match(r"cam\d_", key) or key in {_key(k) for k in _POSE}:
+                raise unreadable(name, f"{found[1]} is {found[2]!r}, not a number") from error
+            continue  # a remark
+        if not np.isfinite(values[key]):
+            raise invalid(name, f"{found[1]} is {found[2]}")
+    return values
+
+
+def _lens(values: Mapping[str, float], prefix: str, name: str) -> OpenCVLens:
+    found = {short: values[key] for short, text in _CAMERA.items() if (key := f"{prefix}_{_key(text)}") in values}
+    missing = [_CAMERA[short] for short in _NEEDED if short not in found]
+    if missing:
+        raise unreadable(name, f"{prefix} lacks {', '.join(missing)}")
+    return opencv_lens(name, prefix, found)
+
+
+def caldat_text(lens1: OpenCVLens, lens2: OpenCVLens, pair: StereoPair) -> str:
+    """Return a calibration as MatchID writes it."""
+    lines = []
+    for prefix, lens in (("Cam0", lens1), ("Cam1", lens2)):
+        lines += [f"{prefix}_{text};{getattr(lens, _ATTRIBUTES.get(key, key))!r}" for key, text in _CAMERA.items()]
+    pose = pair.cam2_from_cam1
+    numbers = [*pose.translation_mm.tolist(), *euler_zyx_deg(pose.rotation)]
+    lines += [f"{text};{number!r}" for text, number in zip(_POSE, numbers, strict=True)]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,207 @@
+"""Whatever calibration file a user has: recognised by its content, read, and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
+from core.errors import FileFormatError
+from server.formats.calibrations.dice_xml import looks_like_dice, parse_dice_xml
+from server.formats.calibrations.imported_pair import invalid, unreadable
+from server.formats.calibrations.matchid_caldat import looks_like_caldat, parse_caldat
+from server.formats.calibrations.opencv_yaml import looks_like_opencv, parse_opencv
+from server.formats.calibrations.vic3d_xml import looks_like_vic3d, parse_vic3d
+
+PARAMETER_NAMES = (
+    "phd_px",
+    "cx_px",
+    "cy_px",
+    "kappa_per_px2",
+    "aspect",
+    "alpha_rad",
+    "beta_rad",
+    "gamma_rad",
+    "x0_mm",
+    "y0_mm",
+    "z0_mm",
+)
+_MAX_BYTES = 64 << 20
+_LEAST_BASELINE = 1e-6  # of the stand-off
+
+
+@dataclass(frozen=True)
+class LoadedCalibration:
+    """A pair of cameras and where it came from.
+
+    Attributes
+    ----------
+    pair
+        The cameras; the system frame is the target's for a calibration.json, camera 1's own for the imports.
+    image_size1_px, image_size2_px
+        (width, height) the calibration was made for, None where the file does not say.
+    source
+        ``calibration_json``, ``dice_xml``, ``opencv_yaml``, ``matchid_caldat`` or ``vic3d_xml``.
+    sha256
+        Of the file's bytes.
+    details
+        The whole content of a calibration.json, empty for other programs' files.
+    """
+
+    pair: StereoPair
+    image_size1_px: tuple[int, int] | None
+    image_size2_px: tuple[int, int] | None
+    source: str
+    sha256: str
+    details: dict[str, Any]
+
+
+IMPORTED = "imported"
+_DEEPEST = 30  # levels of nesting; our own files have six
+
+
+def imported_content(data: bytes, *, name: str) -> dict[str, Any]:
+    """Return the content of a ``calibration.json`` that carries the bytes of any calibration file.
+
+    A calibration of this program is carried over as it is. Another program's text is wrapped whole, so that no digit
+    and no lens term is lost on the way; :func:`parse_calibration` reads either.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`load_calibration`.
+    """
+    loaded = parse_calibration(data, name=name)
+    if loaded.details:
+        if _nested_deeper(loaded.details, _DEEPEST):
+            raise unreadable(name, f"it is nested more than {_DEEPEST} levels deep")
+        return loaded.details
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if loaded.source != "vic3d_xml":
+            raise unreadable(name, "it is not UTF-8 text") from error
+        text = data.decode("latin-1")  # VIC-3D's names of folders; no number is among them
+    sizes = {"cam1": loaded.image_size1_px, "cam2": loaded.image_size2_px}
+    return {
+        IMPORTED: {"kind": loaded.source, "sha256": loaded.sha256, "text": text},
+        "image_size_px": {cam: list(size) for cam, size in sizes.items() if size is not None},
+    }
+
+
+def _nested_deeper(value: Any, limit: int) -> bool:
+    layer = [value]
+    for _ in range(limit):
+        parts = [list(v.values()) if isinstance(v, dict) else v for v in layer if isinstance(v, dict | list)]
+        layer = [inner for part in parts for inner in part]
+    return bool(layer)
+
+
+def _camera(name: str, which: str, content: Any) -> Camera:
+    if not isinstance(content, dict):
+        raise unreadable(name, f"{which} is missing" if content is None else f"{which} is not an object")
+    missing = [key for key in PARAMETER_NAMES if key not in content]
+    if missing:
+        raise unreadable(name, f"{which} lacks {', '.join(missing)}")
+    values: dict[str, float] = {}
+    for key in PARAMETER_NAMES:
+        value = content[key]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise unreadable(name, f"{key} of {which} is {value!r}, not a number")
+        if not np.isfinite(value):
+            raise invalid(name, f"{key} of {which} is {value}")
+        values[key] = float(value)
+    for key in ("phd_px", "aspect", "z0_mm"):
+        if values[key] <= 0.0:
+            raise invalid(name, f"{key} of {which} is {values[key]:g}, not positive")
+    return Camera.from_paper(**values)
+
+
+def _size(content: dict[str, Any], which: str) -> tuple[int, int] | None:
+    sizes = content.get("image_size_px", content[which])  # our own files keep it beside the cameras
+    size = sizes.get(which, sizes.get("image_size_px")) if isinstance(sizes, dict) else None
+    if isinstance(size, list) and len(size) == 2 and all(isinstance(v, int) and v > 0 for v in size):
+        return size[0], size[1]
+    return None
+
+
+def _wraps_another(data: bytes) -> bool:
+    # the wrapped text would be taken for the file itself: our own layout is looked for first
+    return data.lstrip()[:1] == b"{" and f'"{IMPORTED}"'.encode() in data
+
+
+def _unwrapped(data: bytes, digest: str, name: str) -> LoadedCalibration:
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise unreadable(name, "it is damaged JSON") from error
+    part = content.get(IMPORTED)
+    text = part.get("text") if isinstance(part, dict) else None
+    known = text.encode("utf-8", "replace") if isinstance(text, str) else b""
+    if _wraps_another(known) or not _of_another(known):
+        raise unreadable(name, "what it says was imported is no calibration")
+    return replace(parse_calibration(known, name=name), sha256=digest, details=content)
+
+
+def _of_another(data: bytes) -> bool:
+    return any(looks(data) for looks in (looks_like_dice, looks_like_opencv, looks_like_caldat, looks_like_vic3d))
+
+
+def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
+    """Recognise and read the bytes of a calibration file, see :func:`load_calibration`."""
+    digest = hashlib.sha256(data).hexdigest()
+    if _wraps_another(data):
+        return _unwrapped(data, digest, name)
+    if looks_like_dice(data):
+        pair, size1, size2 = parse_dice_xml(data, name=name)
+        return LoadedCalibration(pair, size1, size2, "dice_xml", digest, {})
+    if looks_like_opencv(data):
+        pair, size = parse_opencv(data, name=name)
+        return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {})
+    if looks_like_vic3d(data):
+        pair, size = parse_vic3d(data, name=name)
+        return LoadedCalibration(pair, size, size, "vic3d_xml", digest, {})
+    if looks_like_caldat(data):
+        return LoadedCalibration(parse_caldat(data, name=name), None, None, "matchid_caldat", digest, {})
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise unreadable(name, "it is none of the known kinds") from error
+    if not isinstance(content, dict) or not {"cam1", "cam2"} & content.keys():
+        raise unreadable(name, "it is JSON, but has no cam1 and cam2")
+    cam1, cam2 = (_camera(name, which, content.get(which)) for which in ("cam1", "cam2"))
+    pair = StereoPair(cam1, cam2)
+    if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
+        raise invalid(name, "both cameras stand at the same place")
+    sizes = [_size(content, which) for which in ("cam1", "cam2")]
+    return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
+
+
+def load_calibration(path: str | Path) -> LoadedCalibration:
+    """Read a calibration.json, or another program's: DICe XML, OpenCV, MatchID caldat, VIC-3D XML.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``; ``calibration_unreadable`` (unknown kind, damaged, something missing);
+        ``calibration_unsupported`` (a lens model that cannot be carried over exactly);
+        ``calibration_invalid`` (NaN, no rotation, no baseline).
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise unreadable(str(path), f"it has {path.stat().st_size} bytes, far more than a calibration")
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileFormatError(
+            f"The calibration {path} does not exist.", code="file_missing", remedy="Check the path."
+        ) from error
+    except OSError as error:
+        raise unreadable(str(path), error.strerror or str(error)) from error
+    return parse_calibration(data, name=str(path))

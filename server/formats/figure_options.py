@@ -1,0 +1,66 @@
+"""How a field is drawn; apart from the drawing, which takes a second to load."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.errors import InputError
+
+COLOURS = ("viridis", "cividis", "turbo", "coolwarm", "gray")
+WIDTHS_PX = (200, 4000)
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a field is drawn.
+
+    Attributes
+    ----------
+    limits
+        Ends of the colour scale in the variable's unit; None: from ``percentiles``.
+    percentiles
+        Of the drawn values at which the colour scale ends; values beyond get the end's colour, and the bar an arrow.
+    colours
+        One of :data:`COLOURS`.
+    width_px
+        Of the picture.
+    opacity
+        Of the map over the camera's image.
+    dots_per_inch
+        What an inch of the picture has: where it is larger, so are lettering and lines.
+
+    Raises
+    ------
+    InputError
+        ``look_invalid``.
+    """
+
+    limits: tuple[float, float] | None = None
+    percentiles: tuple[float, float] = (1.0, 99.0)
+    colours: str = "viridis"
+    width_px: int = 900
+    opacity: float = 0.75
+    dots_per_inch: int = 100
+
+    def __post_init__(self) -> None:
+        wrong = None
+        if self.limits is not None and not (np.isfinite(self.limits).all() and self.limits[0] < self.limits[1]):
+            wrong = f"the limits {self.limits[0]:g} and {self.limits[1]:g} are not two numbers, the smaller first"
+        elif not 0.0 <= self.percentiles[0] < self.percentiles[1] <= 100.0:
+            wrong = f"the percentiles {self.percentiles[0]:g} and {self.percentiles[1]:g} do not rise within 0 to 100"
+        elif self.colours not in COLOURS:
+            wrong = f"there are no colours {self.colours!r}"
+        elif not WIDTHS_PX[0] <= self.width_px <= WIDTHS_PX[1]:
+            wrong = f"a width of {self.width_px} px is not between {WIDTHS_PX[0]} and {WIDTHS_PX[1]}"
+        elif not 0.0 < self.opacity <= 1.0:
+            wrong = f"an opacity of {self.opacity:g} is not above 0 and at most 1"
+        elif not 50 <= self.dots_per_inch <= 600:
+            wrong = f"{self.dots_per_inch} dots an inch are not between 50 and 600"
+        if wrong is not None:
+            raise InputError(
+                f"A picture cannot be drawn so: {wrong}.",
+                code="look_invalid",
+                remedy=f"Correct it; colours are {', '.join(COLOURS)}.",
+            )

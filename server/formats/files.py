@@ -1,0 +1,150 @@
+"""Files on disk: written aside, synced, renamed; and their checksums.
+
+A file written here is either the whole new one or the old one, whatever happens in between.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+from core.errors import FileFormatError, InputError, StorageError
+from server.formats import disk as _disk
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_CHUNK_BYTES = 1 << 20
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, in hex."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def storage_error(error: OSError, path: Path) -> StorageError:
+    """Turn a failed write into ``storage_full`` or ``storage_failed``."""
+    reason = error.strerror or str(error)
+    if error.errno in _FULL:
+        remedy = "Free space on that disk, then run it again; nothing half-written was kept."
+        return StorageError(f"No space left while writing {path} ({reason}).", code="storage_full", remedy=remedy)
+    return StorageError(f"Writing {path} failed ({reason}).")
+
+
+def fsync_path(path: Path) -> None:
+    """Make a file's content, or a folder's renames and new names, durable."""
+    _disk.disk.sync(path)
+
+
+_hashes: dict[tuple[str, int, int, int], str] = {}
+_MOST_HASHES = 100_000
+
+
+def known_sha256(path: Path) -> str:
+    """As `sha256_of`, but a file that was not touched since is not read again."""
+    stat = path.stat()
+    # the time of the inode's change, which nobody can set
+    key = str(path), stat.st_ino, stat.st_ctime_ns, stat.st_size
+    if key not in _hashes:
+        if len(_hashes) >= _MOST_HASHES:
+            _hashes.clear()
+        _hashes[key] = sha256_of(path)
+    return _hashes[key]
+
+
+def checksum_file(path: Path) -> Path:
+    """Where a file's checksum stands, in the form that ``sha256sum -c`` reads."""
+    return path.with_name(f"{path.name}.sha256")
+
+
+def recorded_sha256(path: Path) -> str | None:
+    """Return the checksum that stands beside a file; None where there is none."""
+    try:
+        text = checksum_file(path).read_text(encoding="ascii").split()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return text[0] if text else None
+
+
+def mismatch(name: str, of: str, folder: str) -> FileFormatError:
+    """Return the error for a file that is not what was written."""
+    return FileFormatError(
+        f"{name} of {of} does not match its checksum.",
+        code="checksum_mismatch",
+        remedy="Restore the file from a backup, or make it anew; nothing else is touched.",
+        file=f"{folder}/{name}",
+    )
+
+
+def require_recorded(path: Path, of: str, folder: str) -> None:
+    """Refuse a file that does not match the checksum beside it, where there is one.
+
+    Raises
+    ------
+    FileFormatError
+        ``checksum_mismatch``, naming the file.
+    """
+    recorded = recorded_sha256(path)
+    if recorded is not None and known_sha256(path) != recorded:
+        raise mismatch(path.name, of, folder)
+
+
+@contextlib.contextmanager
+def written_aside(path: Path, *, checksum: bool = False) -> Iterator[Path]:
+    """Give a temporary path in the same folder; on leaving, sync it, rename it to ``path``, sync the folder.
+
+    With ``checksum``, its SHA-256 is put beside it first, so that a file under its real name never lacks it. If the
+    body raises, the temporary file is removed and ``path`` is left as it was.
+
+    Raises
+    ------
+    StorageError
+        ``storage_full`` or ``storage_failed``, for any :class:`OSError` in the body or in the renaming.
+    """
+    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        yield aside
+        fsync_path(aside)
+        if checksum:
+            write_bytes(checksum_file(path), f"{sha256_of(aside)}  {path.name}\n".encode())
+        _disk.disk.replace(aside, path)
+        fsync_path(path.parent)
+    except OSError as error:
+        raise storage_error(error, path) from error
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes, *, checksum: bool = False) -> None:
+    """Write a whole file, see :func:`written_aside`."""
+    with written_aside(path, checksum=checksum) as aside:
+        _disk.disk.write(aside, data)
+
+
+def make_folder(path: Path) -> None:
+    """Make an output folder, or check that it can take files.
+
+    Raises
+    ------
+    InputError
+        ``output_unusable`` if the path is a file, cannot be made, or cannot be written to.
+    """
+    remedy = "Give a folder that can be written to."
+    if path.exists() and not path.is_dir():
+        raise InputError(f"The output {path} is a file, not a folder.", code="output_unusable", remedy=remedy)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".probe.{secrets.token_hex(4)}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(
+            f"The output folder {path} cannot be written to ({reason}).", code="output_unusable", remedy=remedy
+        ) from error

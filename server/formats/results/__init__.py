@@ -1,0 +1,1 @@
+"""Result files: fields, strain, gauges, summaries."""

@@ -1,0 +1,138 @@
+"""Reading result files back, see :mod:`server.formats.results.writing`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import FileFormatError
+from core.field.points.patch import PatchChoice
+from core.field.points.result import Field, References
+from core.field.points.smoothing_record import Smoothing
+from core.field.region.cuts import Cuts, from_arrays
+from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, HANDED_ON, MOTION, SHAPE
+
+
+def _open(path: Path) -> Any:
+    if not path.exists():
+        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
+    try:
+        dataset = netCDF4.Dataset(str(path), "r")
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be read as a result file: {error.strerror or error}.") from error
+    version = int(getattr(dataset, "format_version", 0))
+    if not 1 <= version <= FORMAT_VERSION:
+        dataset.close()
+        raise FileFormatError(
+            f"{path} has the result format {version or 'none'}; this program reads up to {FORMAT_VERSION}.",
+            code="format_too_new" if version else "file_unreadable",
+            remedy="Read it with the program's version that wrote it.",
+        )
+    dataset.set_auto_mask(False)
+    return dataset
+
+
+def read_field(path: str | Path) -> Field:
+    """Read one result file back.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``, ``file_unreadable`` (not such a file, a variable missing) or ``format_too_new``.
+    """
+    path = Path(path)
+    with _open(path) as dataset:
+        variables = dataset.variables
+        shape = (dataset.dimensions["row"].size, dataset.dimensions["col"].size)
+        curved = CURVATURE if CURVATURE[0].name in variables else ()
+        wanted = SHAPE + (MOTION if dataset.kind == "displacement" else ()) + curved
+        names = [v.name for v in wanted] + ["status", "iterations", "zncc", "covariance"]
+        missing = [name for name in names if name not in variables]
+        if missing:
+            raise FileFormatError(f"{path} lacks the variables {', '.join(missing)}.")
+        arrays: dict[str, Any] = {}
+        for v in wanted:
+            values = np.asarray(variables[v.name][...], dtype=np.float64)
+            if v.component is None:
+                arrays[v.attribute] = values
+            else:
+                tail = 2 if v in CURVATURE else 3
+                arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
+        choice, smoothing = (getattr(dataset, name, None) for name in ("patch_choice", "smoothing"))
+        return Field(
+            **arrays,
+            status=np.asarray(variables["status"][...], dtype=np.int8),
+            iterations=np.asarray(variables["iterations"][...], dtype=np.int32),
+            zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
+            covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
+            smoothing=None if smoothing is None else Smoothing.from_document(json.loads(smoothing)),
+            patch=None if choice is None else PatchChoice.from_document(json.loads(choice)),
+            cuts=_cuts_of(variables),
+            references=_references_of(dataset),
+        )
+
+
+def read_measured(path: str | Path) -> Field:
+    """Read a result file back as it was measured: with its displacement before smoothing.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`read_field`.
+    """
+    field = read_field(path)
+    if field.smoothing is None:
+        return field
+    with _open(Path(path)) as dataset:
+        if "measured_covariance" not in dataset.variables:
+            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
+        read = {
+            name: np.asarray(v[...], dtype=np.float64)
+            for name, v in dataset.variables.items()
+            if name.startswith("measured_")
+        }
+    uvw = np.stack([read[f"measured_{name}_mm"] for name in ("u", "v", "w")], axis=-1)
+    return replace(field, uvw_mm=uvw, covariance=read["measured_covariance"], smoothing=None)
+
+
+def read_attributes(path: str | Path) -> dict[str, Any]:
+    """Read a result file's global attributes; those that hold JSON (``settings`` ...) come back as objects.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`read_field`.
+    """
+    with _open(Path(path)) as dataset:
+        attributes = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
+    for name in ("settings", "inputs_sha256", "patch_choice", "smoothing"):
+        if name in attributes:
+            attributes[name] = json.loads(attributes[name])
+    return attributes
+
+
+def _references_of(dataset: Any) -> References | None:
+    variables = dataset.variables
+    if "reference_step" not in variables:
+        return None
+    steps = np.asarray(variables["reference_step"][...], dtype=np.int32)
+    values: dict[str, NDArray[np.float64]] = {}
+    for what in HANDED_ON:
+        values[what] = np.full((*steps.shape, 2, 2), np.nan)
+        for name, (i, j) in ENTRIES.items():
+            read = np.asarray(variables[f"handed_on_{what}_{name}_px2"][...], dtype=np.float64)
+            values[what][..., i, j] = values[what][..., j, i] = read
+    return References(int(dataset.reference_step), steps, values["noise"], values["pattern"])
+
+
+def _cuts_of(variables: Any) -> Cuts | None:
+    if "cut_line" not in variables:
+        return None
+    points = np.stack([np.asarray(variables[name][...], dtype=np.float64) for name in ("cut_x_px", "cut_y_px")], axis=1)
+    return from_arrays(points, np.asarray(variables["cut_line"][...], dtype=np.int32))

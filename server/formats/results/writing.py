@@ -1,0 +1,336 @@
+"""Result files: one field, one NetCDF-4 file (classic model: xarray, MATLAB and ncdump all open it).
+
+Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` that says why. Files are written aside, so
+that a half-written one cannot be met. :mod:`server.formats.results.reading` reads them back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+from numpy.typing import NDArray
+
+from core.field.points.result import Field, References
+from core.field.region.cuts import Cuts, as_arrays
+from core.status import STATUS_MEANINGS, PointStatus
+from core.strain import StrainField
+from server.formats.files import written_aside
+from server.formats.results.layout import (
+    COMPARISONS,
+    COVARIANCE_NAMES,
+    CURVATURE,
+    ENTRIES,
+    FORMAT_VERSION,
+    HANDED_ON,
+    MOTION,
+    SHAPE,
+)
+from server.formats.results.strain import put_strain
+
+_NEARLY_FULL_BYTES = 1 << 20
+# measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
+# the file. What repeats is always deflated; everything is where at least this share of the points has no numbers
+_MANY_EMPTY = 0.2
+_REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
+_FRAMES = {
+    "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
+    "camera1": "sys = camera 1: X along the rows, Y down the columns, Z along the optical axis, away from the camera",
+}
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from; written into its file.
+
+    Parameters
+    ----------
+    settings
+        Everything the caller chose or left at its default; goes to JSON.
+    inputs
+        Name of each input file and the SHA-256 of its bytes.
+    software_version
+        Of this program.
+    frame
+        ``target`` or ``camera1``: what the system frame is; or its description.
+    step
+        Number of the step, 0 = the reference.
+    reference
+        Number of the reference.
+    extra
+        Further text attributes (a label, a load).
+    """
+
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    software_version: str
+    frame: str = "target"
+    step: int = 0
+    reference: int = 0
+    extra: Mapping[str, str] = field(default_factory=dict)
+
+
+def _put(
+    dataset: Any,
+    name: str,
+    values: NDArray[Any],
+    dims: tuple[str, ...],
+    *,
+    units: str,
+    long_name: str,
+    dtype: str,
+    sparse: bool = False,
+) -> None:
+    fill = np.nan if dtype.startswith("f") else False
+    pack = {"compression": "zlib", "complevel": 1, "shuffle": True} if sparse or name in _REPETITIVE else {}
+    variable = dataset.createVariable(name, dtype, dims, fill_value=fill, **pack)
+    variable.setncatts({"units": units, "long_name": long_name})
+    variable[...] = values
+
+
+def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
+    _put(dataset, "status", status, ("row", "col"), units="1", long_name="what can be said about the point", dtype="i1")
+    dataset.variables["status"].setncatts(
+        {
+            "flag_values": np.array([s.value for s in PointStatus], dtype=np.int8),
+            "flag_meanings": " ".join(s.name.lower() for s in PointStatus),
+            "comment": "; ".join(f"{s.value} = {s.name.lower()}: {STATUS_MEANINGS[s]}" for s in PointStatus),
+        }
+    )
+
+
+def _fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainField | None) -> None:
+    dataset.set_fill_off()
+    rows, cols = result.shape
+    sparse = float(np.mean(~result.valid)) >= _MANY_EMPTY
+    for name, size in (("row", rows), ("col", cols), ("comparison", result.zncc.shape[-1])):
+        dataset.createDimension(name, size)
+    curved = CURVATURE if result.curvature_per_mm is not None else ()
+    for v in SHAPE + (MOTION if result.has_motion else ()) + curved:
+        values = getattr(result, v.attribute)
+        if v.component is not None:
+            values = values[..., v.component]
+        smooth = result.smoothing is not None and v.attribute == "uvw_mm"
+        long_name = f"{v.long_name}, smoothed" if smooth else v.long_name
+        _put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=long_name, dtype=v.dtype, sparse=sparse)
+    _put_status(dataset, result.status)
+    _put(
+        dataset,
+        "iterations",
+        result.iterations,
+        ("row", "col"),
+        units="1",
+        long_name="iterations of the fit",
+        dtype="i4",
+    )
+    _put(
+        dataset,
+        "zncc",
+        result.zncc,
+        ("row", "col", "comparison"),
+        units="1",
+        long_name="zero-mean normalised correlation of each comparison",
+        dtype="f4",
+    )
+    dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
+    _put_covariance(dataset, result, sparse=sparse)
+    if result.cuts:
+        _put_cuts(dataset, result.cuts)
+    if strain is not None:
+        put_strain(dataset, strain, sparse=sparse)
+    if result.references is not None:
+        _put_references(dataset, result.references)
+    dataset.setncatts(_attributes(provenance, moved=result.has_motion))
+    if result.has_motion:
+        matched = provenance.reference if result.references is None else result.references.step
+        dataset.reference_step = np.int32(matched)
+    if result.smoothing is not None:
+        dataset.smoothing = json.dumps(result.smoothing.document(), sort_keys=True)
+        if strain is not None:
+            dataset.strain_note = "strain of smoothed displacements: gauge_px and gauge_mm hold the smoothing's window"
+    if result.patch is not None:
+        dataset.setncatts(
+            {
+                "patch": result.patch.patch,
+                "patch_reason": result.patch.reason,
+                "patch_choice": json.dumps(result.patch.document(), sort_keys=True),
+            }
+        )
+
+
+def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
+    n = result.covariance.shape[-1]
+    names = COVARIANCE_NAMES[:n]
+    dataset.createDimension("i", n)
+    dataset.createDimension("j", n)
+    _put(
+        dataset,
+        "covariance",
+        result.covariance,
+        ("row", "col", "i", "j"),
+        units="mm2",
+        long_name="covariance of " + ", ".join(names),
+        dtype="f4",
+        sparse=sparse,
+    )
+    dataset.variables["covariance"].components = " ".join(names)
+    sigma = result.sigma_mm
+    for k, name in enumerate(names):
+        _put(
+            dataset,
+            f"sigma_{name}",
+            sigma[..., k],
+            ("row", "col"),
+            units="mm",
+            long_name=f"standard deviation of {name}",
+            dtype="f4",
+            sparse=sparse,
+        )
+
+
+def _put_cuts(dataset: Any, cuts: Cuts) -> None:
+    points, of_line = as_arrays(cuts)
+    dataset.createDimension("cut_point", len(points))
+    for k, (name, along) in enumerate((("cut_x_px", "column"), ("cut_y_px", "row"))):
+        _put(
+            dataset,
+            name,
+            points[:, k],
+            ("cut_point",),
+            units="pixel",
+            long_name=f"{along} in camera 1's reference image of a point of a cut: nothing reaches over it",
+            dtype="f8",
+        )
+    _put(
+        dataset, "cut_line", of_line, ("cut_point",), units="1", long_name="which cut the point belongs to", dtype="i4"
+    )
+
+
+def _put_references(dataset: Any, references: References) -> None:
+    _put(
+        dataset,
+        "reference_step",
+        references.steps,
+        ("row", "col"),
+        units="1",
+        dtype="i4",
+        long_name="step that the point was matched against; without numbers, the newest such step that shows it",
+        sparse=True,
+    )
+    for what, cause in HANDED_ON.items():
+        values = getattr(references, f"{what}_px2")
+        for name, (i, j) in ENTRIES.items():
+            _put(
+                dataset,
+                f"handed_on_{what}_{name}_px2",
+                values[..., i, j],
+                ("row", "col"),
+                units="pixel2",
+                dtype="f8",
+                long_name=f"covariance by {cause} of where camera 1 sees the point, as far as later steps inherit it "
+                "that are matched against this one",
+            )
+
+
+def _put_measured(dataset: Any, measured: Field) -> None:
+    assert measured.uvw_mm is not None
+    for k, name in enumerate(("u", "v", "w")):
+        _put(
+            dataset,
+            f"measured_{name}_mm",
+            measured.uvw_mm[..., k],
+            ("row", "col"),
+            units="mm",
+            dtype="f8",
+            long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
+        )
+    _put(
+        dataset,
+        "measured_covariance",
+        measured.covariance,
+        ("row", "col", "i", "j"),
+        units="mm2",
+        dtype="f4",
+        long_name="covariance of x_mm, y_mm, z_mm and the displacement as measured",
+    )
+
+
+def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
+    return {
+        "Conventions": "CF-1.11",
+        "title": "displacement from the reference step" if moved else "shape of the reference step",
+        "kind": "displacement" if moved else "shape",
+        "format_version": np.int32(FORMAT_VERSION),
+        "step": np.int32(provenance.step),
+        "source": f"stereorig {provenance.software_version}",
+        "software_version": provenance.software_version,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "frame": _FRAMES.get(provenance.frame, provenance.frame),
+        "settings": json.dumps(provenance.settings, sort_keys=True),
+        "inputs_sha256": json.dumps(provenance.inputs, sort_keys=True),
+        **provenance.extra,
+    }
+
+
+def write_field(
+    path: str | Path,
+    result: Field,
+    provenance: Provenance,
+    strain: StrainField | None = None,
+    *,
+    measured: Field | None = None,
+    checksum: bool = False,
+) -> None:
+    """Write one result file: aside, synced, renamed.
+
+    Parameters
+    ----------
+    path
+        Of the file; its folder must exist.
+    result
+        A shape (no ``uvw_mm``) or a displacement field.
+    provenance
+        What it was made from and how.
+    strain
+        Of the same points, if it was computed; :func:`server.formats.results.strain.read_strain` reads it back.
+    measured
+        The field before its displacement was smoothed; later steps may go on from it.
+    checksum
+        Put the file's SHA-256 beside it.
+
+    Raises
+    ------
+    StorageError
+        ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
+    """
+    with written_dataset(Path(path), checksum=checksum) as dataset:
+        _fill(dataset, result, provenance, strain)
+        if result.smoothing is not None and measured is not None:
+            _put_measured(dataset, measured)
+
+
+@contextlib.contextmanager
+def written_dataset(path: Path, *, checksum: bool = False) -> Iterator[Any]:
+    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_aside`.
+
+    Raises
+    ------
+    StorageError
+        ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
+    """
+    with written_aside(path, checksum=checksum) as aside:
+        try:
+            with netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
+                yield dataset
+        except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
+            full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
+            raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error

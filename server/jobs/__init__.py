@@ -1,0 +1,1 @@
+"""Jobs, who holds the hardware, events, and requests that have one effect."""

@@ -1,0 +1,430 @@
+"""Jobs: anything that takes longer than a request.
+
+A job goes through phases, each on a lane: ``hardware`` (exclusive, never queued) or ``compute`` (queued, bounded, one
+at a time). Its states are ``queued running cancelling succeeded failed cancelled interrupted``. A job is in the
+catalogue before it is acknowledged; what was not finished when the service ended reads ``interrupted`` after the next
+start.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from core.errors import Cancelled, StateError, StereorigError, StorageError
+from server.base.errors import NotFoundError, QueueFullError
+from server.base.json_values import without_nan
+from server.base.logs import about
+from server.base.problem import RESTART, problem_of
+from server.jobs.events import EventHub
+from server.jobs.hardware import HardwareGate
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import ACTIVE, Job, Phase, State, Waiting
+from server.store.catalog import Catalog
+from server.store.folder import IdMaker, is_id, now_utc
+
+_log = logging.getLogger("stereorig.jobs")
+
+
+class JobManager:
+    """Runs jobs, keeps their table.
+
+    Parameters
+    ----------
+    queue_limit
+        How many compute phases may wait; beyond it :class:`QueueFullError`.
+    """
+
+    def __init__(
+        self, catalog: Catalog, hub: EventHub, gate: HardwareGate, ids: IdMaker, *, queue_limit: int = 16
+    ) -> None:
+        self._catalog = catalog
+        self._hub = hub
+        self._gate = gate
+        self._ids = ids
+        self.queue_limit = queue_limit
+        self._lock = threading.Lock()
+        self._active: dict[str, Job] = {}
+        self._unsaved: dict[str, dict[str, Any]] = {}  # how jobs ended that a full disk has no room for
+        self._queue: deque[Job] = deque()
+        self._parked: set[Job] = set()  # compute jobs that wait for something to do; they hold no lane
+        self._reserved = 0  # jobs that will come to the compute lane after their hardware phase
+        self._wake = threading.Condition(self._lock)
+        self._closing = False
+        self._interrupt_left_overs()
+        self._thread = threading.Thread(target=self._run_compute, name="compute-jobs", daemon=True)
+        self._thread.start()
+
+    def _interrupt_left_overs(self) -> None:
+        for document in self._catalog.jobs():
+            self._ids.seen(document["id"])
+        for document in self._catalog.jobs(states=ACTIVE):
+            document |= {"state": "interrupted", "finished_utc": now_utc(), "problem": problem_of(RESTART)}
+            document["progress"]["eta_s"] = None
+            self._catalog.put_job(document["id"], "interrupted", document)
+
+    # making and finding ----------------------------------------------------------------------------------------
+
+    def submit(
+        self,
+        kind: str,
+        what: str,
+        subject: dict[str, Any],
+        phases: Sequence[Phase],
+        *,
+        prepare: Callable[[Job], dict[str, Any]] | None = None,
+        request: RequestMark | None = None,
+        on_end: Callable[[Job, State], None] | None = None,
+        on_cancel: Callable[[Job], None] | None = None,
+        follows: str | None = None,
+    ) -> Job:
+        """Acknowledge a job and start it.
+
+        Parameters
+        ----------
+        what
+            The holder's name as a busy caller will read it.
+        prepare
+            Runs once it is certain that the job is accepted, before it starts; what it returns, ids of what it
+            made, joins the subject.
+        request
+            What asked for the job: written with it, so that a crash leaves both or none.
+        follows
+            Id of a test whose new steps wake the job when it waits.
+
+        Raises
+        ------
+        BusyError
+            The first phase needs the hardware and somebody has it.
+        QueueFullError
+            Too many computations wait.
+        """
+        job = Job(
+            self._ids.new("j"),
+            kind,
+            dict(subject),
+            phases,
+            self._show,
+            on_end=on_end,
+            on_cancel=on_cancel,
+            follows=follows,
+        )
+        computes = any(p.lane == "compute" for p in phases)
+        if computes:
+            self._reserve()
+        token: object | None = None
+        try:
+            if phases[0].lane == "hardware":
+                token = self._gate.claim(what, job_id=job.id, kind=kind)
+            made = prepare(job) if prepare is not None else {}
+            job.subject |= made
+            row = None if request is None else request.made({**made, "job_id": job.id})
+            self._catalog.put_job(job.id, job.state, job.document(), row)
+        except BaseException:
+            if token is not None:
+                self._gate.release(token)
+            if computes:
+                self._unreserve()
+            raise
+        with self._lock:
+            self._active[job.id] = job
+        self._hub.publish("job", job.document())
+        if token is not None:
+            self._gate.start(lambda: self._run_hardware(job, token))
+        else:
+            self._enqueue(job)
+        return job
+
+    def _reserve(self) -> None:
+        with self._lock:
+            if self._closing:
+                raise StateError("The service is shutting down.", code="shutting_down", remedy="Start it again.")
+            if self._reserved >= self.queue_limit:
+                raise QueueFullError(f"{self._reserved} computations are waiting, the limit is {self.queue_limit}.")
+            self._reserved += 1
+
+    def _unreserve(self) -> None:
+        with self._lock:
+            self._reserved -= 1
+
+    def document(self, job_id: str) -> dict[str, Any]:
+        """Return a job of this or an earlier run."""
+        with self._lock:
+            job, ended = self._active.get(job_id), self._unsaved.get(job_id)
+        if job is not None:
+            return job.document()
+        if ended is not None:
+            return ended
+        found = self._catalog.job(job_id) if is_id(job_id, "j") else None
+        if found is None:
+            raise NotFoundError(f"There is no job {job_id[:40]!r}.", what="job")
+        return found
+
+    def documents(self, limit: int, *, before: str | None = None) -> list[dict[str, Any]]:
+        """Return jobs, newest first; ``before``: only those older than this one."""
+        with self._lock:
+            active = self._unsaved | {j.id: j.document() for j in self._active.values()}
+        return [active.get(d["id"], d) for d in self._catalog.jobs(limit=limit, before=before)]
+
+    def is_active(self, job_id: str) -> bool:
+        """Whether a job is not finished."""
+        with self._lock:
+            return job_id in self._active
+
+    def active_count(self) -> int:
+        """Number of jobs that are not finished."""
+        with self._lock:
+            return len(self._active)
+
+    def waiting_count(self) -> int:
+        """Number of jobs that wait for the compute lane."""
+        with self._lock:
+            return len(self._queue)
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Ask a job to stop.
+
+        Raises
+        ------
+        StateError
+            ``job_finished`` if there is nothing left to cancel.
+        """
+        with self._lock:
+            job = self._active.get(job_id)
+            if job is not None:
+                job._cancel.set()
+                waiting = job in self._queue or job in self._parked
+                if job in self._queue:
+                    self._queue.remove(job)
+                    self._reserved -= 1
+                elif waiting:
+                    self._parked.remove(job)
+                elif job.state == "running":
+                    job.state = "cancelling"
+        if job is None:
+            state = self.document(job_id)["state"]
+            raise StateError(
+                f"Job {job_id} is {state} already.",
+                code="job_finished",
+                remedy="There is nothing to cancel.",
+                state=state,
+            )
+        stop_waiting = job.stop_waiting
+        if stop_waiting is not None:
+            stop_waiting()
+        if job.on_cancel is not None:
+            job.on_cancel(job)
+        if waiting:
+            self._end(job, "cancelled", Cancelled(f"The {job.kind} was cancelled while it waited."))
+        else:
+            self._save(job)
+            self._show(job, "state")
+        return job.document()
+
+    def landed(self, test_id: str) -> None:
+        """Wake the jobs that follow a test."""
+        with self._lock:
+            followers = [job for job in self._active.values() if job.follows == test_id]
+        for job in followers:
+            self._rouse(job)
+
+    def finish(self, job_id: str) -> dict[str, Any]:
+        """Let a job that follows a test end once it has done what there is.
+
+        Raises
+        ------
+        StateError
+            ``not_following`` if it follows nothing, or has ended.
+        """
+        with self._lock:
+            job = self._active.get(job_id)
+        if job is None or job.follows is None:
+            raise StateError(
+                f"Job {job_id} follows no test." if job is not None else f"Job {job_id} has ended.",
+                code="not_following",
+                remedy="Only an analysis made with follow = true can be finished, while it runs.",
+            )
+        job.finishing.set()
+        self._rouse(job)
+        return job.document()
+
+    def _rouse(self, job: Job) -> None:
+        with self._wake:
+            job.woken.set()
+            if job in self._parked and not self._closing:
+                self._parked.remove(job)
+                self._queue.append(job)
+                self._reserved += 1
+                self._wake.notify()
+
+    def _park(self, job: Job) -> bool:
+        """Set a job aside until it is woken; False where it was woken or is to end, and should go on."""
+        with self._wake:
+            if job.woken.is_set() or job.cancelled or self._closing:
+                return False
+            self._parked.add(job)
+            return True
+
+    def cancel_hardware(self) -> str | None:
+        """Cancel the job that holds the hardware, if one does; return its id."""
+        holder = self._gate.holder
+        job_id = holder.get("job_id") if holder else None
+        if job_id is None:
+            return None
+        with self._lock:
+            job = self._active.get(job_id)
+            if job is None:
+                return None
+            job._cancel.set()
+        return str(job_id)
+
+    # running ---------------------------------------------------------------------------------------------------
+
+    def _enqueue(self, job: Job) -> None:
+        with self._wake:
+            if not self._closing:
+                job.stage, job.done, job.total = "waiting", 0, 0
+                self._queue.append(job)
+                self._wake.notify()
+                return
+        self._end(job, "interrupted", RESTART)
+
+    def _run_hardware(self, job: Job, token: object) -> None:
+        # who sees that it has ended may begin something else at once
+        job.let_go = lambda: self._gate.release(token)
+        try:
+            with about(job_id=job.id):
+                finished = self._run_phase(job, 0)
+        finally:
+            self._gate.release(token)
+        if not finished:
+            if any(p.lane == "compute" for p in job.phases):
+                self._unreserve()
+        elif len(job.phases) > 1:
+            self._enqueue(job)
+        else:
+            self._end(job, "succeeded", None)
+
+    def _run_compute(self) -> None:
+        while True:
+            with self._wake:
+                while not self._queue and not self._closing:
+                    self._wake.wait()
+                if self._closing:
+                    return
+                job = self._queue.popleft()
+                self._reserved -= 1
+            index = 0 if job.phases[0].lane == "compute" else 1
+            with about(job_id=job.id):
+                if self._run_phase(job, index):
+                    self._end(job, "succeeded", None)
+
+    def _run_phase(self, job: Job, index: int) -> bool:
+        try:
+            job.check()
+            if job.state == "queued":
+                job.state, job.started_utc = "running", now_utc()
+                self._save(job)
+                self._show(job, "state")
+            while True:
+                job.woken.clear()
+                try:
+                    result = job.phases[index].run(job)
+                except Waiting:
+                    if self._park(job):
+                        return False
+                    job.check()
+                    continue
+                break
+            if result:
+                job.result = {**(job.result or {}), **without_nan(result)}
+            job.check()
+        except Cancelled as error:
+            self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
+            return False
+        except Exception as error:  # noqa: BLE001 - the job's failure, not the service's
+            if job.cancelled and isinstance(error, StereorigError) and error.code == "stage_stopped":
+                self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
+                return False
+            if not isinstance(error, StereorigError):
+                _log.exception("job %s (%s) failed", job.id, job.kind)
+            self._end(job, "failed", error)
+            return False
+        return True
+
+    def _end(self, job: Job, state: State, error: BaseException | None) -> None:
+        job.problem = None if error is None else problem_of(error)
+        if job.on_end is not None:
+            try:
+                job.on_end(job, state)
+            except Exception as second:  # noqa: BLE001 - a result that was not kept is no success
+                _log.exception("closing job %s failed", job.id)
+                state, job.problem = "failed", problem_of(second)
+        ended = now_utc()
+        if job.let_go is not None:
+            job.let_go()
+        # nobody sees a job's end before it is on disk
+        self._save(job, state=state, finished_utc=ended)
+        with self._lock:
+            job.state, job.finished_utc = state, ended
+            self._active.pop(job.id, None)
+        self._show(job, "state")
+
+    def _save(self, job: Job, **final: Any) -> None:
+        try:
+            with job.saving:  # the newest document is the last one written
+                if job.ended:
+                    return
+                job.ended = bool(final)
+                document = job.document() | final
+                if final:
+                    document["progress"]["eta_s"] = None
+                    with self._lock:
+                        self._unsaved[job.id] = document
+                self._catalog.put_job(job.id, document["state"], document)
+                with self._lock:
+                    self._unsaved.pop(job.id, None)
+                    late = list(self._unsaved.items())
+            for job_id, document in late:  # there is room again
+                self._catalog.put_job(job_id, document["state"], document)
+                with self._lock:
+                    self._unsaved.pop(job_id, None)
+        except StorageError:
+            _log.exception("the state of job %s could not be written", job.id)
+
+    def _show(self, job: Job, what: str) -> None:
+        document = {**job.document(), "change": what}
+        if what == "progress":
+            del document["result"]  # it may hold thousands of steps, and progress comes ten times a second
+        self._hub.publish("job", document)
+
+    def begin_close(self) -> None:
+        """Accept nothing more; what ends from now on without its result was interrupted."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify_all()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the compute lane runs."""
+        return self._thread.is_alive() or self._closing
+
+    def close(self) -> None:
+        """Interrupt everything; returns when the compute lane has ended."""
+        with self._wake:
+            self._closing = True
+            queued = [*self._queue, *self._parked]
+            self._queue.clear()
+            self._parked.clear()
+            active = [j for j in self._active.values() if j not in queued]
+            self._wake.notify_all()
+        for job in queued:
+            self._end(job, "interrupted", RESTART)
+        for job in active:
+            job._cancel.set()
+            if job.on_cancel is not None:
+                job.on_cancel(job)
+        self._thread.join(timeout=5.0)

@@ -1,0 +1,1 @@
+"""Reading results for clients: variables, positions, previews, quality, staleness."""

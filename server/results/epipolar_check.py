@@ -1,0 +1,75 @@
+"""The epipolar residual of a calibration over points that were measured with another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.stereo import StereoPair
+from core.errors import FileFormatError, InputError
+from server.formats.calibrations.plausibility import Residual
+from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.results.steps import calibration_of, read_step
+
+Float = NDArray[np.float64]
+
+
+def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_with: Path) -> dict[str, Any]:
+    """Return the epipolar residual of a calibration over points that were measured with another.
+
+    Parameters
+    ----------
+    loaded
+        The calibration to look at.
+    files
+        Result files; the first is read.
+    measured_with
+        The calibration that they were measured with, which says where camera 2 saw each point.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_changed`` if it is not the one that the results name.
+    InputError
+        ``too_few_points`` without a valid point.
+    """
+    step = read_step(files[0], ["epipolar_px"])
+    own = load_calibration(measured_with)
+    named = calibration_of(step)
+    if named is not None and named != own.sha256:
+        raise FileFormatError(
+            f"{measured_with} is not the calibration that {files[0].name} was measured with.",
+            code="calibration_changed",
+            remedy="Give that one.",
+        )
+    ok = step.valid
+    if not ok.any():
+        raise InputError(f"{files[0].name} has no valid point.", code="too_few_points", remedy="Give other results.")
+    variables = step.variables
+    xy1 = np.stack([variables[n].values[ok] for n in ("x_px", "y_px")], axis=1)
+    xyz = np.stack([variables[n].values[ok] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
+    xy2 = _seen_by_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
+    return {
+        "results": files[0].name,
+        "measured_with": Residual.of(own.pair.epipolar_residual_px(xy1, xy2)).document(),
+        "this_calibration": Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2)).document(),
+    }
+
+
+def _seen_by_camera2(pair: StereoPair, xy1: Float, xyz_mm: Float, offset_px: Float) -> Float:
+    """Where camera 2 saw the points: beside the epipolar line by the offset that was measured."""
+    on_line = pair.cam2.project(xyz_mm).xy
+    h = 0.01
+    gradient = np.stack(
+        [
+            (pair.epipolar_residual_px(xy1, on_line + d) - pair.epipolar_residual_px(xy1, on_line - d)) / (2 * h)
+            for d in (np.array([h, 0.0]), np.array([0.0, h]))
+        ],
+        axis=1,
+    )
+    left = offset_px - pair.epipolar_residual_px(xy1, on_line)
+    return np.asarray(on_line + gradient * (left / (gradient**2).sum(axis=1))[:, None])

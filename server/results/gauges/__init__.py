@@ -1,0 +1,1 @@
+"""Extensometers, lines, areas and rigid motions over result files."""

@@ -1,0 +1,97 @@
+"""Whole fields in the frame and without the motion that gauges were asked for, as result files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from core.errors import InputError
+from core.field.points.result import Field
+from core.strain import surface_strain
+from server.formats.files import make_folder
+from server.formats.results.strain import read_strain
+from server.formats.results.writing import Provenance, write_field
+from server.formats.version import software_version
+from server.results.gauges.request import GaugeRequest
+from server.results.reader import library
+
+_CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
+
+
+class FieldWriter:
+    """Writes the field of each step that gauges are read in, as ``step_<nnnn>.nc``.
+
+    Parameters
+    ----------
+    folder
+        Where to; made if it is not there.
+    source
+        Where the results come from.
+    request
+        What was asked for.
+
+    Raises
+    ------
+    InputError
+        ``output_unusable`` if both folders are one; ``option_conflict`` where the request leaves fields as they are.
+    """
+
+    def __init__(self, folder: Path, source: Path, request: GaugeRequest) -> None:
+        if request.align is None and request.remove_rigid is None:
+            raise InputError(
+                "The fields are asked for as they were measured: they lie there already.",
+                code="option_conflict",
+                remedy="Give a frame, or take the rigid motion out.",
+            )
+        if folder.absolute().resolve() == source.absolute().resolve():
+            raise InputError(
+                f"{folder} holds the results that are read.", code="output_unusable", remedy="Give another folder."
+            )
+        make_folder(folder)
+        self._folder, self._request = folder, request
+        self.written: list[Path] = []
+
+    def __call__(
+        self,
+        path: Path,
+        sha256: str,
+        attributes: Mapping[str, Any],
+        field: Field,
+        alignment: dict[str, Any] | None,
+        motion: dict[str, Any] | None,
+    ) -> None:
+        """Write one step; strain, where the result has it, is made anew along the new axes."""
+        with library:
+            strain = read_strain(path)
+        if strain is not None:
+            strain = surface_strain(field, strain.options, subset_px=strain.subset_px)
+        extra = {name: str(attributes[name]) for name in _CARRIED if name in attributes}
+        extra["made_from"] = f"{path.name}, SHA-256 {sha256}"
+        extra["transformation"] = json.dumps(
+            {
+                "align": None if self._request.align is None else self._request.align.model_dump(mode="json"),
+                "alignment": alignment,
+                "remove_rigid": None
+                if self._request.remove_rigid is None
+                else self._request.remove_rigid.model_dump(mode="json"),
+                "rigid_motion": motion,
+            },
+            sort_keys=True,
+        )
+        frame = str(attributes["frame"])
+        if self._request.align is not None:
+            frame = f"aligned by {self._request.align.kind}; before: {frame}"
+        provenance = Provenance(
+            settings=attributes["settings"],
+            inputs=attributes["inputs_sha256"],
+            software_version=software_version(),
+            frame=frame,
+            step=int(attributes["step"]),
+            extra=extra,
+        )
+        to = self._folder / path.name
+        with library:
+            write_field(to, field, provenance, strain)
+        self.written.append(to)

@@ -1,0 +1,386 @@
+"""Gauges over the result files of a measurement: one function behind the command line and the API."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError, MeasurementError, StateError
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels
+from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
+from core.gauge.area import area_statistics, points_within
+from core.gauge.extensometer import extensometer
+from core.gauge.line import places_along
+from core.gauge.locate import places_from_mm
+from core.gauge.reading import Reading
+from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
+from core.gauge.sampling import Samples, sample
+from server.formats.files import sha256_of
+from server.formats.results.layout import COVARIANCE_NAMES
+from server.formats.results.reading import read_attributes, read_field
+from server.formats.version import software_version
+from server.results.gauges.fields import FieldWriter
+from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
+from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
+from server.results.reader import library, read_variable
+from server.results.staleness import stale_results
+
+Float = NDArray[np.float64]
+_Placed = dict[str | None, list[tuple[float, float]]]
+MOST_NUMBERS = 3_000_000
+_CALIBRATION = ("calibration", "calibration.json")
+_EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One result file, read; its field in the frame and without the motion that was asked for."""
+
+    path: Path
+    sha256: str
+    attributes: Mapping[str, Any]
+    field: Field
+    shared: SharedPixels
+
+    @property
+    def head(self) -> dict[str, Any]:
+        load = self.attributes.get("load_n")
+        return {
+            "n": int(self.attributes["step"]),
+            "kind": str(self.attributes["kind"]),
+            "label": str(self.attributes.get("label", "")),
+            "load_n": None if load is None else float(load),
+        }
+
+
+def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> dict[str, Any]:
+    """Read a set of gauges in every step.
+
+    Parameters
+    ----------
+    files
+        Result files of one measurement.
+    request
+        The gauges.
+    fields
+        Takes each step's field in the frame and without the motion that was asked for.
+
+    Returns
+    -------
+    dict
+        ``software_version``, ``settings`` (the request), ``inputs_sha256``, ``stale`` (True where inputs or results
+        are gone or were replaced since, told in ``stale_reasons``), ``frame``, ``subset_px``,
+        ``smoothing_window`` (of the displacements; None: as measured), ``alignment`` and
+        ``steps``: for each step ``n, kind, label, load_n``, ``rigid_motion``, and for ``points``, ``extensometers``,
+        ``lines``, ``areas`` a list of readings. Numbers come with ``sigma`` and ``units``; what is missing is None,
+        with the reason under ``missing``. A step whose rigid motion cannot be told has a ``problem`` and no readings.
+
+    Raises
+    ------
+    StateError
+        ``no_results`` without files.
+    InputError
+        ``step_missing``, ``steps_mixed``, ``gauge_outside``, ``gauge_unusable``, ``gauge_too_large``.
+    NotFoundError
+        ``field_missing`` for a variable that a file lacks.
+    MeasurementError
+        ``too_few_points`` to align.
+    """
+    chosen = _chosen(files, request.steps)
+    alignment: Alignment | None = None
+    first: Mapping[str, Any] | None = None
+    grid: tuple[Float, Float] | None = None
+    hashes, steps, heads = {}, [], []
+    moved_by: set[str] = set()
+    found: set[str] = set()
+    placed: _Placed = {}
+    numbers = 0
+    for path in chosen:
+        step = _read(path)
+        first = step.attributes if first is None else first
+        grid = (step.field.x_px, step.field.y_px) if grid is None else grid
+        _check_same(step, first, grid, path, moved_by)
+        hashes[path.name] = step.sha256
+        if request.align is not None and alignment is None:
+            alignment = _alignment(step, request)
+        if first is step.attributes:
+            placed = _placed(step.field if alignment is None else aligned(step.field, alignment), request)
+        numbers += _count(step.field, request.lines, len(request.variables or COVARIANCE_NAMES))
+        if numbers > MOST_NUMBERS:
+            raise InputError(
+                f"The lines hold more than {MOST_NUMBERS:,} numbers.",
+                code="gauge_too_large",
+                remedy="Ask for fewer places, variables or steps.",
+            )
+        heads.append(step.attributes)
+        steps.append(_read_step(step, alignment, request, placed, found, fields))
+    for name in request.variables or ():
+        if name not in found and any("problem" not in s for s in steps):
+            read_variable(chosen[-1], name)  # says which there are
+    assert first is not None
+    stale = stale_results(chosen, heads)
+    frame = str(first["frame"])
+    if request.align is not None:
+        frame = f"aligned by {request.align.kind}; before: {frame}"
+    return {
+        "software_version": software_version(),
+        "settings": request.model_dump(mode="json"),
+        "inputs_sha256": hashes,
+        "stale": bool(stale),
+        "stale_reasons": stale,
+        "frame": frame,
+        "subset_px": first["settings"]["subset_px"],
+        "smoothing_window": first["settings"].get("smoothing_window"),
+        "alignment": None if alignment is None else _alignment_document(alignment),
+        "steps": steps,
+    }
+
+
+def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
+    if not files:
+        raise StateError(
+            "There is no result file yet.",
+            code="no_results",
+            remedy="Measure first; a step's result can be read once the step is finished.",
+        )
+    there = {_number_of(path): path for path in files}
+    numbers = sorted(there) if wanted is None else sorted(set(wanted))
+    missing = [n for n in numbers if n not in there]
+    if missing:
+        raise InputError(
+            f"There is no result of step {missing[0]}; there are {_listed(sorted(there))}.",
+            code="step_missing",
+            remedy="Ask for steps that were measured.",
+        )
+    return [there[n] for n in numbers]
+
+
+def _number_of(path: Path) -> int:
+    return int(path.stem.removeprefix("step_"))
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers)) if len(numbers) <= 8 else f"{numbers[0]} ... {numbers[-1]}"
+
+
+def _read(path: Path) -> _Step:
+    with library:
+        attributes, field = read_attributes(path), read_field(path)
+    subset = attributes.get("settings", {}).get("subset_px")
+    if not isinstance(subset, int | float):
+        raise InputError(
+            f"{path.name} does not say its subset.", code="settings_missing", remedy="Measure again with this program."
+        )
+    return _Step(path, sha256_of(path), attributes, field, SharedPixels.of(field, float(subset)))
+
+
+def _check_same(step: _Step, first: Mapping[str, Any], grid: tuple[Float, Float], path: Path, refs: set[str]) -> None:
+    """Refuse files that are no one measurement: other points, calibration, subset or reference."""
+    inputs, others = step.attributes["inputs_sha256"], first["inputs_sha256"]
+    field = step.field
+    if step.field.has_motion:
+        refs.add(str(inputs.get("reference_cam1")))
+    differs = (
+        "points"
+        if field.shape != grid[0].shape or (field.x_px != grid[0]).any() or (field.y_px != grid[1]).any()
+        else "calibration"
+        if any(inputs.get(k) != others.get(k) for k in _CALIBRATION)
+        else "subset"
+        if step.attributes["settings"].get("subset_px") != first["settings"].get("subset_px")
+        else "smoothing"
+        if field.has_motion
+        and first["settings"].get("smoothing_window") != step.attributes["settings"].get("smoothing_window")
+        else "reference"
+        if len(refs) > 1 or (refs and str(others.get("reference_cam1")) not in refs)
+        else ""
+    )
+    if differs:
+        raise InputError(
+            f"{path.name} has another {differs} than the first step that was read.",
+            code="steps_mixed",
+            remedy="Give the result files of one measurement.",
+        )
+
+
+def _count(field: Field, lines: Sequence[LineGauge], variables: int) -> int:
+    return variables * sum(len(places_along(field, line.vertices_px, line.count)[1]) for line in lines)
+
+
+def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
+    asked = request.align
+    if isinstance(asked, PlaneAlignment):
+        inside = points_within(step.field, asked.corners())
+        return align_plane(step.field, shared=step.shared, chosen=inside, x_direction=asked.x_direction)
+    assert asked is not None
+    return align_3_2_1(step.field, asked.places_px, shared=step.shared)
+
+
+def _placed(field: Field, request: GaugeRequest) -> _Placed:
+    """Return the pixels of each named point and extensometer; those told in mm are found on the first step's shape."""
+    placed: _Placed = {}
+    gauges: list[PointGauge | ExtensometerGauge] = [*request.points, *request.extensometers]
+    for gauge in gauges:
+        places, in_mm = gauge.places()
+        xy = places_from_mm(field, places) if in_mm else places
+        placed[gauge.name] = [(float(x), float(y)) for x, y in xy]
+    return placed
+
+
+def _read_step(
+    step: _Step,
+    alignment: Alignment | None,
+    request: GaugeRequest,
+    placed: _Placed,
+    found: set[str],
+    fields: FieldWriter | None,
+) -> dict[str, Any]:
+    field = step.field if alignment is None else aligned(step.field, alignment)
+    document = step.head
+    if request.remove_rigid is not None and field.has_motion:
+        removal = request.remove_rigid
+        inside = points_within(field, removal.corners())
+        try:
+            motion = rigid_motion(field, shared=step.shared, chosen=inside, robust=removal.robust)
+        except MeasurementError as error:
+            document["problem"] = {"code": error.code, "cause": error.cause, "remedy": error.remedy}
+            return document
+        field = without_rigid_motion(field, motion, shared=step.shared)
+        document["rigid_motion"] = _motion_document(motion)
+    if fields is not None:
+        frame = None if alignment is None else _alignment_document(alignment)
+        fields(step.path, step.sha256, step.attributes, field, frame, document.get("rigid_motion"))
+    variables = Variables(step.path, field, step.shared, measured=step.field)
+    names = variables.known(request.variables or COVARIANCE_NAMES)
+    found.update(names)
+    return {
+        **document,
+        "points": [_point(variables, names, p.name, *placed[p.name]) for p in request.points],
+        "extensometers": [_extensometer(variables, e.name, *placed[e.name]) for e in request.extensometers],
+        "lines": [_line(variables, names, line) for line in request.lines],
+        "areas": [_area(variables, names, a.name, a.corners()) for a in request.areas],
+    }
+
+
+def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> dict[str, Any]:
+    own = np.arange(len(places.xy_px))
+    variance = np.diagonal(places.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
+    out = {}
+    for name in names:
+        variable, sigma = variables.get(name)
+        k = component_of(name)
+        if k is not None:
+            s = np.sqrt(variance[:, k])
+        elif sigma is not None:
+            s = places.of(sigma)  # as if the errors of the points about it were one
+        else:
+            s = np.full(len(own), np.nan)
+        out[name] = (places.of(variable.values), s, variable.units)
+    return out
+
+
+def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> dict[str, Any]:
+    places = sample(variables.field, [xy])
+    found = {n: _number(v[0], s[0], units) for n, (v, s, units) in _at_places(variables, names, places).items()}
+    return {"name": name, "xy_px": list(xy), "missing": places.missing[0], "values": found}
+
+
+def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> dict[str, Any]:
+    xy, distance = places_along(variables.field, line.vertices_px, line.count)
+    places = sample(variables.field, xy)
+    found = _at_places(variables, names, places)
+    return {
+        "name": line.name,
+        "x_px": xy[:, 0].tolist(),
+        "y_px": xy[:, 1].tolist(),
+        "distance_px": distance.tolist(),
+        "missing": list(places.missing),
+        "values": {n: {"value": _list(v), "sigma": _list(s), "units": units} for n, (v, s, units) in found.items()},
+    }
+
+
+def _extensometer(
+    variables: Variables, name: str | None, a: tuple[float, float], b: tuple[float, float]
+) -> dict[str, Any]:
+    got = extensometer(variables.field, a, b, shared=variables.shared)
+    readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
+    values = {n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n]) for n, r in readings.items()}
+    return {"name": name, "a_px": list(a), "b_px": list(b), "missing": got.missing, "values": values}
+
+
+def _area(
+    variables: Variables, names: Sequence[str], name: str | None, corners: list[tuple[float, float]] | None
+) -> dict[str, Any]:
+    field = variables.field
+    inside = points_within(field, corners)
+    values = {}
+    for n in names:
+        variable, sigma = variables.get(n)
+        # how far other variables' errors reach is not known here: no uncertainty of their mean
+        known = sigma if component_of(n) is not None else None
+        of_place = component_of(n) in range(3)
+        shared = variables.shared.places if of_place else variables.shared
+        got = area_statistics(field, variable.values, known, inside, shared=shared)
+        if n in STRAIN_NAMES and got.count:
+            got = replace(got, mean_sigma=variables.mean_strain_sigma(inside)[STRAIN_NAMES.index(n)])
+        values[n] = {
+            "units": variable.units,
+            "count": got.count,
+            **{k: _finite(getattr(got, k)) for k in ("mean", "mean_sigma", "sd", "rms")},
+            "min": _finite(got.minimum),
+            "max": _finite(got.maximum),
+        }
+    valid = int((inside & field.valid).sum())
+    return {
+        "name": name,
+        "points": int(inside.sum()),
+        "valid": valid,
+        "missing": "" if valid else "no valid point in the area",
+        "values": values,
+    }
+
+
+def _alignment_document(alignment: Alignment) -> dict[str, Any]:
+    sigma = np.sqrt(np.diag(alignment.covariance))
+    return {
+        "rotation": alignment.rotation.tolist(),
+        "origin_mm": alignment.origin_mm.tolist(),
+        "sigma_rad": sigma[:3].tolist(),
+        "sigma_origin_mm": sigma[3:].tolist(),
+        "residual_rms_mm": alignment.residual_rms_mm,
+        "points": alignment.points,
+    }
+
+
+def _motion_document(motion: RigidMotion) -> dict[str, Any]:
+    sigma = np.sqrt(np.diag(motion.covariance))
+    values = {}
+    for k, axis in enumerate("xyz"):
+        values[f"rotation_{axis}_rad"] = _number(motion.rotation_vector_rad[k], sigma[k], "rad")
+    for k, axis in enumerate("xyz"):
+        values[f"translation_{axis}_mm"] = _number(motion.translation_mm[k], sigma[3 + k], "mm")
+    return {
+        "values": values,
+        "centre_mm": motion.centre_mm.tolist(),
+        "covariance": motion.covariance.tolist(),
+        "points": motion.points,
+        "residual_rms_mm": motion.residual_rms_mm,
+        "noise_ratio": motion.noise_ratio,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _list(values: Float) -> list[float | None]:
+    return [_finite(v) for v in values]
+
+
+def _number(value: float, sigma: float, units: str) -> dict[str, Any]:
+    return {"value": _finite(value), "sigma": _finite(sigma), "units": units}

@@ -1,0 +1,89 @@
+"""The variables that gauges read: of a field in its new frame where it has them, else of its result file."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels
+from core.strain.mean import mean_strain_sigma
+from server.base.errors import NotFoundError
+from server.formats.results.layout import COVARIANCE_NAMES, field_variable
+from server.formats.results.strain import read_strain
+from server.results.reader import Variable, library, read_variable
+
+Float = NDArray[np.float64]
+STRAIN_NAMES = ("exx", "eyy", "exy")
+
+
+class Variables:
+    """Variables by name: of the field as it is now, else of the file as it was written."""
+
+    def __init__(self, path: Path, field: Field, shared: SharedPixels, *, measured: Field) -> None:
+        self.path, self.field, self.shared, self.measured = path, field, shared, measured
+        self._read: dict[str, tuple[Variable, Float | None]] = {}
+
+    def get(self, name: str) -> tuple[Variable, Float | None]:
+        """Return values and standard deviations, (r, c) each; the latter None where they are not known."""
+        if name not in self._read:
+            self._read[name] = self._find(name)
+        return self._read[name]
+
+    def mean_strain_sigma(self, inside: NDArray[np.bool_]) -> Float:
+        """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN without strain."""
+        with library:
+            strain = read_strain(self.path)
+        if strain is None:
+            return np.full(3, np.nan)
+        # the file's strain is that of the field as it was measured, along the file's axes
+        return mean_strain_sigma(self.measured, strain.options, inside, subset_px=strain.subset_px)
+
+    def known(self, names: Sequence[str]) -> list[str]:
+        """Return those that this step has: a shape has no displacement."""
+        known = []
+        for name in names:
+            with contextlib.suppress(NotFoundError):
+                self.get(name)
+                known.append(name)
+        return known
+
+    def _find(self, name: str) -> tuple[Variable, Float | None]:
+        sigma = self._sigma(name)
+        if name.startswith("sigma_"):
+            own = self._sigma(name.removeprefix("sigma_"))
+            if own is not None:
+                return Variable(own, "mm", f"standard deviation of {name[6:]}"), None
+        of_field = field_variable(self.field, name)
+        if of_field is not None:
+            return Variable(*of_field), sigma
+        variable = read_variable(self.path, name)
+        values = variable.values
+        if values.shape != self.field.shape or not np.issubdtype(values.dtype, np.number):
+            raise InputError(
+                f"{name} of {self.path.name} is no scalar over the points.",
+                code="field_not_scalar",
+                remedy="Choose a variable with one number a point.",
+            )
+        held = np.where(self.field.valid, values.astype(np.float64), np.nan)
+        return Variable(held, variable.units, variable.long_name), sigma
+
+    def _sigma(self, name: str) -> Float | None:
+        k = component_of(name)
+        if k is not None:
+            return self.field.sigma_mm[..., k] if k < self.field.covariance.shape[-1] else None
+        try:
+            values = read_variable(self.path, f"sigma_{name}").values
+        except NotFoundError:
+            return None
+        return np.asarray(values, dtype=np.float64) if values.shape == self.field.shape else None
+
+
+def component_of(name: str) -> int | None:
+    """Return the place of a variable in the points' covariance; None for others."""
+    return COVARIANCE_NAMES.index(name) if name in COVARIANCE_NAMES else None

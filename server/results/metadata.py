@@ -1,0 +1,105 @@
+"""What only people know about a test: lenses, light, pattern, specimen, purpose.
+
+Nothing here is measured or guessed. A fact that nobody told is None, and a report lists it as not stated. Facts about
+cameras and lenses stand in the rig file, and are kept with every step that is captured; those of a test go before them.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, StringConstraints, ValidationError
+
+from core.errors import FileFormatError
+from server.base.models import StepNumber
+from server.config.camera_facts import Above, CameraFacts, ClosedFacts, Text
+from server.results.gauges.request import GaugeRequest
+
+
+class TestFacts(ClosedFacts):
+    """What is told of one test."""
+
+    __test__ = False
+
+    purpose: Text | None = Field(None, description="What the test is for.")
+    laboratory: Text | None = Field(None, description="Laboratory, address.")
+    operator: Text | None = Field(None, description="Who ran it.")
+    specimen: Text | None = Field(None, description="The specimen; in place of the test's own field of that name.")
+    material: Text | None = Field(None, description="Its material.", examples=["Aluminium 6061-T6"])
+    loading: Text | None = Field(None, description="How it is loaded: machine, rate, control, load cell.")
+    environment: Text | None = Field(None, description="Temperature, humidity, vibration.")
+    lighting: Text | None = Field(
+        None, description="Lamps, their arrangement, polarisation.", examples=["2 LED panels, 45 degrees, diffuse"]
+    )
+    pattern_technique: Text | None = Field(
+        None, description="How the pattern was applied.", examples=["matt white ground, black spray paint"]
+    )
+    pattern_feature_mm: Above | None = Field(
+        None, description="Size of the pattern's features as the operator knows it; a report measures it besides."
+    )
+    pattern_feature_method: Text | None = Field(
+        None, description="How the operator knows pattern_feature_mm.", examples=["stamp of 0.18 mm dots"]
+    )
+    standoff_mm: Above | None = Field(
+        None, description="Distance from the lens to the specimen by a ruler; a report computes the pinhole's besides."
+    )
+    frame_rate_hz: Above | None = Field(None, description="Rate at which the images were taken.")
+    exposure_ms: Above | None = Field(None, description="Exposure of both cameras, where their records do not say it.")
+    cam1: CameraFacts | None = Field(None, description="Camera 1; goes before what the rig file says.")
+    cam2: CameraFacts | None = Field(None, description="Camera 2.")
+    static_steps: list[StepNumber] | None = Field(
+        None,
+        description="Steps in which nothing moved since the reference: noise floor and bias come from them. Left out: "
+        "steps whose label begins with the word `static`.",
+        max_length=10_000,
+    )
+    gauges: GaugeRequest | None = Field(None, description="Gauges whose histories the report shows.")
+    notes: Annotated[str, StringConstraints(max_length=20_000)] | None = Field(None, description="Anything else.")
+
+    def camera(self, cam: str) -> CameraFacts | None:
+        """Facts of one camera."""
+        return self.cam1 if cam == "cam1" else self.cam2
+
+    def document(self) -> dict[str, Any]:
+        """Return what was told, nothing else."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+def parse_facts(document: Mapping[str, Any], *, name: str) -> TestFacts:
+    """Read facts.
+
+    Raises
+    ------
+    FileFormatError
+        ``facts_invalid``, one line that names the first wrong field.
+    """
+    try:
+        return TestFacts.model_validate(dict(document))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "file"
+        raise FileFormatError(
+            f"{name}: {where}: {first['msg']}.",
+            code="facts_invalid",
+            field=where,
+            remedy="Correct it; docs/report.md lists what can be told.",
+        ) from error
+
+
+def load_facts(path: Path) -> TestFacts:
+    """Read a facts.toml.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``, ``file_unreadable``, ``facts_invalid``.
+    """
+    try:
+        return parse_facts(tomllib.loads(path.read_text(encoding="utf-8")), name=str(path))
+    except FileNotFoundError as error:
+        raise FileFormatError(f"{path} does not exist.", code="file_missing", remedy="Check the path.") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise FileFormatError(f"{path} cannot be read as TOML: {error}.") from error

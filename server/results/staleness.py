@@ -1,0 +1,128 @@
+"""Whether results still belong to what lies beside them: inputs that are gone or were replaced since make them stale.
+
+A result file holds the SHA-256 of everything it was made from. Files that have not been touched since their step was
+committed are not read again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from server.formats.files import known_sha256
+from server.store.durable import known_json
+
+CAMERAS = ("cam1", "cam2")
+
+
+def stale_inputs(
+    test: Path,
+    steps: Mapping[int, Mapping[str, Any]],
+    *,
+    calibration: Path | None,
+    calibration_sha256: str | None,
+    reference: int,
+) -> list[str]:
+    """Return what is gone or differs in a test's folder from what an analysis was made of; empty: it stands.
+
+    Parameters
+    ----------
+    test
+        The test's folder, with ``steps/<nnnn>/``.
+    steps
+        By step, by camera, the checksums that the analysis was made with.
+    calibration, calibration_sha256
+        The calibration's file, None where it is not known, and its checksum.
+    reference
+        The reference step's number.
+    """
+    found = []
+    if calibration is not None and calibration_sha256 is not None:
+        found += _changed(calibration, calibration_sha256, f"{calibration.name}")
+    for n, hashes in sorted(steps.items()):
+        what = f"the reference, step {n}," if n == reference else f"step {n}"
+        folder = test / "steps" / f"{n:04d}"
+        mark = folder / "step.json"
+        if not mark.is_file():
+            found.append(f"{what} is gone")
+            continue
+        recorded = _recorded(mark)
+        for cam in CAMERAS:
+            image = folder / f"{cam}.tif"
+            if recorded is not None and cam in recorded and recorded[cam] != hashes.get(cam):
+                found.append(f"{cam} of {what} was replaced")
+            elif recorded is None or not image.is_file() or _touched_after(image, mark):
+                found += _changed(image, hashes.get(cam), f"{cam} of {what}")
+    return found
+
+
+def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return what was found to be gone or replaced since result files were written.
+
+    Parameters
+    ----------
+    files
+        Result files of one measurement.
+    attributes
+        Of each, as :func:`server.formats.results.reading.read_attributes` gives them.
+    """
+    folder = files[0].absolute().parent
+    summary = known_json(folder / "summary.json")
+    test = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
+    heads = list(attributes)
+    steps = {int(a["step"]): _images(a["inputs_sha256"]) for a in heads}
+    first = heads[0]["inputs_sha256"]
+    reference = int(heads[-1].get("reference_step", 0))
+    steps.setdefault(reference, {cam: heads[-1]["inputs_sha256"].get(f"reference_{cam}") for cam in CAMERAS})
+    calibration = None
+    if "calibration.json" in first and test is not None:
+        calibration = test / "calibration.json"
+    elif isinstance(summary.get("calibration"), dict):
+        calibration = Path(str(summary["calibration"].get("file")))
+        if test is not None and calibration.name == "calibration.json" and calibration.parent.name == test.name:
+            calibration = test / "calibration.json"  # whatever folder the measurement was started from
+        elif not calibration.is_absolute() and not calibration.is_file():
+            calibration = None
+    sha256 = first.get("calibration", first.get("calibration.json"))
+    found = _missing_results(folder, summary)
+    if test is not None:
+        return found + stale_inputs(
+            test, steps, calibration=calibration, calibration_sha256=sha256, reference=reference
+        )
+    if calibration is not None and calibration.is_file():  # one that was moved away may well be what it was
+        found += _changed(calibration, sha256, calibration.name)
+    for head in heads:
+        for cam in CAMERAS:
+            image = Path(str(head.get(f"{cam}_file", "")))
+            if image.is_file():
+                found += _changed(image, _images(head["inputs_sha256"]).get(cam), f"{cam} of step {int(head['step'])}")
+    return found
+
+
+def _missing_results(folder: Path, summary: dict[str, Any]) -> list[str]:
+    """Results that the measurement's own record names and that are not there."""
+    listed = [s.get("step", s.get("n")) for s in summary.get("steps", []) if isinstance(s, dict)]
+    there = {int(path.stem.removeprefix("step_")) for path in folder.glob("step_[0-9]*.nc")}
+    return [f"the result of step {n} is gone" for n in listed if isinstance(n, int) and n not in there]
+
+
+def _images(inputs: Mapping[str, str]) -> dict[str, Any]:
+    """The step's own images' checksums; the service and the command line name them differently."""
+    return {cam: inputs.get(cam, inputs.get(f"step_{cam}")) for cam in CAMERAS}
+
+
+def _changed(path: Path, sha256: Any, what: str) -> list[str]:
+    if not path.is_file():
+        return [f"{what} is gone"]
+    return [] if sha256 is None or known_sha256(path) == sha256 else [f"{what} was replaced"]
+
+
+def _touched_after(image: Path, mark: Path) -> bool:
+    """Whether an image's inode changed after its step was committed, which comes last; nobody can set that time."""
+    return image.stat().st_ctime_ns > mark.stat().st_ctime_ns
+
+
+def _recorded(mark: Path) -> dict[str, Any] | None:
+    found = known_json(mark).get("sha256")
+    return found if isinstance(found, dict) else None

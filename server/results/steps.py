@@ -1,0 +1,366 @@
+"""What an export is made of: one step at a time, read from its result file as it is, with where it comes from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import FileFormatError, InputError
+from core.field.region.cuts import Cuts, from_arrays
+from core.status import PointStatus
+from server.base.errors import NotFoundError
+from server.formats.files import sha256_of
+from server.formats.version import software_version
+from server.results.reader import library
+
+ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
+_GRID = ("row", "col")
+_CALIBRATION = ("calibration", "calibration.json")  # as stereorig measure and the service name it
+
+
+@dataclass(frozen=True)
+class StepVariable:
+    """One variable of a step over the grid of points.
+
+    Attributes
+    ----------
+    values
+        (r, c) or (r, c, ...), as stored; NaN where a point has no number.
+    units, long_name
+        As stored.
+    flags
+        Name of each value of a variable of states.
+    parts
+        Names along the third axis, where the file has them.
+    """
+
+    values: NDArray[Any]
+    units: str
+    long_name: str
+    flags: dict[int, str] | None = None
+    parts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """One step's result, or the variables of it that were asked for.
+
+    Attributes
+    ----------
+    n
+        Number of the step.
+    variables
+        By name, in the file's order.
+    attributes
+        The file's own, as text and numbers.
+    cuts
+        Cracks and borders of holes.
+    """
+
+    n: int
+    variables: dict[str, StepVariable]
+    attributes: dict[str, Any]
+    cuts: Cuts | None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid."""
+        rows, cols = self.variables["x_px"].values.shape
+        return rows, cols
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(r, c) True where a point has numbers."""
+        return np.isin(self.variables["status"].values, (PointStatus.OK, PointStatus.EXTRAPOLATED))
+
+    @property
+    def load_n(self) -> float | None:
+        """Load in newtons; None where it is not known."""
+        text = self.attributes.get("load_n")
+        return None if text is None else float(text)
+
+    @property
+    def label(self) -> str:
+        """What the user called the step."""
+        return str(self.attributes.get("label", ""))
+
+
+@dataclass(frozen=True)
+class Source:
+    """Results to export, and what is known about where they come from.
+
+    Attributes
+    ----------
+    files
+        Result files of one measurement, by step.
+    name
+        What names of files start with.
+    title
+        For people: the test's name.
+    image
+        Camera 1's reference image, where it is known.
+    about
+        Further facts for every export: ids of test, analysis and calibration.
+    mask
+        The image that says where points may lie, where there was one.
+    """
+
+    files: Sequence[Path]
+    name: str
+    title: str = ""
+    image: Path | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+    mask: Path | None = None
+
+
+def number_of(path: Path) -> int:
+    """Return the step's number in the name of a result file."""
+    return int(path.stem.removeprefix("step_"))
+
+
+def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
+    """Return the result files of the steps asked for; all without a wish.
+
+    Raises
+    ------
+    NotFoundError
+        ``no_results`` without any, ``step_missing`` for one that is not there.
+    """
+    files = {number_of(path): path for path in source.files}
+    if not files:
+        raise NotFoundError(
+            "There are no finished steps to export.",
+            code="no_results",
+            remedy="Wait for the first step, or measure again.",
+        )
+    missing = [] if steps is None else [n for n in steps if n not in files]
+    if missing:
+        raise NotFoundError(
+            f"There is no result for step {missing[0]}.",
+            code="step_missing",
+            remedy="Ask for steps that are finished.",
+            available=sorted(files),
+        )
+    return [files[n] for n in sorted(files if steps is None else set(steps))]
+
+
+def read_step(path: Path, names: Sequence[str] | None = None, *, always: Sequence[str] = ALWAYS) -> StepResult:
+    """Read a result file, or some of its variables.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    names
+        Variables to read; those of ``always`` are read in any case. None: all over the grid of points.
+    always
+        What the form needs: places and status.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``, ``file_unreadable``.
+    NotFoundError
+        ``field_missing``, with the names that there are.
+    """
+    if not path.exists():
+        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
+    try:
+        with library, netCDF4.Dataset(path, "r") as data:
+            data.set_auto_mask(False)
+            return _read(path, data, names, always)
+    except OSError as error:
+        raise FileFormatError(f"{path.name} cannot be read: {error}.", file=path.name) from error
+
+
+def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[str]) -> StepResult:
+    over_grid = [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
+    lacking = [name for name in ALWAYS if name not in over_grid]
+    if lacking:
+        raise FileFormatError(f"{path.name} is no result: it lacks {', '.join(lacking)}.", file=path.name)
+    missing = [name for name in names or () if name not in over_grid]
+    if missing:
+        raise NotFoundError(
+            f"{path.name} has no variable {missing[0]!r} over its points; it has {', '.join(over_grid)}.",
+            code="field_missing",
+            remedy="Use one of these names.",
+            available=sorted(over_grid),
+        )
+    wanted = set(over_grid) if names is None else {*always, *names}
+    variables = {name: _variable(data.variables[name]) for name in over_grid if name in wanted}
+    cuts = None
+    if "cut_line" in data.variables:
+        points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
+        cuts = from_arrays(points, np.asarray(data.variables["cut_line"][...], dtype=np.int32))
+    attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
+    return StepResult(int(attributes.get("step", number_of(path))), variables, attributes, cuts)
+
+
+def _variable(variable: Any) -> StepVariable:
+    flags = None
+    if "flag_meanings" in variable.ncattrs():
+        numbers = np.atleast_1d(variable.flag_values)
+        flags = {int(v): name for v, name in zip(numbers, variable.flag_meanings.split(), strict=True)}
+    parts = next((str(getattr(variable, a)) for a in ("comparisons", "components") if a in variable.ncattrs()), "")
+    return StepVariable(
+        np.asarray(variable[...]),
+        str(getattr(variable, "units", "1")),
+        str(getattr(variable, "long_name", "")),
+        flags,
+        tuple(parts.split()),
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, Any]:
+    """Return what every export says: software, frame, settings, calibration, inputs; values are plain.
+
+    Parameters
+    ----------
+    path
+        The result file, to say its checksum.
+    """
+    said = step.attributes
+    inputs = json.loads(said.get("inputs_sha256", "{}"))
+    document: dict[str, Any] = {
+        "software": f"stereorig {software_version()}",
+        "measured_with": said.get("source", ""),
+        "measured": said.get("created", ""),
+        "kind": said.get("kind", ""),
+        "frame": said.get("frame", ""),
+        "length_unit": "mm",
+        "settings": json.loads(said.get("settings", "{}")),
+        "calibration_sha256": calibration_of(step),
+        "inputs_sha256": inputs,
+        **source.about,
+    }
+    for name in ("strain", "smoothing", "patch_choice", "transformation"):
+        if name in said:
+            document[name] = json.loads(said[name])
+    for name in ("strain_axes", "strain_note", "patch", "patch_reason", "made_from"):
+        if name in said:
+            document[name] = said[name]
+    document["step"] = step.n
+    document["label"], document["load_n"] = step.label, step.load_n
+    if path is not None:
+        document["result_file"] = path.name
+        document["result_sha256"] = sha256_of(path)
+    return document
+
+
+def calibration_of(step: StepResult) -> str | None:
+    """Return the SHA-256 of the calibration that a step was measured with; None where the file does not say."""
+    inputs = json.loads(step.attributes.get("inputs_sha256", "{}"))
+    return next((str(inputs[name]) for name in _CALIBRATION if name in inputs), None)
+
+
+def notes_of(document: dict[str, Any]) -> list[str]:
+    """Return the few lines that a picture says of its provenance."""
+    settings = document["settings"]
+    said = [
+        f"{name} {settings[key]}{unit}"
+        for name, key, unit in (
+            ("subset", "subset_px", " px"),
+            ("step", "step_px", " px"),
+            ("patch", "patch", ""),
+            ("interpolation", "interpolation", ""),
+            ("prefilter", "prefilter_px", " px"),
+            ("smoothing window", "smoothing_window", " points"),
+        )
+        if settings.get(key)
+    ]
+    strain = document.get("strain")
+    if strain:
+        mm = strain.get("gauge_mm")
+        said.append(f"gauge {strain['gauge_px']:g} px{'' if mm is None else f' = {mm:.3g} mm'}, {strain['tensor']}")
+    calibration = document.get("calibration_id"), (document["calibration_sha256"] or "")[:12]
+    known = " ".join(str(part) for part in calibration if part) or "not known"
+    return [f"frame: {document['frame']}", f"{', '.join(said)}; calibration {known}; {document['measured_with']}"]
+
+
+def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | None = None) -> Iterator[StepResult]:
+    """Read the chosen steps one after the other; a variable that only some steps have is no error.
+
+    Raises
+    ------
+    NotFoundError
+        ``field_missing`` for a variable that no step has.
+    """
+    files = chosen(source, steps)
+    if names is None:
+        yield from (read_step(path) for path in files)
+        return
+    require_known(files, names)
+    for path in files:
+        there = variables_of(path)
+        yield read_step(path, [name for name in names if name in there])
+
+
+def require_known(files: Sequence[Path], names: Sequence[str] | None) -> None:
+    """Refuse a variable that no file has.
+
+    Raises
+    ------
+    NotFoundError
+        ``field_missing``, with the names that there are.
+    """
+    there = [set(variables_of(path)) for path in files] if names else []
+    for name in names or ():
+        if not any(name in found for found in there):
+            read_step(files[-1], [name])  # says which there are
+
+
+def variables_of(path: Path) -> list[str]:
+    """Return the names of a result file's variables over its points."""
+    try:
+        with library, netCDF4.Dataset(path, "r") as data:
+            return [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
+    except OSError as error:
+        raise FileFormatError(f"{path.name} cannot be read: {error}.", file=path.name) from error
+
+
+def require_same_grid(step: StepResult, first: StepResult) -> None:
+    """Refuse steps that lie on different grids of points.
+
+    Raises
+    ------
+    InputError
+        ``steps_mixed``.
+    """
+    same = step.shape == first.shape and all(
+        np.array_equal(step.variables[n].values, first.variables[n].values) for n in ("x_px", "y_px")
+    )
+    if not same:
+        raise InputError(
+            f"Steps {first.n} and {step.n} have different points; they cannot be stacked in one file.",
+            code="steps_mixed",
+            remedy="Export the steps of one analysis, or choose another format.",
+        )
+
+
+def columns_of(step: StepResult) -> dict[str, StepVariable]:
+    """Return a step's variables with one number a point each: comparisons apart, without covariance matrices."""
+    flat: dict[str, StepVariable] = {}
+    for name, variable in step.variables.items():
+        values = variable.values
+        if values.ndim == 2:
+            flat[name] = variable
+        elif values.ndim == 3:
+            for k in range(values.shape[2]):
+                part = variable.parts[k] if k < len(variable.parts) else str(k)
+                flat[f"{name}_{part}"] = StepVariable(
+                    values[..., k], variable.units, f"{variable.long_name}, {part}", variable.flags
+                )
+    return flat

@@ -1,0 +1,235 @@
+"""What is connected to this machine: cameras by every driver, serial ports, and what is wrong with each.
+
+Each driver looks in a thread of its own and within a time limit, so that one that hangs or misses a library spoils
+nothing but its own part of the list. Nothing is opened, and no byte goes to a serial port: a device that nobody named
+may be anything.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from core.errors import StereorigError
+from drivers.cameras.protocol import FoundDevice
+from drivers.registry import CAMERA_DRIVERS, discover_cameras
+from drivers.stages.serial_ports import discover_ports
+from server.rig import Rig
+from server.rig.cameras import CAMERAS
+
+#: name of the search for serial ports among those of the camera drivers
+SERIAL = "serial"
+
+
+class _Closed(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ListedDevice(_Closed):
+    """A camera or a serial port."""
+
+    kind: Literal["camera", "serial"] = Field(description="What it may be used as; a serial port may hold anything.")
+    driver: str = Field(description="`driver` for the rig file; empty for a serial port.", examples=["aravis"])
+    device: str = Field(
+        description="`device` (camera) or `url` (serial port) for the rig file.", examples=["Aravis-Fake-GV01"]
+    )
+    model: str = Field(description="Maker and model as the device gives them; empty if it does not.")
+    serial: str = Field(description="Serial number; empty if the device gives none.")
+    address: str = Field(description="Network address, bus position or USB ids; empty if there is none.")
+    problem: str | None = Field(description="Why it cannot be used as it is, and what to do; null if nothing is known.")
+    in_use_by: str | None = Field(description="`cam1`, `cam2` or `stage` when this service itself uses it.")
+    extra: dict[str, str] = Field(description="What else is known: `link` is a serial port's lasting name.")
+
+
+class DriverState(_Closed):
+    """How one driver's search went."""
+
+    name: str = Field(description="Name of the driver; `serial` looks for serial ports.", examples=["aravis"])
+    state: Literal["ok", "missing", "failed", "timeout"] = Field(
+        description="`missing`: a library is not installed; `timeout`: no answer in time."
+    )
+    found: int = Field(description="Devices it saw.")
+    problem: str | None = Field(description="What went wrong; null if nothing did.")
+    remedy: str | None = Field(description="What to do about it, such as what to install.")
+
+
+class DeviceListing(_Closed):
+    """Everything that was found."""
+
+    cameras: list[ListedDevice] = Field(description="Cameras that a driver sees, and those that this service holds.")
+    serial_ports: list[ListedDevice] = Field(description="Serial ports; none is opened or asked who it is.")
+    drivers: list[DriverState] = Field(description="How each driver's search went.")
+
+
+@dataclass(frozen=True)
+class HeldDevice:
+    """A device that this service has open; ``problem`` when it has lost it."""
+
+    name: str  # cam1, cam2 or stage
+    driver: str
+    device: str
+    model: str = ""
+    serial: str = ""
+    problem: str | None = None
+
+
+def held_by(rig: Rig) -> list[HeldDevice]:
+    """Say what a running rig has open, without asking any device."""
+    if rig.fault is not None:
+        return []
+    held = []
+    for cam in CAMERAS:
+        section, shown = rig.config.camera(cam), rig.describe_camera(cam)
+        device = shown["device"]
+        if device is None:  # closed in between
+            return []
+        fault = shown.get("fault")
+        held.append(
+            HeldDevice(
+                cam,
+                section.driver,
+                section.device or cam,
+                device["model"],
+                device["serial"],
+                None if fault is None else f"{fault['cause']} {fault.get('remedy', '')}".strip(),
+            )
+        )
+    held.append(HeldDevice("stage", SERIAL, rig.config.stage.url))
+    return held
+
+
+class _Search:
+    """One driver's search, in a thread of its own."""
+
+    def __init__(self, name: str, look: Callable[[], list[FoundDevice]]) -> None:
+        self.name = name
+        self._look = look
+        self._found: list[FoundDevice] = []
+        self._error: Exception | None = None
+        self.done = threading.Event()
+        threading.Thread(target=self._run, name=f"search for {name}", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            self._found = list(self._look())
+        except Exception as error:  # noqa: BLE001  # whatever a driver brings up is its own part of the list
+            self._error = error
+        finally:
+            self.done.set()
+
+    def result(self, deadline: float, limit_s: float) -> tuple[list[FoundDevice], DriverState]:
+        if not self.done.wait(max(0.0, deadline - time.monotonic())):
+            problem = f"The search has not come to an end within {limit_s:g} s."
+            remedy = "Look again in a while; unplug devices one by one if it stays so."
+            return [], DriverState(name=self.name, state="timeout", found=0, problem=problem, remedy=remedy)
+        error = self._error
+        if error is None:
+            return self._found, DriverState(
+                name=self.name, state="ok", found=len(self._found), problem=None, remedy=None
+            )
+        if isinstance(error, StereorigError):
+            state: Literal["missing", "failed"] = "missing" if error.code == "driver_missing" else "failed"
+            return [], DriverState(name=self.name, state=state, found=0, problem=error.cause, remedy=error.remedy)
+        problem = f"{type(error).__name__}: {error}"
+        if isinstance(error, ImportError):
+            remedy = "Install what the message names."
+            return [], DriverState(name=self.name, state="missing", found=0, problem=problem, remedy=remedy)
+        return [], DriverState(
+            name=self.name, state="failed", found=0, problem=problem, remedy="Report this with the message above."
+        )
+
+
+class DeviceFinder:
+    """Looks for devices; a search that still hangs is waited for, never started a second time.
+
+    Parameters
+    ----------
+    drivers
+        Names of the camera drivers; all that there are when left out.
+    discover, ports
+        What looks for cameras of one driver, and for serial ports.
+    """
+
+    def __init__(
+        self,
+        drivers: Iterable[str] | None = None,
+        *,
+        discover: Callable[[str], list[FoundDevice]] = discover_cameras,
+        ports: Callable[[], list[FoundDevice]] = discover_ports,
+    ) -> None:
+        self._drivers = sorted(CAMERA_DRIVERS if drivers is None else drivers)
+        self._discover = discover
+        self._ports = ports
+        self._lock = threading.Lock()
+        self._searches: dict[str, _Search] = {}
+
+    def find(self, *, timeout_s: float = 5.0, held: Iterable[HeldDevice] = ()) -> DeviceListing:
+        """List everything that shows itself within ``timeout_s`` seconds; ``held`` is what this service uses."""
+        deadline = time.monotonic() + timeout_s
+        with self._lock:
+            searches = [self._search(name) for name in (*self._drivers, SERIAL)]
+        results = [search.result(deadline, timeout_s) for search in searches]
+        found = [device for devices, _ in results for device in devices]
+        holders = list(held)
+        listed = [_listed(device, next((h for h in holders if _same(device, h)), None)) for device in found]
+        seen = {device.in_use_by for device in listed}
+        listed += [_unseen(holder) for holder in holders if holder.name not in seen and holder.driver != SERIAL]
+        return DeviceListing(
+            cameras=[device for device in listed if device.kind == "camera"],
+            serial_ports=[device for device in listed if device.kind == "serial"],
+            drivers=[state for _, state in results],
+        )
+
+    def _search(self, name: str) -> _Search:
+        running = self._searches.get(name)
+        if running is None or running.done.is_set():
+            look = self._ports if name == SERIAL else lambda: self._discover(name)
+            running = self._searches[name] = _Search(name, look)
+        return running
+
+
+def _same(found: FoundDevice, held: HeldDevice) -> bool:
+    if found.kind == "serial":
+        return held.driver == SERIAL and _same_path(found.device, held.device)
+    if found.driver != held.driver:
+        return False
+    return is_called(found, held.device) or (
+        bool(held.serial) and (found.serial, found.model) == (held.serial, held.model)
+    )
+
+
+def is_called(found: FoundDevice | ListedDevice, name: str) -> bool:
+    """Whether a rig file may mean this camera by ``name``: its id, address, serial number, or any path to it."""
+    known = {found.device, found.address, found.serial} - {""}
+    return name in known or any(_same_path(path, name) for path in (found.device, found.extra.get("node", "")))
+
+
+def _same_path(one: str, two: str) -> bool:
+    return one.startswith("/") and two.startswith("/") and Path(one).resolve() == Path(two).resolve()
+
+
+def _listed(found: FoundDevice, holder: HeldDevice | None) -> ListedDevice:
+    # a driver that sees the camera in use cannot know that it is we who use it
+    problem = found.problem if holder is None else holder.problem
+    fields: dict[str, Any] = vars(found) | {"problem": problem, "extra": dict(found.extra)}
+    return ListedDevice(**fields, in_use_by=None if holder is None else holder.name)
+
+
+def _unseen(holder: HeldDevice) -> ListedDevice:
+    return ListedDevice(
+        kind="camera",
+        driver=holder.driver,
+        device=holder.device,
+        model=holder.model,
+        serial=holder.serial,
+        address="",
+        problem=holder.problem,
+        in_use_by=holder.name,
+        extra={},
+    )

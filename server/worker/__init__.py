@@ -1,0 +1,1 @@
+"""The process wall: executors, the worker process, the tasks that cross it."""

@@ -1,0 +1,153 @@
+"""What runs on a Dask worker: the same task functions as in the service's own worker, one at a time in a process.
+
+Where the worker shares no disk with the service, a step comes with the content of its files and its result goes back as
+content; here it lies in a folder of its own meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import os
+import tempfile
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from server.worker import process as worker_process
+from server.worker.process import TaskChannel
+from server.worker.tasks import StepTask
+
+_REPORT_S = 0.2
+_MOST_STOPPED = 10_000
+_one_at_a_time = threading.Lock()  # kernels of numba's must not be called by two threads at once
+_stopped: OrderedDict[str, None] = OrderedDict()
+_ready = False
+
+
+def stop(name: str) -> None:
+    """Let a task that runs here end; harmless where it does not."""
+    _stopped[name] = None
+    while len(_stopped) > _MOST_STOPPED:
+        _stopped.popitem(last=False)
+
+
+class _Channel(TaskChannel):
+    """Progress through the scheduler, a few times a second; cancellation by :func:`stop`."""
+
+    def __init__(self, name: str, tell: Callable[[dict[str, Any]], None]) -> None:
+        super().__init__(lambda _: None, 0, None)
+        self._name = name
+        self._tell = tell
+        self._next = 0.0
+        self._stage = ""
+
+    @property
+    def cancelled(self) -> bool:
+        return self._name in _stopped
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if stage != self._stage or now >= self._next:
+            self._stage, self._next = stage, now + _REPORT_S
+            self._tell({"task": self._name, "stage": stage, "done": done, "total": total})
+
+
+def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args: Any) -> Any:
+    """Run a task that finds its files by their paths.
+
+    Parameters
+    ----------
+    name
+        Of the task, for :func:`stop` and for its progress.
+    topic
+        Where its progress is told.
+    threads
+        Kernel threads of this worker.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    with _one_at_a_time:
+        _prepare(threads)
+        channel = _Channel(name, lambda said: worker.log_event(topic, said))
+        worker_process._current = channel
+        try:
+            channel.check()
+            return function(*args)
+        finally:
+            worker_process._current = None
+
+
+def _prepare(threads: int) -> None:
+    global _ready
+    if _ready:
+        return
+    cv2 = importlib.import_module("cv2")
+    cv2.setNumThreads(1)
+    kernels = importlib.import_module("core.threads")
+    kernels.set_threads(min(threads, kernels.available_threads()))
+    _ready = True
+
+
+def run_with_files(
+    name: str, topic: str, threads: int, function: Callable[[StepTask], Any], task: StepTask, contents: dict[str, bytes]
+) -> tuple[Any, dict[str, bytes]]:
+    """Run a step with the content of its files; return the function's answer, and the files that it wrote.
+
+    Parameters
+    ----------
+    contents
+        By path on the service's machine, every file that the step reads.
+    """
+    place = _folder() / hashlib.sha256(task.folder.encode()).hexdigest()[:24]
+    local = {path: place / f"{hashlib.sha256(path.encode()).hexdigest()[:16]}-{Path(path).name}" for path in contents}
+    folder = place / "results"
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, content in contents.items():
+        target = folder / Path(path).name if Path(path).parent == Path(task.folder) else local[path]
+        local[path] = target
+        # the reference's files are the same each time: what is there is not written again
+        if not target.exists() or target.stat().st_size != len(content) or target.read_bytes() != content:
+            aside = target.with_name(f".{target.name}.{os.getpid()}.part")
+            aside.write_bytes(content)
+            aside.replace(target)
+    there = {str(path): str(target) for path, target in local.items()}
+    moved = replace(
+        task,
+        folder=str(folder),
+        calibration=there[task.calibration],
+        images={which: there[path] for which, path in task.images.items()},
+        noise=None if task.noise is None else there[task.noise],
+        averages={there[path]: value for path, value in task.averages.items() if path in there},
+        earlier={
+            n: replace(step, images=(there[step.images[0]], there[step.images[1]])) for n, step in task.earlier.items()
+        },
+        following=None,
+    )
+    answer = run(name, topic, threads, function, moved)
+    written = {}
+    for file in (f"starts_{task.n:04d}.npz", f"step_{task.n:04d}.nc"):  # the result last
+        if (folder / file).is_file():
+            written[file] = (folder / file).read_bytes()
+    with contextlib.suppress(OSError):  # read once
+        for which in ("cur1", "cur2"):
+            if task.images[which] not in (task.images["ref1"], task.images["ref2"]):
+                Path(moved.images[which]).unlink(missing_ok=True)
+    return answer, written
+
+
+_kept: tempfile.TemporaryDirectory[str] | None = None
+
+
+def _folder() -> Path:
+    """This process' own folder; it goes with the process."""
+    global _kept
+    if _kept is None:
+        _kept = tempfile.TemporaryDirectory(prefix="stereorig-")
+    return Path(_kept.name)

@@ -1,0 +1,139 @@
+"""The compute worker's side: one process, spawned, with warm kernels.
+
+Imports nothing heavy before the thread counts are pinned, since the numerical libraries read them once, when they are
+loaded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import faulthandler
+import gc
+import importlib
+import logging
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from typing import Any
+
+from core.compiling import COMPILING, told_when_compiling
+from core.errors import Cancelled
+from server.base.memory import settle
+from server.base.priority import end_with_parent, lower_worker
+
+_log = logging.getLogger("stereorig.worker")
+_current: TaskChannel | None = None
+
+
+class TaskChannel:
+    """A running task's way back to whoever asked for it: progress out, cancellation in."""
+
+    def __init__(self, send: Callable[[tuple[Any, ...]], None], task_id: int, cancel: Event | None) -> None:
+        self._send = send
+        self._task_id = task_id
+        self._cancel = cancel
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether the task should stop."""
+        return self._cancel is not None and self._cancel.is_set()
+
+    def check(self) -> None:
+        """Raise :class:`core.errors.Cancelled` if the task should stop."""
+        if self.cancelled:
+            raise Cancelled("The computation was cancelled.")
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Report progress."""
+        self._send(("progress", self._task_id, stage, done, total))
+
+
+def current_task() -> TaskChannel:
+    """Return the running task's channel; one that leads nowhere outside the worker (another executor, a test)."""
+    return _current if _current is not None else TaskChannel(lambda _: None, 0, None)
+
+
+def pin_threads(threads: int) -> None:
+    """Set the thread counts of every numerical library; before they are imported."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    os.environ["NUMBA_NUM_THREADS"] = str(threads)
+
+
+class LogHandler(logging.Handler):
+    """Sends log records to the service, which knows whose task it was and how lines are to look."""
+
+    def __init__(self, send: Callable[[tuple[Any, ...]], None]) -> None:
+        super().__init__()
+        self._send = send
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record, its arguments and traceback as text."""
+        travelling = copy.copy(record)
+        travelling.msg, travelling.args = record.getMessage(), None
+        if record.exc_info:
+            travelling.exc_text = logging.Formatter().formatException(record.exc_info)
+            travelling.exc_info = None
+        with contextlib.suppress(OSError):  # the service is gone
+            self._send(("log", travelling))
+
+
+def serve(
+    connection: Connection, cancel: Event, threads: int, warm_up: str | None, log_level: int = logging.WARNING
+) -> None:
+    """Run tasks from ``connection`` one after another until it closes."""
+    global _current
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to handle
+    faulthandler.enable()  # a fault in compiled code leaves its place on the terminal
+    end_with_parent()
+    pin_threads(threads)
+    import cv2
+
+    cv2.setNumThreads(1)
+    lock = threading.Lock()
+
+    def send(message: tuple[Any, ...]) -> None:
+        with lock:
+            connection.send(message)
+
+    logging.getLogger().addHandler(LogHandler(send))
+    logging.getLogger().setLevel(max(log_level, logging.INFO))  # below it, others' libraries tell all they do
+    if warm_up is not None:
+        module, name = warm_up.split(":")
+        try:
+            with told_when_compiling(lambda: send(("compiling",))):
+                getattr(importlib.import_module(module), name)(threads)
+        except Exception:  # noqa: BLE001 - the first task will say what is wrong to somebody who asked
+            _log.exception("warming up failed")
+    settle()
+    lower_worker()  # not before: somebody waits for it to be ready
+    send(("ready",))
+    while True:
+        try:
+            task_id, function, args, kwargs = connection.recv()
+        except (EOFError, OSError):
+            return  # the service is gone
+        _current = channel = TaskChannel(send, task_id, cancel)
+        try:
+            with told_when_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
+                result = function(*args, **kwargs)
+        except BaseException as error:  # noqa: BLE001 - carried back to the caller
+            _reply_error(send, task_id, error)
+        else:
+            send(("result", task_id, result))
+        _current = result = args = kwargs = None
+        # by number, what a task leaves in circles is little to the collector; by size it is images
+        gc.collect()
+
+
+def _reply_error(send: Callable[[tuple[Any, ...]], None], task_id: int, error: BaseException) -> None:
+    trace = "".join(traceback.format_exception(error))
+    try:
+        send(("error", task_id, error, trace))
+    except Exception:  # noqa: BLE001 - an error that cannot be pickled still has its text
+        send(("error", task_id, RuntimeError(f"{type(error).__name__}: {error}"), trace))

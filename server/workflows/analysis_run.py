@@ -1,0 +1,323 @@
+"""An analysis at work: one task a step in the worker, each step's file announced once it can be read.
+
+A run knows nothing that the folder does not: it begins anew, goes on where another one stopped, or follows a test, and
+measures each step from the same steps before it in any case.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from typing import Any
+
+from core.errors import Cancelled, FileFormatError, MeasurementError, StereorigError, StorageError
+from server.base.json_values import without_nan
+from server.base.problem import problem_of
+from server.formats.files import sha256_of
+from server.jobs.job import Job, Waiting
+from server.store.tests import StepFiles
+from server.worker.dask_cluster import ClusterError
+from server.worker.executor import WorkerDiedError
+from server.worker.tasks import EarlierStep, StepTask, measure_step
+from server.workflows.camera_identity import check_same_cameras
+from server.workflows.noise_sequence import averages_of
+from server.workflows.service import Service
+from server.workflows.waiting import run_side_by_side, run_task
+
+
+class StepsFailedError(MeasurementError):
+    """Some steps could not be measured; the others were, and are kept."""
+
+    code = "steps_failed"
+    remedy = "Read each step's problem in the summary; the other steps' results stand."
+
+
+def calibration_changed(where: str) -> FileFormatError:
+    """Return the error for a calibration that was replaced."""
+    return FileFormatError(
+        f"calibration.json {where} is not the one it was made with.",
+        code="calibration_changed",
+        remedy="Restore the file from a backup, or make a new test with the other calibration.",
+        file="calibration.json",
+    )
+
+
+def is_independent(document: dict[str, Any]) -> bool:
+    """Whether the steps of an analysis need no step but the reference."""
+    return bool(document["kind"] == "profile" or document["settings"].get("start_from") == "reference")
+
+
+class AnalysisRun:
+    """The compute phase of one job; called again when the job that follows a test is woken.
+
+    Parameters
+    ----------
+    test_id
+        The test; the analysis is in the job's subject.
+    """
+
+    def __init__(self, service: Service, test_id: str) -> None:
+        self._service = service
+        self._test_id = test_id
+        self._loaded = False
+        self._document: dict[str, Any] = {}
+        self._summaries: dict[int, dict[str, Any]] = {}  # of the steps that are finished
+        self._failed: dict[int, StereorigError] = {}  # in this run
+        self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from
+        self._next = 0  # place of that step
+
+    def __call__(self, job: Job) -> dict[str, Any]:
+        """Measure what is not measured yet: a step that fails does not take the others with it.
+
+        Raises
+        ------
+        StereorigError
+            What went wrong with the reference; or, with the same code, with the first other step that failed.
+        Waiting
+            It follows a test and has measured all that there is.
+        """
+        if not self._loaded:
+            self._load(job)
+        while True:
+            self._measure(job)
+            if job.follows is None:
+                break
+            finishing = job.finishing.is_set()  # asked before looking: what landed before it is measured
+            if self._take_new_steps():
+                continue
+            if finishing:
+                break
+            count = len(self._document["steps"])
+            job.progress("waiting for the next step", 1000 * count, 1000 * count)
+            raise Waiting
+        steps = self._document["steps"]
+        job.progress("done", 1000 * len(steps), 1000 * len(steps))
+        return self._result(job)
+
+    def _load(self, job: Job) -> None:
+        """Take over what another run finished; a result without summary, or damaged, is measured again."""
+        tests, analysis_id = self._service.tests, job.subject["analysis_id"]
+        self._document = tests.analysis(self._test_id, analysis_id)
+        known = tests.step_summaries(self._test_id, analysis_id)
+        for n in self._document["steps"]:
+            with contextlib.suppress(StereorigError):
+                tests.result_file(self._test_id, analysis_id, n)
+                if n in known:
+                    self._summaries[n] = known[n]
+        self._loaded = True
+        self._tell(job)
+
+    def _tell(self, job: Job) -> None:
+        """Put what is finished into the job's result."""
+        finished = [self._summaries[n] for n in self._document["steps"] if n in self._summaries]
+        job.result = {
+            "analysis_id": self._document["id"],
+            "test_id": self._test_id,
+            "steps_finished": [s["n"] for s in finished],
+            "steps": finished,
+        }
+
+    def _measure(self, job: Job) -> None:
+        steps: list[int] = self._document["steps"]
+        if is_independent(self._document):
+            self._measure_side_by_side(job)
+            return
+        while self._next < len(steps):
+            n = steps[self._next]
+            if n in self._summaries:
+                self._done[n] = self._service.tests.step(self._test_id, n)
+            else:
+                job.check()
+                self._service.require_room()  # while what the job ends with can still be written
+                self._measure_one(job, self._next, n)
+            self._next += 1
+
+    def _measure_one(self, job: Job, index: int, n: int) -> None:
+        service, document, steps = self._service, self._document, self._document["steps"]
+
+        def progress(stage: str, found: int, of: int) -> None:
+            # steps are the unit a user thinks in; within a step, the points found so far
+            fraction = min(found / of, 1.0) if of > 0 else 0.0
+            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * len(steps))
+
+        started = time.monotonic()
+        try:
+            self._check_cameras(n)
+            task = task_of(service, document, n, self._done, steps[index + 1] if index + 1 < len(steps) else None)
+            summary = run_task(service.executor, job, measure_step, task, progress=progress)
+        except StereorigError as error:
+            self._note_failure(n, error)
+            return
+        self._note(job, n, summary, started)
+
+    def _measure_side_by_side(self, job: Job) -> None:
+        """Measure steps that need no other than the reference, as many at once as there are workers."""
+        steps: list[int] = self._document["steps"]
+        if self._next == 0 and self._document["kind"] == "displacement":  # the others need it
+            if steps[0] not in self._summaries:
+                job.check()
+                self._measure_one(job, 0, steps[0])
+            self._next = 1
+        open_steps = [n for n in steps[self._next :] if n not in self._summaries]
+        began = time.monotonic()
+        shares: dict[int, float] = {}
+
+        def tasks() -> Iterator[tuple[int, Callable[[], StepTask]]]:
+            for n in open_steps:
+                try:
+                    self._check_cameras(n)
+                    task = task_of(self._service, self._document, n, {}, None)
+                except StereorigError as error:
+                    self._note_failure(n, error)
+                    continue
+                yield n, lambda task=task: task  # type: ignore[misc]
+
+        def progress(n: int, stage: str, share: float) -> None:
+            shares[n] = share
+            done = len(self._summaries) + len(self._failed) + sum(shares.values())
+            text = f"step {n}: {stage}" if len(shares) < 2 else f"{len(shares)} steps at once"
+            job.progress(text, round(1000 * min(done, len(steps))), 1000 * len(steps))
+
+        def ended(n: int, future: Future[Any]) -> None:
+            shares.pop(n, None)
+            try:
+                summary = future.result()
+            except StereorigError as error:
+                self._note_failure(n, error)
+            else:
+                self._note(job, n, summary, began)
+
+        run_side_by_side(self._service.executor, job, measure_step, tasks(), ended, progress)
+        self._next = len(steps)
+
+    def _note_failure(self, n: int, error: StereorigError) -> None:
+        """Keep a step's own failure; raise what is not its own doing, or what nothing can go on without."""
+        displacement = self._document["kind"] == "displacement"
+        if isinstance(error, Cancelled | StorageError | WorkerDiedError | ClusterError):
+            raise error
+        if displacement and n == self._document["steps"][0]:
+            raise error
+        self._failed[n] = error
+
+    def _note(self, job: Job, n: int, summary: dict[str, Any], started: float) -> None:
+        """A step is finished: durable first, then told."""
+        service, analysis_id = self._service, self._document["id"]
+        summary = without_nan({"n": n, **summary, "wall_s": round(time.monotonic() - started, 3)})
+        service.tests.put_step_summary(self._test_id, analysis_id, n, summary)
+        self._summaries[n] = summary
+        self._done[n] = service.tests.step(self._test_id, n)
+        self._tell(job)
+        service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
+
+    def _check_cameras(self, n: int) -> None:
+        """Refuse a step of other cameras: what lands later was not there to be checked when the analysis was made."""
+        if not self._document.get("follow"):
+            return
+        calibration = self._service.tests.calibration_file(self._test_id)
+        check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.get("cameras"), f"Step {n}")
+
+    def _take_new_steps(self) -> bool:
+        """Make the steps that have landed since part of the analysis; whether there are any."""
+        tests, steps = self._service.tests, self._document["steps"]
+        known = set(steps)
+        new = [n for n in tests.step_numbers(self._test_id) if n > steps[0] and n not in known]
+        if new:
+            hashes = {str(n): tests.step(self._test_id, n).document["sha256"] for n in new}
+            self._document = tests.extend_analysis(self._test_id, self._document["id"], new, hashes)
+        return bool(new)
+
+    def _result(self, job: Job) -> dict[str, Any]:
+        self._tell(job)
+        assert job.result is not None
+        if self._failed:
+            first = min(self._failed)
+            job.result["steps_failed"] = {str(n): problem_of(error) for n, error in self._failed.items()}
+            raise StepsFailedError(
+                f"{len(self._failed)} of {len(self._document['steps'])} steps failed; step {first}: "
+                f"{self._failed[first].cause}",
+                code=self._failed[first].code,
+                remedy=self._failed[first].remedy,
+                steps_failed=sorted(self._failed),
+            )
+        return job.result
+
+
+def task_of(
+    service: Service, document: dict[str, Any], n: int, done: dict[int, StepFiles], following: int | None
+) -> StepTask:
+    """Return the task of one step, its inputs compared with those that the analysis was made of."""
+    test_id, displacement = document["test_id"], document["kind"] == "displacement"
+    reference = document["steps"][0] if displacement else n
+    ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
+    for k, step in ((reference, ref), (n, now)):
+        if step.document["sha256"] != document["inputs"]["steps"][str(k)]:
+            raise FileFormatError(
+                f"Step {k} of test {test_id} was replaced since the analysis was made.",
+                code="step_changed",
+                remedy="Start a new analysis.",
+            )
+    if sha256_of(service.tests.calibration_file(test_id)) != document["inputs"]["calibration_sha256"]:
+        raise calibration_changed(f"of test {test_id}, on which the analysis rests,")
+    checksums = {
+        "calibration.json": document["inputs"]["calibration_sha256"],
+        **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
+        **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
+    }
+    noise = document["settings"].get("noise")
+    if noise:
+        checksums["noise.json"] = noise["sha256"]
+    earlier: dict[int, StepFiles] = {}
+    if displacement and document["settings"].get("reference_update", "never") != "never":
+        earlier = {k: step for k, step in done.items() if k != reference}
+    after = None
+    if following is not None and displacement:
+        with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
+            after = service.tests.step(test_id, following)
+    return StepTask(
+        folder=str(service.tests.analysis_path(test_id, document["id"])),
+        calibration=str(service.tests.calibration_file(test_id)),
+        kind="motion" if n != reference else "shape",
+        n=n,
+        reference=reference,
+        images={"ref1": str(ref.cam1), "ref2": str(ref.cam2), "cur1": str(now.cam1), "cur2": str(now.cam2)},
+        previous=next(reversed(done), None),
+        keeps_starts=displacement and (n == reference or not is_independent(document)),
+        settings=document["settings"],
+        inputs=checksums,
+        noise=str(service.tests.analysis_path(test_id, document["id"]) / "noise.json") if noise else None,
+        averages={
+            str(path): averages_of(step.document)
+            for step in (ref, now, after, *earlier.values())
+            if step is not None
+            for path in (step.cam1, step.cam2)
+        },
+        label=now.document["label"],
+        load_n=now.document["load_n"],
+        following=None if after is None else (str(after.cam1), str(after.cam2)),
+        earlier={
+            k: EarlierStep(
+                (str(step.cam1), str(step.cam2)), (step.document["sha256"]["cam1"], step.document["sha256"]["cam2"])
+            )
+            for k, step in earlier.items()
+        },
+    )
+
+
+def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
+    """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
+    found = job.result or {}
+    document = {
+        "analysis_id": analysis_id,
+        "state": state,
+        "job_id": job.id,
+        "problem": job.problem,
+        "steps": found.get("steps", []),
+        "steps_failed": found.get("steps_failed", {}),
+    }
+    service.tests.put_summary(test_id, analysis_id, document)
+    if state == "succeeded":
+        service.tests.drop_starts(test_id, analysis_id)
+    else:
+        service.tests.drop_half_written(test_id, analysis_id)  # by a worker that was ended in the middle

@@ -1,0 +1,187 @@
+"""Analyses: what is checked before one is begun, beginning one, and going on with one that was interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from core.errors import InputError, StateError
+from server.compute.region import make_grid
+from server.formats.files import sha256_of
+from server.formats.images import decode_mask, read_image
+from server.formats.version import software_version
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import Job, Phase
+from server.results.staleness import stale_inputs
+from server.store.index import analysis_entry
+from server.workflows.analysis_run import AnalysisRun, calibration_changed, close
+from server.workflows.service import Service
+
+
+def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:
+    """Return the steps of an analysis, the reference first.
+
+    Raises
+    ------
+    StateError
+        ``no_steps`` if the reference does not exist.
+    InputError
+        ``step_missing`` if a step that was asked for does not exist, or all are and one is gone.
+    """
+    there = service.tests.step_numbers(test_id)
+    if reference not in there:
+        raise StateError(
+            f"Test {test_id} has no step {reference} to refer to; it has {len(there)} steps.",
+            code="no_steps",
+            remedy="Capture or import the reference first.",
+        )
+    everything = wanted is None
+    if wanted is None:
+        wanted = [n for n in there if n > reference]
+    missing = [n for n in wanted if n not in there]
+    if missing:
+        raise InputError(
+            f"Test {test_id} has no step {missing[0]}.", code="step_missing", remedy="Ask for steps that exist."
+        )
+    # an incomplete step keeps its folder and its number; one that was deleted is not missed
+    numbers = {*there, *service.tests.incomplete_steps(test_id), *service.tests.deleted_steps(test_id)}
+    gone = [n for n in range(reference, max(numbers)) if n not in numbers]
+    if gone and everything:
+        raise InputError(
+            f"Step {gone[0]} of test {test_id} is gone; steps up to {max(numbers)} were taken.",
+            code="step_missing",
+            remedy="Restore its folder from a backup, or name the steps to measure.",
+        )
+    return [reference, *[n for n in dict.fromkeys(wanted) if n != reference]]
+
+
+def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Path) -> dict[str, Any]:
+    """Checksums of everything that an analysis reads, fixed when it is made."""
+    return {
+        "calibration_sha256": sha256_of(calibration),
+        "steps": {str(n): service.tests.step(test_id, n).document["sha256"] for n in steps},
+    }
+
+
+def stale_reasons(service: Service, test_id: str, document: dict[str, Any]) -> list[str]:
+    """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
+    test, inputs = service.tests.path(test_id), document.get("inputs", {})
+    return stale_inputs(
+        test,
+        {int(n): hashes for n, hashes in inputs.get("steps", {}).items()},
+        calibration=test / "calibration.json",
+        calibration_sha256=inputs.get("calibration_sha256"),
+        reference=document["steps"][0],
+    )
+
+
+def check_calibration(service: Service, test_id: str, calibration: Path) -> None:
+    """Refuse a calibration other than the one the test was made with.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_changed``.
+    """
+    made_with = service.tests.read(test_id).get("calibration_sha256")
+    if made_with is not None and sha256_of(calibration) != made_with:
+        raise calibration_changed(f"of test {test_id}")
+
+
+def check_region(service: Service, test_id: str, reference: int, settings: dict[str, Any], mask: bytes | None) -> None:
+    """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
+    image = read_image(service.tests.step(test_id, reference).cam1)
+    make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
+
+
+def submit(
+    service: Service,
+    test_id: str,
+    prepare: Callable[[Job], dict[str, Any]],
+    request: RequestMark | None,
+    *,
+    follow: bool = False,
+) -> Job:
+    """Queue the measurement of the analysis that ``prepare`` makes or finds.
+
+    Raises
+    ------
+    QueueFullError
+        Too many computations wait.
+    """
+    job = service.jobs.submit(
+        "analysis",
+        "an analysis",
+        {"test_id": test_id},
+        [Phase("compute", AnalysisRun(service, test_id))],
+        prepare=prepare,
+        request=request,
+        follows=test_id if follow else None,
+        on_end=lambda job, state: close(service, job, test_id, job.subject["analysis_id"], state),
+    )
+    analysis_id = job.subject["analysis_id"]
+    stored = service.tests.analysis(test_id, analysis_id)
+    service.catalog.put_entry("analysis", test_id, analysis_id, analysis_entry({**stored, "job_id": job.id}))
+    return job
+
+
+def continue_analysis(
+    service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool = False
+) -> Job:
+    """Queue what an analysis has not measured yet, on the same inputs, with the same settings.
+
+    Parameters
+    ----------
+    other_version
+        Go on although another version of the program began it.
+
+    Raises
+    ------
+    StateError
+        ``analysis_running``, ``analysis_finished``, ``analysis_stale`` or ``software_changed``.
+    """
+    with service.continuing:  # two at once would both find nobody at work
+        return _continue(service, test_id, analysis_id, request, other_version=other_version)
+
+
+def _continue(service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool) -> Job:
+    document = service.tests.analysis(test_id, analysis_id)
+    runs = service.tests.analysis_jobs(test_id, analysis_id)
+    if runs and service.jobs.is_active(runs[-1]["job_id"]):
+        raise StateError(
+            f"Analysis {analysis_id} is being worked on.",
+            code="analysis_running",
+            remedy="Follow its job, or cancel it first.",
+            job_id=runs[-1]["job_id"],
+        )
+    summary = service.tests.summary(test_id, analysis_id)
+    if summary is not None and summary["state"] == "succeeded":
+        raise StateError(
+            f"Analysis {analysis_id} is finished: nothing is left to continue.",
+            code="analysis_finished",
+            remedy="Start a new analysis for other steps.",
+        )
+    stale = stale_reasons(service, test_id, document)
+    if stale:
+        raise StateError(
+            f"Analysis {analysis_id} cannot go on: {'; '.join(stale)}.",
+            code="analysis_stale",
+            remedy="Restore the files from a backup, or start a new analysis.",
+            reasons=stale,
+        )
+    begun_by, now = document.get("software"), software_version()
+    if begun_by != now and not other_version:
+        raise StateError(
+            f"Analysis {analysis_id} was begun by version {begun_by}, this is {now}: its steps might not agree.",
+            code="software_changed",
+            remedy="Start a new analysis, or send other_version = true.",
+            begun_by=begun_by,
+            now=now,
+        )
+
+    def prepare(job: Job) -> dict[str, Any]:
+        service.tests.add_analysis_job(test_id, analysis_id, {"job_id": job.id, **request.document()})
+        return {"analysis_id": analysis_id}
+
+    return submit(service, test_id, prepare, request, follow=bool(document.get("follow")))

@@ -1,0 +1,116 @@
+"""A burst: steps at an interval, as one job that holds the cameras; each step is durable before it is told."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from core.errors import MeasurementError, StereorigError
+from server.base.metrics import timed_capture
+from server.base.problem import problem_of
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import Job, Phase
+from server.workflows.capture import commit_pair, take_pair
+from server.workflows.service import Service
+
+_LOOK_S = 0.02
+#: what one pair can suffer and the next be spared; anything else ends the burst
+_OF_THE_PAIR = frozenset({"skew_too_large", "pair_incomplete", "frame_incomplete"})
+
+
+class BurstIncompleteError(MeasurementError):
+    """Some steps of a burst were not taken; the others were, and are kept."""
+
+    code = "burst_incomplete"
+    remedy = "Read the job's result: steps that were taken, and each failure's problem. Take the missing ones again."
+
+
+def start_burst(
+    service: Service,
+    test_id: str,
+    facts: dict[str, Any],
+    *,
+    count: int,
+    interval_ms: float,
+    frames: int,
+    request: RequestMark,
+) -> str:
+    """Take ``count`` steps, ``interval_ms`` from one beginning to the next; return the job's id.
+
+    Raises
+    ------
+    BusyError
+        Somebody has the cameras.
+    StorageError
+        ``storage_full``.
+    """
+    service.require_room()
+    job = service.jobs.submit(
+        "burst",
+        f"a burst of {count} steps",
+        {"test_id": test_id},
+        [Phase("hardware", lambda job: _run(service, job, test_id, facts, count, interval_ms, frames))],
+        request=request,
+    )
+    return job.id
+
+
+def _run(
+    service: Service, job: Job, test_id: str, facts: dict[str, Any], count: int, interval_ms: float, frames: int
+) -> dict[str, Any]:
+    steps: list[dict[str, Any]] = []
+    failures: list[dict[str, Any]] = []
+    result: dict[str, Any] = {"test_id": test_id, "count": count, "steps": steps, "failures": failures}
+    job.result = result
+    began = time.monotonic()
+    first_ns: int | None = None
+    for index in range(count):
+        job.progress("steps", index, count)
+        _wait_until(job, began + index * interval_ms / 1000.0)
+        place = {"job_id": job.id, "index": index, "count": count, "interval_ms": interval_ms}
+        try:
+            step = _take(service, job, test_id, facts, frames, place, first_ns)
+        except StereorigError as error:
+            if error.code not in _OF_THE_PAIR:
+                raise
+            failures.append({"index": index, "problem": problem_of(error)})
+            continue
+        first_ns = step["host_monotonic_ns"] if first_ns is None else first_ns
+        told = {"index": index, "n": step["n"], "since_first_ms": step["burst"]["since_first_ms"]}
+        steps.append({**told, "quality": step["quality"]["code"], "sha256": step["sha256"]})
+    job.progress("steps", count, count)
+    if failures:
+        first = failures[0]
+        raise BurstIncompleteError(
+            f"{len(failures)} of {count} steps were not taken; the first, number {first['index']}: "
+            f"{first['problem']['cause']}",
+            failed=[failure["index"] for failure in failures],
+        )
+    return result
+
+
+@timed_capture("capture")
+def _take(
+    service: Service,
+    job: Job,
+    test_id: str,
+    facts: dict[str, Any],
+    frames: int,
+    place: dict[str, Any],
+    first_ns: int | None,
+) -> dict[str, Any]:
+    service.require_room()
+    taken = take_pair(service.rig, frames, job.check)
+    since_ns = 0 if first_ns is None else taken.shot.host_ns - first_ns
+    burst = {**place, "since_first_ms": round(since_ns / 1e6, 3)}
+    return commit_pair(service, test_id, {**facts, "burst": burst}, taken)
+
+
+def _wait_until(job: Job, moment: float) -> None:
+    """Wait, and look every 20 ms whether the burst is to end; one that is late goes on at once."""
+    while True:
+        job.check()
+        left = moment - time.monotonic()
+        if left <= 0.0:
+            return
+        time.sleep(min(left, _LOOK_S))

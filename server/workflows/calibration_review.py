@@ -1,0 +1,127 @@
+"""Plans of calibrations before they are carried out, and what people decide on calibrations afterwards."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from core.calibration import CalibrationOptions
+from core.calibration.expect import LineModel, expect
+from core.calibration.prepare import EXPECTED_NOISE_PX
+from core.errors import StateError
+from core.target import GridTarget
+from server.compute.calibration_fit import nominals_of
+from server.store.folder import now_utc
+from server.store.index import calibration_entry
+from server.workflows.calibration_sequence import CalibrationPlan, check_plan, rig_facts, targets_of
+from server.workflows.service import Service
+
+Decision = Literal["accepted", "discarded"]
+
+
+def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None, roll_deg: float) -> dict[str, Any]:
+    """Return what a plan may be expected to leave uncertain, as the API shows it.
+
+    Raises
+    ------
+    CalibrationInputError
+        A plan that would be refused before anything moves.
+    StateError
+        Where the stage cannot go there.
+    """
+    check_plan(plan)
+    if service.rig.config.stage is not None:
+        targets_of(service, plan)
+    rig = rig_facts(service.config)
+    target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
+    model: LineModel = "parabola"
+    if plan.localiser == "profile":
+        # as core.calibration.from_images chooses
+        model = "local" if target.node_tolerance_mm > 0.0 else "straight"
+    noise = EXPECTED_NOISE_PX if noise_px is None else noise_px
+    options = CalibrationOptions(axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"])
+    told = expect(
+        plan.positions_mm, target, nominals_of(rig), options, noise_px=noise, roll_deg=roll_deg, line_model=model
+    )
+    names = ("middle", *(f"{z} {y} {x}" for z in ("back", "front") for y in ("-Y", "+Y") for x in ("-X", "+X")))
+    return {
+        "assumed": {
+            "noise_px": noise,
+            "line_model": model,
+            "roll_deg": roll_deg,
+            "text": f"Each intersection is found to {noise:g} px a coordinate ({model} lines); the cameras are the rig "
+            f"file's, look at the target's centre and see it turned by {roll_deg:g} degrees.",
+        },
+        "parameters": {n: {"value": v, "sigma": told.sigma[n]} for n, v in told.parameters.items()},
+        "points": [
+            {"name": name, "xyz_mm": xyz, "sigma_mm": sigma}
+            for name, xyz, sigma in zip(names, told.points_mm.tolist(), told.sigma_mm.tolist(), strict=True)
+        ],
+        "shape_rms_mm": told.volume.shape_rms_mm,
+        "scale": told.volume.scale,
+        "centre_px": told.volume.centre_px,
+        "standoff_relative": told.volume.standoff_relative,
+        "seen_share": {"cam1": told.seen[0], "cam2": told.seen[1]},
+        "refused": bool(told.reasons),
+        "reasons": list(told.reasons),
+    }
+
+
+def decide(service: Service, calibration_id: str, decision: Decision | None, note: str, by: str) -> None:
+    """Keep what somebody decided on a calibration; None takes an earlier decision back.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such calibration.
+    StateError
+        ``calibration_not_complete`` where there is nothing to accept.
+    """
+    state = service.calibrations.read(calibration_id)["state"]
+    if state == "unfinished" or (state != "complete" and decision == "accepted"):
+        raise StateError(
+            f"Calibration {calibration_id} is {state}.",
+            code="calibration_not_complete",
+            remedy="Decide on a calibration that has ended; only complete ones can be accepted.",
+            state=state,
+        )
+    document = None if decision is None else {"decision": decision, "note": note, "by": by, "decided_utc": now_utc()}
+    service.calibrations.put_judgement(calibration_id, document)
+    entry = calibration_entry(service.calibrations, calibration_id)
+    service.catalog.put_entry("calibration", "", calibration_id, entry)
+    service.hub.publish("calibration", {"calibration_id": calibration_id, "state": entry["state"]})
+
+
+def newest_accepted(service: Service) -> str:
+    """Return the id of the calibration that was made last of those accepted.
+
+    Raises
+    ------
+    StateError
+        ``no_calibration_accepted``.
+    """
+    accepted = [e["id"] for e in service.catalog.entries("calibration") if e.get("decision") == "accepted"]
+    if not accepted:
+        raise StateError(
+            "No calibration has been accepted.",
+            code="no_calibration_accepted",
+            remedy="Accept one (PUT /calibrations/{id}/judgement), or name one by its id.",
+        )
+    return str(max(accepted))
+
+
+def check_not_discarded(service: Service, calibration_id: str) -> None:
+    """Refuse a discarded calibration.
+
+    Raises
+    ------
+    StateError
+        ``calibration_discarded``.
+    """
+    judgement = service.calibrations.read(calibration_id).get("judgement")
+    if judgement is not None and judgement["decision"] == "discarded":
+        why = f": {judgement['note']}" if judgement.get("note") else "."
+        raise StateError(
+            f"Calibration {calibration_id} was discarded{why}",
+            code="calibration_discarded",
+            remedy="Use another one, or take the decision back.",
+        )

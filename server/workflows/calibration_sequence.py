@@ -1,0 +1,156 @@
+"""The calibration sequence: move, settle, average, read back; return to zero and look whether the grid is where it was.
+
+Each camera travels along its own optical axis. Every position is arrived at from one side (the stage driver takes up
+backlash), positions that enter the computation are read back. The fit runs in the worker once the hardware is free
+again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from core.errors import CalibrationInputError
+from server.config.rig_file import RigConfig
+from server.jobs.job import Job
+from server.rig.cameras import CAMERAS
+from server.store.index import calibration_entry
+from server.worker.tasks import FitTask, fit_calibration
+from server.workflows.service import Service
+from server.workflows.waiting import run_task
+
+SAME_POSITION_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class CalibrationPlan:
+    """What to do.
+
+    Parameters
+    ----------
+    positions_mm, held_out_mm
+        dZ of the fitted positions and of those kept for the check.
+    frames
+        Frames averaged at each position.
+    """
+
+    positions_mm: tuple[float, ...]
+    held_out_mm: tuple[float, ...]
+    frames: int
+    localiser: Literal["profile", "paper"]
+    label: str = ""
+
+    def stops_mm(self) -> list[float]:
+        """All dZ, ascending, with zero among them: the grid is looked at there first and last."""
+        return sorted({0.0, *self.positions_mm, *self.held_out_mm})
+
+
+def check_plan(plan: CalibrationPlan) -> None:
+    """Refuse a plan that cannot determine the cameras, before anything moves.
+
+    Raises
+    ------
+    CalibrationInputError
+        ``calibration_underdetermined`` or ``positions_overlap``.
+    """
+    fitted = np.unique(np.asarray(plan.positions_mm))
+    if fitted.size < 2 or np.ptp(fitted) < SAME_POSITION_MM:
+        raise CalibrationInputError(
+            f"The plan fits {fitted.size} position ({', '.join(f'{p:g} mm' for p in fitted)}); with one, a camera's "
+            "pinhole distance cannot be told from its distance to the target.",
+            remedy="Give two or more positions that lie millimetres apart.",
+        )
+    both = set(plan.positions_mm) & set(plan.held_out_mm)
+    if both:
+        raise CalibrationInputError(
+            f"Position {min(both):g} mm is both fitted and held out.",
+            code="positions_overlap",
+            remedy="Keep the positions for the check out of the fit.",
+        )
+
+
+def targets_of(service: Service, plan: CalibrationPlan) -> list[dict[int, float]]:
+    """Return the axis positions of every stop, each checked against the limits."""
+    stops = []
+    for dz in plan.stops_mm():
+        targets = service.rig.targets_for_dz(dict.fromkeys(CAMERAS, dz))
+        service.rig.check_targets(targets)
+        stops.append(targets)
+    return stops
+
+
+def take_views(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> dict[str, Any]:
+    """Hardware phase: every view on disk, with its read-back dZ."""
+    rig = service.rig
+    stops = [*plan.stops_mm(), 0.0]
+    views: list[dict[str, Any]] = []
+    cameras = rig.identities()
+    for index, dz in enumerate(stops):
+        job.check()
+        service.require_room()
+        job.progress("views", index, len(stops))
+        moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)))
+        job.check()
+        shot = rig.shoot(plan.frames, job.check)
+        role = _role(plan, dz, last=index == len(stops) - 1)
+        for cam in CAMERAS:
+            axis = rig.config.camera(cam).stage_axis
+            view = {
+                "index": index,
+                "camera": cam,
+                "device": cameras[cam],
+                "role": role,
+                "dz_mm": rig.dz_of(cam, moved[axis].position_mm),
+                "dz_commanded_mm": dz,
+                "axis": axis,
+                "position_mm": moved[axis].position_mm,
+                "frames": shot.frames,
+                "full_scale": (2 ** shot.bit_depth[cam] - 1) * shot.scale,
+                "skew_ms": shot.skew_ms,
+            }
+            views.append(view | service.calibrations.put_view(calibration_id, index, cam, shot.pixels[cam]))
+    service.calibrations.put_views_done(calibration_id, views)
+    job.progress("views", len(stops), len(stops))
+    return {"calibration_id": calibration_id, "views": len(views)}
+
+
+def _role(plan: CalibrationPlan, dz: float, *, last: bool) -> str:
+    if last:
+        return "zero_again"
+    if dz in plan.held_out_mm:
+        return "held_out"
+    return "fitted" if dz in plan.positions_mm else "zero"
+
+
+def fit(service: Service, job: Job, calibration_id: str) -> dict[str, Any]:
+    """Compute phase: find the grid in every view, adjust, check; ``calibration.json`` is there when this returns."""
+    document = service.calibrations.read(calibration_id)
+    task = FitTask(str(service.calibrations.path(calibration_id)), document["plan"], document["taken"])
+    return dict(run_task(service.worker, job, fit_calibration, task))
+
+
+def rig_facts(config: RigConfig) -> dict[str, Any]:
+    """What the fit needs of the rig file."""
+    return {
+        "name": config.rig.name,
+        "target": config.target.model_dump(mode="json"),
+        "axis_tilt_sigma_rad": config.calibration.axis_tilt_sigma_rad,
+        "cam1": config.cam1.model_dump(mode="json"),
+        "cam2": config.cam2.model_dump(mode="json"),
+    }
+
+
+def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, Any]:
+    """``plan.json``."""
+    return {**asdict(plan), "rig": rig_facts(config)}
+
+
+def close(service: Service, job: Job, calibration_id: str, state: str) -> None:
+    """Leave a record of a calibration that did not come to be, and put the index right."""
+    if state != "succeeded" and job.problem is not None:
+        service.calibrations.put_failure(calibration_id, {**job.problem, "job_state": state})
+    entry = calibration_entry(service.calibrations, calibration_id)
+    service.catalog.put_entry("calibration", "", calibration_id, entry)
+    service.hub.publish("calibration", {"calibration_id": calibration_id, "state": entry["state"]})

@@ -1,0 +1,202 @@
+"""Taking a step into a test: from the cameras, or from files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from core.errors import ImageError
+from server.base.metrics import timed_capture
+from server.formats.calibrations.recognise import load_calibration
+from server.formats.images import GrayImage, decode_image, encode_tiff
+from server.results.quality import image_quality, pair_quality
+from server.rig import Rig
+from server.rig.cameras import CAMERAS, PairShot
+from server.store.folder import now_utc
+from server.store.index import step_entry
+from server.workflows.camera_identity import check_same_cameras
+from server.workflows.service import Service
+
+#: a camera further from its calibrated place than this is off: 10 um of 400 mm change the scale by 2.5e-5
+OFF_ZERO_MM = 0.01
+
+
+@timed_capture("capture")
+def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frames: int) -> dict[str, Any]:
+    """Capture a pair and commit it as the test's next step; returns ``step.json``."""
+    service.require_room()
+    with service.gate.hold("the capture of a step", test_id=test_id):
+        taken = service.gate.call(lambda: take_pair(service.rig, frames))
+        return commit_pair(service, test_id, facts, taken)
+
+
+@dataclass(frozen=True, eq=False)
+class TakenPair:
+    """A captured pair, and what the rig was like as it was taken.
+
+    Parameters
+    ----------
+    shot
+        The images.
+    positions_mm
+        Of the stage, read back, by axis.
+    settings
+        Exposure (ms) and gain (dB) of each camera, as read back.
+    frame_counts
+        What became of each camera's frames while it was taken.
+    pair_counts
+        What became of the triggers meanwhile.
+    """
+
+    shot: PairShot
+    positions_mm: dict[int, float]
+    settings: dict[str, dict[str, float | None]]
+    frame_counts: dict[str, dict[str, int]]
+    pair_counts: dict[str, int]
+
+
+def take_pair(rig: Rig, frames: int, check: Callable[[], None] | None = None) -> TakenPair:
+    """Capture; call on the owner thread, with the hold. ``check`` may raise between the frames."""
+    pair = rig.pair
+    units = pair.units.items()
+    before, pairs_before = {cam: unit.counters() for cam, unit in units}, pair.account()
+    shot = rig.shoot(frames, check)
+    return TakenPair(
+        shot=shot,
+        positions_mm=rig.positions_mm(),
+        settings={
+            cam: {"exposure_ms": unit.settings.exposure_ms, "gain_db": unit.settings.gain_db} for cam, unit in units
+        },
+        frame_counts={cam: _difference(unit.counters(), before[cam]) for cam, unit in units},
+        pair_counts=_difference(pair.account(), pairs_before),
+    )
+
+
+def _difference(after: dict[str, int], before: dict[str, int]) -> dict[str, int]:
+    return {name: count - before.get(name, 0) for name, count in after.items()}
+
+
+def commit_pair(service: Service, test_id: str, facts: dict[str, Any], taken: TakenPair) -> dict[str, Any]:
+    """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
+
+    Raises
+    ------
+    ImageError
+        ``image_size_mismatch``.
+    StateError
+        ``wrong_camera`` when the test's calibration is other cameras'.
+    StorageError
+        It is not on disk.
+    """
+    rig, shot = service.rig, taken.shot
+    sizes: dict[str, list[int]] = {cam: [*reversed(shot.pixels[cam].shape)] for cam in CAMERAS}
+    _check_sizes(service, test_id, sizes)
+    if service.tests.is_calibrated(test_id):
+        check_same_cameras(service.tests.calibration_file(test_id), rig.identities(), "The step")
+    depth = {cam: 16 if shot.scale > 1 else shot.bit_depth[cam] for cam in CAMERAS}
+    quality = pair_quality(*(image_quality(shot.pixels[cam], depth[cam]) for cam in CAMERAS))
+    dz = {cam: rig.dz_of(cam, taken.positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
+    if quality["code"] == "ok" and max(abs(v) for v in dz.values()) > OFF_ZERO_MM:
+        quality["code"] = "cameras_off_zero"
+    quality |= {"skew_ms": shot.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": taken.pair_counts}
+    for cam in CAMERAS:
+        quality[cam] |= taken.settings[cam] | {"frames": taken.frame_counts[cam]}
+    document = {
+        **facts,
+        "source": "capture",
+        "captured_utc": now_utc(),
+        "host_monotonic_ns": shot.host_ns,
+        "skew_ms": shot.skew_ms,
+        "image_speed_px_s": shot.image_speed_px_s,
+        "cameras": rig.identities(),
+        "rig": rig.record(),
+        "frames": shot.frames,
+        "grey_scale": shot.scale,
+        "bit_depth": shot.bit_depth,
+        "frame_sequence": shot.sequence,
+        "dz_mm": dz,
+        "scene": rig.scene,
+        "quality": quality,
+        "image_size_px": sizes,
+    }
+    images: dict[str, bytes] = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
+    return _announce(service, service.tests.add_step(test_id, images, document))
+
+
+@timed_capture("import")
+def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: dict[str, Any]) -> dict[str, Any]:
+    """Commit two image files as the test's next step; returns ``step.json``.
+
+    Raises
+    ------
+    ImageError
+        A file is no gray image, or its size is not that of the test's calibration or other images; ``image_blank``,
+        ``same_image``.
+    """
+    service.require_room()
+    images: dict[str, GrayImage] = {cam: decode_image(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
+    sizes: dict[str, list[int]] = {cam: [*reversed(images[cam].shape)] for cam in CAMERAS}
+    _check_sizes(service, test_id, sizes)
+    _check_content(images)
+    depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
+    document = {
+        **facts,
+        "source": "import",
+        "captured_utc": now_utc(),
+        "skew_ms": None,
+        "bit_depth": depth,
+        "quality": pair_quality(*(image_quality(images[cam], depth[cam]) for cam in CAMERAS)),
+        "image_size_px": sizes,
+    }
+    data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
+    return _announce(service, service.tests.add_step(test_id, data, document))
+
+
+def _check_content(images: dict[str, GrayImage]) -> None:
+    """Refuse files that no camera pair can have taken; a capture of a dark scene is kept and flagged instead."""
+    for cam in CAMERAS:
+        if images[cam].min() == images[cam].max():
+            raise ImageError(
+                f"The image of {cam} is blank: every pixel is {int(images[cam].max())}.",
+                code="image_blank",
+                remedy="Check which files were exported, then import the pair again.",
+            )
+    if np.array_equal(images["cam1"], images["cam2"]):
+        raise ImageError(
+            "The images of cam1 and cam2 are the same, pixel by pixel.",
+            code="same_image",
+            remedy="Give each camera its own image.",
+        )
+
+
+def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) -> None:
+    """Refuse images that cannot be measured with the test's calibration, or with its other images."""
+    known: dict[str, tuple[str, list[int]]] = {}
+    numbers = service.tests.step_numbers(test_id)
+    if numbers:
+        first = service.tests.step(test_id, numbers[0]).document.get("image_size_px", {})
+        known |= {cam: ("the test's others are", list(size)) for cam, size in first.items()}
+    if service.tests.is_calibrated(test_id):
+        calibration = load_calibration(service.tests.calibration_file(test_id))
+        theirs = {"cam1": calibration.image_size1_px, "cam2": calibration.image_size2_px}
+        known |= {cam: ("the test's calibration is for", [*wh]) for cam, wh in theirs.items() if wh is not None}
+    for name, size in sizes.items():
+        what, other = known.get(name, ("", size))
+        if other != size:
+            raise ImageError(
+                f"The image of {name} is {size[0]} x {size[1]} px, {what} {other[0]} x {other[1]} px.",
+                code="image_size_mismatch",
+                remedy="Use images of the cameras that were calibrated, unscaled and uncropped.",
+            )
+
+
+def _announce(service: Service, step: dict[str, Any]) -> dict[str, Any]:
+    entry = step_entry(step)
+    service.catalog.put_entry("step", step["test_id"], f"{step['n']:04d}", entry)
+    job = {"job_id": step["burst"]["job_id"]} if step.get("burst") else {}
+    service.hub.publish("step", {"test_id": step["test_id"], **entry, **job})
+    service.jobs.landed(step["test_id"])
+    return step

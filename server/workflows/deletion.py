@@ -1,0 +1,116 @@
+"""Deleting: into the trash, never what a job or a capture is using."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from core.errors import StateError, StereorigError
+from server.jobs.job import ACTIVE
+from server.store.index import calibration_entry, entries_of_test
+from server.store.lost_jobs import LostJobs
+from server.store.trash import Kind
+from server.workflows.service import Service
+
+
+def delete(
+    service: Service,
+    kind: Kind,
+    ids: dict[str, Any],
+    *,
+    by: str,
+    why: str = "asked for",
+    if_still: Callable[[], bool] | None = None,
+) -> dict[str, Any] | None:
+    """Move something into the trash; return the trash's entry.
+
+    Parameters
+    ----------
+    kind, ids
+        As of `server.store.trash.Trash.put`.
+    by, why
+        Who asks, and on what occasion.
+    if_still
+        Asked once nothing can change any more; on False nothing is deleted, and None is returned.
+
+    Raises
+    ------
+    NotFoundError
+        There is no such thing.
+    StateError
+        ``in_use``, with the job or capture that uses it.
+    StorageError
+        When the disk fails.
+    """
+    name = _name(service, kind, ids)  # that it exists
+    with service.tests.still():
+        _check_unused(service, kind, ids)
+        if if_still is not None and not if_still():
+            return None
+        name = _name(service, kind, ids)
+        trash_id = service.trash.put(service.folder, kind, ids, name=name, by=by, why=why)
+    if kind != "noise":
+        entry_id = f"{ids['n']:04d}" if kind == "step" else str(ids[f"{kind}_id"])
+        parent = ids["test_id"] if kind in ("step", "analysis") else ""
+        service.catalog.remove_entry(kind, parent, entry_id)
+    service.hub.publish("deleted", {"kind": kind, **ids, "trash_id": trash_id})
+    return service.trash.entry(trash_id)
+
+
+def restore(service: Service, trash_id: str) -> dict[str, Any]:
+    """Move something back from the trash; return what it is; errors as `server.store.trash.Trash.restore`."""
+    with service.tests.still():
+        document = service.trash.restore(trash_id)
+    if document["kind"] == "calibration":
+        entry = calibration_entry(service.calibrations, document["calibration_id"])
+        service.catalog.put_entry("calibration", "", document["calibration_id"], entry)
+    elif document["kind"] != "noise":
+        for known in entries_of_test(service.tests, document["test_id"], LostJobs(), []):
+            service.catalog.put_entry(*known)
+    service.hub.publish("restored", {k: v for k, v in document.items() if k in ("kind", "n") or k.endswith("_id")})
+    return document
+
+
+def _name(service: Service, kind: Kind, ids: dict[str, Any]) -> str:
+    """What people call it; also finds out whether it is there."""
+    if kind == "test":
+        service.tests.path(ids["test_id"])
+        try:
+            return str(service.tests.read(ids["test_id"]).get("name", ""))
+        except StereorigError:
+            return ""  # what is damaged can be deleted too
+    if kind == "step":
+        try:
+            return str(service.tests.step(ids["test_id"], ids["n"]).document.get("label", ""))
+        except StereorigError as error:
+            if error.code == "not_found":
+                raise
+            return ""
+    if kind == "analysis":
+        service.tests.analysis_path(ids["test_id"], ids["analysis_id"])
+        return ""
+    if kind == "calibration":
+        service.calibrations.path(ids["calibration_id"])
+        return ""
+    service.noise.path(ids["noise_id"])
+    return ""
+
+
+def _check_unused(service: Service, kind: Kind, ids: dict[str, Any]) -> None:
+    what = {k: v for k, v in ids.items() if k != "n"}
+
+    def uses(subject: dict[str, Any]) -> bool:
+        return all(subject.get(name) == value for name, value in what.items())
+
+    for job in service.catalog.jobs(states=ACTIVE):
+        if service.jobs.is_active(job["id"]) and uses({**job["subject"], **(job["result"] or {})}):
+            raise _in_use(
+                kind, f"by job {job['id']} ({job['kind']})", "Wait for the job or cancel it.", job_id=job["id"]
+            )
+    holder = service.gate.holder
+    if holder is not None and uses(holder):
+        raise _in_use(kind, f"by {holder['what']}", "Try again when that is done.")
+
+
+def _in_use(kind: str, by: str, remedy: str, **more: Any) -> StateError:
+    return StateError(f"The {kind} is in use {by}.", code="in_use", remedy=remedy, **more)

@@ -1,0 +1,131 @@
+"""How things stand at the moment of a scrape: queue, cameras, disk, worker, stage."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from core.errors import DeviceError, StereorigError
+from drivers.stages.protocol import AxisState
+from server.formats.version import software_version
+
+if TYPE_CHECKING:
+    from server.workflows.service import Service
+
+_log = logging.getLogger("stereorig.metrics")
+_MIB = 2**20
+
+
+def _gauge(name: str, text: str, value: float) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"stereorig_{name}", text, value=value)
+
+
+class StateCollector(Collector):
+    """Reads the service when Prometheus asks; a part that cannot be read is left out, never given as zero."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    def describe(self) -> list[Metric]:
+        """Return nothing: the names are only known once they are collected."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every figure."""
+        for part in (self._general, self._jobs, self._disk, self._worker, self._readers, self._cameras, self._stage):
+            try:
+                yield from part()
+            except StereorigError as error:
+                _log.info("some figures are missing: %s", error)
+
+    def _general(self) -> Iterator[Metric]:
+        service = self._service
+        info = GaugeMetricFamily("stereorig_build_info", "The program's version; always 1.", labels=["version"])
+        info.add_metric([software_version()], 1)
+        yield info
+        yield _gauge("uptime_seconds", "Time since the service began.", time.monotonic() - service.started_monotonic)
+        yield _gauge("ready", "Whether it can capture and compute (/readyz).", not service.not_ready())
+        yield _gauge("rig_fault", "Whether the rig could not be opened.", service.rig.fault is not None)
+        yield _gauge("hardware_held", "Whether somebody uses the hardware.", service.gate.holder is not None)
+
+    def _jobs(self) -> Iterator[Metric]:
+        jobs = self._service.jobs
+        yield _gauge("jobs_active", "Jobs that have not ended.", jobs.active_count())
+        yield _gauge("compute_queue", "Jobs that wait for the worker.", jobs.waiting_count())
+        yield _gauge("compute_queue_limit", "Jobs that may wait; beyond it 503.", jobs.queue_limit)
+
+    def _disk(self) -> Iterator[Metric]:
+        service = self._service
+        usage = os.statvfs(service.folder.root)
+        yield _gauge("disk_free_bytes", "Room on the data folder's disk.", service.folder.free_mib() * _MIB)
+        yield _gauge("disk_size_bytes", "Size of the data folder's disk.", usage.f_blocks * usage.f_frsize)
+        reserve = service.config.service.free_reserve_mib * _MIB
+        yield _gauge("disk_reserve_bytes", "Room below which no step is taken.", reserve)
+
+    def _worker(self) -> Iterator[Metric]:
+        worker = self._service.worker
+        yield CounterMetricFamily("stereorig_worker_starts", "How often the compute worker was started.", worker.starts)
+        yield _gauge("worker_ready", "Whether the worker takes tasks.", worker.ready.is_set())
+        memory = _resident_bytes(worker.pid)
+        if memory is not None:
+            yield _gauge("worker_resident_bytes", "Memory of the worker.", memory)
+
+    def _readers(self) -> Iterator[Metric]:
+        readers = GaugeMetricFamily("stereorig_streams", "Streams that are open, by kind.", labels=["kind"])
+        for kind, number in self._service.streams.counts().items():
+            readers.add_metric([kind], number)
+        yield readers
+
+    def _cameras(self) -> Iterator[Metric]:
+        pair = self._service.rig.pair
+        frames = CounterMetricFamily("stereorig_frames", "What became of the frames.", labels=["camera", "what"])
+        own = GaugeMetricFamily("stereorig_camera_driver", "The driver's own counts.", labels=["camera", "what"])
+        faults = GaugeMetricFamily("stereorig_camera_fault", "Whether the camera is lost.", labels=["camera"])
+        again = CounterMetricFamily("stereorig_camera_reconnections", "Times it came back.", labels=["camera"])
+        for cam, unit in pair.units.items():
+            for what, number in unit.counters().items():
+                frames.add_metric([cam, what], number)
+            faults.add_metric([cam], unit.fault is not None)
+            again.add_metric([cam], unit.reconnections)
+            try:
+                for what, figure in unit.statistics().items():
+                    own.add_metric([cam, what], figure)
+            except DeviceError as error:  # it was lost just now
+                _log.info("no figures of %s: %s", cam, error)
+        pairs = CounterMetricFamily("stereorig_pairs", "What became of the triggers.", labels=["what"])
+        for what, number in pair.account().items():
+            pairs.add_metric([what], number)
+        yield from (frames, own, faults, again, pairs)
+
+    def _stage(self) -> Iterator[Metric]:
+        answers = GaugeMetricFamily("stereorig_stage_up", "Whether the motion controller answers.")
+        places = GaugeMetricFamily("stereorig_axis_position_mm", "Position that was read back.", labels=["axis"])
+        states = GaugeMetricFamily("stereorig_axis_state", "1 for the state the axis is in.", labels=["axis", "state"])
+        try:
+            for axis in self._service.rig.describe_stage()["axes"]:
+                number = str(axis["axis"])
+                if axis["position_mm"] is not None:
+                    places.add_metric([number], axis["position_mm"])
+                for state in AxisState:
+                    states.add_metric([number, state.value], axis["state"] == state.value)
+            answers.add_metric([], self._service.rig.fault is None)
+        except DeviceError:
+            answers.add_metric([], 0)
+        yield from (answers, places, states)
+
+
+def _resident_bytes(pid: int | None) -> int | None:
+    """Return a process' resident memory; None where there is no such process, or no /proc."""
+    if pid is None:
+        return None
+    try:
+        with open(f"/proc/{pid}/statm", encoding="ascii") as file:  # noqa: PTH123 - a pseudo file, read at each scrape
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return None

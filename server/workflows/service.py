@@ -1,0 +1,222 @@
+"""The service: every part put together once, with no globals."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from core.errors import StereorigError, StorageError
+from server.base.logs import log_job_event
+from server.base.metrics import Metrics
+from server.base.streams import Streams
+from server.config.rig_file import RigConfig
+from server.exports.aside import ExportProcess
+from server.jobs.events import EventHub
+from server.jobs.hardware import HardwareGate
+from server.jobs.idempotency import OneEffect, RequestMark
+from server.jobs.job import Job
+from server.jobs.manager import JobManager
+from server.rig import Rig
+from server.rig.build import check_config
+from server.rig.devices import DeviceFinder
+from server.store.calibrations import CalibrationStore
+from server.store.catalog import Catalog
+from server.store.folder import DataFolder
+from server.store.index import rebuild
+from server.store.noise import NoiseStore
+from server.store.tests import TestStore
+from server.store.trash import Trash
+from server.worker.dask_cluster import ClusterExecutor
+from server.worker.executor import ComputeWorker, start_worker
+from server.workflows.metrics_state import StateCollector
+
+_log = logging.getLogger("stereorig.service")
+_OPEN_WAIT_S = 5.0
+# numbers stay below 2^53, which JavaScript can hold, for some centuries
+_EVENTS_A_START = 1_000_000
+_END_MOTION_S = 2.0
+
+
+class Service:
+    """Rig, store, jobs and worker of one running service.
+
+    Parameters
+    ----------
+    config
+        The rig file.
+    data
+        The data folder; locked while the service runs.
+    record
+        File that gets a transcript of the stage's wire.
+    worker
+        One that was started already, so that it gets warm meanwhile; the service ends it.
+    """
+
+    def __init__(
+        self, config: RigConfig, data: Path, *, record: Path | None = None, worker: ComputeWorker | None = None
+    ) -> None:
+        check_config(config)
+        self.config = config
+        self.folder = DataFolder(data)
+        try:
+            self.catalog = Catalog(self.folder.root / "catalog.sqlite")
+        except BaseException:
+            self.folder.close()
+            raise
+        self.calibrations = CalibrationStore(self.folder)
+        self.tests = TestStore(self.folder)
+        self.noise = NoiseStore(self.folder)
+        self.trash = Trash(self.folder.root)
+        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
+        for line in self.differences:
+            _log.info("catalogue: %s", line)
+        self.metrics = Metrics()
+        # the clock alone may step back, and the catalogue alone may be lost
+        self.hub = EventHub(start=_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
+        self.hub.listen(self.metrics.on_event)
+        self.hub.listen(log_job_event)
+        self.streams = Streams(live_view=config.service.live_views, events=config.service.event_streams)
+        self.gate = HardwareGate()
+        self.jobs = JobManager(
+            self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
+        )
+        self.worker = worker or start_worker(config.service.kernel_threads)
+        self.executor: ComputeWorker | ClusterExecutor = self.worker  # of analyses
+        if config.compute.scheduler is not None:
+            self.executor = ClusterExecutor(
+                config.compute.scheduler, images=config.compute.images, threads=config.compute.threads_per_worker
+            )
+        self.rig = Rig(config, self.gate, self.hub.publish, record=record)
+        self.finder = DeviceFinder()
+        self.exports = ExportProcess(self.folder.root)
+        # stopping must not wait behind forty slow requests
+        self.stop_thread = ThreadPoolExecutor(max_workers=2, thread_name_prefix="stop")
+        self.abort_thread = ThreadPoolExecutor(max_workers=4, thread_name_prefix="abort")
+        self.started_monotonic = time.monotonic()
+        self.closing = False
+        #: held from the look at a thing to its change, where a client says which state it means
+        self.changes = threading.Lock()
+        self.metrics.registry.register(StateCollector(self))
+        self._effects = OneEffect(self.catalog)
+        self.continuing = threading.Lock()
+        opened = threading.Event()
+        token = self.gate.claim("the opening of the rig")
+
+        def open_rig() -> None:
+            try:
+                self.rig.open()
+            finally:
+                self.gate.release(token)
+                opened.set()
+
+        self._end: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._end_thread = threading.Thread(target=self._await_end, name="end", daemon=True)
+        self._end_thread.start()
+        self.gate.start(open_rig)
+        # so that the first request finds the rig; a device that hangs must not keep the service from starting
+        opened.wait(timeout=_OPEN_WAIT_S)
+
+    def require_room(self) -> None:
+        """Refuse with ``storage_full`` when less than the reserve is left on the disk."""
+        self.folder.require_room(self.config.service.free_reserve_mib)
+
+    def not_ready(self) -> list[dict[str, str]]:
+        """Return why nothing can be captured or computed now: code and cause each; empty when all can."""
+        reasons = []
+        if self.closing:
+            reasons.append({"code": "shutting_down", "cause": "The service is ending."})
+        if self.rig.fault is not None:
+            reasons.append({"code": str(self.rig.fault["code"]), "cause": str(self.rig.fault["cause"])})
+        if not self.worker.ready.is_set():
+            reasons.append({"code": "worker_starting", "cause": "The compute worker is starting."})
+        try:
+            self.require_room()
+        except StorageError as error:
+            reasons.append({"code": error.code, "cause": error.cause})
+        return reasons
+
+    def stop_job(self, job: Job) -> None:
+        """Stop the stage for a job that is being cancelled, if it holds the hardware."""
+        if self.rig.fault is None and self.gate.while_held_by(job.id, self.rig.stop):
+            self.stop_until_released(job.id)
+
+    def stop_until_released(self, job_id: str) -> None:
+        """Go on stopping in the background, see :meth:`_stop_until_released`."""
+        threading.Thread(target=self._stop_until_released, args=(job_id,), name="stop again", daemon=True).start()
+
+    def _stop_until_released(self, job_id: str) -> None:
+        """Stop the stage until a cancelled job has let the hardware go.
+
+        A job that passed its last check just before it was cancelled may start a motion just after the first stop.
+        Once it has let go, the next motion is somebody else's and must not be touched.
+        """
+        for _ in range(100):
+            time.sleep(0.02)
+            try:
+                if self.closing or not self.gate.while_held_by(job_id, self.rig.stop):
+                    return
+            except StereorigError as error:  # the job closes the rig just now, or the line was lost
+                _log.debug("stopping again failed: %s", error)
+
+    def is_alive(self) -> bool:
+        """Whether the threads that everything waits for run."""
+        return self.catalog.alive and self.jobs.alive
+
+    def begin_end(self) -> None:
+        """Have the stage stopped, at once and in the background; a signal handler may call it: it takes no lock."""
+        self._end.put(True)
+
+    def _await_end(self) -> None:
+        if self._end.get():
+            self._end_motion()
+
+    def _end_motion(self) -> None:
+        """Let nobody begin a motion any more, and stop the one that runs until its job has let the hardware go."""
+        self.closing = True
+        self.gate.shut()
+        self.jobs.begin_close()
+        self.jobs.cancel_hardware()
+        deadline = time.monotonic() + _END_MOTION_S
+        try:
+            while self.rig.fault is None:
+                self.rig.stop()
+                holder = self.gate.holder
+                if holder is None or "job_id" not in holder or time.monotonic() > deadline:
+                    return
+                time.sleep(0.02)
+        except Exception:  # noqa: BLE001 - closing the rig tries again
+            _log.exception("the stage could not be stopped at shutdown")
+
+    def stop_streams(self) -> None:
+        """End live views and event streams, which would otherwise outlast every shutdown."""
+        self.closing = True
+        self.hub.close()
+
+    def close(self) -> None:
+        """Stop the stage first, then jobs, worker, rig and files."""
+        self.stop_streams()
+        self.begin_end()
+        self._end_thread.join(timeout=_END_MOTION_S + 2.0)
+        self.jobs.close()
+        if self.executor is not self.worker:
+            self.executor.shutdown()
+        self.worker.shutdown()
+        self.exports.close()
+        self.gate.close()
+        self.rig.close()
+        self.stop_thread.shutdown(wait=False)
+        self.abort_thread.shutdown(wait=False)
+        self.catalog.close()
+        self.folder.close()
+
+    def once(
+        self, scope: str, key: str | None, body_sha256: str, make: Callable[[], dict[str, Any]]
+    ) -> tuple[dict[str, Any], bool]:
+        """Run ``make`` once per Idempotency-Key, see :meth:`server.jobs.idempotency.OneEffect.once`."""
+        return self._effects.once(RequestMark(scope, key, body_sha256), make)

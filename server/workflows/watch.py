@@ -1,0 +1,170 @@
+"""Watch mode: a step at each change of a channel that a script posts.
+
+What is watched lies in the test's folder, and what a change is compared with is the channel's value in the newest step
+that bears it: both outlive a restart, and a reading that asked for a step and got an error asks again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from core.errors import StateError
+from server.base.errors import NotFoundError
+from server.store.durable import read_json, write_json
+from server.store.folder import now_utc
+from server.workflows.capture import capture_step
+from server.workflows.service import Service
+
+#: watched like any channel, and kept in the steps' own field
+LOAD = "load_n"
+
+
+def value_of(step: dict[str, Any], channel: str) -> float | None:
+    """Value of a channel in a step's document, or in a reading's; None where it has none."""
+    value = step.get("load_n") if channel == LOAD else step.get("channels", {}).get(channel)
+    return None if value is None else float(value)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a reading.
+
+    Parameters
+    ----------
+    reason
+        ``first`` reading of the channel or ``changed`` enough: a step was taken. ``below_threshold`` or
+        ``channel_absent``: none was.
+    value, last_value
+        Of the watched channel, now and at the step that it is compared with.
+    n
+        Number of the step that was taken.
+    """
+
+    reason: str
+    value: float | None
+    last_value: float | None
+    n: int | None = None
+
+
+class Watches:
+    """The watches of one data folder's tests; one reading of a test at a time."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._guard = threading.Lock()
+        self._locks: dict[str, threading.Lock] = {}
+        self._known: dict[tuple[str, str], tuple[tuple[int, int], tuple[int, float] | None]] = {}
+
+    def _turn(self, test_id: str) -> threading.Lock:
+        with self._guard:
+            return self._locks.setdefault(test_id, threading.Lock())
+
+    def begin(
+        self, test_id: str, settings: dict[str, Any], allow: Callable[[dict[str, Any] | None], None] | None = None
+    ) -> dict[str, Any]:
+        """Watch a channel from now on, in place of what was watched before.
+
+        Parameters
+        ----------
+        allow
+            Is given what is watched now, None for nothing, and raises where that must not be replaced.
+        """
+        with self._turn(test_id):
+            if allow is not None:
+                there = (self._service.tests.path(test_id) / "watch.json").is_file()
+                allow(self.read(test_id) if there else None)
+            document = {**settings, "active": True, "since_utc": now_utc()}
+            write_json(self._service.tests.path(test_id) / "watch.json", document)
+        return self.read(test_id)
+
+    def end(self, test_id: str) -> dict[str, Any]:
+        """Take no further steps."""
+        with self._turn(test_id):
+            document = self._document(test_id)
+            if document["active"]:
+                write_json(self._service.tests.path(test_id) / "watch.json", {**document, "active": False})
+        return self.read(test_id)
+
+    def _document(self, test_id: str) -> dict[str, Any]:
+        path = self._service.tests.path(test_id) / "watch.json"
+        if not path.is_file():
+            raise NotFoundError(
+                f"Nothing is watched in test {test_id}.", what="watch", remedy="PUT /tests/{id}/watch with a channel."
+            )
+        return read_json(path)
+
+    def read(self, test_id: str) -> dict[str, Any]:
+        """Return what is watched, and what the next reading is compared with.
+
+        Raises
+        ------
+        NotFoundError
+            If nothing ever was.
+        """
+        document = self._document(test_id)
+        last = self._last(test_id, document["channel"])
+        n, value = (None, None) if last is None else last
+        return {**document, "last_value": value, "last_step": n}
+
+    def _last(self, test_id: str, channel: str) -> tuple[int, float] | None:
+        """Newest step that bears a channel, and its value; looked up once until there are other steps."""
+        mark = self._service.tests.steps_mark(test_id)
+        known = self._known.get((test_id, channel))
+        if known is None or known[0] != mark:
+            known = mark, self._look_up(test_id, channel)
+            self._known[test_id, channel] = known
+        return known[1]
+
+    def _look_up(self, test_id: str, channel: str) -> tuple[int, float] | None:
+        tests = self._service.tests
+        for n in reversed(tests.step_numbers(test_id)):
+            value = value_of(tests.step(test_id, n).document, channel)
+            if value is not None:
+                return n, value
+        return None
+
+    def reading(self, test_id: str, facts: dict[str, Any]) -> Outcome:
+        """Take a step if the watched channel has changed enough.
+
+        Parameters
+        ----------
+        facts
+            The reading as a step's document will hold it: ``label``, ``load_n``, ``channels``, ``timestamp_utc``.
+
+        Raises
+        ------
+        StateError
+            ``watch_off`` when nothing is watched; ``hardware_busy`` when somebody has the cameras.
+        CameraError, StorageError
+            No step was taken; the same reading may be sent again.
+        """
+        with self._turn(test_id):
+            try:
+                document = self._document(test_id)
+            except NotFoundError as error:
+                if error.context.get("what") != "watch":
+                    raise
+                document = {"active": False}
+            if not document["active"]:
+                raise StateError(
+                    f"Nothing is watched in test {test_id}: the reading would be lost.",
+                    code="watch_off",
+                    remedy="PUT /tests/{id}/watch with a channel, or POST /tests/{id}/steps.",
+                )
+            channel, threshold = str(document["channel"]), float(document["threshold"])
+            value, last = value_of(facts, channel), self._last(test_id, channel)
+            last_value = None if last is None else last[1]
+            if value is None:
+                return Outcome("channel_absent", None, last_value)
+            change = None if last_value is None else abs(value - last_value)
+            if change is not None and (change < threshold or change == 0.0):
+                return Outcome("below_threshold", value, last_value)
+            label = facts["label"] or document.get("label", "")
+            watch = {"channel": channel, "value": value, "last_value": last_value, "threshold": threshold}
+            step = capture_step(
+                self._service, test_id, {**facts, "label": label, "watch": watch}, frames=int(document["frames"])
+            )
+            return Outcome("first" if last is None else "changed", value, last_value, step["n"])

@@ -1,0 +1,100 @@
+"""The simulated rigs as the accuracy script uses them: true cameras, scenes, pictures with a stated noise."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.cameras.camera import Camera, RigidTransform
+from core.cameras.stereo import StereoPair
+from sim.render import RenderOptions, material_points, render
+from sim.scene import UPRIGHT, Scene
+from sim.surface import flat
+from sim.texture import Texture, speckle
+
+ROOT = Path(__file__).resolve().parents[3]
+ELEVEN = (
+    "phd_px",
+    "cx_px",
+    "cy_px",
+    "kappa_per_px2",
+    "aspect",
+    "alpha_rad",
+    "beta_rad",
+    "gamma_rad",
+    "x0_mm",
+    "y0_mm",
+    "z0_mm",
+)
+DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """True cameras of a rig file, and its picture size."""
+
+    pair: StereoPair
+    size_px: tuple[int, int]
+    speckle_mm: float
+    blur_px: float
+
+    def texture(self, seed: int = 1) -> Texture:
+        return speckle(diameter_mm=self.speckle_mm, seed=seed)
+
+    def shoot(
+        self, scene: Scene, *, noise: float = 2.0, seed: int = 0, cam: int | None = None, dz_mm: float = 0.0
+    ) -> list[NDArray[np.uint8]] | list[Float]:
+        """Pictures of both cameras, 8 bit with noise; unrounded where noise is 0, so that nothing but the method shows."""
+        rng = np.random.default_rng(seed)
+        out = []
+        for k, camera in enumerate((self.pair.cam1, self.pair.cam2)):
+            if cam is not None and k != cam:
+                continue
+            clean = render(
+                scene, camera.moved(dz_mm), self.size_px, options=RenderOptions(blur_px=self.blur_px, threads=2)
+            )
+            grey = DARK + (BRIGHT - DARK) * clean * (1.0 if k == 0 else 0.88)
+            if noise:
+                out.append(np.clip(np.round(grey + rng.normal(0.0, noise, grey.shape)), 0, 255).astype(np.uint8))
+            else:
+                out.append(grey)
+        return out
+
+
+def load_rig(name: str = "sim_paper") -> Rig:
+    """Read the true cameras of ``config/<name>.toml``."""
+    table = tomllib.loads((ROOT / "config" / f"{name}.toml").read_text())
+    sim = table["sim"]
+    cams = [Camera.from_paper(**{k: sim[c][k] for k in ELEVEN}) for c in ("cam1", "cam2")]
+    width, height = table["cam1"]["image_size_px"]
+    return Rig(StereoPair(*cams), (width, height), sim["speckle_mm"], sim["blur_px"])
+
+
+def plane_scene(texture: Texture, *, in_plane: Float | None = None, motion: RigidTransform | None = None) -> Scene:
+    """A speckled plane near Z_sys = 0, stretched by ``in_plane`` (2, 2) and then moved by ``motion`` (system frame)."""
+    surface = flat() if in_plane is None else flat(in_plane)
+    pose = UPRIGHT if motion is None else motion @ UPRIGHT
+    return Scene(name="plane", surface=surface, texture=texture, sys_from_body=pose)
+
+
+def true_points(scene: Scene, moved: Scene, camera: Camera, xy_px: Float) -> tuple[Float, Float]:
+    """Reference places and displacements (..., 3), system frame, of the material that camera 1's pixels see."""
+    st, lip = material_points(scene, camera, xy_px)
+    here = scene.sys_from_body.apply(scene.surface.place(st, lip))
+    there = moved.sys_from_body.apply(moved.surface.place(st, lip))
+    return here, there - here
+
+
+def turn(axis: Float, angle_rad: float, about_mm: Float | None = None) -> RigidTransform:
+    """Rotation about an axis of the system frame through ``about_mm``."""
+    n = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    K = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
+    R = np.eye(3) + np.sin(angle_rad) * K + (1 - np.cos(angle_rad)) * K @ K
+    c = np.zeros(3) if about_mm is None else np.asarray(about_mm)
+    return RigidTransform(R, c - R @ c)

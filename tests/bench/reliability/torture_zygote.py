@@ -1,0 +1,98 @@
+"""A process that has loaded everything and forks services: a thousand starts must not load the modules a thousand times.
+
+Reads a JSON object a line (``argv``, ``out``, ``err``) and answers with the process number of a service that was forked for
+it. What is forked runs the same command line on the same files as one that is started from the shell; only loading is
+spared, of the service's modules and of its worker's.
+
+    python -m tests.bench.reliability.torture_zygote
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import time
+import types
+from typing import Any
+
+from server.base.priority import end_with_parent
+from server.worker.process import pin_threads
+
+
+def load() -> None:
+    """Load what service and worker need, and run the kernels once; no thread may be left running."""
+    pin_threads(1)
+    import cv2
+
+    cv2.setNumThreads(1)
+    import uvicorn  # noqa: F401
+
+    import server.api.app
+    import server.cli.operation.serve
+    import server.compute.calibration_fit
+    import server.compute.measurement
+    import server.compute.noise_fit
+
+    server.compute.measurement.warm_up(1)
+
+
+def fork_workers() -> None:
+    """Let the services of this process fork their workers too, before they have threads and locks of their own."""
+    import server.worker.executor
+
+    fork = multiprocessing.get_context("fork")
+    server.worker.executor.multiprocessing = types.SimpleNamespace(get_context=lambda _: fork)  # type: ignore[attr-defined]
+    start = server.worker.executor.start_worker
+
+    def started(*arguments: Any, **more: Any) -> server.worker.executor.ComputeWorker:
+        worker = start(*arguments, **more)
+        while worker.pid is None:
+            time.sleep(0.001)
+        return worker
+
+    server.worker.executor.start_worker = started
+
+
+def serve(order: dict[str, Any]) -> None:
+    """Be the service; never returns."""
+    status = 70
+    try:
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        end_with_parent()
+        os.setsid()
+        for fd, path in ((1, order["out"]), (2, order["err"])):
+            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), fd)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        from server.cli.main import main
+
+        status = main(order["argv"])
+    except BaseException:  # noqa: BLE001 - whoever looks at the service finds it there
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def main() -> int:
+    """Load, then fork for every line."""
+    load()
+    fork_workers()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for what is killed
+    print(json.dumps({"ready": True}), flush=True)
+    for line in sys.stdin:
+        order = json.loads(line)
+        pid = os.fork()
+        if pid == 0:
+            serve(order)
+        print(json.dumps({"pid": pid}), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

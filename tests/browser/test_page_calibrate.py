@@ -1,0 +1,252 @@
+"""The page's calibrations in a browser: foreseen, run, seen, refused, cut short, compared, decided on."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from sim.rig import CameraName
+from tests.service.test_service_chain import SMALL
+from tests.support.page_bench import Watched, watched
+from tests.support.service_rig import wait_for_job, wait_for_rig
+
+pytestmark = pytest.mark.timeout(500)
+API = "/api/v1"
+SLOW = 200_000
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("calibrate") / "data")
+    yield made
+    made.close()
+
+
+def newest(client: httpx.Client) -> str:
+    return str(client.get(f"{API}/calibrations").json()["calibrations"][-1]["id"])
+
+
+def begin(shown: Page) -> None:
+    shown.get_by_role("button", name="Calibrate", exact=True).click()
+
+
+def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
+    client.put(f"{API}/sim/scene", json={"scene": "grid"}).raise_for_status()
+    shown = page.open("#/calibrate")
+    told = client.post(f"{API}/calibrations:expect", json={}).json()
+    expected = shown.locator('[data-role="expected"]')
+    # the same figures as the API's, before anything is begun
+    expect(expected).to_contain_text("middle of the volume")
+    z_um = 1000 * told["points"][0]["sigma_mm"][2]
+    cell = expected.locator("tbody tr").first.locator("td").last
+    assert float(cell.inner_text().split()[0]) == pytest.approx(z_um, rel=0.01)
+    shown.get_by_label("Fitted positions").fill("0, 0.05")
+    expect(expected).to_contain_text("would be refused", timeout=SLOW)
+    shown.get_by_label("Fitted positions").fill("0, 5")
+    shown.get_by_label("Held-out positions").fill("2")
+    shown.get_by_label("Frames averaged").fill("4")
+    shown.get_by_label("Label", exact=True).first.fill("morning")
+    begin(shown)
+    expect(shown.get_by_label("Progress of the calibration")).to_be_visible()
+    expect(shown.get_by_role("region", name="Verdict")).to_contain_text("morning", timeout=SLOW)
+    document = client.get(f"{API}/calibrations/{newest(client)}").json()
+    assert document["plan"]["held_out_mm"] == [2.0]
+    verdict = shown.get_by_role("region", name="Verdict")
+    for reason in document["verdict"]["reasons"]:
+        expect(verdict).to_contain_text(reason)
+    expect(shown.get_by_text(f"{document['checks']['held_out']['rbe_px']:.5f} px").first).to_be_visible()
+    # one figure of the parameters, with its uncertainty
+    expect(shown.get_by_role("region", name="Ten parameters")).to_contain_text(f"{document['cam1']['z0_mm']:.2f}")
+    # what was foreseen came to be: the simulated grid stands on its corner
+    noise = sum(document["noise_px"].values()) / 2
+    told = client.post(
+        f"{API}/calibrations:expect", json={"positions_mm": [0, 5], "noise_px": noise, "roll_deg": 45.0}
+    ).json()
+    for name, sigma in document["sigma"].items():
+        assert 0.5 < told["parameters"][name]["sigma"] / sigma < 2.0, name
+    assert told["shape_rms_mm"] == pytest.approx(document["uncertainty"]["shape_rms_mm"], rel=0.5)
+    # the crosses lie where the intersections were found, in the pixels of the picture that is shown
+    residuals = client.get(f"{API}/calibrations/{document['id']}/residuals").json()["views"]
+    image = shown.get_by_alt_text("Calibration view of cam2")
+    shown.wait_for_function("image => image.naturalWidth === 256", arg=image.element_handle())
+    shown.get_by_label("Position", exact=True).select_option(index=1)  # 2 mm, held out
+    found = next(v for v in residuals if v["camera"] == "cam2" and v["held_out"])
+    path = shown.locator('.view [data-role="nodes"]').nth(1)
+    expect(path).to_have_count(1)
+    drawn = [tuple(map(float, xy)) for xy in re.findall(r"M([-\d.]+) ([-\d.]+)h", path.get_attribute("d") or "")]
+    wanted = [tuple(xy) for row in found["found_px"] for xy in row]
+    assert len(drawn) == 81
+    assert np.abs(np.array(drawn) - wanted).max() < 1e-6
+    box = path.evaluate(
+        "path => { const b = path.getBBox(), m = path.getScreenCTM();"
+        "return [b.x * m.a + m.e, b.y * m.d + m.f, (b.x + b.width) * m.a + m.e, (b.y + b.height) * m.d + m.f] }"
+    )
+    frame = image.bounding_box()
+    assert frame is not None
+    for k, (low, size, pixels) in enumerate(((frame["x"], frame["width"], 256), (frame["y"], frame["height"], 240))):
+        values = [xy[k] for xy in wanted]
+        assert box[k] == pytest.approx(low + (min(values) + 0.5) / pixels * size, abs=1)
+        assert box[k + 2] == pytest.approx(low + (max(values) + 0.5) / pixels * size, abs=1)
+    # ten times the magnification, ten times the arrow
+    arrows = shown.locator('.view [data-role="arrows"]').nth(1)
+    slider = shown.get_by_label("Magnification of the residual arrows")
+
+    def first_arrow() -> float:
+        told_ = re.search(r"l([-\d.e]+) ([-\d.e]+)", arrows.get_attribute("d") or "")
+        assert told_ is not None
+        return float(told_[1])
+
+    slider.fill("2")
+    before = first_arrow()
+    assert before == pytest.approx(100 * found["residual_px"][0][0][0], rel=1e-6)
+    slider.fill("3")
+    assert first_arrow() == pytest.approx(10 * before, rel=1e-6)
+    page.sound()
+
+
+def test_a_scene_without_a_grid_is_refused_with_cause_and_remedy(page: Watched, client: httpx.Client) -> None:
+    client.put(f"{API}/sim/scene", json={"scene": "steel"}).raise_for_status()
+    shown = page.open("#/calibrate")
+    try:
+        begin(shown)
+        progress = shown.locator('[data-role="progress"]')
+        expect(progress.locator(".problem")).to_be_visible(timeout=SLOW)
+        problem = client.get(f"{API}/calibrations/{newest(client)}").json()["problem"]
+        expect(progress).to_contain_text(problem["cause"])
+        expect(progress).to_contain_text(problem["remedy"])
+        expect(progress).to_contain_text(problem["code"])
+        # and it is in the list as what it is
+        expect(shown.locator("tr", has_text=newest(client))).to_contain_text("failed")
+    finally:
+        client.put(f"{API}/sim/scene", json={"scene": "grid"}).raise_for_status()
+    page.sound()
+
+
+@pytest.mark.fault(34)
+def test_what_a_verdict_refused_is_shown_with_its_reasons(
+    page: Watched, client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = service.rig._devices.world
+    assert world is not None
+    expose = world.expose
+
+    # somebody leans on camera 2 while it stands at 2 mm
+    def leant_on(cam: CameraName, **how: Any) -> Any:
+        image = expose(cam, **how)
+        return np.roll(image, 1, axis=1) if cam == "cam2" and abs(world._position_mm(2) - 2.0) < 0.2 else image
+
+    monkeypatch.setattr(world, "expose", leant_on)
+    shown = page.open("#/calibrate")
+    shown.get_by_label("Fitted positions").fill("0, 5")
+    shown.get_by_label("Held-out positions").fill("2")
+    begin(shown)
+    progress = shown.locator('[data-role="progress"]')
+    expect(progress.locator(".problem")).to_contain_text("calibration_rejected", timeout=SLOW)
+    refused = newest(client)
+    document = client.get(f"{API}/calibrations/{refused}").json()
+    assert (document["state"], document["verdict"]["level"]) == ("failed", "failed")
+    assert document["checks"]["held_out"]["rbe_px"] > 10 * document["checks"]["fitted"]["rbe_px"]
+    verdict = shown.get_by_role("region", name="Verdict")
+    assert len(document["verdict"]["reasons"]) >= 1
+    for reason in document["verdict"]["reasons"]:
+        expect(verdict).to_contain_text(reason)
+    expect(verdict).to_contain_text(document["problem"]["remedy"])
+    # which view it was is seen: its arrows are the long ones
+    views = client.get(f"{API}/calibrations/{refused}/residuals").json()["views"]
+    worst = max(views, key=lambda view: float(view["rbe_px"]))
+    assert (worst["camera"], worst["held_out"]) == ("cam2", True)
+    shown.get_by_label("Position", exact=True).select_option(index=1)
+    expect(shown.get_by_text(re.compile(r"held out, dZ .*; RBE (1\.0|0\.99)\d*\spx"))).to_be_visible()
+    arrows = shown.locator('.view [data-role="arrows"]')
+    expect(arrows).to_have_count(2)
+    # long, and yet in the picture
+    found = re.search(r"l([-\d.e]+) ([-\d.e]+)", arrows.nth(1).get_attribute("d") or "")
+    assert found is not None
+    assert 25 < np.hypot(float(found[1]), float(found[2])) < 60
+    # it is there to be looked at, and for nothing else
+    expect(verdict.get_by_role("button", name="Accept", exact=True)).to_have_count(0)
+    expect(shown.get_by_label(f"Compare {refused}")).to_be_disabled()
+    for answer in (
+        client.get(f"{API}/calibrations/{refused}/file"),
+        client.post(f"{API}/tests", json={"name": "hasty", "calibration_id": refused}),
+    ):
+        assert (answer.status_code, answer.json()["code"]) == (409, "calibration_not_complete"), answer.text
+    answer = client.put(f"{API}/calibrations/{refused}/judgement", json={"decision": "accepted"})
+    assert answer.status_code == 409
+    page.sound()
+
+
+def test_cancel_and_a_camera_lost_in_mid_run_are_shown(page: Watched, client: httpx.Client, service: Service) -> None:
+    shown = page.open("#/calibrate")
+    begin(shown)
+    shown.get_by_role("button", name="Cancel").click()
+    progress = shown.locator('[data-role="progress"]')
+    expect(progress).to_contain_text("cancelled", timeout=SLOW)
+    begin(shown)
+    expect(progress).to_contain_text("taking views", timeout=SLOW)
+    service.rig.pair.units["cam2"].grabber.faults.gone = True  # type: ignore[attr-defined]
+    expect(progress.locator(".problem")).to_contain_text("cam2", timeout=SLOW)
+    expect(progress).to_contain_text("camera_lost")
+    job = wait_for_job(client, client.post(f"{API}/rig/reconnect").json()["job"])
+    assert job["state"] == "succeeded"
+    wait_for_rig(client)
+    page.sound()
+
+
+def test_import_compare_accept_discard(page: Watched, client: httpx.Client, tmp_path: Path) -> None:
+    made = next(c for c in client.get(f"{API}/calibrations").json()["calibrations"] if c["state"] == "complete")
+    document = client.get(f"{API}/calibrations/{made['id']}/file").json()
+    document["cam1"]["z0_mm"] += 10 * document["sigma"]["cam1.z0_mm"] * 2**0.5
+    file = tmp_path / "other.json"
+    file.write_text(json.dumps(document), encoding="utf-8")
+    shown = page.open("#/calibrate")
+    shown.get_by_text("Import a calibration").click()
+    shown.get_by_label("File").set_input_files(file)
+    shown.get_by_role("button", name="Import", exact=True).click()
+    expect(shown.get_by_text("is imported")).to_be_visible()
+    other = newest(client)
+    for one in (made["id"], other):
+        shown.get_by_label(f"Compare {one}").check()
+    shown.get_by_role("button", name="Compare the two chosen").click()
+    dialog = shown.get_by_role("dialog")
+    row = dialog.locator("tr", has_text="cam1 z0")
+    assert float(row.locator("td").last.inner_text().replace("−", "-")) == pytest.approx(
+        -10.0, abs=0.2
+    )  # the list is newest first
+    dialog.get_by_role("button", name="Close").click()
+
+    shown.get_by_role("button", name="Accept", exact=True).click()
+    expect(shown.get_by_role("region", name="Verdict")).to_contain_text("accepted")
+    assert client.get(f"{API}/calibrations/{other}").json()["judgement"]["decision"] == "accepted"
+    # a new test measures with it unless another one is chosen
+    shown.get_by_role("link", name="Test", exact=True).click()
+    expect(shown.get_by_label("Calibration", exact=True)).to_have_value(other)
+    shown.go_back()
+    shown.get_by_role("link", name="other.json").click()
+    shown.get_by_role("button", name="Discard", exact=True).click()
+    shown.get_by_label("Why").fill("a trial")
+    shown.get_by_role("dialog").get_by_role("button", name="Discard").click()
+    expect(shown.get_by_role("region", name="Verdict")).to_contain_text("discarded by local: a trial")
+    shown.get_by_role("button", name="Delete …").click()
+    shown.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(shown.get_by_role("link", name="other.json")).to_have_count(0)
+    assert client.get(f"{API}/calibrations/{other}").status_code == 404
+    page.sound()
+
+
+def test_on_a_tablet_nothing_hangs_over(chromium: Browser, client: httpx.Client) -> None:
+    with watched(chromium, str(client.base_url).rstrip("/"), viewport={"width": 820, "height": 1180}) as page:
+        shown = page.open("#/calibrate")
+        shown.wait_for_selector(".view")
+        assert not shown.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth")
+        page.sound()

@@ -1,0 +1,408 @@
+"""The whole job in a browser, as a user does it: rig, calibration, test, region, seeds, measurement, field, files.
+
+Everything that the page can do is done by mouse and keyboard; the API is only read, to compare. What the page cannot
+do is done to the simulated world: a camera's cable is pulled and put back.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import xarray
+from PIL import Image
+from playwright.sync_api import Locator, Page, expect
+
+from core.cameras.camera import Camera
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from tests.browser.test_page_test import Editor
+from tests.support.page_bench import Watched
+from tests.support.service_rig import SMALL, true_cameras
+
+pytestmark = pytest.mark.timeout(500)
+API = "/api/v1"
+SLOW = 200_000
+expect.set_options(timeout=30_000)  # the machine may be busy
+WIDTH, HEIGHT = 256, 240
+# load on the simulated plate in kPa, and what the load frame would tell in N
+STEPS = ((0.0, 0.0), (344.5, 193.9), (689.0, 387.8))
+# the paper's plate: radius and thickness in mm, Young's modulus in N/mm^2, Poisson's ratio
+RADIUS, THICKNESS, MODULUS, POISSON = 13.385, 0.762, 71.0e3, 0.334
+
+
+@dataclass
+class Made:
+    """What the first test leaves for those after it."""
+
+    test_id: str = ""
+    calibration_id: str = ""
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("job") / "data")
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def made() -> Made:
+    return Made()
+
+
+def sound(page: Watched, *expected: int) -> None:
+    """Nothing went elsewhere, no error, nothing refused; a camera that is busy with a capture may have no figures."""
+    busy = [line for line in page.refused if line.startswith("409")]
+    assert [one for one in busy if not re.search(r"/cameras/cam[12]/stats$", one)] == []
+    page.sound(*expected, *([409] if busy else []))
+
+
+def go(shown: Page, screen: str, heading: str) -> None:
+    """Choose a screen in the bar."""
+    shown.get_by_role("navigation", name="Screens").get_by_role("link", name=screen, exact=True).click()
+    expect(shown.get_by_role("heading", level=1, name=heading)).to_be_visible()
+
+
+def put_before_the_cameras(shown: Page, scene: str, load: float) -> None:
+    """Choose what the simulated rig sees."""
+    go(shown, "Rig", "tiny rig")
+    shown.get_by_text("Simulated scene").click()
+    shown.get_by_label("Scene", exact=True).select_option(scene)
+    shown.get_by_label("Load", exact=True).fill(str(load))
+    with shown.expect_response(lambda answer: answer.url.endswith("/sim/scene")) as told:
+        shown.get_by_role("button", name="Show it").click()
+    assert told.value.status == 200
+
+
+def live_pictures_move(shown: Page) -> None:
+    """Wait until both live views show pictures that change: each exposure has its own noise."""
+    for cam in ("cam1", "cam2"):
+        image = shown.get_by_alt_text(f"Live view of {cam}", exact=True)
+        shown.wait_for_function("image => image.naturalWidth === 256", arg=image.element_handle())
+        before = image.screenshot()
+        for _ in range(100):
+            if image.screenshot() != before:
+                break
+            shown.wait_for_timeout(100)
+        else:
+            raise AssertionError(f"the live view of {cam} stands still")
+
+
+def capture(shown: Page, label: str, load_n: float) -> Locator:
+    """Capture a step; returns the figures that are shown of it."""
+    group = shown.get_by_role("group", name="Capture")
+    group.get_by_label("Label").fill(label)
+    group.get_by_label("Load").fill(str(load_n))
+    group.get_by_role("button", name="Capture").click()
+    quality = shown.locator('[data-role="quality"]')
+    expect(quality).to_contain_text(label, timeout=SLOW)
+    return quality
+
+
+def open_test(shown: Page) -> None:
+    go(shown, "Test", "Tests")
+    shown.get_by_role("link", name="Pressure test").first.click()
+    expect(shown.get_by_role("heading", level=1, name="Pressure test")).to_be_visible()
+
+
+def deflection_mm(x: Any, y: Any, pressure_kpa: float) -> Any:
+    """W of a clamped circular plate under pressure, by the textbook; towards the cameras, so negative."""
+    stiffness = MODULUS * THICKNESS**3 / (12 * (1 - POISSON**2))
+    share = np.clip(1 - (np.hypot(x, y) / RADIUS) ** 2, 0, None)
+    return -pressure_kpa * 1e-3 * RADIUS**4 / (64 * stiffness) * share**2
+
+
+def grey_of(shot: bytes) -> int:
+    return int(np.asarray(Image.open(io.BytesIO(shot)).convert("L"))[0, 0])
+
+
+def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: Made) -> None:
+    shown = page.open()
+    live_pictures_move(shown)
+    put_before_the_cameras(shown, "grid", 0)
+
+    # calibrate by the rig file's plan, and accept
+    go(shown, "Calibrate", "Calibrate")
+    expect(shown.get_by_label("Fitted positions")).to_have_value("0, 5")
+    shown.get_by_label("Frames averaged").fill("4")
+    shown.get_by_label("Label", exact=True).first.fill("before the test")
+    shown.get_by_role("button", name="Calibrate", exact=True).click()
+    expect(shown.get_by_label("Progress of the calibration")).to_be_visible()
+    verdict = shown.get_by_role("region", name="Verdict")
+    expect(verdict).to_contain_text("before the test", timeout=SLOW)
+    expect(verdict).to_contain_text("is within 0.1 px")
+    verdict.get_by_role("button", name="Accept").click()
+    expect(verdict).to_contain_text("accepted")
+    made.calibration_id = client.get(f"{API}/calibrations").json()["calibrations"][-1]["id"]
+    expect(verdict).to_contain_text(made.calibration_id)
+
+    # a test with the accepted calibration, and what only the operator knows
+    put_before_the_cameras(shown, "plate", STEPS[0][0])
+    go(shown, "Test", "Tests")
+    expect(shown.get_by_label("Calibration", exact=True)).to_have_value(made.calibration_id)
+    shown.get_by_label("Name").fill("Pressure test")
+    shown.get_by_label("Specimen").fill("aluminium plate 7")
+    shown.keyboard.press("Tab")  # to the calibration, the notes, the button
+    shown.keyboard.press("Tab")
+    shown.keyboard.press("Tab")
+    shown.keyboard.press("Enter")
+    expect(shown.get_by_role("heading", level=1, name="Pressure test")).to_be_visible()
+    made.test_id = shown.url.split("/")[-1]
+    shown.get_by_text("Facts for the report").click()
+    shown.get_by_label("Operator").fill("A. Smith")
+    shown.get_by_role("button", name="Save the facts").click()
+    expect(shown.get_by_text("The facts are kept.")).to_be_visible()
+
+    # three steps, each with its load
+    for n, (pressure, load) in enumerate(STEPS):
+        if n:
+            put_before_the_cameras(shown, "plate", pressure)
+            open_test(shown)
+        quality = capture(shown, f"{pressure:g} kPa", load)
+        expect(quality).to_contain_text(f"Step {n}")
+        expect(shown.locator(f'[data-step="{n}"]')).to_contain_text(f"{pressure:g} kPa")
+    told = client.get(f"{API}/tests/{made.test_id}").json()["steps"]
+    assert [(one["label"], one["load_n"]) for one in told] == [(f"{p:g} kPa", load) for p, load in STEPS]
+
+    # a region, and three points in both views
+    first, second = Editor(shown), Editor(shown, 2)
+    true = true_cameras(SMALL)
+    one, two = (Camera.from_paper(**true[cam]) for cam in ("cam1", "cam2"))
+    places = np.array([[-2.4, -1.8, 0.0], [2.1, -1.5, 0.0], [0.3, 2.2, 0.0]])
+    first.drag((60, 60), (180, 170))
+    first.tool("Seed")
+    for k, (a, b) in enumerate(zip(one.project(places).xy, two.project(places).xy, strict=True)):
+        first.click(*a)
+        expect(shown.locator('[data-role="epipolar"]')).to_have_count(k + 1)
+        second.click(*b)
+        expect(shown.get_by_text("from its epipolar line")).to_have_count(k + 1)
+        shown.wait_for_timeout(350)  # two clicks, not a double one
+    shown.get_by_label("Subset", exact=True).fill("25")
+    shown.get_by_label("Step", exact=True).fill("5")
+    expect(shown.locator('[data-role="texture"]')).to_contain_text("subsets")
+    shown.get_by_role("button", name="Measure", exact=True).click()
+    progress = shown.locator('[data-role="progress"]')
+    expect(progress.get_by_label("Progress of the analysis")).to_be_visible()
+    expect(shown.locator("#bar-job")).to_contain_text("analysis")
+    expect(progress.locator(".badge")).to_have_text("succeeded", timeout=SLOW)
+    progress.get_by_role("link", name="Show results").click()
+
+    look_at_the_field(shown, client, made.test_id)
+    export_opens(shown, client, made.test_id)
+    report_says(shown)
+
+    go(shown, "Jobs & system", "Jobs and system")
+    for kind in ("calibration", "analysis"):
+        expect(shown.locator("tr", has_text=kind).first).to_contain_text("succeeded")
+    sound(page)
+
+
+def look_at_the_field(shown: Page, client: httpx.Client, test_id: str) -> None:
+    """Under the mouse, at zoom, are the right pixel, the field's value there, and the image's grey level."""
+    analysis = client.get(f"{API}/tests/{test_id}").json()["analyses"][-1]["id"]
+    canvas = shown.locator('canvas[data-role="map"][data-shown="2 w_mm reference"]')
+    expect(canvas).to_be_attached()
+    fields: dict[str, Any] = {
+        name: np.array(
+            client.get(f"{API}/tests/{test_id}/analyses/{analysis}/steps/2/fields/{name}").json()["values"], dtype=float
+        )
+        for name in ("x_px", "y_px", "w_mm", "x_mm", "y_mm", "status")
+    }
+    assert np.isin(fields["status"], (0, 10)).mean() > 0.95
+    stored = client.get(f"{API}/tests/{test_id}/steps/0/cam1", params={"format": "png"}).content
+    image = np.asarray(Image.open(io.BytesIO(stored)))
+    frame = shown.locator(".view .frame").first
+    readout = shown.locator(".view .readout").first
+    frame.scroll_into_view_if_needed()
+    spot = (131.2, 104.7)  # where the mouse is to be, px
+    shown.get_by_label("Opacity", exact=True).fill("0")
+    for turns in (0, 4, 8):  # of the wheel, over that place
+        for _ in range(turns):
+            shown.mouse.move(*on_screen(canvas, *spot))
+            shown.mouse.wheel(0, -250)
+        x, y = on_screen(canvas, *spot)
+        shown.mouse.move(x + 1, y)
+        shown.mouse.move(x, y)
+        distance = np.hypot(fields["x_px"] - spot[0], fields["y_px"] - spot[1])
+        r, c = np.unravel_index(np.argmin(distance), distance.shape)
+        expect(readout).to_have_attribute("data-value", repr(float(fields["w_mm"][r, c])))
+        expect(readout).to_have_attribute("data-column", "131")
+        expect(readout).to_have_attribute("data-row", "105")
+        expect(readout).to_contain_text(f"{fields['w_mm'][r, c]:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
+    # large as it is now, a pixel of the image is many of the screen: its middle has its grey level, but for the JPEG
+    for column, row in ((131, 105), (132, 105), (131, 103)):
+        x, y = on_screen(canvas, column, row)
+        seen = grey_of(shown.screenshot(clip={"x": int(x), "y": int(y), "width": 1, "height": 1}))
+        assert abs(seen - int(image[row, column])) <= 12
+    shown.get_by_label("Opacity", exact=True).fill("75")
+    # the whole field is the plate's
+    wrong = 1e3 * (fields["w_mm"] - deflection_mm(fields["x_mm"], fields["y_mm"], STEPS[2][0]))
+    good = np.isin(fields["status"], (0, 10))
+    assert np.abs(fields["w_mm"][good]).max() > 0.05
+    assert np.sqrt(np.mean(wrong[good] ** 2)) < 2.0  # um
+
+
+def on_screen(canvas: Locator, x: float, y: float) -> tuple[float, float]:
+    """Where a pixel lies in the window, by the transform that the browser drew it with."""
+    box = canvas.evaluate("c => { const b = c.getBoundingClientRect(); return [b.left, b.top, b.width, b.height] }")
+    return box[0] + (x + 0.5) / WIDTH * box[2], box[1] + (y + 0.5) / HEIGHT * box[3]
+
+
+def export_opens(shown: Page, client: httpx.Client, test_id: str) -> None:
+    """NetCDF and CSV as they are saved by the page hold the field that the page shows."""
+    analysis = client.get(f"{API}/tests/{test_id}").json()["analyses"][-1]["id"]
+    w = np.array(client.get(f"{API}/tests/{test_id}/analyses/{analysis}/steps/2/fields/w_mm").json()["values"], float)
+    shown.get_by_text("Export and report").click()
+    files = {}
+    for form in ("nc", "csv"):
+        shown.get_by_label("format", exact=True).select_option(form)
+        with shown.expect_download(timeout=SLOW) as saved:
+            shown.get_by_role("button", name="Save the file").click()
+        assert saved.value.suggested_filename.endswith(f".{form}")
+        files[form] = Path(saved.value.path())
+    with xarray.open_dataset(files["nc"], engine="netcdf4") as opened:
+        assert opened["w_mm"].attrs["units"] == "mm"
+        np.testing.assert_allclose(opened["w_mm"].values, w, atol=1e-12)
+    text = files["csv"].read_text(encoding="utf-8-sig")
+    rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+    assert len(rows) == w.size
+    column = next(name for name in rows[0] if name.startswith("w_mm"))
+    np.testing.assert_allclose([float(row[column]) for row in rows], w.ravel(), rtol=1e-6)
+
+
+def report_says(shown: Page) -> None:
+    """The report opens in a window of its own, whole, and says what was measured, how, and what is missing."""
+    with shown.context.expect_page(timeout=SLOW) as opened:
+        shown.get_by_role("link", name="Open the report").click()
+    report = opened.value
+    report.wait_for_load_state()
+    said = report.locator("body")
+    words = " ".join(said.inner_text().split())
+    wanted = (
+        "Pressure test Report of a displacement measurement",
+        "aluminium plate 7",
+        "A. Smith",
+        "689 kPa 387.8",
+        "Stereo angle",
+        "Subset size 25 px",
+        "Step size 5 px",
+        "Strain formulation Green-Lagrange",
+        "Calibration good",
+        "simulated rig",
+        "Laboratory not stated",
+    )
+    assert [text for text in wanted if text not in words] == [], words
+    assert report.locator("img").count() + report.locator("svg").count() > 2
+    for image in report.locator("img").all():
+        assert image.evaluate("image => image.complete && image.naturalWidth > 0")
+    report.close()
+
+
+def test_a_calibration_that_is_refused(page: Watched, client: httpx.Client, made: Made) -> None:
+    assert made.calibration_id, "the test before this one failed"
+    shown = page.open()
+    put_before_the_cameras(shown, "grid", 0)
+    go(shown, "Calibrate", "Calibrate")
+    shown.get_by_label("Fitted positions").fill("0, 0.05")
+    shown.get_by_label("Held-out positions").fill("0.02")
+    shown.get_by_label("Frames averaged").fill("1")
+    expected = shown.locator('[data-role="expected"]')
+    expect(expected).to_contain_text("Such views would be refused", timeout=SLOW)
+    expect(expected).to_contain_text("allowed are 3 px")
+    shown.get_by_role("button", name="Calibrate", exact=True).click()  # all the same
+    progress = shown.locator('[data-role="progress"]')
+    expect(progress.locator(".problem")).to_be_visible(timeout=SLOW)
+    refused = client.get(f"{API}/calibrations").json()["calibrations"][-1]
+    assert refused["state"] == "failed"
+    problem = client.get(f"{API}/calibrations/{refused['id']}").json()["problem"]
+    for part in ("cause", "remedy", "code"):
+        expect(progress).to_contain_text(problem[part])
+    expect(shown.locator("tr", has_text=refused["id"])).to_contain_text("failed")
+    # nobody can accept it, and no test can be made with it
+    panel = shown.locator("section.panel", has=shown.get_by_role("heading", name=refused["id"]))
+    expect(panel).to_contain_text(problem["cause"])
+    expect(panel.get_by_role("button", name="Accept")).to_have_count(0)
+    go(shown, "Test", "Tests")
+    choice = shown.get_by_label("Calibration", exact=True)
+    expect(choice).to_have_value(made.calibration_id)
+    assert refused["id"] not in [option.get_attribute("value") for option in choice.locator("option").all()]
+    sound(page)
+
+
+def test_a_camera_lost_in_mid_run(page: Watched, client: httpx.Client, service: Service, made: Made) -> None:
+    assert made.test_id, "the first test failed"
+    shown = page.open()
+    put_before_the_cameras(shown, "plate", STEPS[0][0])
+    open_test(shown)
+    group = shown.get_by_role("group", name="Capture")
+    group.get_by_label("Label").fill("in a row")
+    group.get_by_text("A burst").click()
+    group.get_by_label("Steps").fill("2000")
+    group.get_by_role("button", name="Capture").click()
+    expect(group.get_by_label("Progress of the burst")).to_be_visible()
+    expect(shown.locator('[data-step="4"]')).to_be_attached(timeout=SLOW)
+    cable = service.rig.pair.units["cam2"].grabber.faults  # type: ignore[attr-defined]
+    cable.gone = True
+    try:
+        problem = group.locator(".problem")
+        expect(problem).to_contain_text("cam2", timeout=SLOW)
+        expect(problem).to_contain_text("camera_lost")
+        job = client.get(f"{API}/jobs", params={"limit": 1}).json()["jobs"][0]
+        expect(problem).to_contain_text(job["problem"]["remedy"])
+        # the rig's screen says it as well, and goes on by itself once the camera is there again
+        go(shown, "Rig", "tiny rig")
+        box = shown.get_by_role("region", name="cam2", exact=True)
+        for part in ("cause", "remedy", "code"):
+            fault = client.get(f"{API}/rig").json()["cameras"]["cam2"]["fault"]
+            expect(box.get_by_role("alert")).to_contain_text(fault[part])
+        expect(shown.get_by_text("without cam2", exact=True)).to_be_visible()
+    finally:
+        cable.gone = False
+    live_pictures_move(shown)
+    expect(shown.get_by_text("without cam2", exact=True)).to_have_count(0)
+    expect(shown.locator(".problem")).to_have_count(0)
+    # what landed before is whole, and the next step has the next number
+    open_test(shown)
+    steps = client.get(f"{API}/tests/{made.test_id}").json()["steps"]
+    assert [one["n"] for one in steps] == list(range(len(steps)))
+    quality = capture(shown, "after it", 0.0)
+    expect(quality).to_contain_text(f"Step {len(steps)}: after it")
+    for cam in ("cam1", "cam2"):
+        stored = client.get(f"{API}/tests/{made.test_id}/steps/{len(steps)}/{cam}", params={"format": "png"}).content
+        assert Image.open(io.BytesIO(stored)).size == (WIDTH, HEIGHT)
+    sound(page, 503)
+
+
+def test_a_job_that_is_cancelled(page: Watched, client: httpx.Client, made: Made) -> None:
+    assert made.test_id, "the first test failed"
+    shown = page.open("#/test")
+    open_test(shown)
+    Editor(shown).drag((40, 40), (210, 200))
+    shown.get_by_label("Subset", exact=True).fill("31")
+    shown.get_by_label("Step", exact=True).fill("1")
+    shown.get_by_role("textbox", name="Steps", exact=True).fill("0-2")
+    shown.get_by_label("Label", exact=True).last.fill("too fine")
+    shown.get_by_role("button", name="Measure", exact=True).click()
+    progress = shown.locator('[data-role="progress"]')
+    expect(shown.locator("#bar-job")).to_contain_text("analysis", timeout=SLOW)
+    progress.get_by_role("button", name="Cancel").click()
+    expect(progress.locator(".badge")).to_have_text("cancelled", timeout=SLOW)
+    go(shown, "Jobs & system", "Jobs and system")
+    row = shown.locator("tbody tr").first
+    expect(row).to_contain_text("analysis")
+    expect(row).to_contain_text("cancelled")
+    expect(row.get_by_role("button", name="Cancel")).to_have_count(0)
+    # and what was cancelled is among the results as what it is
+    go(shown, "Results", "Results")
+    shown.get_by_role("link", name="too fine").click()
+    expect(shown.get_by_text("cancelled", exact=True).first).to_be_visible()
+    sound(page)

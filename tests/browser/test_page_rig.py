@@ -1,0 +1,151 @@
+"""The page in a browser: the shell, the rig's screen, jobs."""
+
+from __future__ import annotations
+
+import re
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, expect
+
+from server.http.access import KeyFile
+from server.workflows.service import Service
+from tests.support.page_bench import Watched, watched
+from tests.support.service_rig import served
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def test_both_live_views_come_and_nothing_is_asked_elsewhere(page: Watched) -> None:
+    shown = page.open()
+    for cam in ("cam1", "cam2"):
+        image = shown.get_by_alt_text(f"Live view of {cam}", exact=True)
+        expect(image).to_be_visible()
+        shown.wait_for_function("image => image.naturalWidth === 160", arg=image.element_handle())
+    expect(shown.get_by_role("button", name="STOP")).to_be_in_viewport()
+    expect(shown.locator("#bar-stage")).to_contain_text("mm")
+    expect(shown.locator(".chart canvas")).to_have_count(4)
+    page.sound()
+
+
+def test_the_grey_level_under_the_mouse_is_the_cameras_at_any_zoom(page: Watched, client: httpx.Client) -> None:
+    client.put("/api/v1/sim/scene", json={"scene": "grid"}).raise_for_status()
+    shown = page.open()
+    view = shown.locator(".view").first
+    frame = view.locator(".frame")
+    readout = view.locator(".readout")
+    for key, presses in (("0", 1), ("1", 1), ("+", 9)):
+        frame.focus()
+        for _ in range(presses):
+            shown.keyboard.press(key)
+        box = frame.bounding_box()
+        assert box is not None
+        shown.mouse.move(box["x"] + box["width"] / 2 + 3, box["y"] + box["height"] / 2 + 2)
+        expect(readout).to_have_text(re.compile("grey"))
+        shown.wait_for_timeout(300)
+        column = int(readout.get_attribute("data-column") or -1)
+        row = int(readout.get_attribute("data-row") or -1)
+        # where that pixel lies by the transform that the browser drew it with
+        corner = view.locator(".content > img").first.evaluate(
+            "(image, at) => { const box = image.getBoundingClientRect(); return [(at[0] - box.left) / box.width * 160, "
+            "(at[1] - box.top) / box.height * 144] }",
+            [box["x"] + box["width"] / 2 + 3, box["y"] + box["height"] / 2 + 2],
+        )
+        assert (column, row) == (int(corner[0]), int(corner[1]))
+        grey = re.search(r"grey (\d+) of 255", readout.inner_text())
+        assert grey is not None
+        told = client.get("/api/v1/cameras/cam1/pixel", params={"x_px": column, "y_px": row}).json()["value"]
+        assert abs(int(grey[1]) - told) <= 15  # two frames, each with its noise of 2 grey levels
+    page.sound()
+
+
+def test_settings_are_set_and_what_the_camera_took_is_told(page: Watched, client: httpx.Client) -> None:
+    shown = page.open()
+    box = shown.get_by_role("region", name="cam2", exact=True)
+    box.get_by_label("Exposure").fill("12.5")
+    box.get_by_role("button", name="Set").click()
+    expect(box.get_by_text("The camera took 12.50 ms")).to_be_visible()
+    assert client.get("/api/v1/cameras/cam2").json()["settings"]["exposure_ms"] == 12.5
+    box.get_by_label("Exposure").fill("5000")
+    box.get_by_role("button", name="Set").click()
+    # cause and remedy as the API gives them
+    notice = shown.get_by_role("alert").filter(has_text="5000")
+    expect(notice).to_be_visible()
+    page.sound(409, 422)
+    client.patch("/api/v1/cameras/cam2", json={"exposure_ms": 10.0}).raise_for_status()
+
+
+def test_overlays_lie_over_the_image(page: Watched) -> None:
+    shown = page.open()
+    view = shown.locator(".view").first
+    view.get_by_label("What is laid over cam1").select_option("texture")
+    overlay = view.locator(".content > img").nth(1)
+    shown.wait_for_function("image => image.naturalWidth > 0", arg=overlay.element_handle())
+    picture, map_ = view.locator(".content > img").first.bounding_box(), overlay.bounding_box()
+    assert picture == map_
+    expect(view.get_by_text("green: error below 0.01 px")).to_be_visible()
+    page.sound()
+
+
+def test_charts_take_the_colours_of_the_theme(page: Watched) -> None:
+    shown = page.open()
+    expect(shown.locator(".chart canvas")).to_have_count(4)
+    light, dark = "207,214,218", "55,66,74"  # --line of the style sheet
+    drawn = f"""colour => {{
+        const c = document.querySelector('.chart canvas'), seen = new Set();
+        const of = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        for (let k = 0; k < of.length; k += 4) if (of[k + 3] === 255) seen.add(String(of.slice(k, k + 3)));
+        return seen.has(colour) && !seen.has(colour === '{light}' ? '{dark}' : '{light}');
+    }}"""
+    shown.wait_for_function(drawn, arg=light)
+    shown.emulate_media(color_scheme="dark")
+    shown.wait_for_function(drawn, arg=dark)
+    shown.get_by_role("button", name="Light or dark colours").click()  # light, whatever the system has
+    shown.wait_for_function(drawn, arg=light)
+    page.sound()
+
+
+def test_jog_moves_the_axis_and_stop_is_told(page: Watched, client: httpx.Client) -> None:
+    shown = page.open()
+    axis = shown.locator('[data-axis="1"]')
+    axis.get_by_role("button", name="Jog axis 1 forth").click()
+    expect(axis.locator('[data-role="position"]')).to_have_text(re.compile(r"^1(\.0+)? ?mm|^1\.0"), timeout=15_000)
+    shown.get_by_role("button", name="STOP").click()
+    expect(shown.get_by_text("Stop is on the wire")).to_be_visible()
+    assert client.get("/api/v1/stage").json()["axes"][0]["position_mm"] == pytest.approx(1.0, abs=0.01)
+    page.sound()
+
+
+def test_by_keyboard_alone_and_on_a_tablet(chromium: Browser, client: httpx.Client) -> None:
+    with watched(
+        chromium, str(client.base_url).rstrip("/"), viewport={"width": 820, "height": 1180}, has_touch=True
+    ) as page:
+        shown = page.open()
+        shown.keyboard.press("Tab")
+        expect(shown.get_by_text("Skip to the content")).to_be_focused()
+        wide = shown.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth")
+        assert not wide
+        shown.get_by_role("link", name="Jobs & system").focus()
+        shown.keyboard.press("Enter")
+        expect(shown.get_by_role("heading", name="Jobs and system")).to_be_visible()
+        shown.keyboard.press("Escape")
+        shown.keyboard.press("Escape")
+        expect(shown.get_by_text("Stop is on the wire")).to_be_visible()
+        page.sound()
+
+
+def test_where_keys_are_needed_the_page_asks_for_one(chromium: Browser, service: Service, client: httpx.Client) -> None:
+    key = KeyFile(service.folder.root).add("page-operator", "operator")
+    with served(service, keys_required=True) as guarded, watched(chromium, str(guarded.base_url).rstrip("/")) as page:
+        page.page.goto(page.origin)
+        dialog = page.page.get_by_role("dialog", name="Log in")
+        dialog.get_by_label("Key").fill("sr_wrong")
+        dialog.get_by_role("button", name="Log in").click()
+        expect(dialog.get_by_text("This key is nobody's.")).to_be_visible()
+        dialog.get_by_label("Key").fill(key)
+        dialog.get_by_role("button", name="Log in").click()
+        expect(page.page.get_by_text("page-operator (operator)")).to_be_visible()
+        # pictures and events come with the cookie
+        image = page.page.get_by_alt_text("Live view of cam1", exact=True)
+        page.page.wait_for_function("image => image.naturalWidth === 160", arg=image.element_handle())
+        page.sound(401)

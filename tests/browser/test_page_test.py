@@ -1,0 +1,331 @@
+"""The page's tests in a browser: make one, capture, import, draw, click seeds, measure."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Locator, Page, Request, expect
+
+from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from tests.service.test_service_chain import SMALL
+from tests.support.page_bench import Watched
+from tests.support.service_rig import new_test, true_cameras
+
+pytestmark = pytest.mark.timeout(500)
+API = "/api/v1"
+SLOW = 300_000
+WIDTH, HEIGHT = 256, 240
+# width of a drawing on the screen; its bounding box would count the stroke
+ON_SCREEN = "path => path.getBBox().width * path.getScreenCTM().a"
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("page") / "data")
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def cameras() -> dict[str, dict[str, float]]:
+    return true_cameras(SMALL)
+
+
+@pytest.fixture(scope="module")
+def calibration(client: httpx.Client, cameras: dict[str, dict[str, float]]) -> str:
+    sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(cameras))})
+    assert sent.status_code == 201, sent.text
+    return str(sent.json()["id"])
+
+
+@pytest.fixture(scope="module")
+def plate(client: httpx.Client, calibration: str) -> str:
+    """A test with two steps of the plate."""
+    test_id = new_test(client, name="plate", calibration_id=calibration)
+    for load in (0.0, 344.5):
+        client.put(f"{API}/sim/scene", json={"scene": "plate", "load": load}).raise_for_status()
+        client.post(f"{API}/tests/{test_id}/steps", json={"label": f"{load} kPa"}).raise_for_status()
+    return test_id
+
+
+def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str) -> None:
+    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
+    shown = page.open("#/test")
+    shown.get_by_role("button", name="Make the test").click()
+    expect(shown.get_by_role("alert")).to_contain_text("The test has no name.")
+    shown.get_by_label("Name").fill("Plate <b> & more")
+    shown.get_by_label("Specimen").fill("aluminium")
+    shown.get_by_label("Calibration", exact=True).select_option(calibration)
+    shown.get_by_role("button", name="Make the test").click()
+    expect(shown.get_by_role("heading", name="Plate <b> & more")).to_be_visible()
+    test_id = page.page.url.split("/")[-1]
+    # facts that the report asks for
+    shown.get_by_text("Facts for the report").click()
+    shown.get_by_label("Operator").fill("A. Smith")
+    camera = shown.get_by_role("group", name="Camera 2 and its lens")
+    camera.get_by_label("Focal length").fill("50")
+    shown.get_by_role("button", name="Save the facts").click()
+    expect(shown.get_by_text("The facts are kept.")).to_be_visible()
+    assert client.get(f"{API}/tests/{test_id}/facts").json() == {
+        "operator": "A. Smith",
+        "cam2": {"lens": {"focal_length_mm": 50.0}},
+    }
+    # a step with what the load frame said, and what the pair is worth
+    group = shown.get_by_role("group", name="Capture")
+    group.get_by_label("Label").fill("1.25 kN")
+    group.get_by_label("Load").fill("1250")
+    group.get_by_label("Channels").fill("stroke_mm = 0,42")
+    group.get_by_role("button", name="Capture").click()
+    expect(shown.get_by_role("alert").filter(has_text="is no channel")).to_be_visible()
+    group.get_by_label("Channels").fill("stroke_mm = 0.42, temperature_c = -21.3")
+    group.get_by_role("button", name="Capture").click()
+    quality = shown.locator('[data-role="quality"]')
+    expect(quality).to_contain_text("Step 0: 1.25 kN", timeout=SLOW)
+    step = client.get(f"{API}/tests/{test_id}/steps/0").json()
+    assert step["channels"] == {"stroke_mm": 0.42, "temperature_c": -21.3}
+    assert step["load_n"] == 1250.0
+    expect(quality).to_contain_text(f"{step['quality']['cam2']['focus']:.3f}"[:4])
+    thumbnail = shown.locator('[data-step="0"] img')
+    shown.wait_for_function("image => image.naturalWidth === 132", arg=thumbnail.element_handle())
+    page.sound()
+
+
+def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: httpx.Client, tmp_path: Path) -> None:
+    test_id = new_test(client, name="imported")
+    rng = np.random.default_rng(5)
+    files: dict[str, list[Path]] = {"left": [], "right": []}
+    for n in (10, 2, 1):  # not as they are to come out
+        for side, value in (("left", 60), ("right", 120)):
+            image = np.clip(rng.normal(value, 12, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
+            image[0, 0] = n
+            path = tmp_path / f"{side}_{n}.png"
+            assert cv2.imwrite(str(path), image)
+            files[side].append(path)
+    shown = page.open(f"#/test/{test_id}")
+    shown.get_by_text("Import existing pairs").click()
+    shown.get_by_label("Images of camera 1").set_input_files(files["left"])
+    shown.get_by_label("Images of camera 2").set_input_files(files["right"][:2])
+    expect(shown.get_by_text("Camera 1 has 3 images, camera 2 has 2.")).to_be_visible()
+    shown.get_by_label("Images of camera 2").set_input_files(files["right"])
+    shown.get_by_role("button", name="Import", exact=True).click()
+    expect(shown.get_by_text("3 of 3 pairs are steps now.")).to_be_visible(timeout=SLOW)
+    assert [s["label"] for s in client.get(f"{API}/tests/{test_id}").json()["steps"]] == ["left_1", "left_2", "left_10"]
+    for n, number in enumerate((1, 2, 10)):
+        for cam, side in (("cam1", "left"), ("cam2", "right")):
+            data = client.get(f"{API}/tests/{test_id}/steps/{n}/{cam}", params={"format": "png"}).content
+            got = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            assert np.array_equal(got, cv2.imread(str(tmp_path / f"{side}_{number}.png"), cv2.IMREAD_UNCHANGED))
+    # without a calibration it cannot be measured, and says so
+    shown.get_by_role("button", name="Rectangle in the middle").click()
+    shown.get_by_role("button", name="Measure", exact=True).click()
+    expect(shown.get_by_role("alert").filter(has_text="calibration")).to_be_visible()
+    page.sound(409, 422)
+
+
+class Editor:
+    """Camera 1's picture, and where its pixels are by the transform that the browser drew it with."""
+
+    def __init__(self, shown: Page, camera: int = 1) -> None:
+        self.page = shown
+        self.view = shown.locator(".view").nth(camera - 1)
+        self.image = self.view.locator(".content > img").first
+        shown.wait_for_function("image => image.naturalWidth === 256", arg=self.image.element_handle())
+        self.show()
+
+    def show(self) -> None:
+        """Bring all of it into the window: what lies outside cannot be clicked."""
+        self.view.evaluate("view => view.scrollIntoView({block: 'end', behavior: 'instant'})")
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        box = self.image.bounding_box()
+        assert box is not None
+        return box["x"] + (x + 0.5) / WIDTH * box["width"], box["y"] + (y + 0.5) / HEIGHT * box["height"]
+
+    def click(self, x: float, y: float) -> None:
+        self.page.mouse.click(*self.place(x, y))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        self.page.mouse.move(*self.place(*start))
+        self.page.mouse.down()
+        middle = ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
+        self.page.mouse.move(*self.place(*middle))
+        self.page.mouse.move(*self.place(*end))
+        self.page.mouse.up()
+
+    def key(self, name: str, times: int = 1) -> None:
+        frame = self.view.locator(".frame")
+        frame.evaluate("frame => frame.focus({preventScroll: true})")
+        for _ in range(times):
+            self.page.keyboard.press(name)
+
+    def tool(self, name: str) -> None:
+        self.page.get_by_role("toolbar", name="Drawing").get_by_role("button", name=name, exact=True).click()
+        self.show()
+
+
+def asked(shown: Page, path: str, act: Callable[[], object], key: str = "", *like: Any) -> dict[str, Any]:
+    """Return the body that the page sends to an operation once this is done: the one with these numbers under a key.
+
+    What is drawn is judged a little later, so that a body from before may still be under way.
+    """
+
+    def right(request: Request) -> bool:
+        if request.method != "POST" or not request.url.endswith(path):
+            return False
+        if not key:
+            return True
+        found = np.array(json.loads(request.post_data or "{}")["region"].get(key))
+        return found.shape == np.shape(like[0]) and bool(np.abs(found - like[0]).max() <= like[1])
+
+    with shown.expect_request(right, timeout=60_000) as info:
+        act()
+    return dict(json.loads(info.value.post_data or "{}"))
+
+
+@pytest.mark.parametrize("presses", [0, 4])
+def test_the_region_that_is_posted_is_the_one_drawn(page: Watched, plate: str, presses: int) -> None:
+    shown = page.open(f"#/test/{plate}")
+    editor = Editor(shown)
+    editor.key("+", presses)
+    middle = (127.5, 119.5)
+    (x0, y0), (x1, y1) = (middle[0] - 31, middle[1] - 24), (middle[0] + 28, middle[1] + 26)
+    # to a pixel
+    sent = asked(shown, "/texture", lambda: editor.drag((x0, y0), (x1, y1)), "rectangle", [x0, y0, x1, y1], 1.0)
+    # a corner by keyboard: whole pixels; and back
+    corner = shown.get_by_role("button", name="Corner 1 of the region")
+    corner.focus()
+    before = sent["region"]["rectangle"]
+    moved = [before[0] - 1, before[1] - 10, before[2], before[3]]
+    asked(
+        shown, "/texture", lambda: (corner.press("ArrowLeft"), corner.press("Shift+ArrowUp")), "rectangle", moved, 1e-6
+    )
+    undo = shown.get_by_role("button", name="Undo")
+    asked(shown, "/texture", lambda: (undo.click(), undo.click()), "rectangle", before, 1e-6)
+    # a polygon in its place, a hole, a crack
+    corners = [(90, 85), (165, 88), (160, 150), (95, 145)]
+
+    def polygon() -> None:
+        editor.tool("Polygon")
+        for xy in corners:
+            editor.click(*xy)
+            shown.wait_for_timeout(350)
+        editor.key("Enter")
+
+    asked(shown, "/texture", polygon, "polygon", corners, 1.0)
+    hole, crack = [(110, 100), (120, 100), (115, 110)], [(130, 120), (140, 122), (150, 119)]
+    for name, points in (("Hole", hole), ("Crack line", crack)):
+        editor.tool(name)
+        for xy in points:
+            editor.click(*xy)
+            shown.wait_for_timeout(350)
+        editor.key("Enter")
+    shown.get_by_label("Subset", exact=True).fill("15")
+    shown.get_by_role("textbox", name="Steps", exact=True).fill("0")
+    sent = asked(shown, "/analyses", lambda: shown.get_by_role("button", name="Measure", exact=True).click())
+    assert np.abs(np.array(sent["region"]["holes"][0]) - hole).max() <= 1.0
+    assert np.abs(np.array(sent["region"]["cracks"][0]) - crack).max() <= 1.0
+    assert "rectangle" not in sent["region"]
+    assert sent["subset_px"] == 15
+    progress = shown.locator('[data-role="progress"]')
+    cancel: Locator = progress.get_by_role("button", name="Cancel")
+    cancel.or_(progress.locator(".badge")).first.wait_for(timeout=SLOW)
+    if cancel.is_visible():
+        cancel.click()
+    page.sound(409)  # it may have ended before the cancel came
+
+
+@pytest.mark.parametrize("camera", [1, 2])
+def test_the_grey_level_under_the_mouse_is_the_recorded_one(
+    page: Watched, client: httpx.Client, plate: str, camera: int
+) -> None:
+    data = client.get(f"{API}/tests/{plate}/steps/0/cam{camera}", params={"format": "png"}).content
+    stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    shown = page.open(f"#/test/{plate}")
+    editor = Editor(shown, camera)
+    readout = editor.view.locator(".readout")
+    frame = editor.view.locator(".frame").bounding_box()
+    assert frame is not None
+    for key, presses in (("0", 1), ("1", 1), ("+", 10)):
+        editor.key(key, presses)
+        for dx, dy in ((5.0, 3.0), (-41.0, 28.0)):
+            at = (frame["x"] + frame["width"] / 2 + dx, frame["y"] + frame["height"] / 2 + dy)
+            box = editor.image.bounding_box()
+            assert box is not None
+            column = int((at[0] - box["x"]) / box["width"] * WIDTH)
+            row = int((at[1] - box["y"]) / box["height"] * HEIGHT)
+            shown.mouse.move(*at)
+            expect(readout).to_contain_text(re.compile(rf"grey {stored[row, column]} of 255$"))
+            assert readout.get_attribute("data-column") == str(column)
+            assert readout.get_attribute("data-row") == str(row)
+    page.sound()
+
+
+def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client: httpx.Client, plate: str) -> None:
+    shown = page.open(f"#/test/{plate}")
+    editor = Editor(shown)
+    editor.drag((90, 80), (170, 160))
+    texture = shown.locator('[data-role="texture"]')
+    expect(texture).to_contain_text("texture")
+    shown.get_by_label("Subset", exact=True).fill("41")
+    body = {"region": {"rectangle": [90, 80, 170, 160]}, "subset_px": 41, "step_px": 10}
+    told = client.post(f"{API}/tests/{plate}/steps/0/texture", json=body).json()
+    expect(texture).to_contain_text(f"of {told['subsets']} subsets")
+    square = shown.locator('[data-role="subset"]')
+    picture = editor.image.bounding_box()
+    assert picture is not None
+    assert square.evaluate(ON_SCREEN) == pytest.approx(41 / WIDTH * picture["width"], abs=1)
+    shown.get_by_label("texture map").check()
+    expect(shown.get_by_text("a subset of 41 px")).to_be_visible()
+    shown.get_by_role("button", name="Look at them").click()
+    assert square.evaluate(ON_SCREEN) == pytest.approx(41 * 6, abs=1)
+    page.sound()
+
+
+def test_seeds_in_both_views_and_a_measurement(
+    page: Watched, client: httpx.Client, plate: str, cameras: dict[str, dict[str, float]]
+) -> None:
+    pair = StereoPair(*(Camera.from_paper(**cameras[cam]) for cam in ("cam1", "cam2")))
+    # places on the plate, by the rig's own cameras
+    places = np.array([[-0.8, -0.5, 0.0], [0.9, -0.4, 0.0], [0.1, 0.9, 0.0]])
+    one, two = (camera.project(places).xy for camera in (pair.cam1, pair.cam2))
+    shown = page.open(f"#/test/{plate}")
+    first, second = Editor(shown), Editor(shown, 2)
+    x, y = one.mean(axis=0)
+    first.drag((x - 45, y - 40), (x + 45, y + 40))
+    first.tool("Seed")
+    for a, b in zip(one, two, strict=True):
+        asked(shown, "/seeds:check", lambda a=a: first.click(*a))
+        shown.wait_for_selector('[data-role="epipolar"]', state="attached")
+        asked(shown, "/seeds:check", lambda b=b: second.click(*b))
+        shown.wait_for_timeout(350)
+    off = shown.get_by_text("from its epipolar line")
+    expect(off).to_have_count(3)
+    for text in off.all_inner_texts():
+        assert float(re.search(r"lies ([\d.]+) px", text)[1]) < 2.0  # type: ignore[index]
+    shown.get_by_label("Subset", exact=True).fill("25")
+    shown.get_by_label("Label", exact=True).last.fill("seeded")
+    button = shown.get_by_role("button", name="Measure", exact=True)
+    sent = asked(shown, "/analyses", button.click)
+    assert np.abs(np.array(sent["seeds"]) - one).max() <= 1.0
+    assert np.abs(np.array(sent["seeds_cam2"]) - two).max() <= 1.0
+    progress = shown.locator('[data-role="progress"]')
+    expect(progress.locator(".badge")).to_have_text("succeeded", timeout=SLOW)
+    analysis = client.get(f"{API}/tests/{plate}").json()["analyses"][-1]
+    assert progress.get_by_role("link", name="Show results").get_attribute("href") == (
+        f"#/results/{plate}/{analysis['id']}"
+    )
+    expect(shown.get_by_role("link", name="seeded")).to_be_visible()
+    summary = client.get(f"{API}/tests/{plate}/analyses/{analysis['id']}").json()["summary"]
+    assert summary["state"] == "complete" or summary["steps"]
+    page.sound()

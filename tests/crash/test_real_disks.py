@@ -1,0 +1,267 @@
+"""Disks as they really are: full ones and read-only ones, mounted for the test alone, under the whole service."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.errors import StateError, StorageError
+from server.jobs.job import Phase
+from server.store.catalog import Catalog
+from server.store.folder import DataFolder
+from tests.service.test_service_jobs import Bench
+from tests.support.requirements import missing
+from tests.support.service_rig import TINY
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
+    """Run a script in a mount namespace of its own; nothing that it mounts is seen or left outside."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        missing("root and the program unshare (apt-get install util-linux), for mounts of its own,")
+    body = textwrap.indent(script, "    ")  # the worker's process loads it too
+    (folder / "script.py").write_text(f'def main():\n{body}\n\nif __name__ == "__main__":\n    main()\n')
+    (folder / "rig.toml").write_text(TINY.replace("[service]", "[service]\nfree_reserve_mib = 0.0"))
+    done = subprocess.run(
+        ["unshare", "-m", sys.executable, str(folder / "script.py"), str(folder)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=560,
+        check=False,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"},
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-6000:]
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+FULL = """
+import hashlib, json, subprocess, sys, time
+from pathlib import Path
+
+folder = Path(sys.argv[1])
+data = folder / "data"
+data.mkdir()
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=5m", "tmpfs", str(data)], check=True)
+
+from server.config.rig_file import load_config
+from server.workflows.service import Service
+from server.store.verify import verify
+from service_rig import new_test, served, wait_for_job, wait_for_rig
+from tests.crash.test_service_kill import write_test_folder
+
+write_test_folder(data / "tests" / "t000007-abcdef", 12)
+(data / "ballast").write_bytes(bytes(1_600_000))
+service = Service(load_config(folder / "rig.toml"), data)
+out = {}
+try:
+    with served(service) as client:
+        wait_for_rig(client)
+        api = "/api/v1"
+        # steps until the disk is full
+        test_id, acknowledged = new_test(client), []
+        while (answer := client.post(f"{api}/tests/{test_id}/steps", json={})).status_code == 201:
+            acknowledged.append(answer.json())
+        out["step"] = [answer.status_code, answer.json()["code"], answer.json()["remedy"]]
+        out["steps"] = len(acknowledged)
+        wrong = []
+        for step in acknowledged:
+            for cam in ("cam1", "cam2"):
+                content = client.get(f"{api}/tests/{test_id}/steps/{step['n']}/{cam}").content
+                if hashlib.sha256(content).hexdigest() != step["sha256"][cam]:
+                    wrong.append(step["n"])
+        out["wrong"] = wrong
+        out["shown"] = len(client.get(f"{api}/tests/{test_id}").json()["steps"])
+        # whoever looks after the machine makes room
+        (data / "ballast").unlink()
+        again = new_test(client)
+        out["again"] = client.post(f"{api}/tests/{again}/steps", json={}).status_code
+        # room for a few results, not for all
+        free = service.folder.free_mib() * 2**20
+        (data / "ballast").write_bytes(bytes(max(0, int(free) - 700_000)))
+        body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "step_px": 4, "strain": None}
+        made = client.post(f"{api}/tests/t000007-abcdef/analyses", json=body).json()
+        job = wait_for_job(client, made["job"])
+        out["job"] = [job["state"], (job["problem"] or {}).get("code")]
+        url = f"{api}/tests/t000007-abcdef/analyses/{made['analysis_id']}"
+        shown = client.get(url).json()
+        out["finished"] = shown["steps_finished"]
+        out["readable"] = [client.get(f"{url}/steps/{n}/fields/z_mm").status_code for n in shown["steps_finished"]]
+        out["analysis"] = [shown["state"], shown["problem"]["code"]]
+        (data / "ballast").unlink()
+        out["damaged"] = [f.text for f in verify(data).findings if f.level == "damaged"]
+        out["after"] = client.post(f"{api}/tests/{again}/steps", json={}).status_code
+finally:
+    service.close()
+print(json.dumps(out))
+"""
+
+
+@pytest.mark.fault(3)
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_disk_that_fills_up_while_it_captures_and_analyses(tmp_path: Path) -> None:
+    out = run_with_mounts(FULL, tmp_path)
+    assert out["step"][:2] == [507, "storage_full"]
+    assert out["step"][2]
+    assert out["steps"] > 10
+    assert out["shown"] == out["steps"]
+    assert out["wrong"] == []
+    assert out["again"] == 201, "room that was made is used at once"
+    assert out["job"] == ["failed", "storage_full"]
+    assert out["analysis"] == ["failed", "storage_full"]
+    assert 1 <= len(out["finished"]) < 12
+    assert set(out["readable"]) == {200}
+    assert out["damaged"] == []
+    assert out["after"] == 201
+
+
+READ_ONLY = """
+import json, subprocess, sys
+from pathlib import Path
+
+folder = Path(sys.argv[1])
+data = folder / "data"
+from server.store.catalog import Catalog
+from server.store.folder import DataFolder
+
+opened = DataFolder(data)
+Catalog(data / "catalog.sqlite").close()
+opened.close()
+subprocess.run(["mount", "--bind", str(data), str(data)], check=True)
+subprocess.run(["mount", "-o", "remount,ro,bind", str(data)], check=True)
+command = [sys.executable, "-m", "server.cli"]
+serve = subprocess.run([*command, "serve", "--config", str(folder / "rig.toml"), "--port", "0", "--data", str(data)],
+                       capture_output=True, text=True, timeout=120)
+looked = subprocess.run([*command, "verify", str(data), "--json"], capture_output=True, text=True, timeout=120)
+mended = subprocess.run([*command, "repair", str(data)], capture_output=True, text=True, timeout=120)
+out = {"serve": [serve.returncode, serve.stdout, serve.stderr], "repair": [mended.returncode, mended.stderr]}
+print(json.dumps({**out, "verify": [looked.returncode, json.loads(looked.stdout)]}))
+"""
+
+
+@pytest.mark.fault(8)
+def test_a_data_folder_on_a_read_only_disk_is_refused_with_the_reason_and_can_be_verified(tmp_path: Path) -> None:
+    out = run_with_mounts(READ_ONLY, tmp_path)
+    status, shown, errors = out["serve"]
+    assert status == 1
+    assert shown == ""
+    last = errors.splitlines()[-1]
+    assert last.startswith("stereorig: data_folder_unusable: ")
+    assert "Read-only file system" in last
+    assert "--data" in last
+    assert out["verify"] == [0, {"sound": True, "files_verified": 0, "files_without_checksum": 0, "findings": []}]
+    assert out["repair"][0] == 1
+    assert "data_folder_unusable" in out["repair"][1]
+
+
+@pytest.mark.fault(8)
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EIO])
+def test_a_disk_without_locks_is_refused_and_not_taken_for_one_in_use(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", fails)
+    with pytest.raises(StorageError) as caught:
+        DataFolder(tmp_path / "data")
+    assert caught.value.code == "data_folder_unusable"
+    assert os.strerror(number) in caught.value.cause
+    assert caught.value.remedy
+
+
+@pytest.mark.fault(8)
+def test_a_disk_whose_locks_keep_nobody_out_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+    with pytest.raises(StorageError) as caught:
+        DataFolder(tmp_path / "data")
+    assert caught.value.code == "data_folder_unusable"
+    assert "lock" in caught.value.cause
+    monkeypatch.undo()
+    DataFolder(tmp_path / "data").close()
+
+
+@pytest.mark.fault(8)
+def test_a_disk_whose_rename_does_not_replace_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace = Path.replace
+
+    def stays(self: Path, target: Path) -> Path:
+        return Path(target) if Path(target).exists() else replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", stays)
+    with pytest.raises(StorageError) as caught:
+        DataFolder(tmp_path / "data")
+    assert caught.value.code == "data_folder_unusable"
+
+
+@pytest.mark.fault(6)
+def test_a_second_service_still_reads_as_such(tmp_path: Path) -> None:
+    first = DataFolder(tmp_path / "data")
+    with pytest.raises(StateError) as caught:
+        DataFolder(tmp_path / "data")
+    assert caught.value.code == "data_folder_locked"
+    assert caught.value.context["holder"] == f"process {os.getpid()} on {os.uname().nodename}"
+    first.close()
+
+
+@pytest.mark.fault(3)
+def test_a_job_that_ended_with_the_disk_full_never_reads_as_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path)
+    go = threading.Event()
+    job = bench.jobs.submit("analysis", "an analysis", {}, [Phase("compute", lambda _: go.wait(20) and None)])
+    while job.state == "queued":
+        time.sleep(0.005)
+
+    def full(*_: object) -> None:
+        raise StorageError("No space left.", code="storage_full")
+
+    monkeypatch.setattr(bench.catalog, "put_job", full)
+    go.set()
+    while bench.jobs.is_active(job.id):
+        time.sleep(0.005)
+    assert bench.catalog.job(job.id)["state"] == "running"  # type: ignore[index]
+    assert bench.jobs.document(job.id)["state"] == "succeeded"
+    assert bench.jobs.documents(10)[0]["state"] == "succeeded"
+    monkeypatch.undo()
+    other = bench.jobs.submit("analysis", "an analysis", {}, [Phase("compute", lambda _: None)])
+    bench.end_of(other)
+    deadline = time.monotonic() + 20.0
+    while bench.catalog.job(job.id)["state"] != "succeeded" and time.monotonic() < deadline:  # type: ignore[index]
+        time.sleep(0.005)
+    assert bench.catalog.job(job.id)["state"] == "succeeded", "written once there is room"  # type: ignore[index]
+    bench.close()
+
+
+@pytest.mark.fault(3)
+def test_a_catalogue_whose_commit_failed_works_again_once_there_is_room(tmp_path: Path) -> None:
+    catalog = Catalog(tmp_path / "catalog.sqlite")
+    catalog.put_job("j000001-abcdef", "running", {"id": "j000001-abcdef"})
+
+    def limit(pages: int) -> None:
+        catalog.transact(lambda c: c.execute(f"PRAGMA max_page_count = {pages}").fetchone())
+
+    limit(8)
+    for _ in range(3):
+        with pytest.raises(StorageError) as caught:
+            catalog.put_job("j000002-abcdef", "running", {"text": "x" * 30000})
+        assert caught.value.code == "storage_full", "and not that a transaction is still open"
+    limit(100000)
+    catalog.put_job("j999999-abcdef", "succeeded", {"id": "j999999-abcdef"})
+    assert catalog.job("j999999-abcdef") == {"id": "j999999-abcdef"}
+    catalog.close()

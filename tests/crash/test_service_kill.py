@@ -1,0 +1,197 @@
+"""The service killed at work: what was acknowledged is there after the next start, and nothing is left running."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from server.config.rig_file import parse_config
+from server.formats.images import encode_tiff
+from sim.rig import SimRig
+from sim.world import SimWorld
+from tests.support.service_rig import TINY
+
+TIME = "2026-01-01T00:00:00Z"
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = TINY.replace("speckle_mm = 0.45", "speckle_mm = 0.4").replace("kernel_threads = 1", "kernel_threads = 2")
+
+
+def write_test_folder(folder: Path, steps: int, load_a_step: float = 0.0) -> None:
+    """Write a test as another service would have left it: a copied folder is a valid test."""
+    config = parse_config(CONFIG)
+    rig = SimRig.from_dict(config.model_dump(exclude_none=True))
+    world = SimWorld(rig, lambda _: 0.0)
+    rng = np.random.default_rng(5)
+    (folder / "analyses").mkdir(parents=True)
+    pair = world.true_pair()
+    calibration = {"cam1": pair.cam1.paper_parameters(), "cam2": pair.cam2.paper_parameters()}
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    for n in range(steps):
+        world.set_scene("plate", load=n * load_a_step)
+        step = folder / "steps" / f"{n:04d}"
+        step.mkdir(parents=True)
+        sha256 = {}
+        for cam in ("cam1", "cam2"):
+            content = encode_tiff(world.expose(cam, exposure_ms=10.0, gain_db=0.0, rng=rng))  # type: ignore[arg-type]
+            (step / f"{cam}.tif").write_bytes(content)
+            sha256[cam] = hashlib.sha256(content).hexdigest()
+        facts = {"label": "", "load_n": None, "source": "import", "captured_utc": TIME, "skew_ms": None, "quality": {}}
+        document = {"n": n, "test_id": folder.name, **facts, "sha256": sha256}
+        (step / "step.json").write_text(json.dumps(document))
+    document = {"id": folder.name, "name": "copied", "specimen": "", "notes": "", "calibration_id": None}
+    (folder / "test.json").write_text(json.dumps({**document, "created_utc": TIME}))
+
+
+def start(tmp_path: Path) -> tuple[subprocess.Popen[str], httpx.Client]:
+    command = [sys.executable, "-m", "server.cli", "serve", "--config", str(tmp_path / "rig.toml"), "--port", "0"]
+    process = subprocess.Popen(
+        [*command, "--data", str(tmp_path / "data")],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    url = next(word for word in line.split() if word.startswith("http://"))
+    return process, httpx.Client(base_url=f"{url}/api/v1", timeout=60.0, trust_env=False)
+
+
+def children_of(pid: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(path.parent.name))
+    return found
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.fault(1)
+@pytest.mark.fault(2)
+def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(CONFIG)
+    write_test_folder(tmp_path / "data" / "tests" / "t000007-abcdef", 40)
+    process, client = start(tmp_path)
+    try:
+        test = "/tests/t000007-abcdef"
+        assert len(client.get(test).json()["steps"]) == 40
+        body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "step_px": 2}
+        accepted = client.post(f"{test}/analyses", json=body).json()
+        url = f"{test}/analyses/{accepted['analysis_id']}"
+        deadline = time.monotonic() + 240
+        while len(client.get(url).json()["steps_finished"]) < 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        announced = client.get(url).json()["steps_finished"]
+        new = client.post("/tests", json={"name": "new"}).json()["id"]
+        acknowledged = [client.post(f"/tests/{new}/steps", json={}).json() for _ in range(3)]
+        children = children_of(process.pid)
+        assert children
+    finally:
+        process.kill()
+        process.communicate()
+        client.close()
+    deadline = time.monotonic() + 10
+    while any(is_running(pid) for pid in children) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(is_running(pid) for pid in children)
+
+    process, client = start(tmp_path)
+    try:
+        job = client.get(f"/jobs/{accepted['job']['id']}").json()
+        assert job["state"] == "interrupted"
+        shown = client.get(url).json()
+        assert shown["state"] == "interrupted"
+        assert set(announced) <= set(shown["steps_finished"])
+        for n in announced:
+            assert client.get(f"{url}/steps/{n}/fields/z_mm").status_code == 200
+        for step in acknowledged:
+            assert client.get(f"/tests/{new}/steps/{step['n']}").json() == step
+            for cam in ("cam1", "cam2"):
+                content = client.get(f"/tests/{new}/steps/{step['n']}/{cam}").content
+                assert hashlib.sha256(content).hexdigest() == step["sha256"][cam]
+        assert [s["n"] for s in shown["summary"]["steps"]] == shown["steps_finished"]
+        # a new analysis can start at once, and comes to its end
+        fresh = client.post(f"{test}/analyses", json={**body, "step_px": 20, "steps": [0, 1]})
+        assert fresh.status_code == 202, fresh.text
+        deadline = time.monotonic() + 240
+        while (new_job := client.get(f"/jobs/{fresh.json()['job']['id']}").json())["state"] in ("queued", "running"):
+            assert time.monotonic() < deadline, new_job
+            time.sleep(0.02)
+        assert new_job["state"] == "succeeded", new_job["problem"]
+        rest = client.post(f"{url}:continue", headers={"Idempotency-Key": "rest"})
+        assert rest.status_code == 202, rest.text
+        assert (
+            client.post(f"{url}:continue", headers={"Idempotency-Key": "rest"}).json()["job"]["id"]
+            == (rest.json()["job"]["id"])
+        )
+        kept = shown["steps_finished"]
+        deadline = time.monotonic() + 240
+        while len(client.get(url).json()["steps_finished"]) < len(kept) + 1 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        finished = client.get(url).json()["steps_finished"]
+        assert len(finished) > len(kept)
+        assert finished == list(range(len(finished)))
+        assert client.post(f"/jobs/{rest.json()['job']['id']}/cancel").status_code == 202
+        again = client.post(f"{test}/analyses", json={**body, "steps": [1]})
+        assert again.status_code == 202
+        assert not list((tmp_path / "data").rglob(".*.part"))
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=20)
+        client.close()
+    assert process.returncode == 0
+    assert errors == ""
+
+
+@pytest.mark.fault(6)
+def test_a_second_service_on_the_same_folder_ends_and_names_the_first(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(TINY)
+    process, client = start(tmp_path)
+    try:
+        second = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "server.cli",
+                "serve",
+                "--config",
+                str(tmp_path / "rig.toml"),
+                "--port",
+                "0",
+                "--data",
+                str(tmp_path / "data"),
+            ],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert second.returncode == 1, second.stderr
+        assert f"process {process.pid} on " in second.stderr
+        assert "data_folder_locked" in second.stderr
+        assert client.get("/healthz").json()["status"] == "ok"  # the first goes on
+        test_id = client.post("/tests", json={"name": "still there"}).json()["id"]
+        assert client.get(f"/tests/{test_id}").status_code == 200
+    finally:
+        process.kill()
+        process.communicate()
+        client.close()

@@ -1,0 +1,562 @@
+"""``stereorig measure`` end to end on rendered images with a known truth, and every bad input in one line."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+
+from core.field.smoothed import smoothed_displacement
+from core.measure import MeasureOptions
+from server.cli import main
+from server.cli.measurement import measure
+from server.formats.images import read_image, write_image
+from server.formats.results.reading import read_field, read_measured
+from sim.catalog import make_scene
+from sim.render import RenderOptions, render
+from sim.rig import CAMERA_NAMES, SimRig
+from sim.truth import truth_at
+
+ROOT = Path(__file__).resolve().parents[3]
+SIZE = (230, 200)
+LOADS = (0.0, 0.5, 1.0)
+ROI = "50,45,180,155"
+
+
+def small_rig() -> SimRig:
+    """The paper's rig with smaller sensors: the same rays, fewer pixels."""
+    tables = tomllib.loads((ROOT / "config" / "sim_paper.toml").read_text())
+    for name in CAMERA_NAMES:
+        tables[name]["image_size_px"] = list(SIZE)
+        tables["sim"][name] |= {"cx_px": SIZE[0] / 2 + 3.0, "cy_px": SIZE[1] / 2 - 2.0}
+    return SimRig.from_dict(tables)
+
+
+@pytest.fixture(scope="module")
+def rig() -> SimRig:
+    return small_rig()
+
+
+@pytest.fixture(scope="module")
+def originals(rig: SimRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with three pairs of a moving block and the true calibration."""
+    folder = tmp_path_factory.mktemp("block")
+    rng = np.random.default_rng(1)
+    for n, load in enumerate(LOADS):
+        scene = make_scene(rig, "block", load=load)
+        for name in CAMERA_NAMES:
+            sim = rig.camera(name)
+            seen = render(scene, sim.camera, sim.size_px, options=RenderOptions(blur_px=rig.blur_px, threads=1))
+            write_image(folder / f"{name}_{n}.tif", sim.sensor.expose(sim.lighting.apply(seen), rng, exposure=1.0))
+    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERA_NAMES}
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    return folder
+
+
+@pytest.fixture
+def folder(originals: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    shutil.copytree(originals, tmp_path / "in")
+    return tmp_path / "in"
+
+
+def command(folder: Path, results: Path, **changes: str | list[str] | None) -> list[str]:
+    options: dict[str, Any] = {
+        "cam1": str(folder / "cam1_*.tif"),
+        "cam2": str(folder / "cam2_*.tif"),
+        "calibration": str(folder / "calibration.json"),
+        "roi": ROI,
+        "subset": "21",
+        "out": str(results),
+    }
+    options.update(changes)
+    arguments = ["measure"]
+    for name, value in options.items():
+        if value is not None:
+            arguments += [f"--{name}", *([value] if isinstance(value, str) else value)]
+    return arguments
+
+
+@pytest.fixture(scope="module")
+def measured(originals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "new" / "folder"
+    assert main(command(originals, out)) == 0
+    return out
+
+
+def test_shape_and_displacement_agree_with_the_truth(measured: Path, rig: SimRig) -> None:
+    assert sorted(p.name for p in measured.iterdir()) == [*(f"step_000{n}.nc" for n in range(3)), "summary.json"]
+    for n, load in enumerate(LOADS):
+        with xr.open_dataset(measured / f"step_000{n}.nc") as data:
+            np.testing.assert_array_equal(data["x_px"][0], np.arange(50, 181, 10))
+            np.testing.assert_array_equal(data["y_px"][:, 0], np.arange(45, 156, 10))
+            xy = np.stack([data["x_px"], data["y_px"]], axis=-1)
+            truth = truth_at(make_scene(rig, "block"), rig.cam1.camera, xy, now=make_scene(rig, "block", load=load))
+            ok = data["status"].values == 0
+            assert ok.mean() > 0.99
+            # noise of 2 of 255 at 21 px gives 0.2 to 0.3 um; the true calibration adds nothing
+            xyz = np.stack([data["x_mm"], data["y_mm"], data["z_mm"]], axis=-1)
+            assert np.sqrt(np.mean((xyz - truth.xyz_mm)[ok] ** 2)) < 0.4e-3
+            if n == 0:
+                assert "u_mm" not in data
+                assert data.attrs["kind"] == "shape"
+                continue
+            uvw = np.stack([data["u_mm"], data["v_mm"], data["w_mm"]], axis=-1)
+            assert np.sqrt(np.mean((uvw - truth.uvw_mm)[ok] ** 2)) < 0.5e-3
+            assert np.abs(uvw - truth.uvw_mm)[ok].max() < 3e-3
+            assert data.attrs["kind"] == "displacement"
+            assert json.loads(data.attrs["settings"])["subset_px"] == 21
+
+
+def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> None:
+    summary = json.loads((measured / "summary.json").read_text())
+    assert [step["step"] for step in summary["steps"]] == [0, 1, 2]
+    assert summary["settings"]["roi"] == [50.0, 45.0, 180.0, 155.0]
+    assert summary["calibration"]["source"] == "calibration_json"
+    for step in summary["steps"]:
+        assert step["points"] == 14 * 12
+        assert step["valid"] == sum(v for k, v in step["status"].items() if k in ("ok", "extrapolated"))
+        assert step["epipolar_offset_rms_px"] < 0.05
+        assert min(step["zncc_median"].values()) > 0.95
+        assert Path(step["cam1"]).name == f"cam1_{step['step']}.tif"
+    assert summary["steps"][0]["plane_residual_rms_mm"] < 0.5e-3  # the block's face is flat
+
+
+def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) -> None:
+    arguments = command(folder, tmp_path / "out", cam1=str(folder / "cam1_0.tif"), cam2=str(folder / "cam2_0.tif"))
+    crack, hole = "50,100.2,90.5,101.7,130,96.4", "140,60,165,60,165,85,140,85"
+    assert main([*arguments, "--crack", crack, "--hole", hole]) == 0
+    with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
+        settings = json.loads(data.attrs["settings"])
+        assert settings["cracks"] == [[[50.0, 100.2], [90.5, 101.7], [130.0, 96.4]]]
+        assert settings["holes"] == [[[140.0, 60.0], [165.0, 60.0], [165.0, 85.0], [140.0, 85.0]]]
+        inside = (data["x_px"] >= 140) & (data["x_px"] <= 165) & (data["y_px"] >= 60) & (data["y_px"] <= 85)
+        assert (data["status"].values[inside.values] == 2).all()
+        assert (data["status"].values[~inside.values] == 0).mean() > 0.97
+        assert data["cut_line"].values.tolist() == [0] * 5 + [1] * 3  # the hole's border is closed
+        assert data["cut_y_px"].values[5:].tolist() == [100.2, 101.7, 96.4]
+    cuts = read_field(tmp_path / "out" / "step_0000.nc").cuts
+    assert cuts is not None
+    assert cuts.lines_px[1].tolist() == settings["cracks"][0]
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "code"),
+    [
+        ("--crack", "50,100", "cut_invalid"),
+        ("--crack", "50,100,60", "cut_invalid"),
+        ("--crack", "a,b,c,d", "cut_invalid"),
+        ("--crack", "50,100,nan,100", "cut_invalid"),
+        ("--crack", "60,100,60,100", "cut_invalid"),
+        ("--crack", "50,100,500,100", "cut_outside_image"),
+        ("--hole", "50,60,70,60", "cut_invalid"),
+        ("--hole", "50,60,70,80,60,70", "region_empty"),
+        ("--hole", "10,10,200,10,200,180,10,180", "region_empty"),
+    ],
+)
+def test_cracks_and_holes_that_are_none(
+    originals: Path, tmp_path: Path, capfd: Any, option: str, text: str, code: str
+) -> None:
+    assert main([*command(originals, tmp_path / "out"), option, text]) != 0
+    assert code in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_several_paths_a_mask_seeds_and_the_other_models(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    mask[40:160, 45:121] = 255
+    Image.fromarray(mask).save(folder / "mask.png")
+    out = tmp_path / "out"
+    (tmp_path / "out").mkdir()
+    (out / "step_0007.nc").write_text("of an earlier, longer run")
+    (out / "notes.txt").write_text("the user's own")
+    code = main(
+        command(
+            folder,
+            out,
+            cam1=[str(folder / "cam1_0.tif"), str(folder / "cam1_1.tif")],
+            cam2=[str(folder / "cam2_1.tif"), str(folder / "cam2_0.tif")],
+            mask=str(folder / "mask.png"),
+            patch="rigid",
+            interpolation="cubic",
+            seed="80,85",
+        )
+    )
+    assert code == 0
+    assert sorted(p.name for p in out.iterdir()) == ["notes.txt", "step_0000.nc", "step_0001.nc", "summary.json"]
+    with xr.open_dataset(out / "step_0001.nc") as data:
+        masked = data["status"].values == 2
+        np.testing.assert_array_equal(masked, np.broadcast_to(np.arange(50, 181, 10) > 120, masked.shape))
+        assert np.isnan(data["w_mm"].values[masked]).all()
+        assert (data["status"].values[~masked] == 0).mean() > 0.99
+        assert json.loads(data.attrs["settings"])["patch"] == "rigid"
+        assert "mask" in json.loads(data.attrs["inputs_sha256"])
+    assert "step 1 of 1" in capfd.readouterr().err
+
+
+def test_a_test_folder_copied_by_hand(folder: Path, tmp_path: Path, measured: Path) -> None:
+    test = tmp_path / "t000001"
+    hashes = json.loads((measured / "summary.json").read_text())["steps"]
+    for n in range(2):
+        step = test / "steps" / f"{n:04d}"
+        step.mkdir(parents=True)
+        for cam in CAMERA_NAMES:
+            shutil.copy(folder / f"{cam}_{n}.tif", step / f"{cam}.tif")
+        (step / "step.json").write_text(json.dumps({"n": n, "sha256": hashes[n]["sha256"]}))
+    shutil.copy(folder / "calibration.json", test)
+    assert main(["measure", str(test), "--subset", "21", "--step", "20"]) == 0
+    summary = json.loads((test / "exports" / "measure" / "summary.json").read_text())
+    for step in summary["steps"]:  # camera 2 does not see the rim of camera 1's image
+        assert step["valid"] > 70
+        assert set(step["status"]) <= {"ok", "outside_image"}
+
+
+@pytest.mark.fault(4)
+def test_a_flipped_bit_in_a_test_folder_is_named(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    step = tmp_path / "t" / "steps" / "0000"
+    step.mkdir(parents=True)
+    for cam in CAMERA_NAMES:
+        shutil.copy(folder / f"{cam}_0.tif", step / f"{cam}.tif")
+    (step / "step.json").write_text(json.dumps({"sha256": {"cam1": "0" * 64}}))
+    shutil.copy(folder / "calibration.json", tmp_path / "t")
+    fails(["measure", str(tmp_path / "t")], "checksum_mismatch", "cam1.tif", capfd)
+
+
+def test_defaults_are_the_measurements_own() -> None:
+    parser = argparse.ArgumentParser()
+    measure.add_arguments(parser)
+    defaults, own = parser.parse_args([]), MeasureOptions()
+    assert (int(defaults.subset), defaults.patch, defaults.interpolation) == (
+        own.subset_px,
+        own.patch,
+        own.interpolation,
+    )
+
+
+def test_strain_is_in_files_and_summary(measured: Path) -> None:
+    """A block moves as a whole: its strain is noise, of the size that is told."""
+    summary = json.loads((measured / "summary.json").read_text())
+    assert summary["settings"]["strain"] == {"window": 9, "order": 1, "tensor": "green_lagrange"}
+    assert summary["steps"][0]["strain"] is None
+    for step in summary["steps"][1:]:
+        strain = step["strain"]
+        assert strain["gauge_px"] == 8 * 10 + 21
+        assert strain["gauge_mm"] == pytest.approx(101 * 0.033, rel=0.1)
+        with xr.open_dataset(measured / step["file"]) as data:
+            whole = (slice(4, -4), slice(4, -4))
+            assert (data["strain_status"].values[whole] == 0).all()
+            for name in ("exx", "eyy", "exy"):
+                off, sigma = (1e6 * data[n].values[whole] for n in (name, f"sigma_{name}"))
+                assert np.abs(off).max() < 5 * sigma.max()
+                assert np.median(data[f"sigma_{name}"].values[data["strain_status"].values == 0]) * 1e6 == (
+                    pytest.approx(strain["noise_floor_microstrain"][name], rel=1e-4)
+                )
+                assert sigma.max() < 150.0
+            assert np.isnan(data["exx"].values[data["strain_status"].values != 0]).all()
+    with xr.open_dataset(measured / "step_0000.nc") as data:
+        assert "exx" not in data
+
+
+def test_strain_off_and_other_strain(folder: Path, tmp_path: Path) -> None:
+    two = {name: [str(folder / f"{name}_{n}.tif") for n in (0, 2)] for name in ("cam1", "cam2")}
+    assert main(command(folder, tmp_path / "off", roi="60,60,120,120", strain="off", **two)) == 0
+    summary = json.loads((tmp_path / "off" / "summary.json").read_text())
+    assert summary["settings"]["strain"] is None
+    assert summary["steps"][1]["strain"] is None
+    with xr.open_dataset(tmp_path / "off" / "step_0001.nc") as data:
+        assert "exx" not in data
+    more = {"strain": "5", "strain-order": "2", "strain-tensor": "hencky"}
+    assert main(command(folder, tmp_path / "on", roi="60,60,120,120", **more, **two)) == 0
+    with xr.open_dataset(tmp_path / "on" / "step_0001.nc") as data:
+        assert "Hencky" in data["exx"].long_name
+        assert data["exx"].window_points == 5
+        assert json.loads(data.attrs["strain"])["order"] == 2
+
+
+def fails(arguments: list[str], code: str, word: str, capfd: Any) -> None:
+    assert main(arguments) == 1
+    err = capfd.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("stereorig: ")]
+    assert len(lines) == 1, err
+    assert lines[0].startswith(f"stereorig: {code}: ")
+    assert word in lines[0]
+    assert " Remedy: " in lines[0]
+    assert "Traceback" not in err
+
+
+BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
+    ({"strain": "4"}, "option_out_of_range", "--strain"),
+    ({"strain": "wide"}, "option_out_of_range", "--strain"),
+    ({"strain": "103"}, "option_out_of_range", "--strain"),
+    ({"cam1": "IN/none_*.tif"}, "file_missing", "none_"),
+    ({"cam2": ["IN/cam2_0.tif", "IN/none.tif"]}, "file_missing", "none.tif"),
+    ({"cam2": ["IN/cam2_0.tif"]}, "counts_differ", "3 images"),
+    ({"cam2": "IN/cam1_*.tif"}, "same_image", "cam1_0.tif"),
+    ({"calibration": "IN/none.json"}, "file_missing", "none.json"),
+    ({"calibration": "IN/cam1_0.tif"}, "calibration_unreadable", "cam1_0.tif"),
+    ({"roi": "300,20,400,100"}, "region_outside_image", "230 x 200"),
+    ({"roi": "-20,20,100,100"}, "region_outside_image", "230 x 200"),
+    ({"roi": "180,155,50,45"}, "region_unusable", "empty"),
+    ({"roi": "50,50,50,50"}, "region_unusable", "empty"),
+    ({"roi": "nan,45,180,155"}, "region_unusable", "finite"),
+    ({"roi": "50,45,60,155"}, "region_too_small", "smaller"),
+    ({"mask": "IN/none.png"}, "file_missing", "none.png"),
+    ({"mask": "IN/wrong.png"}, "mask_size", "100 x 100"),
+    ({"mask": "IN/black.png"}, "region_empty", "white"),
+    ({"subset": "20"}, "option_out_of_range", "20"),
+    ({"subset": "zwanzig"}, "option_out_of_range", "zwanzig"),
+    ({"step": "0"}, "option_out_of_range", "--step"),
+    ({"seed": "10,10"}, "seed_outside", "10,10"),
+    ({"seed": "1000,90"}, "seed_outside", "1000,90"),
+    ({"seed": "80,85,500,85"}, "seed_outside", "camera 2"),
+    ({"seed": "80,85,80,150"}, "seed_off_epipolar", "epipolar line"),
+    ({"roi": None}, "option_missing", "--roi"),
+    ({"out": "IN/cam1_0.tif"}, "output_unusable", "cam1_0.tif"),
+]
+
+
+@pytest.mark.parametrize(("changes", "code", "word"), BAD_OPTIONS, ids=lambda v: str(v)[:40])
+def test_bad_options(folder: Path, tmp_path: Path, capfd: Any, changes: dict[str, Any], code: str, word: str) -> None:
+    Image.fromarray(np.full((100, 100), 255, np.uint8)).save(folder / "wrong.png")
+    Image.fromarray(np.zeros((SIZE[1], SIZE[0]), np.uint8)).save(folder / "black.png")
+    place = {
+        k: [s.replace("IN", str(folder), 1) for s in v]
+        if isinstance(v, list)
+        else v
+        if v is None
+        else v.replace("IN", str(folder), 1)
+        for k, v in changes.items()
+    }
+    before = sorted(folder.iterdir())
+    fails(command(folder, tmp_path / "out", **place), code, word, capfd)
+    assert not (tmp_path / "out").exists()
+    assert sorted(folder.iterdir()) == before
+
+
+def test_bad_images(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    good = read_image(folder / "cam2_1.tif")
+    for data, code, word in (
+        (good[:, :-1], "image_size_mismatch", "229 x 200"),
+        (np.full_like(good, 90), "image_blank", "90"),
+        (good[:50], "image_size_mismatch", "step 1"),
+    ):
+        write_image(folder / "cam2_1.tif", data)
+        fails(command(folder, tmp_path / "out"), code, word, capfd)
+    (folder / "cam2_1.tif").write_bytes((folder / "cam2_0.tif").read_bytes()[:2000])
+    fails(command(folder, tmp_path / "out"), "image_unreadable", "cam2_1.tif", capfd)
+    Image.fromarray(np.stack([good, good // 2, good], axis=-1)).save(folder / "cam2_1.tif")
+    fails(command(folder, tmp_path / "out"), "image_unsupported", "colour", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_calibrations(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    content = json.loads((folder / "calibration.json").read_text())
+    path = folder / "calibration.json"
+    for changes, code in (
+        ({"phd_px": float("nan")}, "calibration_invalid"),
+        ({"aspect": None}, "calibration_unreadable"),
+    ):
+        path.write_text(json.dumps({**content, "cam2": {**content["cam2"], **changes}}))
+        fails(command(folder, tmp_path / "out"), code, next(iter(changes)), capfd)
+    path.write_text(json.dumps({**content, "image_size_px": {"cam1": [512, 480], "cam2": [512, 480]}}))
+    fails(command(folder, tmp_path / "out"), "image_size_mismatch", "512 x 480", capfd)
+    path.write_text(json.dumps({"cam1": content["cam1"], "cam2": content["cam1"]}))
+    fails(command(folder, tmp_path / "out"), "calibration_invalid", "same place", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+def test_swapped_cameras_are_refused(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    swapped = command(folder, tmp_path / "out", cam1=str(folder / "cam2_*.tif"), cam2=str(folder / "cam1_*.tif"))
+    fails(swapped, "cameras_swapped", "", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+def test_noise_without_texture_is_refused(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    rng = np.random.default_rng(2)
+    for cam in CAMERA_NAMES:
+        write_image(folder / f"{cam}_0.tif", rng.normal(120, 2, (SIZE[1], SIZE[0])).round().astype(np.uint8))
+    fails(command(folder, tmp_path / "out"), "image_blank", "noise only", capfd)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system that takes no new folders")
+def test_a_folder_that_cannot_be_made(folder: Path, capfd: Any) -> None:
+    fails(command(folder, Path("/proc/stereorig/out")), "output_unusable", "/proc/stereorig", capfd)
+
+
+@pytest.mark.specimen
+def test_the_specimen(specimen_dir: Path, tmp_path: Path) -> None:
+    code = main(
+        [
+            "measure",
+            "--cam1",
+            str(specimen_dir / "*_0.tif"),
+            "--cam2",
+            str(specimen_dir / "*_1.tif"),
+            "--calibration",
+            str(specimen_dir / "calibration_dice.xml"),
+            "--roi",
+            "340,430,1560,690",
+            "--out",
+            str(tmp_path / "out"),
+        ]
+    )
+    assert code == 0
+    steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
+    assert len(steps) == 3
+    for step in steps:
+        assert step["points"] == 123 * 27
+        assert step["valid_fraction"] >= 0.97
+        # the calibration that came with the images is off by 0.09 px across the epipolar lines
+        assert step["epipolar_offset_sd_px"] <= 0.08
+        assert abs(step["epipolar_offset_mean_px"]) <= 0.1
+        assert step["plane_residual_rms_mm"] <= 0.015
+        # nothing wrong among the valid: no point far from the epipolar line
+        with xr.open_dataset(tmp_path / "out" / step["file"]) as data:
+            ok = np.isin(data["status"], (0, 10))
+            off = data["epipolar_px"].values[ok] - np.median(data["epipolar_px"].values[ok])
+            assert np.abs(off).max() <= 5 * 0.08
+
+
+def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from core.noise import NoiseModel
+    from server.formats.noise_json import load_noise, noise_content, write_noise
+
+    file = tmp_path / "noise.json"
+    model = NoiseModel(coefficients=(1.96, 0.0128, 0.0), frames=8)
+    write_noise(file, noise_content({"cam1": model, "cam2": model}))
+    out = tmp_path / "out"
+    assert (
+        main(
+            command(
+                folder,
+                out,
+                noise=str(file),
+                roi="90,80,130,110",
+                cam1=[str(folder / "cam1_0.tif")],
+                cam2=[str(folder / "cam2_0.tif")],
+            )
+        )
+        == 0
+    )
+    with xr.open_dataset(out / "step_0000.nc") as data:
+        assert (data["status"].values == 0).all()
+        settings, inputs = (json.loads(data.attrs[name]) for name in ("settings", "inputs_sha256"))
+    assert inputs["noise"] == load_noise(file).sha256
+    assert settings["noise"]["cam1"] == {"coefficients": [1.96, 0.0128, 0.0], "frames": 8}
+    assert "these cameras' gain" not in capsys.readouterr().err
+    wrong = NoiseModel(coefficients=(12.0, 0.0, 0.0), frames=8)
+    write_noise(file, noise_content({"cam1": wrong, "cam2": wrong}))
+    assert (
+        main(
+            command(
+                folder,
+                out,
+                noise=str(file),
+                roi="90,80,130,110",
+                cam1=[str(folder / "cam1_0.tif")],
+                cam2=[str(folder / "cam2_0.tif")],
+            )
+        )
+        == 0
+    )
+    assert "the noise file says 3.46" in capsys.readouterr().err
+
+
+def test_a_prefilter_is_recorded_and_silly_ones_are_refused(
+    originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(
+            command(
+                originals,
+                tmp_path / "out",
+                cam1=str(originals / "cam1_[01].tif"),
+                cam2=str(originals / "cam2_[01].tif"),
+                prefilter="0.8",
+            )
+        )
+        == 0
+    )
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["settings"]["prefilter_px"] == 0.8
+    with xr.open_dataset(tmp_path / "out" / "step_0001.nc") as data:
+        assert json.loads(data.attrs["settings"])["prefilter_px"] == 0.8
+    for wrong in ("-1", "nan", "5.3", "much"):
+        capsys.readouterr()
+        assert main(command(originals, tmp_path / "no", prefilter=wrong)) != 0
+        assert "prefilter" in capsys.readouterr().err
+        assert not (tmp_path / "no").exists()
+
+
+def test_smoothing_is_told_and_the_measurement_stays_reproducible(
+    originals: Path, measured: Path, tmp_path: Path, capfd: Any
+) -> None:
+    assert main(command(originals, tmp_path / "out", smooth="5")) == 0
+    said = capfd.readouterr()
+    assert "smoothed over 5 points: what is told apart is 61 px" in said.err + said.out
+    assert "gauge grows from 101 to 141 px" in said.err + said.out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["settings"]["smoothing_window"] == 5
+    assert summary["steps"][0]["smoothing"] is None
+    told = summary["steps"][2]["smoothing"]
+    assert (told["window"], told["resolution_px"]) == (5, 61.0)
+    # 33 um a pixel, more along the surface where it stands aslant
+    assert 0.033 * 61 < told["resolution_mm"] < 0.04 * 61
+    raw, smooth = (read_field(folder / "step_0002.nc") for folder in (measured, tmp_path / "out"))
+    assert smooth.smoothing is not None
+    np.testing.assert_array_equal(smooth.status, raw.status)
+    np.testing.assert_array_equal(smooth.xyz_mm, raw.xyz_mm)
+    again = smoothed_displacement(raw, 5, subset_px=21)
+    np.testing.assert_allclose(smooth.uvw_mm, again.uvw_mm, atol=1e-9)
+    assert np.nanmean(smooth.sigma_mm[..., 5]) < 0.9 * np.nanmean(raw.sigma_mm[..., 5])
+    with xr.open_dataset(tmp_path / "out" / "step_0002.nc") as data:
+        assert data["exx"].attrs["gauge_px"] == 141.0
+        assert "smoothed" in data["u_mm"].attrs["long_name"]
+        assert "smoothing" in data.attrs["strain_note"]
+    assert main(["gauge", str(tmp_path / "out"), "--area", "all"]) == 0
+    for wrong in ("4", "1", "53", "some"):
+        assert main(command(originals, tmp_path / "no", smooth=wrong)) != 0
+        assert "--smooth" in capfd.readouterr().err
+
+
+def test_each_step_against_the_one_before_it(folder: Path, tmp_path: Path, rig: SimRig) -> None:
+    """Incremental correlation: displacements stay totals; each file says what it was matched against."""
+    out = tmp_path / "out"
+    assert main([*command(folder, out), "--reference-update", "always", "--smooth", "3"]) == 0
+    steps = json.loads((out / "summary.json").read_text())["steps"]
+    assert [step.get("reference_step") for step in steps] == [None, 0, 1]
+    assert steps[2]["points_by_reference"] == {"1": steps[2]["valid"]}
+    with xr.open_dataset(out / "step_0002.nc") as data:
+        assert data.attrs["reference_step"] == 1
+        assert json.loads(data.attrs["settings"])["reference_update"] == "always"
+        inputs = json.loads(data.attrs["inputs_sha256"])
+        assert inputs["matched_cam1"] == steps[1]["sha256"]["cam1"]
+        xy = np.stack([data["x_px"], data["y_px"]], axis=-1)
+        ok = data["status"].values == 0
+        assert (data["reference_step"].values[ok] == 1).all()
+        smooth, plain = (np.stack([data[f"{p}{c}_mm"] for c in "uvw"], axis=-1) for p in ("", "measured_"))
+    truth = truth_at(make_scene(rig, "block"), rig.cam1.camera, xy, now=make_scene(rig, "block", load=LOADS[2]))
+    assert ok.mean() > 0.99
+    assert np.abs(plain - truth.uvw_mm)[ok].max() < 3e-3
+    assert np.abs(smooth - plain)[ok].max() > 1e-5
+    with xr.open_dataset(out / "step_0001.nc") as data:
+        assert data.attrs["reference_step"] == 0
+    again = read_measured(out / "step_0002.nc")
+    np.testing.assert_array_equal(again.uvw_mm, plain)
+    assert again.references is not None
+    assert np.isfinite(again.references.noise_px2[ok]).all()
+
+
+def test_a_way_of_updating_that_is_none_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([*command(folder, tmp_path / "out"), "--reference-update", "sometimes"])
+    assert caught.value.code == 2

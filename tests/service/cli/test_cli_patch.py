@@ -1,0 +1,134 @@
+"""``stereorig measure --patch``: a sphere whose skin then bends, on rendered images with a known truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from server.cli import main
+from server.formats.images import write_image
+from server.formats.results.reading import read_field
+from sim.catalog import make_scene
+from sim.render import RenderOptions, render
+from sim.rig import CAMERA_NAMES, SimRig
+from sim.scene import UPRIGHT, Scene
+from sim.surface import sphere
+from sim.truth import truth_at
+from tests.service.cli.test_cli_measure import command, small_rig
+
+# a sphere of 30 mm; it moves as a block; then its skin straightens to 90 mm and goes back
+STATES = ("still", "moved", "bent", "moved")
+
+
+def scene(rig: SimRig, state: str) -> Scene:
+    if state == "bent":
+        texture = make_scene(rig, "sphere").texture
+        return Scene(name="sphere", surface=sphere(90.0), texture=texture, sys_from_body=UPRIGHT)
+    motion = {"translation_mm": (0.03, -0.02, 0.05), "rotation_rad": (0.0, 0.0, 0.004)}
+    return make_scene(rig, "sphere", load=float(state == "moved"), **motion)
+
+
+@pytest.fixture(scope="module")
+def rig() -> SimRig:
+    return small_rig()
+
+
+@pytest.fixture(scope="module")
+def folder(rig: SimRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sphere")
+    rng = np.random.default_rng(1)
+    for n, state in enumerate(STATES):
+        for name in CAMERA_NAMES:
+            sim = rig.camera(name)
+            seen = render(scene(rig, state), sim.camera, sim.size_px, options=RenderOptions(blur_px=rig.blur_px))
+            write_image(folder / f"{name}_{n}.tif", sim.sensor.expose(sim.lighting.apply(seen), rng, exposure=1.0))
+    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERA_NAMES}
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    return folder
+
+
+def errors_um(rig: SimRig, data: Any, state: str) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of Z (n,) and, of a displacement, of u, v, w (n, 3)."""
+    xy = np.stack([data["x_px"], data["y_px"]], axis=-1)
+    truth = truth_at(scene(rig, "still"), rig.cam1.camera, xy, now=scene(rig, state))
+    ok = data["status"].values == 0
+    assert ok.mean() > 0.97
+    z = (data["z_mm"].values - truth.xyz_mm[..., 2])[ok] * 1e3
+    if "u_mm" not in data:
+        return z, np.zeros((0, 3))
+    uvw = np.stack([data["u_mm"], data["v_mm"], data["w_mm"]], axis=-1)
+    return z, (uvw - truth.uvw_mm)[ok] * 1e3
+
+
+def test_auto_decides_shape_and_motion_apart_keeps_to_it_and_says_why(
+    rig: SimRig, folder: Path, tmp_path: Path, capfd: Any
+) -> None:
+    assert main(command(folder, tmp_path / "out", patch="auto")) == 0
+    said = capfd.readouterr().err
+    assert "shape: curved: plane patches err by" in said
+    assert "step 1: stretch: plane patches err by less than" in said
+    assert "step 2: curved: plane patches err by" in said
+    steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
+    assert [step["patch"]["patch"] for step in steps] == ["curved", "stretch", "curved", "curved"]
+    assert [step["patch"]["kept"] for step in steps] == [False, False, False, True]
+    assert all(step["patch"]["asked"] == "auto" for step in steps)
+    # 1.8 um along Z, a tenth and more of it along the ray besides
+    assert 1.5e-3 < steps[0]["patch"]["plane_error_mm"] < 2.5e-3
+    for n, state in enumerate(STATES):
+        path = tmp_path / "out" / f"step_{n:04d}.nc"
+        with xr.open_dataset(path) as data:
+            assert data.attrs["patch"] == steps[n]["patch"]["patch"]
+            assert data.attrs["patch_reason"] == steps[n]["patch"]["reason"]
+            assert json.loads(data.attrs["patch_choice"]) == steps[n]["patch"]
+            z, uvw = errors_um(rig, data, state)
+            assert abs(z.mean()) < 0.1
+            if n:
+                assert np.abs(uvw.mean(0)).max() < 0.15
+                assert np.sqrt((uvw**2).mean()) < (0.35 if state == "moved" and n == 1 else 0.6)
+            assert ("curvature_1" in data) == (data.attrs["patch"] == "curved")
+            if "curvature_1" in data:
+                mean = 0.5 * (data["curvature_1"] + data["curvature_2"])
+                assert abs(30.0 * float(mean.mean()) - 1.0) < 0.05
+                assert data["curvature_1"].attrs["units"] == "mm-1"
+        assert read_field(path).patch is not None
+
+
+def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
+    rig: SimRig, folder: Path, tmp_path: Path, capfd: Any
+) -> None:
+    two = {cam: [str(folder / f"{cam}_{n}.tif") for n in (0, 2)] for cam in ("cam1", "cam2")}
+    assert main(command(folder, tmp_path / "out", patch="stretch", **two)) == 0
+    said = capfd.readouterr().err
+    assert "shape: plane: asked for; plane patches err by" in said
+    assert "step 1: stretch: asked for; plane patches err by" in said
+    assert said.count("curved ones would err less") == 2
+    with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
+        z, _ = errors_um(rig, data, "still")
+        choice = json.loads(data.attrs["patch_choice"])
+        assert choice["curved_advised"]
+        # what it says of itself, against the truth: the error is along camera 1's ray, 30 degrees from Z
+        assert abs(choice["plane_error_mm"] * 1e3 * np.cos(np.radians(30.0)) / abs(z.mean()) - 1.0) < 0.1
+        assert "curvature_1" not in data
+
+
+def test_curved_patches_asked_for_are_taken_for_both(rig: SimRig, folder: Path, tmp_path: Path) -> None:
+    assert main(command(folder, tmp_path / "out", patch="curved")) == 0
+    for n, state in enumerate(STATES):
+        with xr.open_dataset(tmp_path / "out" / f"step_{n:04d}.nc") as data:
+            assert data.attrs["patch_reason"] == "curved: asked for"
+            z, uvw = errors_um(rig, data, state)
+            assert abs(z.mean()) < 0.1
+            assert uvw.size == 0 or np.abs(uvw.mean(0)).max() < 0.15
+
+
+def test_an_unknown_patch_is_refused(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(command(folder, tmp_path / "out", patch="bent"))
+    assert stopped.value.code == 2
+    assert "curved" in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()

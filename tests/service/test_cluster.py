@@ -1,0 +1,234 @@
+"""Analyses on a Dask cluster of processes: the same numbers as in the own worker, whatever becomes of a worker."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from tests.crash.test_service_kill import CONFIG, write_test_folder
+from tests.service.test_continue_follow import API, BODY, begin, contents, folder_of, wait_for_steps
+from tests.support.requirements import missing
+from tests.support.service_rig import a_second, served, wait_for_job
+
+ROOT = Path(__file__).resolve().parents[2]
+STEPS = 7
+INDEPENDENT = {"start_from": "reference"}
+
+
+class Cluster:
+    """A scheduler and its workers, each a process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._file = folder / "scheduler.json"
+        self._log = (folder / "cluster.log").open("wb")
+        self.workers: list[subprocess.Popen[bytes]] = []
+        self._scheduler = self._start(
+            "dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--scheduler-file", str(self._file)
+        )
+        try:
+            deadline = time.monotonic() + 120
+            while not self._file.exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+            self.address: str = json.loads(self._file.read_text())["address"]
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.{module}", "--no-dashboard", *arguments],
+            cwd=self._folder,
+            stdout=self._log,
+            stderr=self._log,
+            env=environment,
+        )
+
+    def add_worker(self) -> subprocess.Popen[bytes]:
+        worker = self._start(
+            "dask_worker",
+            "--scheduler-file",
+            str(self._file),
+            "--nthreads",
+            "1",
+            "--no-nanny",
+            "--host",
+            "127.0.0.1",
+            "--local-directory",
+            str(self._folder),
+        )
+        self.workers.append(worker)
+        return worker
+
+    def close(self) -> None:
+        for process in [*self.workers, self._scheduler]:
+            process.kill()
+            process.wait()
+        self._log.close()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    if importlib.util.find_spec("distributed") is None:
+        missing("distributed (pip install distributed)")
+    made = Cluster(tmp_path_factory.mktemp("cluster"))
+    try:
+        for _ in range(2):
+            made.add_worker()
+        yield made
+    finally:
+        made.close()
+
+
+class Place:
+    """A service whose analyses run here or there."""
+
+    def __init__(self, data: Path, compute: str) -> None:
+        self.data = data
+        self.service = Service(parse_config(f"{CONFIG}\n{compute}"), data)
+        self._context = served(self.service)
+        self.client: httpx.Client = self._context.__enter__()
+
+    def close(self) -> None:
+        self._context.__exit__(None, None, None)
+        self.service.close()
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    write_test_folder(folder / "tests" / "t000001-abcdef", STEPS, load_a_step=100.0)
+    return folder
+
+
+URL = f"{API}/tests/t000001-abcdef"
+
+
+def measured(place: Place, **changes: Any) -> str:
+    url, job = begin(place.client, URL, **changes)
+    done = wait_for_job(place.client, job)
+    assert done["state"] == "succeeded", done["problem"]
+    return url
+
+
+@pytest.fixture(scope="module")
+def here(data: Path) -> dict[str, list[dict[str, Any]]]:
+    """What the service's own worker finds, in a chain and with steps that need the reference alone."""
+    place = Place(data, "")
+    try:
+        found = {}
+        for name, changes in (("chain", {}), ("independent", INDEPENDENT)):
+            folder = folder_of(place, measured(place, **changes))
+            found[name] = [contents(folder / f"step_{n:04d}.nc") for n in range(STEPS)]
+    finally:
+        place.close()
+    return found
+
+
+@pytest.fixture(scope="module")
+def elsewhere(data: Path, here: Any, cluster: Cluster) -> Iterator[Place]:
+    """The same data folder, its analyses on the cluster, images by path."""
+    place = Place(data, f'[compute]\nscheduler = "{cluster.address}"')
+    yield place
+    place.close()
+
+
+def assert_equal(found: list[dict[str, Any]], folder: Path) -> None:
+    for n, one in enumerate(found):
+        two = contents(folder / f"step_{n:04d}.nc")
+        assert one.keys() == two.keys()
+        for name, values in one.items():
+            if values.dtype.kind == "f":
+                # single precision is the file's, not the measurement's
+                limit = 1e-9 if values.dtype.itemsize == 8 else 1e-6
+                np.testing.assert_allclose(two[name], values, rtol=limit, atol=limit * 1e-3, err_msg=f"{n} {name}")
+            else:
+                np.testing.assert_array_equal(two[name], values, err_msg=f"{n} {name}")
+    assert np.nanmax(np.abs(found[-1]["w_mm"])) > 0.05  # a plate that bends
+
+
+@pytest.mark.fault(44)
+@pytest.mark.parametrize("kind", ["chain", "independent"])
+def test_a_cluster_finds_what_the_worker_finds(elsewhere: Place, here: Any, kind: str) -> None:
+    url = measured(elsewhere, **(INDEPENDENT if kind == "independent" else {}))
+    assert_equal(here[kind], folder_of(elsewhere, url))
+    assert elsewhere.client.get(url).json()["steps_finished"] == list(range(STEPS))
+
+
+def test_a_killed_workers_steps_are_done_again(elsewhere: Place, here: Any, cluster: Cluster) -> None:
+    url, job = begin(elsewhere.client, URL, **INDEPENDENT)
+    wait_for_steps(elsewhere.client, url, 2)
+    victim = cluster.workers.pop(0)
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.wait()
+    cluster.add_worker()
+    done = wait_for_job(elsewhere.client, job)
+    assert done["state"] == "succeeded", done["problem"]
+    assert_equal(here["independent"], folder_of(elsewhere, url))
+
+
+@pytest.mark.fault(43)
+@pytest.mark.flaky(reruns=2)  # the second is by the clock, and the machine may be busy
+def test_an_analysis_on_the_cluster_is_cancelled_within_a_second_and_goes_on(elsewhere: Place, here: Any) -> None:
+    client = elsewhere.client
+    url, job = begin(client, URL, **INDEPENDENT)
+    wait_for_steps(client, url, 2)
+    limit = a_second(client)
+    asked = time.monotonic()
+    assert client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert wait_for_job(client, job)["state"] == "cancelled"
+    assert time.monotonic() - asked < limit
+    rest = client.post(f"{url}:continue").json()["job"]
+    done = wait_for_job(client, rest)
+    assert done["state"] == "succeeded", done["problem"]
+    assert_equal(here["independent"], folder_of(elsewhere, url))
+
+
+@pytest.mark.parametrize("kind", ["chain", "independent"])
+def test_images_may_travel_with_the_steps(
+    elsewhere: Place, data: Path, here: Any, cluster: Cluster, tmp_path: Path, kind: str
+) -> None:
+    shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
+    place = Place(tmp_path, f'[compute]\nscheduler = "{cluster.address}"\nimages = "scatter"')
+    try:
+        url = measured(place, **(INDEPENDENT if kind == "independent" else {}))
+        assert_equal(here[kind], folder_of(place, url))
+        names = {path.suffix for path in folder_of(place, url).iterdir()}
+        assert ".npz" not in names  # nothing is left of what only an unfinished analysis needs
+    finally:
+        place.close()
+
+
+def test_a_scheduler_that_is_not_there_is_named(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.worker.dask_cluster._CONNECT_S", 0.5)
+    shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
+    place = Place(tmp_path, '[compute]\nscheduler = "tcp://127.0.0.1:9"')
+    try:
+        _, job = begin(place.client, URL, **INDEPENDENT)
+        problem = wait_for_job(place.client, job)["problem"]
+        assert problem["code"] == "cluster_unreachable"
+        assert "tcp://127.0.0.1:9" in problem["cause"]
+    finally:
+        place.close()
+
+
+def test_steps_that_start_from_the_reference_need_total_correlation(elsewhere: Place) -> None:
+    body = {**BODY, **INDEPENDENT, "reference_update": "always"}
+    answer = elsewhere.client.post(f"{URL}/analyses", json=body)
+    assert (answer.status_code, answer.json()["code"]) == (422, "values_disagree")

@@ -1,0 +1,251 @@
+"""Slow, many and half-finished connections, on raw sockets: each has its time, and a stop is served all the same."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from server.api.app import create_app
+from server.http.connections import ConnectionLimits
+from server.http.server import OrderlyServer
+from server.workflows.service import Service
+from tests.support.service_rig import tiny_config, wait_for_rig
+
+API = "/api/v1"
+LIMITS = ConnectionLimits(most=12, header_s=1.0, body_bytes_per_s=1000.0, body_s=1.0, unread_s=2.0)
+END_S = 30.0  # a second would do on a machine that does nothing else
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    made = Service(tiny_config(), tmp_path_factory.mktemp("connections") / "data")
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def port(own: Service) -> Iterator[int]:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    # so that an unread answer waits with us, and not in the kernel
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024)
+    listener.bind(("127.0.0.1", 0))
+    server = OrderlyServer(create_app(own, close_service=False), own, limits=LIMITS)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    with httpx.Client(
+        base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60.0, trust_env=False
+    ) as client:
+        wait_for_rig(client)
+    yield int(listener.getsockname()[1])
+    own.stop_streams()
+    server.should_exit = True
+    thread.join(20.0)
+    listener.close()
+
+
+def dial(port: int) -> socket.socket:
+    made = socket.create_connection(("127.0.0.1", port), timeout=END_S)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 * 1024)
+    return made
+
+
+def request(method: str, path: str, *lines: str) -> bytes:
+    return "\r\n".join([f"{method} {path} HTTP/1.1", "Host: 127.0.0.1", *lines, "", ""]).encode()
+
+
+def ended(connection: socket.socket) -> bool:
+    """Whether the other side ends it before our patience does."""
+    try:
+        while connection.recv(65536):
+            pass
+    except ConnectionError:
+        return True
+    except TimeoutError:
+        return False
+    return True
+
+
+def refused(own: Service, why: str) -> float:
+    found = re.search(rf'connections_refused_total{{why="{why}"}} (\S+)', own.metrics.text().decode())
+    return 0.0 if found is None else float(found[1])
+
+
+def test_headers_that_never_end_end_the_connection(own: Service, port: int) -> None:
+    before = refused(own, "slow_headers")
+    silent, dripping = dial(port), dial(port)
+    stop = threading.Event()
+
+    def drip() -> None:
+        with contextlib.suppress(OSError):
+            dripping.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+            while not stop.wait(0.2):
+                dripping.sendall(b"X-A: b\r\n")
+
+    thread = threading.Thread(target=drip)
+    thread.start()
+    try:
+        assert ended(silent)
+        assert ended(dripping)
+    finally:
+        stop.set()
+        thread.join()
+        silent.close()
+        dripping.close()
+    assert refused(own, "slow_headers") >= before + 2
+
+
+def test_a_second_request_on_a_connection_has_its_time_too(own: Service, port: int) -> None:
+    with dial(port) as connection:
+        connection.sendall(request("GET", "/healthz"))
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        connection.sendall(b"GET /healthz HT")
+        assert ended(connection)
+
+
+def test_a_body_that_comes_by_the_drop_ends_the_connection(own: Service, port: int) -> None:
+    before = refused(own, "slow_body")
+    with dial(port) as connection:
+        connection.sendall(request("POST", f"{API}/tests", "Content-Type: application/json", "Content-Length: 1000000"))
+        stop = threading.Event()
+
+        def drip() -> None:
+            with contextlib.suppress(OSError):
+                while not stop.wait(0.1):
+                    connection.sendall(b" ")
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        try:
+            assert ended(connection)
+        finally:
+            stop.set()
+            thread.join()
+    assert refused(own, "slow_body") == before + 1
+
+
+def test_a_body_at_a_fair_pace_may_take_longer_than_that(port: int) -> None:
+    body = b'{"name": "slow but steady"}' + b" " * 40_000
+    with dial(port) as connection:
+        head = ("Content-Type: application/json", f"Content-Length: {len(body)}", "Connection: close")
+        connection.sendall(request("POST", f"{API}/tests", *head))
+        for start in range(0, len(body), 1000):  # about two seconds and a half
+            connection.sendall(body[start : start + 1000])
+            time.sleep(0.06)
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+    assert answer.startswith(b"HTTP/1.1 201"), answer[:200]
+
+
+def test_an_answer_that_nobody_reads_ends_the_connection_and_holds_little(own: Service, port: int) -> None:
+    before = refused(own, "unread")
+    with dial(port) as connection:
+        connection.sendall(request("GET", f"{API}/cameras/cam1/stream.mjpg?rate_hz=30"))
+        deadline = time.monotonic() + END_S
+        while refused(own, "unread") == before:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    deadline = time.monotonic() + END_S
+    while own.streams.counts()["live_view"]:  # and its place is free again
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_idle_connections_give_way_to_new_ones(own: Service, port: int) -> None:
+    idle = []
+    for _ in range(LIMITS.most):
+        idle.append(dial(port))
+        idle[-1].sendall(request("GET", "/healthz"))
+        assert idle[-1].recv(65536).startswith(b"HTTP/1.1 200")
+    try:
+        with dial(port) as newcomer:
+            newcomer.sendall(request("GET", "/healthz"))
+            assert newcomer.recv(65536).startswith(b"HTTP/1.1 200")
+        assert refused(own, "too_many") >= 1
+    finally:
+        for connection in idle:
+            connection.close()
+
+
+@pytest.mark.fault(50)
+def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(own: Service, port: int) -> None:
+    def opened(path: str) -> socket.socket:
+        connection = dial(port)
+        connection.sendall(request("GET", path))
+        assert connection.recv(64).startswith(b"HTTP/1.1 200"), path
+        return connection
+
+    view = opened(f"{API}/cameras/cam1/stream.mjpg?rate_hz=1")
+    busy = [opened(f"{API}/events") for _ in range(LIMITS.most - 1)]
+    try:
+        with dial(port) as newcomer:
+            newcomer.sendall(request("GET", "/healthz"))
+            assert newcomer.recv(65536).startswith(b"HTTP/1.1 200")
+            assert ended(view)  # what only looks went first
+        busy.append(opened(f"{API}/events"))  # now all work
+        with dial(port) as crowded:
+            crowded.sendall(request("POST", f"{API}/stage/stop", "Content-Length: 0"))
+            assert crowded.recv(64).startswith(b"HTTP/1.1 200")
+    finally:
+        for connection in [view, *busy]:
+            connection.close()
+
+
+def test_where_all_work_a_newcomer_is_refused_in_words(own: Service, port: int) -> None:
+    busy = []
+    try:
+        for _ in range(LIMITS.most + 1):
+            busy.append(dial(port))
+            busy[-1].sendall(request("GET", f"{API}/events"))
+            if len(busy) <= LIMITS.most:
+                assert busy[-1].recv(64).startswith(b"HTTP/1.1 200")
+        answer = b"".join(iter(lambda: busy[-1].recv(65536), b""))  # and it is closed
+        assert answer.startswith(b"HTTP/1.1 503"), answer
+        assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "too_many_connections"
+    finally:
+        for connection in busy:
+            connection.close()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+        b"GET /\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 4\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\nGET",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"a" * 200_000,
+        b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: -1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: a\x00b\r\n\r\n",
+        b"\r\n\r\n\r\n\x00\x00",
+    ],
+)
+def test_what_is_no_proper_http_is_refused_and_the_connection_ends(port: int, data: bytes) -> None:
+    with dial(port) as connection:
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(data)
+        answer = b""
+        with contextlib.suppress(ConnectionError):
+            answer = b"".join(iter(lambda: connection.recv(65536), b""))
+    status = re.match(rb"HTTP/1.1 (\d+)", answer)
+    assert status is None or status[1] in (b"400", b"403", b"404"), answer[:300]
+    if status is not None:
+        assert b"application/problem+json" in answer
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0, trust_env=False) as client:
+        assert client.get("/healthz").status_code == 200
+
+
+def test_settings_are_kept_to(tmp_path: Path) -> None:
+    made = Service(tiny_config(compute_queue="compute_queue = 2\nconnections = 40"), tmp_path / "data")
+    try:
+        server = OrderlyServer(create_app(made, close_service=False), made)
+        assert server._keeper.limits.most == 40
+    finally:
+        made.close()

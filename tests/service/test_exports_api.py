@@ -1,0 +1,188 @@
+"""Exports over HTTP: every form, one file or a ZIP of them, made beside the service; refusals before the first byte."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import h5py
+import httpx
+import numpy as np
+import pytest
+import scipy.io
+from PIL import Image
+
+from server.exports.aside import FOLDER
+from server.workflows.service import Service
+from tests.support.export_results import write_results
+
+FILES = {
+    "nc": "application/zip",
+    "csv": "application/zip",
+    "vtu": "application/zip",
+    "mat": "application/x-matlab-data",
+    "h5": "application/x-hdf5",
+    "png": "application/zip",
+    "svg": "application/zip",
+    "gif": "image/gif",
+    "mp4": "video/mp4",
+}
+
+
+@pytest.fixture(scope="module")
+def url(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An analysis whose results were put there, with a step whose images are gone since."""
+    test = service.tests.create({"name": "Panel", "specimen": "", "notes": ""}, None)
+    document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
+    analysis = service.tests.create_analysis(test["id"], document)
+    write_results(service.tests.analysis_path(test["id"], analysis["id"]))
+    return f"/api/v1/tests/{test['id']}/analyses/{analysis['id']}/export"
+
+
+def _content(data: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert archive.testzip() is None
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.mark.parametrize("form", FILES)
+def test_every_form_comes_as_a_file(client: httpx.Client, service: Service, url: str, form: str) -> None:
+    reply = client.get(url, params={"format": form, "width_px": 300})
+    assert reply.status_code == 200, reply.text
+    assert reply.headers["content-type"] == FILES[form]
+    assert "attachment; filename=" in reply.headers["content-disposition"]
+    assert "step 0" in reply.headers["x-stale"]
+    if FILES[form] == "application/zip":
+        names = sorted(_content(reply.content))
+        steps = [1, 2] if form in ("png", "svg") else [0, 1, 2]
+        wanted = [f"_step_{n:04d}" for n in steps] + ([".pvd"] if form == "vtu" else [])
+        assert len(names) == len(wanted)
+        assert all(any(w in name for name in names) for w in wanted)
+    assert not list((service.folder.root / FOLDER).iterdir())  # nothing is left behind
+
+
+def test_files_hold_what_was_asked_for(client: httpx.Client, url: str) -> None:
+    one = client.get(url, params={"format": "csv", "step": 2, "variables": "exx,u_mm"})
+    assert one.headers["content-type"].startswith("text/csv")
+    header = next(line for line in one.text.splitlines() if not line.startswith("#")).split(",")
+    assert {"u_mm", "exx"} < set(header)
+    assert "v_mm" not in header
+    assert '"calibration_sha256"' not in one.text
+    assert "# calibration_sha256: c0c0" in one.text
+    stack = client.get(url, params={"format": "h5", "steps": "0,2"})
+    with h5py.File(io.BytesIO(stack.content)) as file:
+        np.testing.assert_array_equal(file["step"][...], [0, 2])
+    mat = scipy.io.loadmat(io.BytesIO(client.get(url, params={"format": "mat", "steps": "1-2"}).content))
+    assert {"step_0001", "step_0002"} <= mat.keys()
+    png = client.get(url, params={"format": "png", "step": 1, "variables": "exx", "limits": "-0.001,0.002"})
+    assert png.headers["content-type"] == "image/png"
+    with Image.open(io.BytesIO(png.content)) as picture:
+        assert picture.width == 900
+    stored = client.get(url, params={"step": 1})
+    assert stored.headers["content-type"] == "application/x-netcdf"
+    assert stored.content[:4] == b"\x89HDF"
+
+
+@pytest.mark.parametrize(
+    ("params", "status", "code"),
+    [
+        ({"format": "exe"}, 422, "invalid_request"),
+        ({"format": "csv", "step": 9}, 404, "not_found"),
+        ({"format": "csv", "steps": "5-3"}, 422, "step_invalid"),
+        ({"format": "csv", "steps": "0;1"}, 422, "invalid_request"),
+        ({"format": "csv", "variables": "nix"}, 404, "field_missing"),
+        ({"format": "nc", "variables": "w_mm"}, 422, "option_conflict"),
+        ({"format": "png", "limits": "2,1"}, 422, "look_invalid"),
+        ({"format": "png", "limits": "1.2.3,4"}, 422, "look_invalid"),
+        ({"format": "png", "percentiles": "90,10"}, 422, "look_invalid"),
+        ({"format": "png", "colours": "jet"}, 422, "invalid_request"),
+        ({"format": "png", "over_image": "true"}, 404, "image_missing"),
+        ({"format": "gif", "fps": 0}, 422, "invalid_request"),
+    ],
+)
+def test_refusals_are_problems(
+    client: httpx.Client, service: Service, url: str, params: dict[str, Any], status: int, code: str
+) -> None:
+    reply = client.get(url, params=params)
+    assert (reply.status_code, reply.json()["code"]) == (status, code), reply.text
+    assert reply.json()["remedy"]
+    folder = service.folder.root / FOLDER
+    assert not folder.exists() or not list(folder.iterdir())
+
+
+def test_no_finished_step(client: httpx.Client, service: Service) -> None:
+    test = service.tests.create({"name": "", "specimen": "", "notes": ""}, None)
+    analysis = service.tests.create_analysis(test["id"], {"kind": "profile", "steps": [0], "settings": {}})
+    reply = client.get(f"/api/v1/tests/{test['id']}/analyses/{analysis['id']}/export", params={"format": "csv"})
+    assert (reply.status_code, reply.json()["code"]) == (404, "no_results")
+
+
+def test_the_service_answers_while_films_are_made_and_refuses_too_many(client: httpx.Client, url: str) -> None:
+    answers: list[int] = []
+    base = str(client.base_url)
+
+    def film() -> None:
+        with httpx.Client(base_url=base, timeout=120.0, trust_env=False) as other:
+            answers.append(other.get(url, params={"format": "gif", "width_px": 400}).status_code)
+
+    threads = [threading.Thread(target=film) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    slowest = 0.0
+    while any(thread.is_alive() for thread in threads):
+        begun = time.monotonic()
+        assert client.get("/healthz").status_code == 200
+        slowest = max(slowest, time.monotonic() - begun)
+        time.sleep(0.02)
+    assert slowest < 1.0
+    assert answers.count(200) == 4  # made one after the other
+    assert answers.count(503) == 2
+
+
+def test_a_client_that_goes_away_ends_its_export(client: httpx.Client, service: Service, url: str) -> None:
+    with httpx.Client(base_url=str(client.base_url), trust_env=False) as other, pytest.raises(httpx.ReadTimeout):
+        other.get(url, params={"format": "gif", "width_px": 2500}, timeout=httpx.Timeout(5.0, read=0.2))
+    deadline = time.monotonic() + 30.0
+    folder: Path = service.folder.root / FOLDER
+    while list(folder.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert client.get(url, params={"format": "csv", "step": 0}).status_code == 200
+
+
+def test_what_a_kill_left_is_removed_at_the_start(tmp_path: Path) -> None:
+    from server.exports.aside import ExportProcess
+
+    (tmp_path / FOLDER / "tmpabc").mkdir(parents=True)
+    (tmp_path / FOLDER / "tmpabc" / "half.zip").write_bytes(b"x")
+    made = ExportProcess(tmp_path)
+    assert not (tmp_path / FOLDER).exists()
+    made.close()
+
+
+def test_gauges_come_as_a_table_and_for_matlab(client: httpx.Client, url: str) -> None:
+    gauges = url.replace("/export", "/gauges")
+    body = {
+        "points": [{"name": "p", "xy_px": [61.0, 81.0]}, {"xy_px": [40.0 + 7 * 25, 60.0 + 7 * 3]}],
+        "variables": ["w_mm"],
+    }
+    read = client.post(gauges, json=body)
+    assert read.status_code == 200, read.text
+    table = client.post(gauges, json=body, params={"format": "csv"})
+    lines = [line.split(",") for line in table.text.splitlines() if not line.startswith("#")]
+    mat = client.post(gauges, json=body, params={"format": "mat"})
+    found = scipy.io.loadmat(io.BytesIO(mat.content), simplify_cells=True)
+    assert list(found["gauges"]) == lines[0]
+    assert list(found["gauges"]["gauge"]) == [line[lines[0].index("gauge")] for line in lines[1:]]
+    at = lines[0].index("value")
+    values = [float(line[at]) if line[at] else np.nan for line in lines[1:]]
+    np.testing.assert_array_equal(found["gauges"]["value"], values)
+    w = [s["points"][0]["values"]["w_mm"]["value"] for s in read.json()["steps"][1:]]
+    np.testing.assert_allclose(w, [-0.05, -0.10], atol=1e-9)
+    assert set(w) <= set(values)
+    assert any(len(m) for m in found["gauges"]["missing"])  # the second lies at a failed point
+    assert found["about"]["frame"].startswith("sys: X_sys")

@@ -1,0 +1,176 @@
+"""Log lines: ids of request and job, text and JSON, from threads and from the worker."""
+
+from __future__ import annotations
+
+import contextvars
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, ids_now
+from server.jobs.hardware import HardwareGate
+from server.worker.executor import ComputeWorker
+from server.workflows.service import Service
+from tests.support.service_rig import TINY, new_test, wait_for_job, wait_for_rig
+
+API = "/api/v1"
+ROOT = Path(__file__).resolve().parents[2]
+_log = logging.getLogger("stereorig.of_a_test")
+
+
+class Lines(logging.Handler):
+    """Keeps formatted lines."""
+
+    def __init__(self, formatter: logging.Formatter) -> None:
+        super().__init__()
+        self.setFormatter(formatter)
+        self.addFilter(AboutFilter())
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(self.format(record))
+
+    def documents(self) -> list[dict[str, object]]:
+        return [json.loads(line) for line in self.lines]
+
+
+@pytest.fixture
+def as_json() -> Iterator[Lines]:
+    handler, root = Lines(JsonFormatter()), logging.getLogger()
+    level = root.level
+    root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    yield handler
+    root.removeHandler(handler)
+    root.setLevel(level)
+
+
+def test_a_json_line_holds_the_ids_what_the_caller_gave_and_the_traceback(as_json: Lines) -> None:
+    with about(request_id="r1"), about(job_id="j1"):
+        try:
+            raise ValueError("of two\nlines")
+        except ValueError:
+            _log.exception("it failed: %s", "why", extra={"axis": 2})
+    _log.warning("nobody's")
+    first, second = as_json.documents()
+    assert first["message"] == "it failed: why"
+    assert (first["level"], first["logger"], first["axis"]) == ("error", "stereorig.of_a_test", 2)
+    assert (first["request_id"], first["job_id"]) == ("r1", "j1")
+    assert "ValueError: of two\nlines" in str(first["traceback"])
+    assert str(first["utc"]).endswith("Z")
+    assert "request_id" not in second
+
+
+def test_a_text_line_stays_one_line_whatever_a_client_sends() -> None:
+    handler = Lines(TextFormatter())
+    record = logging.makeLogRecord(
+        {"name": "n", "levelname": "INFO", "msg": "GET %s", "args": ("/a\r\n2026 ERROR forged\x1b[2J\u2028x",)}
+    )
+    with about(request_id="r1"):
+        handler.handle(record)
+    (line,) = handler.lines
+    assert len(line.splitlines()) == 1
+    assert "\x1b" not in line
+    assert r"/a\r\n2026 ERROR forged\x1b[2J" in line
+    assert line.endswith("[request_id=r1]")
+
+
+def test_the_hardware_thread_knows_whose_work_it_does() -> None:
+    gate = HardwareGate()
+    try:
+        with about(request_id="r2"):
+            assert gate.call(ids_now) == {"request_id": "r2"}
+        assert gate.call(ids_now) == {}
+    finally:
+        gate.close()
+
+
+def test_the_workers_lines_reach_the_service_and_name_the_job(as_json: Lines) -> None:
+    worker = ComputeWorker(threads=1)
+    try:
+        with about(job_id="j000007-abcdef"):
+            worker.submit(exec, "import logging; logging.getLogger('stereorig.there').warning('seen %d', 3)").result(60)
+        lines = [line for line in as_json.documents() if line["logger"] == "stereorig.there"]
+        assert [(line["message"], line["job_id"]) for line in lines] == [("seen 3", "j000007-abcdef")]
+    finally:
+        worker.shutdown()
+
+
+def test_a_requests_lines_and_its_jobs_lines_can_be_told_apart(
+    client: httpx.Client, service: Service, as_json: Lines
+) -> None:
+    wait_for_rig(client)
+    made = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 0.3}}, headers={"X-Request-Id": "mine-1"})
+    job = made.json()["job"]
+    wait_for_job(client, job)
+    client.get(f"{API}/jobs/%0d%0ax", headers={"X-Request-Id": "mine-2"})
+    deadline = time.monotonic() + 10.0
+    while not [x for x in as_json.documents() if x.get("request_id") == "mine-2"] and time.monotonic() < deadline:
+        time.sleep(0.01)
+    lines = as_json.documents()
+    states = [line["state"] for line in lines if line.get("job_id") == job["id"] and "state" in line]
+    assert states == ["queued", "running", "succeeded"]
+    (request,) = [line for line in lines if line["logger"] == "stereorig.http" and line["request_id"] == "mine-1"]
+    assert (request["method"], request["path"], request["status"]) == ("POST", f"{API}/stage/moves", 202)
+    assert request["who"] == "local"
+    assert float(str(request["duration_ms"])) > 0.0
+
+
+def test_ids_do_not_leak_between_threads() -> None:
+    seen = []
+    with about(request_id="r3"):
+        plain = threading.Thread(target=lambda: seen.append(ids_now()))
+        context = contextvars.copy_context()
+        knowing = threading.Thread(target=lambda: seen.append(context.run(ids_now)))
+        for thread in (plain, knowing):
+            thread.start()
+            thread.join()
+    assert seen == [{}, {"request_id": "r3"}]
+    assert ids_now() == {}
+
+
+def test_serve_writes_json_lines_where_it_is_told(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(TINY)
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "server.cli",
+            "serve",
+            "--config",
+            str(tmp_path / "rig.toml"),
+            "--port",
+            "0",
+            "--data",
+            str(tmp_path / "data"),
+            "--log-format",
+            "json",
+            "--log-level",
+            "info",
+        ],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    try:
+        assert process.stdout is not None
+        url = next(word for word in process.stdout.readline().split() if word.startswith("http://"))
+        with httpx.Client(base_url=url, trust_env=False, timeout=60.0) as client:
+            new_test(client)
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=60)
+    lines = [json.loads(line) for line in errors.splitlines()]
+    assert all({"utc", "level", "logger", "message"} <= set(line) for line in lines)
+    assert any(line.get("path") == f"{API}/tests" and line["status"] == 201 for line in lines)

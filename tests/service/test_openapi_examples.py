@@ -1,0 +1,193 @@
+"""The examples in the API's description are true: a small simulated rig accepts each request and answers like that."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from server.api.docs.openapi import EXAMPLES
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from tests.bench.documents.openapi import current
+from tests.support.api_scenario import FILE, Session, operations_of, run, short
+from tests.support.service_rig import SMALL, served
+
+Json = dict[str, Any]
+COMMAND = "run `python -m tests.bench.documents.api_examples` and `python -m tests.bench.documents.openapi`"
+# what they hold is named by the data: variables, settings, counters of a device, figures of a step
+_OPEN = frozenset(
+    {
+        "driver",
+        "extra",
+        "features",
+        "frames",
+        "result",
+        "subject",
+        "summary",
+        "settings",
+        "values",
+        "parameters",
+        "inputs_sha256",
+        "steps",
+        "notes",
+        "reasons",
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def described() -> Json:
+    return current()
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory, described: Json) -> Iterator[Session]:
+    """Every operation called once, as tests/bench/documents/api_examples.py does."""
+    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("examples") / "data")
+    try:
+        with served(service) as client:
+            yield run(client, described)
+    finally:
+        service.close()
+
+
+def schema_of(described: Json, schema: Json) -> Json:
+    return {**schema, "components": described["components"], "$schema": "https://json-schema.org/draft/2020-12/schema"}
+
+
+def successes(operation: Json) -> Iterator[tuple[str, str, Json]]:
+    """Status, media type and content of each successful answer."""
+    for status, response in operation["responses"].items():
+        if status.startswith("2"):
+            for media, content in response.get("content", {}).items():
+                yield status, media, content
+
+
+def untyped(described: Json, schema: Json) -> bool:
+    """Whether a schema says of an object no more than that it is one."""
+    if "$ref" in schema:
+        return untyped(described, described["components"]["schemas"][schema["$ref"].rsplit("/", 1)[1]])
+    return not schema or (schema.get("type") == "object" and not schema.get("properties"))
+
+
+def missing(described: Json) -> list[str]:
+    """What a reader of the description would miss: a line each."""
+    found = []
+    for name, operation in operations_of(described).items():
+        if not operation.get("summary"):
+            found.append(f"{name}: no summary")
+        for media, content in operation.get("requestBody", {}).get("content", {}).items():
+            if not content.get("examples"):
+                found.append(f"{name}: no example of what is sent as {media}")
+        for status, media, content in successes(operation):
+            if media == "application/json" and untyped(described, content.get("schema", {})):
+                found.append(f"{name}: {status} has no type")
+            if media == "application/json" and "example" not in content:
+                found.append(f"{name}: no example of answer {status}")
+            if not content.get("schema") and not (media == "text/event-stream" and content.get("example")):
+                found.append(f"{name}: {status} as {media} says not even whether it is text")
+        if not any(status.startswith("2") for status in operation["responses"]):
+            found.append(f"{name}: no successful answer")
+    return found
+
+
+def test_every_operation_has_summary_examples_and_types(described: Json) -> None:
+    assert missing(described) == [], COMMAND
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda o: o.pop("summary"), "no summary"),
+        (lambda o: o["requestBody"]["content"]["application/json"].pop("examples"), "no example of what is sent"),
+        (lambda o: o["responses"]["202"]["content"]["application/json"].pop("example"), "no example of answer 202"),
+        (
+            lambda o: o["responses"]["202"]["content"]["application/json"].update(
+                schema={"type": "object", "additionalProperties": True}
+            ),
+            "202 has no type",
+        ),
+    ],
+)
+def test_what_is_missing_is_seen(spoil: Any, says: str) -> None:
+    fresh = json.loads(json.dumps(current()))
+    spoil(fresh["paths"]["/api/v1/stage/moves"]["post"])
+    assert [line for line in missing(fresh) if says in line]
+
+
+def test_every_example_fits_its_schema(described: Json) -> None:
+    looked_at = 0
+    for name, operation in operations_of(described).items():
+        for content in operation.get("requestBody", {}).get("content", {}).values():
+            for example in content.get("examples", {}).values():
+                try:
+                    jsonschema.validate(example["value"], schema_of(described, content["schema"]))
+                except jsonschema.ValidationError as error:
+                    pytest.fail(f"{name}, what is sent: {error.message} at {error.json_path}")
+                looked_at += 1
+        for status, _, content in successes(operation):
+            if "example" not in content:
+                continue
+            try:
+                jsonschema.validate(content["example"], schema_of(described, content.get("schema", {})))
+            except jsonschema.ValidationError as error:
+                pytest.fail(f"{name}, answer {status}: {error.message} at {error.json_path}")
+            looked_at += 1
+    assert looked_at > 100
+
+
+def test_the_session_calls_every_operation_and_each_answer_that_has_a_body(session: Session, described: Json) -> None:
+    assert set(session.replies) == set(session.operations)
+    for name, operation in session.operations.items():
+        for status, media, _ in successes(operation):
+            if media == "application/json":
+                assert media in session.replies[name].get(status, {}), (name, status, COMMAND)
+
+
+def test_every_example_of_a_request_is_one_that_the_service_took(session: Session, described: Json) -> None:
+    """What the session sends was accepted (it asserts so); the description shows just that."""
+    taken = {(sent.operation, sent.media_type, json.dumps(sent.value, sort_keys=True)) for sent in session.requests}
+    for name, operation in operations_of(described).items():
+        for media, content in operation.get("requestBody", {}).get("content", {}).items():
+            for example in content["examples"].values():
+                sent = json.dumps(example["value"], sort_keys=True)
+                assert (name, media, sent) in taken, (name, example["summary"], COMMAND)
+
+
+def test_files_in_examples_are_told_as_files(described: Json) -> None:
+    form = described["paths"]["/api/v1/tests/{test_id}/steps:import"]["post"]["requestBody"]["content"]
+    for example in form["multipart/form-data"]["examples"].values():
+        assert example["value"]["cam1"] == example["value"]["cam2"] == FILE
+
+
+def same_keys(one: Any, other: Any, where: str) -> None:
+    """Objects have the same keys, down to where the data name them."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        assert set(one) == set(other), (where, sorted(set(one) ^ set(other)), COMMAND)
+        for key in one:
+            if key not in _OPEN:
+                same_keys(one[key], other[key], f"{where}.{key}")
+    elif isinstance(one, list) and isinstance(other, list) and one and other:
+        same_keys(one[0], other[0], f"{where}[0]")
+
+
+def test_examples_of_answers_have_the_keys_of_real_ones(session: Session, described: Json) -> None:
+    looked_at = 0
+    for name, operation in operations_of(described).items():
+        for status, media, content in successes(operation):
+            if media == "application/json":
+                same_keys(content["example"], short(session.replies[name][status][media]), f"{name} {status}")
+                looked_at += 1
+    assert looked_at > 60
+
+
+def test_the_description_holds_the_file_of_examples(described: Json) -> None:
+    examples = json.loads(EXAMPLES.read_text(encoding="utf-8"))
+    assert set(examples) == set(operations_of(described)), COMMAND
+    wheel = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    assert '"api/docs/examples.json"' in wheel  # the service of an installed wheel shows them too

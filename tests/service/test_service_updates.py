@@ -1,0 +1,111 @@
+"""Reference update in the service: what was asked for is recorded, and a fresh worker goes on from the files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from core.errors import FileFormatError
+from server.api.models import AnalysisRequest
+from server.compute import measurement
+from server.formats.images import write_image
+from server.worker.tasks import EarlierStep, StepTask
+from tests.support import sequence_bench as bench
+
+STEPS = (3, 4, 6, 7)  # as a test numbers them, one is missing
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    for k, n in enumerate(STEPS):
+        scene = bench.plate(0.3 * k, np.array([0.021, -0.013, 0.02]) * k)
+        for cam, image in zip(("cam1", "cam2"), bench.shoot(scene, seed=k), strict=True):
+            write_image(folder / f"{cam}_{n}.tif", image)
+    cameras = (bench.rig().pair.cam1, bench.rig().pair.cam2)
+    document = {cam: c.paper_parameters() for cam, c in zip(("cam1", "cam2"), cameras, strict=True)}
+    (folder / "calibration.json").write_text(json.dumps(document))
+    return folder
+
+
+def tasks(inputs: Path, out: Path, **settings: Any) -> list[StepTask]:
+    """The tasks of an analysis, as the service makes them."""
+    out.mkdir()
+    body = AnalysisRequest.model_validate(
+        {"region": {"rectangle": [190, 180, 330, 300]}, "step_px": 14, "patch": "stretch", "strain": None, **settings}
+    )
+    chosen = body.model_dump(exclude={"kind", "label", "steps", "noise_id"}) | {"noise": None}
+    paths = {n: (str(inputs / f"cam1_{n}.tif"), str(inputs / f"cam2_{n}.tif")) for n in STEPS}
+    sums = {n: [hashlib.sha256(Path(p).read_bytes()).hexdigest() for p in paths[n]] for n in STEPS}
+    first = STEPS[0]
+    return [
+        StepTask(
+            folder=str(out),
+            calibration=str(inputs / "calibration.json"),
+            kind="shape" if k == 0 else "motion",
+            n=n,
+            reference=first,
+            previous=STEPS[k - 1] if k else None,
+            settings=chosen,
+            inputs={},
+            label="",
+            load_n=None,
+            images={"ref1": paths[first][0], "ref2": paths[first][1], "cur1": paths[n][0], "cur2": paths[n][1]},
+            earlier={m: EarlierStep(paths[m], (sums[m][0], sums[m][1])) for m in STEPS[1:k]},
+        )
+        for k, n in enumerate(STEPS)
+    ]
+
+
+def test_a_fresh_worker_goes_on_from_the_files(inputs: Path, tmp_path: Path) -> None:
+    one, fresh = (tasks(inputs, tmp_path / name, reference_update="always") for name in ("one", "fresh"))
+    summaries = [measurement.measure_step(task) for task in one]
+    assert [s.get("reference_step") for s in summaries] == [None, 3, 4, 6]
+    for k, task in enumerate(fresh):
+        (tmp_path / "fresh" / f"step_{STEPS[k]:04d}.nc").unlink(missing_ok=True)
+        if k < 2:  # what was measured before the worker was lost
+            source = tmp_path / "one" / f"step_{STEPS[k]:04d}.nc"
+            (tmp_path / "fresh" / source.name).write_bytes(source.read_bytes())
+            continue
+        measurement._contexts.clear()
+        measurement.measure_step(task)
+        with (
+            xr.open_dataset(tmp_path / "one" / f"step_{STEPS[k]:04d}.nc") as a,
+            xr.open_dataset(tmp_path / "fresh" / f"step_{STEPS[k]:04d}.nc") as b,
+        ):
+            assert a.attrs["reference_step"] == b.attrs["reference_step"] == STEPS[k - 1]
+            for name in ("u_mm", "v_mm", "w_mm", "stretch_11", "sigma_u_mm", "handed_on_noise_xx_px2", "status"):
+                np.testing.assert_allclose(a[name], b[name], rtol=1e-5, atol=1e-9, err_msg=name)
+            assert json.loads(a.attrs["settings"])["reference_update"] == "always"
+            # a file written anew by somebody else is no reference any more
+    document = fresh[3]
+    spoiled = {**document.__dict__, "earlier": {6: EarlierStep(document.earlier[6].images, ("0" * 64, "0" * 64))}}
+    measurement._contexts.clear()
+    with pytest.raises(FileFormatError, match="checksum"):
+        measurement.measure_step(StepTask(**spoiled))
+    measurement._contexts.clear()
+
+
+def test_smoothed_files_still_tell_what_was_measured(inputs: Path, tmp_path: Path) -> None:
+    made = tasks(inputs, tmp_path / "smooth", reference_update="always", smoothing_window=3)
+    for task in made[:3]:
+        measurement.measure_step(task)
+    known = measurement.measure_step(made[3])["displacement_mm"]
+    measurement._contexts.clear()
+    again = measurement.measure_step(made[3])["displacement_mm"]
+    measurement._contexts.clear()
+    for name in "uvw":
+        assert again[name]["mean"] == pytest.approx(known[name]["mean"], abs=1e-8)
+
+
+def test_the_default_is_auto() -> None:
+    body = AnalysisRequest.model_validate({"region": {"rectangle": [0, 0, 9, 9]}})
+    assert body.reference_update == "auto"
+    with pytest.raises(ValueError, match="reference_update"):
+        AnalysisRequest.model_validate({"region": {"rectangle": [0, 0, 9, 9]}, "reference_update": "often"})

@@ -1,0 +1,371 @@
+"""Every operation of the API in one session on a small simulated rig: the examples of the description.
+
+Used by test_openapi_examples.py and by tests/bench/documents/api_examples.py.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+
+from tests.support.service_rig import SMALL, true_cameras, wait_for_job, wait_for_rig
+
+API = "/api/v1"
+REGION = {"rectangle": [95, 95, 165, 150]}
+LONGEST = 4
+TEXT_CHARACTERS = 400
+#: stands in an example for a file that text cannot hold
+FILE = "(the bytes of a file)"
+
+
+@dataclass
+class Sent:
+    """A request of an operation, and what came back."""
+
+    operation: str
+    media_type: str
+    summary: str
+    value: Any
+    status: int
+
+
+@dataclass
+class Session:
+    """What was sent and answered so far.
+
+    Parameters
+    ----------
+    client
+        Talks to the service.
+    operations
+        The description's operations, by their ids.
+    """
+
+    client: httpx.Client
+    operations: dict[str, dict[str, Any]]
+    requests: list[Sent] = field(default_factory=list)
+    replies: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
+    given: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def call(
+        self,
+        operation: str,
+        *ids: Any,
+        summary: str = "",
+        body: Any = None,
+        form: dict[str, Any] | None = None,
+        files: dict[str, bytes] | None = None,
+        text_files: bool = False,
+        query: dict[str, Any] | None = None,
+        headers: dict[str, str] | None = None,
+        body_name: str | None = None,
+    ) -> httpx.Response:
+        """Send a request and keep both sides; one with a summary becomes an example.
+
+        Parameters
+        ----------
+        ids
+            Values of the path's parameters, in their order.
+        form, files
+            A multipart body; ``text_files`` where the files are text that an example can hold.
+        """
+        known = self.operations[operation]
+        path = known["path"]
+        for value in ids:
+            path = re.sub(r"\{[a-z_]+\}", str(value), path, count=1)
+        more: dict[str, Any] = {}
+        if files is not None:
+            more = {"files": {name: (name, data) for name, data in files.items()}, "data": form or {}}
+        elif body is not None:
+            more = {"json": body}
+        with self.client.stream(known["method"], path, params=query, headers=headers, timeout=300.0, **more) as answer:
+            media = answer.headers.get("content-type", "").split(";")[0]
+            if media in ("text/event-stream", "multipart/x-mixed-replace"):
+                content = next(answer.iter_bytes())
+            else:
+                content = answer.read()
+        assert answer.is_success, (operation, answer.status_code, content[:2000])
+        if summary:
+            value = body
+            if files is not None:
+                value = {name: data.decode() if text_files else FILE for name, data in files.items()} | (form or {})
+            media_sent = "application/json" if files is None else "multipart/form-data"
+            self.requests.append(Sent(operation, media_sent, summary, value, answer.status_code))
+        replies = self.replies.setdefault(operation, {}).setdefault(str(answer.status_code), {})
+        if answer.status_code == 204:
+            return answer
+        if media == "application/json":
+            replies.setdefault(media, json.loads(content))
+        elif media.startswith("text/"):
+            replies.setdefault(media, content.decode())
+        elif media:
+            replies.setdefault(media, None)
+        return answer
+
+
+def short(value: Any) -> Any:
+    """Cut long lists and texts, round numbers to what they are good for; keys stay."""
+    if isinstance(value, dict):
+        return {name: short(v) for name, v in value.items()}
+    if isinstance(value, list):
+        return [short(v) for v in (value if len(value) <= LONGEST else value[: LONGEST - 1])]
+    if isinstance(value, str):
+        return value if len(value) <= TEXT_CHARACTERS else value[:TEXT_CHARACTERS].rsplit("\n", 1)[0] + "\n"
+    if isinstance(value, float) and math.isfinite(value) and value != 0.0:
+        return float(f"{value:.6g}")
+    return value
+
+
+def operations_of(description: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the description's operations by id, with method and path."""
+    return {
+        operation["operationId"]: {"method": method.upper(), "path": path, **operation}
+        for path, methods in description["paths"].items()
+        for method, operation in methods.items()
+    }
+
+
+def image(seed: int) -> bytes:
+    """A textured image of the small rig's size, as PNG."""
+    rng = np.random.default_rng(seed)
+    pixels = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (240, 256)), (0, 0), 1.2)
+    _, data = cv2.imencode(".png", cv2.normalize(pixels, None, 10, 245, cv2.NORM_MINMAX).astype(np.uint8))
+    return data.tobytes()
+
+
+def run(client: httpx.Client, description: dict[str, Any]) -> Session:
+    """Go through the whole job; every operation is called at least once."""
+    session = Session(client, operations_of(description))
+    wait_for_rig(client)
+    _look(session.call)
+    _stage(session)
+    calibration = _calibration(session)
+    noise = session.call("create_noise", summary="Eight frames of what stands still", body={"frames": 8}).json()
+    wait_for_job(client, noise["job"])
+    session.call("list_noise")
+    session.call("get_noise", noise["noise_id"])
+    session.call("get_noise_file", noise["noise_id"])
+    test = _test(session, calibration)
+    analysis = _analysis(session, test)
+    _results(session.call, test, analysis)
+    _ends(session, test, analysis, calibration, noise["noise_id"])
+    return session
+
+
+def _look(call: Callable[..., httpx.Response]) -> None:
+    for operation in ("healthz", "metrics", "get_rig", "get_cameras", "get_devices", "get_session"):
+        call(operation)
+    etag = call("get_camera", "cam1").headers["ETag"]
+    call("patch_camera", "cam1", summary="Expose for 12 ms", body={"exposure_ms": 12.0}, headers={"If-Match": etag})
+    call("patch_camera", "cam1", body={"exposure_ms": 10.0})
+    call("get_frame", "cam1")
+    call("get_pixel", "cam1", query={"x_px": 128, "y_px": 120})
+    call("get_stats", "cam1")
+    call("get_live_map", "cam1", "saturation")
+    call("get_stream", "cam1")
+    call("log_in")
+    call("log_out")
+
+
+def _stage(session: Session) -> None:
+    call, client = session.call, session.client
+
+    def done(answer: httpx.Response) -> None:
+        wait_for_job(client, answer.json()["job"])
+
+    call("get_stage")
+    etag = call("get_axis", 1).headers["ETag"]
+    call("patch_axis", 1, summary="4 mm/s", body={"velocity_mm_s": 4.0}, headers={"If-Match": etag})
+    done(call("move", summary="Both cameras 1 mm away from the target", body={"dz_mm": {"cam1": 1.0, "cam2": 1.0}}))
+    done(call("move", summary="One axis to 0.5 mm", body={"positions_mm": {"1": 0.5}}))
+    done(call("move", summary="One axis on by 0.1 mm", body={"by_mm": {"2": 0.1}}))
+    call("stop")
+    call("abort")
+    call("disable", summary="One axis", body={"axes": [1]})
+    call("enable", summary="Both axes", body={"axes": [1, 2]})
+    done(call("home", summary="Both axes", body={"axes": [1, 2]}))
+    done(call("move", body={"dz_mm": {"cam1": 0.0, "cam2": 0.0}}))
+    done(call("leave_configuration", 1, summary="Consent", body={"write_flash": True}))
+    call("get_messages")
+    done(call("reconnect"))
+    wait_for_rig(client)
+
+
+def _calibration(session: Session) -> str:
+    call, client = session.call, session.client
+    plan = {"positions_mm": [0.0, 5.0], "held_out_mm": [2.0]}
+    call("expect_calibration", summary="Two positions", body={"positions_mm": [0.0, 5.0], "noise_px": 0.005})
+    made = call("create_calibration", summary="Two positions and one for the check", body={**plan, "frames": 4}).json()
+    job = wait_for_job(client, made["job"])
+    assert job["state"] == "succeeded", job["problem"]
+    calibration = str(made["calibration_id"])
+    call("list_calibrations")
+    call("get_calibration", calibration)
+    call("get_calibration_file", calibration)
+    call("list_views", calibration)
+    call("get_residuals", calibration)
+    call("get_view", calibration, 0, "cam1")
+    call("get_view_preview", calibration, 0, "cam1")
+    for form in ("paper", "opencv", "matchid", "vic3d"):
+        call("export_calibration", calibration, query={"format": form})
+    call("report_conversion", calibration, query={"format": "opencv"})
+    decision = {"decision": "accepted", "note": "held-out residuals are small"}
+    call("put_judgement", calibration, summary="Measure with it from now on", body=decision)
+    call(
+        "import_calibration",
+        summary="Both cameras as calibration.json",
+        form={"label": "from the old rig"},
+        files={"file": json.dumps(true_cameras(SMALL)).encode()},
+        text_files=True,
+    )
+    return calibration
+
+
+def _test(session: Session, calibration: str) -> str:
+    call, client = session.call, session.client
+    body = {"name": "Plate under pressure", "specimen": "Al 6061-T6, 1.5 mm", "calibration_id": "accepted"}
+    test = str(call("create_test", summary="With the newest accepted calibration", body=body).json()["id"])
+    call("put_scene", summary="A clamped plate under 20 kPa", body={"scene": "plate", "load": 0.0})
+    readings = {"stroke_mm": 0.42, "temperature_c": 21.3}
+    step = {"label": "unloaded", "load_n": 0.0, "timestamp_utc": "2026-03-01T12:00:00.250Z", "channels": readings}
+    call("create_step", test, summary="One load step, with the load frame's own readings", body=step)
+    call("put_scene", summary="A clamped plate under 20 kPa", body={"scene": "plate", "load": 20.0})
+    call("create_step", test, body={"label": "20 kPa", "load_n": 1250.0})
+    burst = {"label": "cycle 3", "count": 2, "interval_ms": 500.0}
+    wait_for_job(client, call("create_step", test, summary="Two steps, two a second", body=burst).json()["job"])
+    form = {"label": "from another program", "load_n": 1300.0, "channels": '{"stroke_mm": 0.42}'}
+    files = {cam: image(k) for k, cam in enumerate(("cam1", "cam2"))}
+    imported = call("import_images", test, summary="A pair of image files", form=form, files=files).json()["n"]
+    call("list_tests")
+    etag = call("get_test", test).headers["ETag"]
+    notes = {"notes": "Second plate of the batch."}
+    call("patch_test", test, summary="New notes", body=notes, headers={"If-Match": etag})
+    call("list_steps", test)
+    etag = call("get_step", test, 1).headers["ETag"]
+    call("patch_step", test, 1, summary="New label", body={"label": "20 kPa, held"}, headers={"If-Match": etag})
+    call("get_step_image", test, 1, "cam1")
+    call("get_step_preview", test, 1, "cam1")
+    call("get_step_pixels", test, 1, "cam1", query={"x_px": 128, "y_px": 120})
+    call("get_step_map", test, 1, "cam1", "texture")
+    facts = {
+        "purpose": "Deflection of a clamped plate",
+        "operator": "A. Smith",
+        "material": "Aluminium 6061-T6",
+        "lighting": "2 LED panels, diffuse",
+        "pattern_technique": "matt white ground, black spray paint",
+        "cam1": {"maker": "Basler", "pixel_um": 3.45, "lens": {"maker": "Schneider", "focal_length_mm": 50.0}},
+        "static_steps": [1],
+    }
+    call("put_facts", test, summary="What the guide's tables ask for and no device can say", body=facts)
+    call("get_facts", test)
+    watch = {"channel": "load_n", "threshold": 500.0, "frames": 1}
+    call("put_watch", test, summary="A step at each further 500 N", body=watch)
+    call("get_watch", test)
+    reading = {"load_n": 1810.2, "timestamp_utc": "2026-03-01T12:00:01Z", "channels": {"stroke_mm": 0.61}}
+    call("post_channels", test, summary="What the load frame reads now", body=reading)
+    call("post_channels", test, body={"load_n": 1811.0})
+    call("end_watch", test)
+    call("judge_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
+    call("check_seed_places", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
+    call("delete_step", test, imported)
+    return test
+
+
+def _analysis(session: Session, test: str) -> str:
+    call, client = session.call, session.client
+    wanted = {"region": REGION, "subset_px": 21, "step_px": 10, "strain": {"window": 3}}
+    made = call(
+        "create_analysis", test, summary="Shape, displacement and strain of two steps", body={**wanted, "steps": [0, 1]}
+    ).json()
+    job = wait_for_job(client, made["job"], 600.0)  # kernels may be compiled first
+    assert job["state"] == "succeeded", job
+    following = call(
+        "create_analysis", test, summary="Go on with each step that lands", body={**wanted, "follow": True}
+    )
+    other = following.json()
+    _until(lambda: len(client.get(f"{API}/tests/{test}/analyses/{other['analysis_id']}").json()["steps_finished"]) > 1)
+    call("cancel_job", other["job"]["id"])
+    wait_for_job(client, other["job"])
+    again = call("continue_analysis", test, other["analysis_id"], summary="The rest", body={"other_version": False})
+    call("finish_analysis", test, other["analysis_id"])
+    wait_for_job(client, again.json()["job"])
+    call("delete_analysis", test, other["analysis_id"])
+    call("list_analyses", test)
+    call("get_analysis", test, made["analysis_id"])
+    return str(made["analysis_id"])
+
+
+def _until(true: Callable[[], bool], seconds: float = 240.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _results(call: Callable[..., httpx.Response], test: str, analysis: str) -> None:
+    call("list_fields", test, analysis, 1)
+    part = {"rows": "0:2", "cols": "0:3"}
+    for form in ("json", "npy", "csv", "nc", "f32", "png"):
+        call("get_field", test, analysis, 1, "w_mm", query={**part, "format": form})
+    call("get_places", test, analysis, 1, "cam1")
+    call("get_probe", test, analysis, query={"x_px": 128, "y_px": 120, "step": 1})
+    gauges = {
+        "extensometers": [{"name": "axial", "a_px": [100.0, 120.0], "b_px": [160.0, 120.0]}],
+        "areas": [{"rectangle_px": [100, 100, 160, 145]}],
+        "variables": ["u_mm", "w_mm"],
+        "remove_rigid": {},
+    }
+    call(
+        "read_gauges",
+        test,
+        analysis,
+        body=gauges,
+        summary="An extensometer and the mean displacement of an area, rigid motion taken out",
+    )
+    call("read_gauges", test, analysis, body=gauges, query={"format": "csv"})
+    line = {
+        "lines": [{"vertices_px": [[100.0, 120.0], [160.0, 120.0]], "count": 5}],
+        "align": {"kind": "plane"},
+        "steps": [1],
+    }
+    call("read_gauges", test, analysis, summary="Deflection along a line in the frame of the best-fit plane", body=line)
+    call(
+        "make_gauge_field",
+        test,
+        analysis,
+        query={"step": 1},
+        body={"align": {"kind": "plane"}, "remove_rigid": {}},
+        summary="In the frame of the best-fit plane, rigid motion taken out",
+    )
+    for form in ("csv", "nc"):
+        call("export", test, analysis, query={"format": form, "step": 1})
+    call("get_report", test, analysis)
+
+
+def _ends(session: Session, test: str, analysis: str, calibration: str, noise: str) -> None:
+    call = session.call
+    call("readyz")
+    jobs = call("list_jobs").json()["jobs"]
+    measured = next(job for job in jobs if job["kind"] == "analysis")
+    call("get_job", measured["id"])
+    call("job_events", measured["id"])
+    call("events", headers={"Last-Event-ID": "0"})
+    there = call("get_test", test).json()
+    copied = {"steps": len(there["steps"]), "results": 2}
+    call("acknowledge_exported", test, summary="All of it lies elsewhere", body=copied)
+    gone = call("delete_noise", noise).json()["id"]
+    call("delete_calibration", calibration)
+    call("delete_test", test)
+    call("list_trash")
+    call("restore_trash", gone)
+    again = call("delete_noise", noise).json()["id"]
+    call("remove_trash", again)

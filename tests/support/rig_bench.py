@@ -1,0 +1,119 @@
+"""Two simulated cameras behind the rig's own parts, small enough for tests of pairing and loss."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from core.errors import CameraError
+from drivers.cameras.protocol import CameraSettings, FrameGrabber, Pixels, TriggerMode
+from server.rig.cameras import CameraPair
+from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
+from server.rig.unit import CAMERAS, Cam, CameraUnit
+from sim.grabber import SimFrameGrabber, TriggerLine
+
+SIZE = (64, 48)
+
+
+class MovingWorld:
+    """A textured wall that moves at a known speed; noise makes every frame its own."""
+
+    def __init__(self, speed_px_s: float = 0.0) -> None:
+        self.speed_px_s = speed_px_s
+        self._began = time.monotonic()
+        # a sum of waves can be shifted by any fraction of a pixel without an interpolator
+        rng = np.random.default_rng(7)
+        self._waves = [(*rng.uniform(-1.2, 1.2, 2), rng.uniform(0, 2 * np.pi)) for _ in range(60)]
+
+    def expose(self, cam: Cam, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
+        assert rng is not None
+        y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
+        x -= self.speed_px_s * (time.monotonic() - self._began)
+        image = sum(np.sin(a * x + b * y + c) for a, b, c in self._waves) * 15.0 + 128.0
+        return np.clip(image + rng.normal(0, 1.0, x.shape), 0, 255).astype(np.uint8)
+
+
+class Bench:
+    """Units, a pair and the trigger line between the cameras."""
+
+    def __init__(
+        self,
+        trigger: TriggerMode = "software",
+        *,
+        rate_hz: float | None = None,
+        by: str = "time",
+        max_skew_ms: float = 5.0,
+        skew_is_set: bool = True,
+        capture_timeout_s: float = 2.0,
+        speed_px_s: float = 0.0,
+        latency_s: float = 0.0,
+        **unit_options: Any,
+    ) -> None:
+        self.line = TriggerLine()
+        self.world = MovingWorld(speed_px_s)
+        self.latency_s = latency_s
+        self.lost: list[tuple[Cam, CameraError]] = []
+        self.units: dict[Cam, CameraUnit] = {
+            cam: CameraUnit(
+                cam,
+                partial(self.grabber, cam),
+                trigger=trigger,
+                rate_hz=rate_hz,
+                size_px=SIZE,
+                on_lost=lambda name, error: self.lost.append((name, error)),
+                **unit_options,
+            )
+            for cam in CAMERAS
+        }
+
+        def source() -> PairSource:
+            if trigger == "software":
+                return TriggeredPairs(self.units, max_skew_ms=max_skew_ms)
+            return StreamedPairs(
+                self.units,
+                by=by,  # type: ignore[arg-type]
+                max_skew_ms=max_skew_ms,
+                capture_timeout_s=capture_timeout_s,
+            )
+
+        for unit in self.units.values():
+            unit.open(CameraSettings(exposure_ms=5.0))
+        self.pair = CameraPair(self.units["cam1"], self.units["cam2"], make_source=source, skew_is_set=skew_is_set)
+
+    def grabber(self, cam: Cam) -> FrameGrabber:
+        return SimFrameGrabber(
+            self.world, cam, image_size_px=SIZE, bit_depth=8, line=self.line, latency_s=self.latency_s
+        )
+
+    @contextmanager
+    def pulses(self, rate_hz: float) -> Iterator[None]:
+        """A pulse generator on the trigger line."""
+        ending = threading.Event()
+
+        def run() -> None:
+            while not ending.wait(1.0 / rate_hz):
+                self.line.pulse()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield
+        finally:
+            ending.set()
+            thread.join()
+
+
+@contextmanager
+def rig_bench(trigger: TriggerMode = "software", **options: Any) -> Iterator[Bench]:
+    """A bench, closed afterwards."""
+    bench = Bench(trigger, **options)
+    try:
+        yield bench
+    finally:
+        bench.pair.close()

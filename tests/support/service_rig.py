@@ -1,0 +1,123 @@
+"""A tiny fast rig, and the service on it, for the service's tests."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import uvicorn
+
+from server.api.app import create_app
+from server.config.rig_file import RigConfig, parse_config
+from server.workflows.service import Service
+from tests.bench.documents.tiny_rig import TINY, tiny_rig
+
+# half of the paper rig's pixels: lines of the grid one pixel wide, speckles of four
+SMALL = (
+    TINY.replace("[160, 144]", "[256, 240]")
+    .replace("3600.0", "6100.0")
+    .replace("phd_px = 3560.0", "phd_px = 6031.0")
+    .replace("phd_px = 3530.0", "phd_px = 5969.0")
+    .replace("cx_px = 80.4", "cx_px = 130.4")
+    .replace("cx_px = 79.7", "cx_px = 124.7")
+    .replace("cy_px = 71.8", "cy_px = 117.8")
+    .replace("cy_px = 72.1", "cy_px = 122.1")
+    .replace("line_width_mm = 0.1", "line_width_mm = 0.06")
+    .replace("speckle_mm = 0.45", "speckle_mm = 0.26")
+)
+
+
+def tiny_config(**replacements: str) -> RigConfig:
+    """Return the tiny rig's configuration, with lines replaced (``velocity_mm_s="velocity_mm_s = 1.0"``)."""
+    return parse_config(tiny_rig(**replacements))
+
+
+def true_cameras(text: str) -> dict[str, dict[str, float]]:
+    """A simulated rig's own cameras as a calibration file, so that nothing need be calibrated."""
+    world = tomllib.loads(text)["sim"]
+    names = (
+        "phd_px",
+        "cx_px",
+        "cy_px",
+        "kappa_per_px2",
+        "aspect",
+        "alpha_rad",
+        "beta_rad",
+        "gamma_rad",
+        "x0_mm",
+        "y0_mm",
+        "z0_mm",
+    )
+    return {cam: {name: world[cam][name] for name in names} for cam in ("cam1", "cam2")}
+
+
+@contextlib.contextmanager
+def served(service: Service, **app: Any) -> Iterator[httpx.Client]:
+    """Serve on a free loopback port in a thread of this process; yields a client. ``app`` goes to `create_app`."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.bind(("127.0.0.1", 0))
+    settings = uvicorn.Config(
+        create_app(service, close_service=False, **app), log_level="error", timeout_graceful_shutdown=2
+    )
+    server = uvicorn.Server(settings)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    try:
+        with httpx.Client(base_url=url, timeout=60.0, trust_env=False) as client:
+            yield client
+    finally:
+        service.stop_streams()
+        server.should_exit = True
+        thread.join(timeout=10.0)
+        listener.close()
+
+
+def wait_for_rig(client: httpx.Client, seconds: float = 60.0) -> None:
+    """Wait until the stage is homed."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        rig = client.get("/api/v1/rig").json()
+        if rig["connected"] and all(axis["state"] == "ready" for axis in rig["stage"]["axes"]):
+            return
+        assert rig["fault"] is None or rig["fault"]["code"] == "not_connected", rig["fault"]
+        time.sleep(0.02)
+    raise AssertionError("the rig did not come up")
+
+
+def wait_for_job(client: httpx.Client, job: dict[str, Any], seconds: float = 240.0) -> dict[str, Any]:
+    """Poll a job until it has ended."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        document: dict[str, Any] = client.get(f"/api/v1/jobs/{job['id']}").json()
+        if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
+            return document
+        time.sleep(0.02)
+    raise AssertionError(f"job {job['id']} did not end: {document}")
+
+
+def a_second(client: httpx.Client) -> float:
+    """A second; more on a machine so busy that a plain answer takes long."""
+    began = time.monotonic()
+    for _ in range(3):
+        client.get("/api/v1/healthz")
+    return 1.0 + 10.0 * (time.monotonic() - began)
+
+
+def new_test(client: httpx.Client, **body: Any) -> str:
+    """Make a test without a calibration."""
+    answer = client.post("/api/v1/tests", json={"name": "a test", **body})
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["id"])
+
+
+def data_of(path: Path) -> Path:
+    """Where a test's service keeps its data."""
+    return path / "data"

@@ -1,0 +1,374 @@
+"""Calibration from intersections made by an independent projection."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from core.calibration import (
+    CalibrationOptions,
+    CalibrationResult,
+    CalibrationView,
+    NominalCamera,
+    calibrate,
+    check_known_distance,
+)
+from core.errors import CalibrationError, CalibrationInputError
+from tests.support.calibration_truth import PAPER, Array, Grid, nodes, project
+
+NOISE_PX = 0.0022
+NOMINAL = (
+    NominalCamera((512, 480), 12000.0, 400.0, -30.0, 0.9617),
+    NominalCamera((512, 480), 12000.0, 400.0, 30.0, 0.9617),
+)
+HELD = CalibrationOptions(held_out_mm=(2.0, 4.0))
+
+
+def make_views(
+    positions: Sequence[float] = (0.0, 2.0, 4.0, 5.0),
+    *,
+    grid: Grid | None = None,
+    noise: float = NOISE_PX,
+    seed: int = 0,
+    error_mm: Array | None = None,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    declared: Callable[[float], float] = lambda dz: dz,
+    cameras: Sequence[dict[str, float]] = PAPER,
+) -> list[CalibrationView]:
+    rng = np.random.default_rng(seed)
+    X, Y = nodes(grid or Grid())
+    if error_mm is not None:
+        X, Y = X + error_mm[..., 0], Y + error_mm[..., 1]
+    views = []
+    for name, camera in zip(("cam1", "cam2"), cameras, strict=True):
+        for dz in positions:
+            xy = project(camera, X, Y, dz, tilt=tilt)
+            views.append(CalibrationView(name, declared(dz), xy + noise * rng.standard_normal(xy.shape)))  # type: ignore[arg-type]
+    return views
+
+
+def shape_error_um(result: CalibrationResult) -> float:
+    """RMS error of points in the target's volume, seen by the true cameras, after the best rigid alignment."""
+    X, Y, Z = (a.ravel() for a in np.meshgrid(*[np.linspace(-4, 4, 5)] * 2, [-1.0, 0.0, 1.0]))
+    found = result.pair.triangulate(*(project(c, X, Y, 0.0, Z) for c in PAPER)).xyz_mm
+    truth = np.column_stack([X, Y, Z])
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return float(1e3 * np.sqrt(np.mean((a @ u @ vt - b) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("phd", "standoff", "angle"),
+    [(1.0, 1.0, 0.0), (1.2, 0.8, 8.0), (0.8, 1.2, -8.0), (1.2, 1.2, -8.0), (0.8, 0.8, 8.0)],
+)
+def test_finds_the_cameras_from_poor_nominal_values(phd: float, standoff: float, angle: float) -> None:
+    nominal = tuple(
+        dataclasses.replace(
+            n, phd_px=n.phd_px * phd, standoff_mm=n.standoff_mm * standoff, angle_deg=n.angle_deg + angle
+        )
+        for n in NOMINAL
+    )
+    result = calibrate(make_views(noise=0.0), Grid(), (nominal[0], nominal[1]), HELD)
+    for camera, truth in zip((result.pair.cam1, result.pair.cam2), PAPER, strict=True):
+        got = camera.paper_parameters()
+        for key, value in got.items():
+            name = key.replace("_per_px2", "").rsplit("_", 1)[0] if key != "kappa_per_px2" else "kappa"
+            # noise-free; what is left is the weak prior on the centre against rounding
+            assert value == pytest.approx(truth[name], rel=1e-4, abs=1e-5), key
+    assert result.held_out is not None
+    assert result.held_out.mean.rbe_px < 1e-4
+    assert shape_error_um(result) < 1e-3
+
+
+def test_exact_grid_reaches_the_noise_in_held_out_positions() -> None:
+    result = calibrate(make_views(), Grid(), NOMINAL, HELD)
+    assert result.held_out is not None
+    # mean distance of isotropic noise is 1.253 sigma = 0.00276
+    assert result.held_out.mean.rbe_px < 0.0035
+    assert result.fitted.mean.rbe_px < 0.0030
+    np.testing.assert_allclose(result.noise_px, NOISE_PX, rtol=0.1)
+    assert result.verdict.level == "good"
+    assert shape_error_um(result) < 0.05
+    assert result.node_corrections_mm is None
+
+
+def test_toleranced_grid_is_corrected_from_both_cameras() -> None:
+    grid = Grid(node_tolerance_mm=0.004)
+    error = np.random.default_rng(3).uniform(-0.004, 0.004, (9, 9, 2))
+    views = make_views(grid=grid, error_mm=error)
+    result = calibrate(views, grid, NOMINAL, HELD)
+    held_fixed = calibrate(views, grid, NOMINAL, dataclasses.replace(HELD, estimate_nodes=False))
+    assert result.held_out is not None
+    assert held_fixed.held_out is not None
+    assert result.held_out.mean.rbe_px < 0.0045
+    # 4 um in a box leave 0.087 px against the nominal grid at 33 um/px; this figure must not hide
+    assert 0.06 < result.held_out.nominal_mean.rbe_px < 0.11
+    assert 0.06 < held_fixed.held_out.mean.rbe_px < 0.11
+    assert shape_error_um(result) < 0.75
+    assert shape_error_um(result) < shape_error_um(held_fixed)
+
+
+@pytest.mark.fault(30)
+@pytest.mark.parametrize(
+    ("positions", "code"),
+    [
+        ((0.0,), "calibration_one_position"),
+        ((2.0, 2.0, 2.0), "calibration_one_position"),
+        ((0.0, 0.002), "calibration_dz_too_small"),
+        ((0.0, 0.1), "calibration_dz_too_small"),
+    ],
+)
+def test_too_little_travel_is_refused_with_the_predicted_uncertainty(positions: tuple[float, ...], code: str) -> None:
+    with pytest.raises(CalibrationInputError, match=r"predicted uncertainty .* um rms of shape") as caught:
+        calibrate(make_views(positions), Grid(), NOMINAL)
+    assert caught.value.code == code
+    assert caught.value.context["predicted_shape"] > 0.0
+
+
+@pytest.mark.fault(31)
+@pytest.mark.parametrize(
+    ("declared", "code", "says"),
+    [
+        (lambda dz: -dz, "positions_sign_reversed", "sign"),
+        (lambda dz: 1000.0 * dz, "positions_unit", "micrometres for millimetres"),
+        (lambda dz: dz / 25.4, "positions_unit", "inches"),
+        (lambda dz: {0.0: 4.0, 2.0: 2.0, 4.0: 0.0, 5.0: 5.0}[dz], "positions_permuted", "seem exchanged"),
+        (lambda dz: {0.0: 0.0, 2.0: 4.0, 4.0: 2.0, 5.0: 5.0}[dz], "positions_permuted", "seem exchanged"),
+        (lambda dz: {0.0: 0.0, 2.0: 2.5, 4.0: 4.0, 5.0: 5.0}[dz], "position_wrong", r"worst is cam1 at \+2.500"),
+    ],
+)
+def test_wrong_positions_are_refused_with_the_cause(declared: Callable[[float], float], code: str, says: str) -> None:
+    with pytest.raises(CalibrationInputError, match=says) as caught:
+        calibrate(make_views(declared=declared), Grid(), NOMINAL)
+    assert caught.value.code == code
+
+
+def changed(views: list[CalibrationView], camera: str, change: Callable[[Array], Array]) -> list[CalibrationView]:
+    return [dataclasses.replace(v, xy_px=change(v.xy_px)) if v.camera == camera else v for v in views]
+
+
+def mirrored(xy: Array) -> Array:
+    # seen in a mirror, the family that runs right-and-down is the other one
+    return np.swapaxes(np.stack([511.0 - xy[..., 0], xy[..., 1]], -1), 0, 1)
+
+
+def quarter_turned(xy: Array) -> Array:
+    # clockwise: right-and-down becomes left-and-down, left-and-down becomes left-and-up
+    turned = np.stack([511.0 - xy[..., 1], xy[..., 0]], -1)
+    return np.swapaxes(turned, 0, 1)[::-1]
+
+
+def half_turned(xy: Array) -> Array:
+    return np.stack([511.0 - xy[..., 0], 479.0 - xy[..., 1]], -1)[::-1, ::-1]
+
+
+@pytest.mark.fault(29)
+@pytest.mark.parametrize("angles", [(-29.0, 31.0), (1.0, 24.0), (-4.2, 4.1)])
+def test_swapped_cameras_are_named(angles: tuple[float, float]) -> None:
+    cameras = [{**c, "gamma": np.radians(a)} for c, a in zip(PAPER, angles, strict=True)]
+    nominal = tuple(dataclasses.replace(n, angle_deg=round(a)) for n, a in zip(NOMINAL, angles, strict=True))
+    views = make_views(cameras=cameras)
+    assert calibrate(views, Grid(), (nominal[0], nominal[1])).fitted.mean.rbe_px < 0.003
+    views = [dataclasses.replace(v, camera="cam2" if v.camera == "cam1" else "cam1") for v in views]
+    with pytest.raises(CalibrationInputError, match="swapped") as caught:
+        calibrate(views, Grid(), (nominal[0], nominal[1]))
+    assert caught.value.code == "cameras_swapped"
+
+
+@pytest.mark.fault(29)
+@pytest.mark.parametrize("camera", ["cam1", "cam2"])
+def test_a_mirrored_image_is_named(camera: str) -> None:
+    with pytest.raises(CalibrationInputError, match=f"{camera} is tilted to the other side") as caught:
+        calibrate(changed(make_views(), camera, mirrored), Grid(), NOMINAL)
+    assert caught.value.code == "image_mirrored"
+
+
+@pytest.mark.parametrize("alphas", [(30.0, 52.0), (36.0, 57.0), (62.0, 40.0)])
+def test_cameras_rolled_against_each_other_are_no_fault(alphas: tuple[float, float]) -> None:
+    cameras = [{**c, "alpha": np.radians(a)} for c, a in zip(PAPER, alphas, strict=True)]
+    result = calibrate(make_views(cameras=cameras), Grid(), NOMINAL)
+    assert result.verdict.level != "failed"
+    assert result.fitted.mean.rbe_px < 0.003
+
+
+@pytest.mark.fault(29)
+def test_an_image_upside_down_is_named() -> None:
+    with pytest.raises(CalibrationInputError, match=r"cam2 .* mirrored or turned by 180 degrees") as caught:
+        calibrate(changed(make_views(), "cam2", half_turned), Grid(), NOMINAL)
+    assert caught.value.code == "image_mirrored"
+
+
+@pytest.mark.fault(29)
+@pytest.mark.parametrize("both", [True, False])
+def test_a_quarter_turn_is_named(both: bool) -> None:
+    square = [{**c, "aspect": 1.0, "cy": c["cy"] + 16.0} for c in PAPER]
+    nominal = tuple(dataclasses.replace(n, image_size_px=(512, 512), aspect=1.0) for n in NOMINAL)
+    views = changed(make_views(cameras=square), "cam1", quarter_turned)
+    if both:
+        views = changed(views, "cam2", quarter_turned)
+    with pytest.raises(CalibrationInputError, match="turned by 90 degrees") as caught:
+        calibrate(views, Grid(), (nominal[0], nominal[1]))
+    assert caught.value.code == "image_rotated"
+
+
+@pytest.mark.fault(29)
+def test_a_camera_at_another_angle_is_named_and_a_small_difference_is_not_held_against_it() -> None:
+    off = (NOMINAL[0], dataclasses.replace(NOMINAL[1], angle_deg=5.0))
+    with pytest.raises(CalibrationInputError, match="cam2 looks at the target from another angle") as caught:
+        calibrate(make_views(), Grid(), off)
+    assert caught.value.code == "angle_mismatch"
+    near = (NOMINAL[0], dataclasses.replace(NOMINAL[1], angle_deg=18.0))
+    assert calibrate(make_views(), Grid(), near).fitted.mean.rbe_px < 0.003
+
+
+@pytest.mark.fault(32)
+def test_a_wrong_pitch_shows_in_a_known_distance_and_nowhere_else() -> None:
+    result = calibrate(make_views(), Grid(pitch_mm=1.005), NOMINAL, HELD)
+    assert result.held_out is not None
+    assert result.held_out.mean.rbe_px < 0.0035
+    made = {c.name: c.made for c in result.checks}
+    assert made == {
+        "held_out": True,
+        "positions": True,
+        "angles": True,
+        "known_distance": False,
+        "stage_axis": False,
+        "aspect": False,
+    }
+    marks = np.array([[project(c, -3.0, 1.0, 0.0), project(c, 3.0, 1.0, 0.0)] for c in PAPER])
+    check = check_known_distance(result.pair, marks, 6.0, covariance=result.covariance, localisation_sigma_px=0.01)
+    assert not check.agrees
+    assert check.ratio == pytest.approx(1.005, abs=2e-4)
+    right = calibrate(make_views(), Grid(), NOMINAL, HELD)
+    good = check_known_distance(right.pair, marks, 6.0, covariance=right.covariance, localisation_sigma_px=0.003)
+    assert good.agrees
+    assert good.ratio == pytest.approx(1.0, abs=2e-5)
+    for points, length in ((marks[:1], 6.0), (marks, -1.0), (marks * np.nan, 6.0)):
+        with pytest.raises(CalibrationInputError, match="two marks"):
+            check_known_distance(right.pair, points, length)
+
+
+@pytest.mark.fault(34)
+@pytest.mark.parametrize(("noise", "level"), [(0.05, "good"), (0.16, "warning"), (0.5, "failed")])
+def test_residuals_are_judged_by_the_bands(noise: float, level: str) -> None:
+    result = calibrate(make_views((0.0, 1.0, 2.0, 4.0, 5.0), noise=noise), Grid(), NOMINAL, HELD)
+    assert result.held_out is not None
+    assert result.held_out.mean.rbe_px == pytest.approx(1.25 * noise, rel=0.1)
+    assert result.verdict.level == level
+    limit = {"good": "within 0.1 px", "warning": "above 0.1 px", "failed": "above 0.3 px"}[level]
+    assert any("Held-out RBE of cam1" in r and limit in r for r in result.verdict.reasons)
+
+
+def test_a_stage_that_travels_off_the_optical_axis_is_suspected() -> None:
+    # 20 mrad across cam1's axis: the whole image moves in proportion to dZ, which the residuals cannot tell
+    shift = 12000.0 * 0.02 / 400.0
+    views = [
+        dataclasses.replace(v, xy_px=v.xy_px + np.array([0.0, shift * v.dz_mm])) if v.camera == "cam1" else v
+        for v in make_views()
+    ]
+    verdict = calibrate(views, Grid(), NOMINAL, HELD).verdict
+    assert verdict.level == "warning"
+    assert any("principal point of cam1" in reason and "off the optical axis" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.fault(34)
+def test_the_worst_view_is_named() -> None:
+    views = make_views()
+    bumped = [
+        dataclasses.replace(v, xy_px=v.xy_px + np.array([0.5, 0.0])) if (v.camera, v.dz_mm) == ("cam2", 4.0) else v
+        for v in views
+    ]
+    result = calibrate(bumped, Grid(), NOMINAL, HELD)
+    assert result.verdict.level == "failed"
+    assert any(r.startswith("Worst views: cam2 at +4.000 mm 0.5") for r in result.verdict.reasons)
+
+
+def test_without_held_out_positions_the_verdict_says_so() -> None:
+    result = calibrate(make_views(), Grid(), NOMINAL)
+    assert result.held_out is None
+    assert result.verdict.level == "warning"
+    assert "No position was held out" in result.verdict.reasons[0]
+
+
+@pytest.mark.parametrize(("held", "code"), [((3.0,), "hold_out_unknown"), ((0.0, 2.0, 4.0, 5.0), "hold_out_all")])
+def test_held_out_positions_must_exist_and_leave_some(held: tuple[float, ...], code: str) -> None:
+    with pytest.raises(CalibrationInputError) as caught:
+        calibrate(make_views(), Grid(), NOMINAL, CalibrationOptions(held_out_mm=held))
+    assert caught.value.code == code
+
+
+def test_read_back_positions_are_used_and_matched_with_the_plan() -> None:
+    # commanded 2, arrived at 2.004; each camera's stage by itself
+    offsets = {0.0: 0.001, 2.0: 2.004, 4.0: 3.993, 5.0: 5.002}
+    X, Y = nodes(Grid())
+    views = [
+        CalibrationView(name, offsets[dz] * s, project(c, X, Y, offsets[dz] * s))
+        for name, c, s in (("cam1", PAPER[0], 1.0), ("cam2", PAPER[1], 1.001))
+        for dz in offsets
+    ]  # type: ignore[misc]
+    result = calibrate(views, Grid(), NOMINAL, HELD)
+    assert result.held_out is not None
+    assert result.held_out.positions_mm[0] == (2.004, 3.993)
+    assert result.held_out.mean.rbe_px < 1e-4
+
+
+def test_missing_intersections_are_left_out() -> None:
+    views = make_views()
+    rng = np.random.default_rng(9)
+    holes = []
+    for v in views:
+        xy = v.xy_px.copy()
+        xy[rng.random((9, 9)) < 0.15] = np.nan
+        holes.append(dataclasses.replace(v, xy_px=xy))
+    result = calibrate(holes, Grid(), NOMINAL, HELD)
+    assert result.held_out is not None
+    assert result.held_out.mean.rbe_px < 0.0035
+    for view, given in zip(result.views, holes, strict=True):
+        np.testing.assert_array_equal(np.isnan(view.residual_px), np.isnan(given.xy_px))
+
+
+@pytest.mark.fault(33)
+def test_nothing_usable_comes_from_numbers_that_are_not() -> None:
+    views = make_views()
+    bad = [dataclasses.replace(views[0], dz_mm=float("nan")), *views[1:]]
+    with pytest.raises(CalibrationInputError) as caught:
+        calibrate(bad, Grid(), NOMINAL)
+    assert caught.value.code == "view_not_finite"
+    collapsed = [dataclasses.replace(v, xy_px=np.full_like(v.xy_px, 200.0)) for v in views]
+    with pytest.raises(CalibrationInputError) as other:
+        calibrate(collapsed, Grid(), NOMINAL)
+    assert other.value.code == "view_degenerate"
+
+
+@pytest.mark.fault(33)
+@pytest.mark.parametrize("seed", range(6))
+def test_nonsense_is_never_called_usable(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scale = (3.0, 20.0, 100.0)[seed % 3]
+    views = [
+        dataclasses.replace(v, xy_px=np.clip(v.xy_px + scale * rng.standard_normal(v.xy_px.shape), 0.0, 479.0))
+        for v in make_views()
+    ]
+    try:
+        result = calibrate(views, Grid(node_tolerance_mm=0.004), NOMINAL, HELD)
+    except (CalibrationError, CalibrationInputError):
+        return  # refused: the other right outcome
+    assert result.verdict.level == "failed"
+
+
+@pytest.mark.fault(33)
+def test_a_solver_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr("core.calibration.solve.adjust", fails)
+    with pytest.raises(CalibrationError, match="Eigenvalues did not converge") as caught:
+        calibrate(make_views(), Grid(), NOMINAL)
+    assert caught.value.code == "calibration_singular"
+    monkeypatch.undo()
+    with pytest.raises(CalibrationError, match="did not settle in 1 iterations") as other:
+        calibrate(make_views(noise=0.5), Grid(node_tolerance_mm=0.1), NOMINAL, CalibrationOptions(max_iterations=1))
+    assert other.value.code == "calibration_not_converged"

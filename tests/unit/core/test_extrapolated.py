@@ -1,0 +1,182 @@
+"""Points outside the calibrated volume: told apart by geometry, their uncertainty against drawn calibrations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from core.calibration import COVARIANCE_NAMES
+from core.calibration.volume import CalibratedVolume, calibrated_volume
+from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
+from core.cameras.stereo import StereoPair
+from core.field.checks.extrapolated import mark_extrapolated
+from core.field.region.region import PointGrid
+from core.measure import MeasureOptions, measure_motion
+from core.status import PointStatus
+from core.target import GridTarget
+from server.cli import main
+from server.formats.calibrations.recognise import load_calibration
+from server.formats.calibrations.volume import volume_of
+from server.formats.images import write_image
+from tests.support.field_bench import SIZE, pair, take
+
+TARGET = GridTarget(pitch_mm=0.5, lines=(7, 7), line_width_mm=0.02)
+POSITIONS = (0.0, 2.0, 5.0)
+
+
+def covariance() -> np.ndarray:
+    """A made-up covariance with the correlation of distance and principal distance that real ones have."""
+    sigma = np.array([2.0, 0.5, 0.5, 1e-10, 2e-5, 2e-5, 2e-5, 2e-3, 2e-3, 0.06])
+    one = np.diag(sigma**2)
+    one[0, 9] = one[9, 0] = 0.999 * sigma[0] * sigma[9]
+    return np.kron(np.eye(2), one)
+
+
+def volume(size: tuple[int, int] = SIZE, **more: Any) -> CalibratedVolume:
+    found = calibrated_volume(
+        pair(), TARGET.all_points_mm(), (size, size), (POSITIONS, POSITIONS), pitch_mm=TARGET.pitch_mm, **more
+    )
+    assert found is not None
+    return found
+
+
+def content() -> dict[str, Any]:
+    """A calibration.json as ``stereorig calibrate`` writes it, as far as the volume needs it."""
+    cameras = {"cam1": pair().cam1, "cam2": pair().cam2}
+    return {
+        **{name: camera.paper_parameters() for name, camera in cameras.items()},
+        "image_size_px": {name: list(SIZE) for name in cameras},
+        "target": {"pitch_mm": 0.5, "lines": [7, 7], "line_width_mm": 0.02, "node_tolerance_mm": 0.0},
+        "views": [
+            {"camera": name, "dz_mm": dz, "held_out": held_out, "name": f"{name}_{dz:g}"}
+            for name in cameras
+            for dz, held_out in ((0.0, False), (2.0, False), (5.0, False), (40.0, True))
+        ],
+        "covariance": {"names": list(COVARIANCE_NAMES), "matrix": covariance().tolist()},
+    }
+
+
+def test_the_volume_is_what_both_cameras_saw_and_a_little_more() -> None:
+    where = volume()
+    nodes = TARGET.all_points_mm().reshape(-1, 2)
+    assert where.contains(np.column_stack([nodes, np.zeros(len(nodes))])).all()
+    # between the cameras' axes depth and place in the image change together
+    assert where.contains(np.array([[0.0, 0.0, -4.0], [0.0, 0.0, 4.0]])).all()
+    assert not where.contains(np.array([[0.0, 0.0, -8.0], [0.0, 0.0, 8.0]])).any()
+    along = pair().cam1.cam_from_sys.rotation[2]  # camera 1's optical axis in the system frame
+    alone = CalibratedVolume(where.pair, np.full(2, 0.1), where.depth_mm)
+    assert alone.contains(np.outer([-4.5, 4.5], along)).all()
+    assert not alone.contains(np.outer([-7.5, 12.5], along)).any()  # behind the travel and as much again
+    assert not where.contains(np.array([[6.0, 0.0, 0.0], [0.0, -7.0, 0.0], [np.nan, 0.0, 0.0]])).any()
+
+
+def test_one_distance_spans_no_volume() -> None:
+    nodes = TARGET.all_points_mm()
+    assert calibrated_volume(pair(), nodes, (SIZE, SIZE), ((0.0, 0.0), POSITIONS), pitch_mm=0.5) is None
+    assert calibrated_volume(pair(), nodes, ((9, 9), SIZE), (POSITIONS, POSITIONS), pitch_mm=0.5) is None
+
+
+def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
+    before = np.array([[0.0, 0.0, 0.0], [3.0, -2.0, 1.0], [-6.0, 5.0, 8.0]])
+    now = before + np.array([0.5, 0.2, -2.0])
+    predicted = volume(covariance=covariance()).covariance_mm2(before, now)
+    rng = np.random.default_rng(5)
+    drawn = rng.multivariate_normal(np.zeros(20), covariance(), 3000)
+    seen = [[camera.project(points).xy for camera in (pair().cam1, pair().cam2)] for points in (before, now)]
+    nominal = [camera.paper_parameters() for camera in (pair().cam1, pair().cam2)]
+    found = []
+    for change in drawn:
+        cameras = [
+            Camera.from_paper(
+                **{**values, **{n: values[n] + d for n, d in zip(TEN_PARAMETER_NAMES, part, strict=True)}}
+            )
+            for values, part in zip(nominal, np.split(change, 2), strict=True)
+        ]
+        drawn_pair = StereoPair(*cameras)
+        # least squares in the images, as the prediction has it: one step from the true place
+        places = []
+        for points, (xy1, xy2) in zip((before, now), seen, strict=True):
+            A = np.concatenate([c.point_jacobian(points) for c in cameras], axis=-2)
+            r = np.concatenate(
+                [
+                    xy - c.project(points).xy
+                    for xy, c in zip((xy1, xy2), (drawn_pair.cam1, drawn_pair.cam2), strict=True)
+                ],
+                axis=-1,
+            )
+            places.append(points + np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(A, r, strict=True)]))
+        found.append(np.concatenate([places[0], places[1] - places[0]], axis=-1))
+    scatter = np.asarray(found).std(axis=0)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(predicted, axis1=1, axis2=2)), scatter, rtol=0.06)
+
+
+@pytest.mark.fault(41)
+def test_points_outside_are_flagged_and_less_certain() -> None:
+    first, now = take("block"), take("block", 1.0)
+    grid = PointGrid.rectangle(30, 30, SIZE[0] - 31, SIZE[1] - 31, step_px=16)
+    field = measure_motion(pair(), *first, *now, grid, MeasureOptions(subset_px=25))
+    # a target that covered the middle only
+    small = GridTarget(pitch_mm=0.25, lines=(7, 7), line_width_mm=0.02)
+    where = calibrated_volume(
+        pair(), small.all_points_mm(), (SIZE, SIZE), (POSITIONS, POSITIONS), pitch_mm=0.25, covariance=covariance()
+    )
+    marked = mark_extrapolated(field, where)
+    flagged = marked.status == PointStatus.EXTRAPOLATED
+    radius = np.hypot(*np.moveaxis(field.xyz_mm[..., :2], -1, 0))
+    assert flagged[field.valid & (radius > 2.0)].all()
+    assert not flagged[field.valid & (radius < 0.8)].any()
+    assert flagged.any()
+    assert (marked.valid == field.valid).all()
+    np.testing.assert_array_equal(marked.uvw_mm, field.uvw_mm)
+    assert (marked.sigma_mm[flagged] > field.sigma_mm[flagged]).all()
+    np.testing.assert_array_equal(marked.covariance[~flagged], field.covariance[~flagged])
+    assert mark_extrapolated(field, None) is field
+
+
+@pytest.mark.fault(41)
+def test_the_command_line_flags_them(tmp_path: Path) -> None:
+    for n, load in enumerate((0.0, 1.0)):
+        for name, image in zip(("cam1", "cam2"), take("block", load), strict=True):
+            write_image(tmp_path / f"{name}_{n}.tif", image)
+    told = content()
+    told["target"] |= {"pitch_mm": 0.25}
+    (tmp_path / "calibration.json").write_text(json.dumps(told))
+    arguments = [
+        "measure",
+        "--cam1",
+        str(tmp_path / "cam1_*.tif"),
+        "--cam2",
+        str(tmp_path / "cam2_*.tif"),
+        "--subset",
+        "25",
+        "--calibration",
+        str(tmp_path / "calibration.json"),
+        "--roi",
+        "30,30,233,194",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(arguments) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    for step in summary["steps"]:
+        assert step["status"]["extrapolated"] > 0
+        assert step["valid"] == step["status"]["ok"] + step["status"]["extrapolated"]
+    with xr.open_dataset(tmp_path / "out" / "step_0001.nc") as data:
+        flagged = data.status.values == PointStatus.EXTRAPOLATED
+        assert np.isfinite(data.u_mm.values[flagged]).all()
+        assert data.sigma_z_mm.values[flagged].mean() > 2.0 * data.sigma_z_mm.values[data.status.values == 0].mean()
+
+
+def test_a_file_that_says_nothing_of_its_views_flags_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(content()))
+    full = volume_of(load_calibration(path))
+    assert full is not None
+    np.testing.assert_allclose(full.depth_mm, volume().depth_mm)  # the held-out view is no part of it
+    path.write_text(json.dumps({name: content()[name] for name in ("cam1", "cam2")}))
+    assert volume_of(load_calibration(path)) is None

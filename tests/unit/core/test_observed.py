@@ -1,0 +1,265 @@
+"""What residuals say of a match: the block sums against a plain twin, and the told scatter against the true one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from core.errors import InputError
+from core.field.checks.gates import GateOptions
+from core.field.checks.residual_test import SigmaLimits, judge
+from core.field.growth.run import Run
+from core.field.points.starts import depth_per_px
+from core.matching import MatchOptions, fit_motion, fit_shape
+from core.matching.kernels.observed import blocks_across
+from core.matching.observed import observed_covariance
+from core.measure import MeasureOptions, ReferencePair
+from core.status import PointStatus
+from tests.support import field_bench as bench
+from tests.support.matching_scene import Plane, Texture, digitise, paper_pair, render, true_g, true_w
+from tests.support.matching_twin import Twin
+
+XY = np.array([[52.0, 61.0], [80.0, 80.0], [103.0, 94.0]])
+AFTER = Plane(np.array([0.02, -0.01, 0.015]), np.array([[1.01, 0.02], [-0.015, 0.995], [0.03, -0.02]]))
+SUBSET = 25
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Four pictures; something else shines through in those at t."""
+    pair = paper_pair(kappa=2e-8)
+    rng = np.random.default_rng(5)
+    own, other = Texture(blob_mm=0.05), Texture(blob_mm=0.05, seed=9)
+    out = [
+        digitise(render(camera, plane, own), noise=2.0, rng=rng)
+        for plane in (Plane(), AFTER)
+        for camera in (pair.cam1, pair.cam2)
+    ]
+    for k in (2, 3):
+        through = render((pair.cam1, pair.cam2)[k - 2], Plane(), other)
+        out[k] = np.clip(0.85 * out[k] + 0.15 * through, 0, 255).astype(np.uint8)
+    return pair, out
+
+
+def twins_covariance(twin: Twin, p: np.ndarray) -> np.ndarray:
+    """Sandwich with clustered errors, pixel by pixel and block by block."""
+    count = len(twin.splines) - 1
+    terms = twin.terms(p)
+    steps = np.array([1e-7, 1e-5, 1e-5, 1e-3, *([1e-6, 1e-5, 1e-5] * 3)])[: len(p)]
+    levels = [twin.residual(k, p) for k in range(count)]
+    s2 = np.array([c for _, c, _ in levels]) ** 2 * [twin.density(k, p) for k in range(count)]
+    W = np.diag(s2) - np.outer(s2, s2) / (1.0 + s2.sum())
+    _, N = twin.equations(p, np.eye(len(p)))
+    J = [twin.jacobian(k, p, steps) for k in range(count)]
+    best = max(zncc for *_, zncc in levels)
+    left = [(d + (1.0 - zncc) * twin.f) * best / zncc for d, _, zncc in levels]
+    across = blocks_across(SUBSET)
+    number = np.zeros((SUBSET, SUBSET), int)
+    for a in range(across):
+        inside = slice(a * SUBSET // across, (a + 1) * SUBSET // across)
+        number[inside] += across * a
+        number[:, inside] += a
+    assert len(np.unique(number)) == across**2
+    weighted = [sum(W[k, o] * J[k] for k in range(count)) * left[o][:, None] for o in range(count)]
+    pulls = np.array([sum(part[number.ravel() == b].sum(0) for part in weighted) for b in range(across**2)])
+    scale = 1.0 / np.sqrt(np.diag(N))
+    z = scale[:, None] * np.linalg.solve(N * np.outer(scale, scale), scale[:, None] * pulls.T)
+    texture = (twin.gradient @ np.linalg.inv(twin.to_px)) ** 2
+    energy = np.bincount(number.ravel(), texture.sum(1))
+    worth = energy.sum() ** 2 / (energy**2).sum()
+    covariance = z @ z.T / (1.0 - 3.0 / worth)
+    order = [0, terms] if count == 1 else [0, 4, 7, 10, 3]
+    return covariance[np.ix_(order, order)]
+
+
+def assert_alike(observed, theirs):
+    """But for one factor: the share of noise in the gradients, which the twin does not know."""
+    scale = np.sqrt(np.outer(np.diag(theirs), np.diag(theirs)))
+    ratio = np.trace(observed / scale) / len(theirs)
+    assert 0.97 < ratio < 1.06
+    assert np.abs(observed / scale - ratio * theirs / scale).max() < 0.02
+
+
+@pytest.mark.parametrize(("interpolation", "order"), [("cubic", 3), ("quintic", 5)])
+def test_it_is_the_twins_for_a_motion(images, interpolation, order):
+    pair, pictures = images
+    options = MatchOptions(subset_px=SUBSET, interpolation=interpolation, tolerance_px=3e-6)
+    fit = fit_motion(
+        pair, *pictures, XY, true_w(pair.cam1, Plane(), XY), true_g(pair.cam1, Plane(), AFTER, XY), options
+    )
+    assert (fit.status == 0).all()
+    observed, known = observed_covariance(pair, pictures, XY, fit.w, fit.G, fit.epipolar_px, options)
+    assert known.all()
+    for i, xy in enumerate(XY):
+        twin = Twin(pair, pictures, xy, subset=SUBSET, order=order)
+        theirs = twins_covariance(twin, np.array([*fit.w[i], fit.epipolar_px[i], *fit.G[i].ravel()]))
+        assert_alike(observed[i], theirs)
+
+
+def test_it_is_the_twins_for_a_shape(images):
+    pair, pictures = images
+    options = MatchOptions(subset_px=SUBSET, tolerance_px=3e-6)
+    fit = fit_shape(pair, *pictures[:2], XY, true_w(pair.cam1, Plane(), XY), options)
+    observed, _ = observed_covariance(pair, pictures[:2], XY, fit.w, None, fit.epipolar_px, options)
+    for i, xy in enumerate(XY):
+        twin = Twin(pair, pictures[:2], xy, subset=SUBSET, order=5)
+        theirs = twins_covariance(twin, np.array([*fit.w[i], fit.epipolar_px[i]]))
+        assert_alike(observed[i], theirs)
+
+
+def test_points_outside_have_none_and_unknowns_must_fit(images):
+    pair, pictures = images
+    w = true_w(pair.cam1, Plane(), XY)
+    far = XY.copy()
+    far[1] = (5.0, 5.0)
+    _, known = observed_covariance(pair, pictures[:2], far, w, None, np.zeros(3), MatchOptions(subset_px=SUBSET))
+    assert known.tolist() == [True, False, True]
+    with pytest.raises(InputError):
+        observed_covariance(pair, pictures[:2], XY, w, np.zeros((3, 3, 3)), np.zeros(3))
+
+
+# fields
+
+MOTION = (0.02, -0.013, 0.03, 0.0006, -0.0004, 0.001)
+OPTIONS = MeasureOptions(subset_px=21, patch="stretch")
+
+
+def pictures(*, noise=2.0, seed=0):
+    return bench.take("block", 0.0, MOTION, seed=seed), bench.take("block", 1.0, MOTION, seed=seed + 1, noise=noise)
+
+
+def through(image, share, where=None):
+    """The picture, and another speckle pattern (its own, turned) over it."""
+    mixed = np.rint((1.0 - share) * image + share * image[::-1, ::-1])
+    return np.where(True if where is None else where, mixed, image).astype(np.uint8)
+
+
+def measured(reference, now, options=OPTIONS):
+    grid = bench.grid(step_px=6.0)
+    field = ReferencePair(bench.pair(), *reference).motion(*now, grid, options)
+    true = bench.truth(grid, bench.scene("block", 0.0, MOTION), bench.scene("block", 1.0, MOTION))
+    return field, field.uvw_mm - true.uvw_mm
+
+
+def told_over_true(field, error):
+    """Of u, v and w, rms over the valid points."""
+    v = field.valid
+    return np.sqrt((field.sigma_mm[v][:, 3:] ** 2).mean(0) / (error[v] ** 2).mean(0))
+
+
+def test_noise_alone_is_told_as_it_is():
+    reference, now = pictures()
+    field, error = measured(reference, now)
+    assert field.valid.all()
+    factor = observed_factor(reference, now, field)
+    assert np.all(np.abs(factor[:4] - 1.0) < 0.2), factor
+    assert 0.9 < factor[4] < 1.5  # across the epipolar line the interpolation's own error shows, too
+    assert np.all(np.abs(told_over_true(field, error) - 1.0) < 0.15)
+
+
+def observed_factor(reference, now, field):
+    """Mean over points of the observed variances over the fit's own."""
+    v = field.valid
+    xy = np.stack([field.x_px, field.y_px], -1)[v]
+    options = OPTIONS.match_options()
+    fit = fit_motion(bench.pair(), *reference, *now, xy, field.starts.w[v], field.starts.G[v], options)
+    observed, known = observed_covariance(bench.pair(), [*reference, *now], xy, fit.w, fit.G, fit.epipolar_px, options)
+    assert known.all()
+    told = np.diagonal(fit.covariance, axis1=1, axis2=2)
+    return (np.diagonal(observed, axis1=1, axis2=2) / told).mean(0)
+
+
+def test_another_pattern_shining_through_is_told_by_the_residuals_not_by_the_fit():
+    reference, clean = pictures()
+    now = tuple(through(image, 0.15) for image in clean)
+    field, error = measured(reference, now)
+    assert field.valid.mean() > 0.95
+    factor = observed_factor(reference, now, field)
+    assert factor[1:3].min() > 2.5  # the fit alone says less than half of the variance
+    ratio = told_over_true(field, error)
+    assert np.all((ratio > 0.7) & (ratio < 1.5)), ratio
+
+
+@pytest.mark.parametrize("noise", [25.0, 40.0])
+def test_images_much_noisier_than_the_reference_are_told_as_they_are(noise):
+    """Their normalised grey levels, and so the residuals, are smaller than their noise by the correlation lost."""
+    field, error = measured(*pictures(noise=noise))
+    assert field.valid.mean() > (0.99 if noise < 30.0 else 0.8)  # beyond, many scatter by more than 0.1 px
+    assert np.all(np.abs(told_over_true(field, error) - 1.0) < 0.12)
+
+
+def test_noise_at_t_alone_does_not_touch_the_shape():
+    reference, now = pictures(noise=15.0)
+    field, error = measured(reference, now)
+    shape = ReferencePair(bench.pair(), *reference).shape(bench.grid(step_px=6.0), OPTIONS)
+    v = field.valid
+    assert v.mean() > 0.99
+    np.testing.assert_allclose(field.sigma_mm[v][:, :3], shape.sigma_mm[v], rtol=0.5)
+    ratio = told_over_true(field, error)
+    assert np.all((ratio > 0.8) & (ratio < 1.25)), ratio
+
+
+def test_a_point_that_scatters_too_far_is_refused_and_no_other():
+    reference, clean = pictures()
+    changed = np.zeros(clean[0].shape, bool)
+    changed[:, 160:] = True
+    now = tuple(through(image, 0.2, changed) for image in clean)
+    # the comparison of correlations alone would be quicker to refuse
+    wide = GateOptions(correlation_least_factor=1e3, correlation_most_factor=2e3)
+    statuses = {}
+    for limit_px in (0.02, 1.0):
+        gates = replace(wide, largest_sigma_px=limit_px, largest_depth_sigma_px=limit_px)
+        field, error = measured(reference, now, replace(OPTIONS, gates=gates))
+        assert (field.status[field.x_px < 160 - 21] == PointStatus.OK).mean() > 0.99
+        assert np.abs(error / field.sigma_mm[..., 3:])[field.valid].max() < 6.0
+        statuses[limit_px] = field.status[field.x_px > 160 + 21]
+    assert (statuses[0.02] == PointStatus.OK).mean() < 0.02
+    assert (statuses[1.0] == PointStatus.OK).mean() > 0.4
+
+
+@pytest.mark.parametrize(("depth_said", "offset_said", "kept"), [(1.0, 1.0, 1.0), (1.0, 1.5, 1.0), (1.5, 1.0, 0.0)])
+def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(depth_said, offset_said, kept):
+    """Residuals show this many times the variances that the fit tells; of noise there is too much for any point."""
+    reference, _ = pictures()
+    run = Run(bench.pair(), *reference, None, None, bench.grid(step_px=6.0), OPTIONS, None, None)
+    run.seed_shape(None)
+    run.finish(True, None)
+    points, count = run.points, int(run.points.ok.sum())
+    sd = np.sqrt(np.diagonal(points.covariance[points.ok], axis1=1, axis2=2)).mean(0)
+    depth_px = max(sd[1], (sd[0] / depth_per_px(run.pair, run.rays, points.w[:, 0])).mean())
+    said = np.array([depth_said, offset_said])
+    points.covariance /= np.sqrt(said[:, None] * said)
+    limits = SigmaLimits(motion_px=0.1, depth_px=0.75 * depth_px)
+    judged = judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits)
+    assert judged.factor == pytest.approx(said, rel=0.25)
+    assert points.ok.sum() / count == pytest.approx(kept, abs=0.05)
+
+
+def test_matches_without_any_residual_stay_as_they_are():
+    reference, _ = pictures()
+    run = Run(bench.pair(), *reference, None, None, bench.grid(step_px=12.0), OPTIONS, None, None)
+    run.seed_shape(None)
+    run.finish(True, None)
+    points = run.points
+    points.covariance[:2] = 0.0
+    before = points.covariance.copy()
+    limits = SigmaLimits(motion_px=0.1, depth_px=0.05)
+    judged = judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits)
+    assert judged.refused == 0
+    assert np.isfinite(judged.factor).all()
+    np.testing.assert_array_equal(points.covariance[:2], before[:2])
+    assert np.isfinite(points.covariance[points.ok]).all()
+    points.covariance[:] = 0.0
+    assert judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits).refused == 0
+    assert not points.covariance.any()
+
+
+def test_blur_at_t_is_told():
+    reference, clean = pictures()
+    now = tuple(cv2.GaussianBlur(image, (0, 0), 1.2) for image in clean)
+    field, error = measured(reference, now)
+    assert field.valid.mean() > 0.95
+    assert np.abs(error / field.sigma_mm[..., 3:])[field.valid].max() < 6.0

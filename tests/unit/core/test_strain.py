@@ -1,0 +1,329 @@
+"""Strain against analytic answers: even strain, rotation, inflation, gradients, edges, cracks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import logm, sqrtm
+
+from core.errors import InputError
+from core.field.region.cuts import Cuts
+from core.status import PointStatus
+from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
+
+F_SMALL = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])
+F_LARGE = np.array([[1.2, 0.05, 0], [0.02, 0.93, 0], [0, 0, 1]])
+
+
+def _strain(field, **options) -> StrainField:
+    return surface_strain(field, StrainOptions(**options), subset_px=33)
+
+
+def _without(field, empty):
+    """The field with some points lost, as the measurement leaves them."""
+    status = np.where(empty, PointStatus.LOW_CORRELATION, field.status).astype(np.int8)
+    gone = {
+        name: np.where(empty.reshape(empty.shape + (1,) * (a.ndim - 2)), np.nan, a)
+        for name in ("xyz_mm", "normal_sys", "uvw_mm", "covariance", "rotation_rad", "stretch")
+        if (a := getattr(field, name)) is not None
+    }
+    return replace(field, status=status, **gone)
+
+
+@pytest.mark.parametrize("F", [F_SMALL, F_LARGE])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("turn_deg", [0.0, 10.0, 77.0])
+def test_even_strain(F, order, turn_deg):
+    """A homogeneous deformation, then a rotation: the tensors of the textbook, by matrix functions."""
+    R = turned((0.2, -0.5, 1.0), turn_deg)
+    C = (F.T @ F)[:2, :2]
+    field = make_field(plane, lambda p: p @ (R @ F).T + np.array([1.0, -2.0, 5.0]))
+    expected = {
+        "green_lagrange": 0.5 * (C - np.eye(2)),
+        "hencky": 0.5 * logm(C),
+        "infinitesimal": (0.5 * (R @ F + (R @ F).T) - np.eye(3))[:2, :2],
+    }
+    for tensor, e in expected.items():
+        found = _strain(field, order=order, tensor=tensor)
+        assert found.valid.sum() > 0.9 * found.valid.size
+        np.testing.assert_allclose(
+            found.strain[found.valid], np.broadcast_to([e[0, 0], e[1, 1], e[0, 1]], (found.valid.sum(), 3)), atol=2e-11
+        )
+
+
+def test_frame_of_a_tilted_surface():
+    """Axis 1 is X_sys projected on the surface, axis 2 completes it with the normal away from the cameras."""
+    R = turned((1.0, 0.7, 0.3), 40.0)
+    n = R[:, 2]
+    axis1 = np.array([1.0, 0, 0]) - n * n[0]
+    axis1 /= np.linalg.norm(axis1)
+    frame = np.stack([axis1, np.cross(n, axis1)], axis=1)
+    e = np.array([[0.01, 0.003], [0.003, -0.004]])
+    stretch = np.eye(3) + frame @ e @ frame.T
+    field = make_field(lambda a, b: plane(a, b) @ R.T, lambda p: p @ stretch.T)
+    C = (np.eye(2) + e) @ (np.eye(2) + e)
+    green = 0.5 * (C - np.eye(2))
+    found = _strain(field)
+    np.testing.assert_allclose(
+        found.strain[found.valid],
+        np.broadcast_to([green[0, 0], green[1, 1], green[0, 1]], (found.valid.sum(), 3)),
+        atol=1e-11,
+    )
+
+
+@pytest.mark.parametrize("surface", [plane, cylinder(30.0), sphere(30.0)])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("angle", [0.01, 10.0, 45.0, 180.0])
+def test_rigid_motion_is_no_strain(surface, order, angle):
+    R = turned((0.3, 1.0, 0.4), angle)
+    field = make_field(surface, lambda p: p @ R.T + np.array([0.0, 0.0, 5.0]))
+    for tensor in ("green_lagrange", "hencky"):
+        found = _strain(field, order=order, tensor=tensor)
+        assert np.abs(found.strain[found.valid]).max() < 1e-11
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_inflation(order):
+    """A cylinder grows by 2 % in radius alone, a sphere by 2 % all over."""
+    grow = 1.02
+    R = 30.0
+    field = make_field(cylinder(R), lambda p: (p - [0, 0, R]) * [grow, 1.0, grow] + [0, 0, R])
+    found = _strain(field, order=order)
+    exact = np.array([0.5 * (grow**2 - 1), 0.0, 0.0])
+    assert np.abs(found.strain[found.valid] - exact).max() < 1e-9
+    field = make_field(sphere(R), lambda p: (p - [0, 0, R]) * grow + [0, 0, R])
+    found = _strain(field, order=order)
+    exact = np.array([0.5 * (grow**2 - 1)] * 2 + [0.0])
+    assert np.abs(found.strain[found.valid] - exact).max() < 1e-9
+
+
+def _rolled(angle_deg, before_mm, after_mm, **more):
+    """A sheet on a cylinder, rolled onto a narrower one about the same slanted axis: no strain at all."""
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+
+    def on(radius, along, across):
+        bent = (
+            (radius * np.sin(along / radius), radius * (1.0 - np.cos(along / radius))) if radius else (along, 0 * along)
+        )
+        return np.stack([c * bent[0] - s * across, s * bent[0] + c * across, bent[1]], axis=-1)
+
+    def surface(a, b):
+        return on(before_mm, c * a + s * b, -s * a + c * b)
+
+    def motion(p):
+        chord, across = c * p[..., 0] + s * p[..., 1], -s * p[..., 0] + c * p[..., 1]
+        along = before_mm * np.arcsin(chord / before_mm) if before_mm else chord
+        return on(after_mm, along, across)
+
+    return make_field(surface, motion, **more)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("angle_deg", "before_mm"), [(0.0, 0.0), (33.0, 0.0), (20.0, 90.0)])
+def test_a_sheet_that_bends_has_no_strain(order, angle_deg, before_mm):
+    """Planes would tell h^2 / (10 R^2) too little, some 240 microstrain on R = 30 mm."""
+    found = _strain(_rolled(angle_deg, before_mm, 30.0), window=9, order=order)
+    x = 0.33 * np.arange(-4, 5)
+    short = (x**4).sum() / (x**2).sum() / 6.0 * abs(1.0 / 30.0**2 - (before_mm and 1.0 / before_mm**2))
+    assert short > 2e-4
+    whole = np.s_[4:-4, 4:-4]
+    assert np.abs(found.strain[whole]).max() < 0.01 * short
+    assert np.abs(found.strain[found.valid]).max() < (0.01 if order == 1 else 0.3) * short
+    assert found.valid.mean() > 0.9
+
+
+def test_noise_does_not_bend_a_flat_sheet():
+    """The curvature of noise has a square; what it makes of strain lies far below the noise."""
+    field = _rolled(0.0, 0.0, 0.0)
+    rng = np.random.default_rng(5)
+    strains = []
+    for _ in range(30):
+        noisy = replace(field, uvw_mm=field.uvw_mm + rng.normal(size=field.uvw_mm.shape) * [2e-4, 2e-4, 4e-4])
+        strains.append(_strain(noisy, window=5).strain)
+    mean = np.nanmean(strains, axis=(0, 1, 2))
+    assert np.abs(mean).max() < 2e-6
+    assert np.nanstd(strains) > 3e-5
+
+
+def test_strain_gradient_planes_and_quadratics():
+    """exx = k x: whole windows agree; at an edge quadratics tell the strain there, planes that in their middle."""
+    k = 2e-4
+
+    def pull(p):
+        return p + np.stack([0.5 * k * p[..., 0] ** 2, 0 * p[..., 0], 0 * p[..., 0]], axis=-1)
+
+    field = make_field(lambda a, b: np.stack([a, b, 0 * a], axis=-1), pull)
+    planes, quadratics = (_strain(field, order=order, tensor="infinitesimal") for order in (1, 2))
+    x = field.xyz_mm[..., 0]
+    inner = (slice(4, -4), slice(4, -4))
+    np.testing.assert_allclose(planes.strain[inner], quadratics.strain[inner], atol=1e-12)
+    np.testing.assert_allclose(planes.strain[inner][..., 0], k * x[inner], atol=1e-10)
+    ok = quadratics.valid
+    np.testing.assert_allclose(quadratics.strain[ok][:, 0], k * x[ok], atol=1e-9)
+    assert planes.strain[15, 0, 0] == pytest.approx(k * x[15, 2], abs=1e-9)
+    assert 3.0 < quadratics.sigma[15, 0, 0] / quadratics.sigma[15, 17, 0] < 12.0
+    assert planes.status[0, 0] == StrainStatus.TOO_FEW
+
+
+def test_derived_figures():
+    U = np.array([[1.02, 0.004, 0], [0.004, 0.99, 0], [0, 0, 1.0]])
+    found = _strain(make_field(plane, lambda p: p @ U.T), tensor="hencky")
+    log = logm(U[:2, :2])
+    values, vectors = np.linalg.eigh(log)
+    ok = found.valid
+    np.testing.assert_allclose(found.principal[ok], np.broadcast_to(values[::-1], (ok.sum(), 2)), atol=1e-11)
+    angle = np.arctan(vectors[1, 1] / vectors[0, 1])
+    np.testing.assert_allclose(found.angle_rad[ok], angle, atol=1e-8)
+    np.testing.assert_allclose(found.max_shear[ok], 0.5 * (values[1] - values[0]), atol=1e-11)
+    deviator = np.sqrt(values[0] ** 2 - values[0] * values[1] + values[1] ** 2)
+    np.testing.assert_allclose(found.von_mises[ok], deviator, atol=1e-11)
+
+
+def test_gauge_size():
+    found = surface_strain(
+        make_field(lambda a, b: np.stack([a, b, 0 * a], -1), lambda p: p), StrainOptions(window=7), subset_px=21
+    )
+    assert found.gauge_px == 6 * 10 + 21
+    assert found.gauge_mm == pytest.approx(81 * 0.033, rel=1e-9)
+
+
+@pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal", "hencky"])
+def test_patch_strain_is_the_same_tensor(tensor):
+    """Stretch and rotation of the patches, made from the same deformation, say what the gauge says."""
+    R = turned((0.2, -0.5, 1.0), 12.0)
+    C = (F_LARGE.T @ F_LARGE)[:2, :2]
+    U = np.real(sqrtm(C))
+    polar = F_LARGE[:2, :2] @ np.linalg.inv(U)
+    whole = R @ np.block([[polar, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+    angle = np.arccos((np.trace(whole) - 1) / 2)
+    axis = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]])
+    vector = axis / np.linalg.norm(axis) * angle
+    field = make_field(
+        plane, lambda p: p @ (R @ F_LARGE).T, stretch=np.array([U[0, 0] - 1, U[1, 1] - 1, U[0, 1]]), rotation_rad=vector
+    )
+    found = _strain(field, tensor=tensor)
+    assert found.patch is not None
+    np.testing.assert_allclose(found.patch[found.valid], found.strain[found.valid], atol=1e-10)
+
+
+# edges, holes, cracks
+
+
+def _opened(p):
+    """The right half moves away by 50 um, on a field strained by 1 per mil along Y."""
+    return p * [1.0, 1.001, 1.0] + np.where(p[..., :1] > 0.05, [0.05, 0.0, 0.0], 0.0)
+
+
+def test_no_window_reaches_over_a_cut():
+    x_cut = 100.0 + 10.0 * 17 + 5.0
+    cuts = Cuts([[(x_cut, 0.0), (x_cut, 1000.0)]])
+    flat = lambda a, b: np.stack([a, b, 0 * a], axis=-1)  # noqa: E731
+    found = _strain(make_field(flat, _opened, cuts=cuts))
+    exact = [0.0, 0.5 * (1.001**2 - 1), 0.0]
+    assert np.abs(found.strain[found.valid] - exact).max() < 1e-11
+    assert found.valid[15, 17]
+    assert found.valid[15, 18]
+    blind = _strain(make_field(flat, _opened))
+    assert np.nanmax(np.abs(blind.strain[..., 0])) > 0.01
+
+
+@pytest.mark.parametrize("slant", [0, 1, 2])
+def test_no_window_reaches_over_empty_points(slant):
+    """A crack that nobody drew leaves a line of lost points, however it slants."""
+    rows, cols = np.mgrid[:31, :35]
+    lost = cols == 17 if slant == 0 else cols - 17 == (rows - 15) // slant
+    right = cols > np.where(lost.any(axis=1), lost.argmax(axis=1), 17)[:, None]
+    field = make_field(lambda a, b: np.stack([a, b, 0 * a], axis=-1), lambda p: p)
+    moved = replace(field, uvw_mm=np.where(right[..., None], [0.05, 0.0, 0.02], 0.0))
+    found = _strain(_without(moved, lost))
+    assert np.abs(found.strain[found.valid]).max() < 1e-11
+    assert (found.status[lost] == StrainStatus.NO_POINT).all()
+    assert np.isnan(found.strain[lost]).all()
+    assert found.valid.sum() > 700
+
+
+def test_islands_have_no_strain():
+    """Few points, or points on one line, are refused; a single lost point costs its neighbours nothing."""
+    field = make_field(plane, lambda p: p @ F_SMALL.T)
+    lost = np.ones(field.shape, bool)
+    lost[10, :] = False
+    found = _strain(_without(field, lost), window=3, least_share=0.3)
+    assert set(np.unique(found.status)) == {StrainStatus.NO_POINT, StrainStatus.TOO_FEW, StrainStatus.ONE_SIDED}
+    assert np.isnan(found.strain).all()
+    assert np.isnan(found.gauge_mm)
+    lost = np.zeros(field.shape, bool)
+    lost[15, 15] = True
+    found = _strain(_without(field, lost))
+    assert (found.valid[4:-4, 4:-4] == ~lost[4:-4, 4:-4]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [
+        ({"window": 4}, "strain_window_invalid"),
+        ({"window": 1}, "strain_window_invalid"),
+        ({"order": 3}, "option_out_of_range"),
+        ({"tensor": "almansi"}, "option_out_of_range"),
+        ({"least_share": 0.0}, "option_out_of_range"),
+        ({"most_amplification": 0.5}, "option_out_of_range"),
+    ],
+)
+def test_refused_options(options, code):
+    with pytest.raises(InputError) as error:
+        StrainOptions(**options)
+    assert error.value.code == code
+
+
+def test_a_shape_has_no_strain():
+    field = make_field(plane, lambda p: p)
+    with pytest.raises(InputError) as error:
+        surface_strain(replace(field, uvw_mm=None), subset_px=33)
+    assert error.value.code == "strain_needs_motion"
+
+
+@pytest.mark.parametrize("shape", [(1, 20), (20, 1), (1, 1)])
+def test_too_small_a_grid(shape):
+    found = _strain(make_field(plane, lambda p: p, shape=shape))
+    assert (found.status == StrainStatus.TOO_FEW).all()
+
+
+def test_speed():
+    """10,000 points with 2 % of them lost: a sequence can afford it."""
+    field = make_field(plane, lambda p: p @ F_SMALL.T, shape=(100, 100))
+    field = _without(field, np.random.default_rng(1).random(field.shape) < 0.02)
+    _strain(field)
+    start = time.process_time()
+    _strain(field)
+    assert time.process_time() - start < 2.0
+
+
+def test_clamped_plate():
+    """Deflection w0 (1 - r^2/a^2)^2; the face moves in the plane by half the thickness times the slope."""
+    w0, a, thick = 0.4, 12.0, 1.5
+
+    def slope(r):
+        return -4.0 * w0 * r / a**2 * (1.0 - r**2 / a**2)
+
+    def press(p):
+        r = np.hypot(p[..., 0], p[..., 1])
+        inward = -0.5 * thick * slope(r) / np.where(r > 0, r, 1.0)
+        return p + np.stack([inward * p[..., 0], inward * p[..., 1], w0 * (1.0 - r**2 / a**2) ** 2], axis=-1)
+
+    field = make_field(lambda x, y: np.stack([x, y, 0 * x], axis=-1), press, shape=(41, 41))
+    found = _strain(field, window=3)
+    x, y = field.xyz_mm[..., 0], field.xyz_mm[..., 1]
+    r, phi = np.hypot(x, y), np.arctan2(y, x)
+    stretch = 2.0 * thick * w0 / a**2 * (1.0 - 3.0 * r**2 / a**2)  # d u_r / d r
+    hoop = 2.0 * thick * w0 / a**2 * (1.0 - r**2 / a**2)  # u_r / r
+    radial = stretch + 0.5 * (stretch**2 + slope(r) ** 2)
+    around = hoop + 0.5 * hoop**2
+    c, s = np.cos(phi), np.sin(phi)
+    exact = np.stack([radial * c**2 + around * s**2, radial * s**2 + around * c**2, (radial - around) * c * s], axis=-1)
+    inner = (slice(1, -1), slice(1, -1))
+    # three points h apart take h^2 / 6 of the third derivative 12 t w0 / a^4 for slope, along and across the window
+    assert np.abs(found.strain[inner] - exact[inner]).max() < 2.4 * 0.33**2 / 6.0 * 12.0 * thick * w0 / a**4
+    assert np.abs(exact).max() > 8e-3

@@ -1,0 +1,132 @@
+"""What the doctor makes of packets, links and the system's settings for them; tables as Linux writes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from server.doctor.cameras import Watch
+from server.doctor.link import check_link, check_network, interface_of
+from server.doctor.report import Check, Notebook
+from server.rig.cameras import PairShot
+
+# /proc/net/route: addresses in hex as a little-endian machine stores them
+ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
+eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0
+eth0\t000200C0\t00000000\t0001\t0\t0\t0\t00FFFFFF\t0\t0\t0
+cam0\t0001A8C0\t00000000\t0001\t0\t0\t0\t00FFFFFF\t0\t0\t0
+cam1\t8001A8C0\t00000000\t0001\t0\t0\t0\t80FFFFFF\t0\t0\t0
+"""
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    write(tmp_path / "net" / "route", ROUTES)
+    write(tmp_path / "sys" / "net" / "core" / "rmem_max", "212992\n")
+    return tmp_path
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("address", "name"),
+    [
+        ("192.168.1.5", "cam0"),
+        ("192.168.1.200", "cam1"),
+        ("192.0.2.9", "eth0"),
+        ("8.8.8.8", "eth0"),
+        ("127.0.0.2", "lo"),
+    ],
+)
+def test_packets_leave_by_the_closest_route(machine: Path, address: str, name: str) -> None:
+    assert interface_of(address, machine) == name
+
+
+def test_no_route_is_told(machine: Path) -> None:
+    write(machine / "net" / "route", ROUTES.splitlines()[0] + "\n")
+    assert interface_of("192.168.1.5", machine) is None
+
+
+def unit(cam: str, address: str) -> Any:
+    extra = {"protocol": "GigE Vision", "address": address, "packet_size_bytes": "1440"}
+    return SimpleNamespace(name=cam, description=SimpleNamespace(extra=extra))
+
+
+def watched(mb_per_s: float, side: int = 512) -> Watch:
+    seen = Watch(seconds=2.0)
+    seen.link = {cam: {"transferred_bytes": 2.0e6 * mb_per_s} for cam in ("cam1", "cam2")}
+    image = np.zeros((side, side), np.uint8)
+    seen.last = PairShot({"cam1": image, "cam2": image}, {"cam1": 8, "cam2": 8}, {}, 1, 1, 0.0, 0)
+    return seen
+
+
+def looked(machine: Path, seen: Watch, *, speed: str, mtu: str, two: str = "192.168.1.6") -> dict[str, Check]:
+    for name in ("cam0", "cam1"):
+        write(machine / "class" / name / "speed", speed)
+        write(machine / "class" / name / "mtu", mtu)
+    book = Notebook()
+    units = {"cam1": unit("cam1", "192.168.1.5"), "cam2": unit("cam2", two)}
+    check_network(book, units, seen, proc=machine, sys=machine / "class")  # type: ignore[arg-type]
+    return {check.name: check for check in book.checks}
+
+
+def test_two_cameras_on_one_link_load_it_together(machine: Path) -> None:
+    found = looked(machine, watched(55.0), speed="1000\n", mtu="9000\n")
+    assert found["cam0"].figures["load"] == pytest.approx(2 * 55.0 * 8 / 1000)
+    assert found["cam0"].state == "warning"
+    assert "88 % of 1000 Mbit/s" in found["cam0"].found
+    assert "link of its own" in str(found["cam0"].remedy)
+
+
+def test_a_link_for_each_camera_is_good(machine: Path) -> None:
+    found = looked(machine, watched(55.0), speed="1000\n", mtu="9000\n", two="192.168.1.200")
+    assert found["cam0"].state == found["cam1"].state == "ok"
+    assert found["cam1"].figures["load"] == pytest.approx(0.44)
+
+
+def test_small_packets_at_a_high_rate_ask_for_jumbo_frames(machine: Path) -> None:
+    found = looked(machine, watched(70.0), speed="10000\n", mtu="1500\n")
+    assert found["cam0"].state == "warning"
+    assert "mtu 9000" in str(found["cam0"].remedy)
+
+
+def test_a_link_without_a_known_speed_has_no_limit(machine: Path) -> None:
+    # what the kernel says of a link that is down, and of many virtual ones
+    found = looked(machine, watched(20.0), speed="-1\n", mtu="1500\n")
+    assert found["cam0"].state == "ok"
+    assert found["cam0"].limit is None
+    assert found["cam0"].figures["load"] is None
+
+
+@pytest.mark.parametrize(("side", "state"), [(400, "ok"), (512, "warning")])
+def test_socket_buffers_hold_an_image(machine: Path, side: int, state: str) -> None:
+    found = looked(machine, watched(1.0, side), speed="1000\n", mtu="9000\n")
+    assert found["socket buffers"].state == state
+
+
+def test_a_camera_that_no_interface_leads_to(machine: Path) -> None:
+    write(
+        machine / "net" / "route", "\n".join(line for line in ROUTES.splitlines() if "cam" in line or "Iface" in line)
+    )
+    found = looked(machine, watched(1.0), speed="1000\n", mtu="9000\n", two="10.1.1.1")
+    assert found["way to cam2"].state == "warning"
+
+
+def test_what_went_wrong_on_the_way_is_named() -> None:
+    seen = Watch(seconds=1.0)
+    seen.link = {
+        "cam1": {"received_packets": 1000.0, "missing_packets": 3.0, "resent_packets": 0.0},
+        "cam2": {"received_packets": 1000.0, "missing_packets": 0.0},
+    }
+    book = Notebook()
+    for cam in ("cam1", "cam2"):
+        check_link(book, SimpleNamespace(name=cam), seen)  # type: ignore[arg-type]
+    assert [check.state for check in book.checks] == ["warning", "ok"]
+    assert book.checks[0].found == "3 missing packets in 1000 packets"

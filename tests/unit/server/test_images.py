@@ -1,0 +1,181 @@
+"""Image files: what is read is what was written, by others too, and what cannot be measured on is refused."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from core.errors import ImageError, StorageError
+from server.formats.images import decode_image, encode_tiff, read_image, read_mask, write_image
+
+RNG = np.random.default_rng(7)
+GRAY8 = RNG.integers(0, 256, (23, 31), dtype=np.uint8)
+GRAY16 = RNG.integers(0, 65536, (23, 31), dtype=np.uint16)
+
+
+def code_of(path: Path) -> str:
+    with pytest.raises(ImageError) as caught:
+        read_image(path)
+    assert str(path) in caught.value.cause
+    assert caught.value.remedy
+    return caught.value.code
+
+
+@pytest.mark.parametrize("image", [GRAY8, GRAY16], ids=["8bit", "16bit"])
+@pytest.mark.parametrize("ending", ["tif", "png"])
+def test_what_opencv_wrote_is_read_to_the_bit(tmp_path: Path, image: np.ndarray, ending: str) -> None:
+    path = tmp_path / f"a.{ending}"
+    assert cv2.imwrite(str(path), image)  # OpenCV's TIFF is LZW-compressed
+    got = read_image(path)
+    assert got.dtype == image.dtype
+    assert got.flags.c_contiguous
+    np.testing.assert_array_equal(got, image)
+
+
+@pytest.mark.parametrize("image", [GRAY8, GRAY16], ids=["8bit", "16bit"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"compression": "zlib"}, {"byteorder": ">"}, {"rowsperstrip": 5}, {"tile": (16, 16)}, {"bigtiff": True}],
+    ids=str,
+)
+def test_every_usual_tiff_is_read(tmp_path: Path, image: np.ndarray, options: dict[str, object]) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", image, photometric="minisblack", **options)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), image)
+
+
+def test_bmp_and_jpeg_are_read(tmp_path: Path) -> None:
+    Image.fromarray(GRAY8).save(tmp_path / "a.bmp")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.bmp"), GRAY8)
+    flat = np.full((16, 16), 90, np.uint8)
+    Image.fromarray(flat).save(tmp_path / "a.jpg")
+    np.testing.assert_allclose(read_image(tmp_path / "a.jpg"), 90, atol=1)
+
+
+def test_white_is_zero_is_turned_round(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", GRAY8, photometric="miniswhite")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), 255 - GRAY8)
+
+
+@pytest.mark.parametrize("ending", ["tif", "png", "bmp"])
+def test_gray_saved_as_colour_is_taken_and_true_colour_refused(tmp_path: Path, ending: str) -> None:
+    rgb = np.repeat(GRAY8[..., None], 3, axis=2)
+    cv2.imwrite(str(tmp_path / f"same.{ending}"), rgb)
+    np.testing.assert_array_equal(read_image(tmp_path / f"same.{ending}"), GRAY8)
+    rgb[3, 4, 1] ^= 1
+    cv2.imwrite(str(tmp_path / f"colour.{ending}"), rgb)
+    assert code_of(tmp_path / f"colour.{ending}") == "image_unsupported"
+
+
+def test_planar_colour_of_equal_channels_is_taken(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", np.stack([GRAY16] * 3), photometric="rgb", planarconfig="separate")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), GRAY16)
+
+
+def test_other_pixel_types_and_stacks_are_refused(tmp_path: Path) -> None:
+    for i, pixels in enumerate((GRAY8.astype(np.float32), GRAY16.astype(np.uint32), GRAY8.astype(np.int16))):
+        tifffile.imwrite(tmp_path / f"{i}.tif", pixels, photometric="minisblack")
+        assert code_of(tmp_path / f"{i}.tif") == "image_unsupported"
+    tifffile.imwrite(tmp_path / "stack.tif", np.stack([GRAY8, GRAY8]), photometric="minisblack")
+    assert code_of(tmp_path / "stack.tif") == "image_unsupported"
+    cv2.imwrite(str(tmp_path / "c16.png"), np.repeat(GRAY16[..., None], 3, axis=2))
+    assert code_of(tmp_path / "c16.png") == "image_unsupported"
+
+
+def test_missing_folder_empty_and_foreign_files(tmp_path: Path) -> None:
+    assert code_of(tmp_path / "none.tif") == "file_missing"
+    assert code_of(tmp_path) == "image_unreadable"
+    (tmp_path / "empty.tif").touch()
+    assert code_of(tmp_path / "empty.tif") == "image_unreadable"
+    (tmp_path / "text.tif").write_text("not an image")
+    assert code_of(tmp_path / "text.tif") == "image_unreadable"
+
+
+@pytest.mark.fault(47)
+@pytest.mark.parametrize("ending", ["tif", "png", "bmp", "jpg"])
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.97])
+def test_truncated_at_any_place_is_unreadable(tmp_path: Path, ending: str, part: float) -> None:
+    path = tmp_path / f"a.{ending}"
+    Image.fromarray(np.kron(GRAY8, np.ones((8, 8), np.uint8))).save(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * part)])
+    assert code_of(path) == "image_unreadable"
+
+
+@pytest.mark.fault(47)
+def test_a_truncated_strip_is_not_filled_up(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.kron(GRAY16, np.ones((8, 8), np.uint16)), rowsperstrip=8, compression="zlib")
+    data = path.read_bytes()
+    path.write_bytes(data[:-50])
+    assert code_of(path) == "image_unreadable"
+
+
+@pytest.mark.fault(47)
+def test_huge_headers_are_refused_before_decoding(tmp_path: Path) -> None:
+    ihdr = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + ihdr + struct.pack(">I", zlib.crc32(ihdr))
+    idat = b"IDAT" + zlib.compress(bytes(1000))
+    png += struct.pack(">I", len(idat) - 4) + idat + struct.pack(">I", zlib.crc32(idat))
+    (tmp_path / "bomb.png").write_bytes(png)
+    assert code_of(tmp_path / "bomb.png") == "image_too_large"
+    small = bytearray(encode_tiff(GRAY8))
+    for tag in (256, 257):  # ImageWidth, ImageLength
+        at = (
+            small.index(struct.pack("<H", tag) + b"\x04\0")
+            if struct.pack("<H", tag) + b"\x04\0" in small
+            else (small.index(struct.pack("<H", tag) + b"\x03\0"))
+        )
+        small[at + 2 : at + 12] = struct.pack("<HII", 4, 1, 100_000)
+    (tmp_path / "bomb.tif").write_bytes(bytes(small))
+    assert code_of(tmp_path / "bomb.tif") == "image_too_large"
+
+
+@pytest.mark.fault(47)
+def test_random_damage_never_escapes_as_another_error() -> None:
+    rng = np.random.default_rng(3)
+    whole = encode_tiff(GRAY8)
+    for _ in range(300):
+        data = bytearray(whole)
+        for at in rng.integers(0, 300, 3):
+            data[int(at)] = int(rng.integers(0, 256))
+        try:
+            image = decode_image(bytes(data), name="x")
+        except ImageError:
+            continue
+        assert image.ndim == 2
+
+
+def test_written_images_are_read_by_others_and_left_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.tif"
+    write_image(path, GRAY16)
+    np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), GRAY16)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(StorageError) as caught:
+        write_image(path, GRAY16 // 2)
+    assert caught.value.code == "storage_full"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.tif"]
+    np.testing.assert_array_equal(read_image(path), GRAY16)
+    with pytest.raises(ValueError, match="uint8 or uint16"):
+        write_image(path, GRAY16.astype(np.float64))  # type: ignore[arg-type]
+
+
+def test_masks_are_white_where_points_may_lie(tmp_path: Path) -> None:
+    mask = GRAY8 > 127
+    for name, image in (
+        ("8.png", mask.astype(np.uint8) * 255),
+        ("16.png", mask.astype(np.uint16) * 65535),
+        ("1.png", mask),
+    ):
+        Image.fromarray(image).save(tmp_path / name)
+        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)

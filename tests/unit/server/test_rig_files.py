@@ -1,0 +1,121 @@
+"""The rig files in config/ can be used, and the reference of their keys is that of the model."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from server.cli import main
+from server.config.reference import json_schema, markdown
+from server.config.rig_file import RigConfig, load_config, parse_config
+from server.rig.build import check_config
+from tests.bench.documents.rig_file import PAGE
+
+ROOT = Path(__file__).resolve().parents[3]
+FILES = sorted((ROOT / "config").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_rig_file_is_good(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    check_config(load_config(path))
+    assert main(["rigfile", str(path)]) == 0
+    assert "good" in capsys.readouterr().out
+
+
+def test_the_page_of_all_keys_is_up_to_date() -> None:
+    assert PAGE.read_text(encoding="utf-8") == markdown(), "run: python -m tests.bench.documents.rig_file"
+
+
+def test_every_key_of_the_model_stands_on_the_page_with_a_meaning() -> None:
+    page = markdown()
+    schema = json_schema()
+    for name, section in schema["$defs"].items():
+        for key, field in section.get("properties", {}).items():
+            assert field.get("description"), (name, key)
+            assert f"| `{key}` |" in page, (name, key)
+    for line in page.splitlines():
+        if line.startswith("| `"):
+            assert "None" not in line.split("|")[2], line
+            assert "{" not in line.split("|")[2], line
+
+
+def _accepts(schema: dict[str, Any], value: Any, known: dict[str, Any]) -> bool:
+    """Judge a value by a JSON schema, written anew from the standard for the words that are used here."""
+    if "$ref" in schema:
+        return _accepts(known[schema["$ref"].rsplit("/", 1)[-1]], value, known)
+    if "anyOf" in schema:
+        return any(_accepts(option, value, known) for option in schema["anyOf"])
+    if "const" in schema:
+        return bool(value == schema["const"])
+    if "enum" in schema:
+        return value in schema["enum"]
+    kind = schema.get("type")
+    if kind == "object":
+        if not isinstance(value, dict) or not set(schema.get("required", ())) <= set(value):
+            return False
+        properties, more = schema.get("properties", {}), schema.get("additionalProperties", True)
+        for key, item in value.items():
+            rule = properties.get(key, more)
+            if rule is False or (isinstance(rule, dict) and not _accepts(rule, item, known)):
+                return False
+        return True
+    if kind == "array":
+        rules = schema.get("prefixItems") or [schema["items"]] * len(value)
+        return len(rules) == len(value) and all(_accepts(r, v, known) for r, v in zip(rules, value, strict=True))
+    if kind in ("number", "integer"):
+        right = isinstance(value, int | float) and not isinstance(value, bool)
+        return (
+            right
+            and schema.get("minimum", value) <= value <= schema.get("maximum", value)
+            and not ("exclusiveMinimum" in schema and value <= schema["exclusiveMinimum"])
+        )
+    return isinstance(value, {"string": str, "boolean": bool}.get(str(kind), object))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_schema_takes_good_files_and_no_unknown_key(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rigfile", "--schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    data = tomllib.loads(path.read_text())
+    assert _accepts(schema, data, schema["$defs"])
+    data["cam1"]["expsure_ms"] = 3.0
+    assert not _accepts(schema, data, schema["$defs"])
+    del data["cam1"]["expsure_ms"]
+    data["cam1"]["phd_px"] = 0.0
+    assert not _accepts(schema, data, schema["$defs"])
+
+
+def test_bad_files_are_named_with_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.toml"
+    bad.write_text(FILES[0].read_text().replace("soft_limits_mm", "soft_limit_mm"))
+    assert main(["rigfile", str(FILES[0]), str(bad)]) == 1
+    out = capsys.readouterr().out
+    assert "soft_limit" in out
+    assert f"{FILES[0]}: " in out
+
+
+def test_without_a_file_the_page_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rigfile"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"`[{name}]`" in out for name in RigConfig.model_fields)
+
+
+def test_the_laboratory_file_explains_every_key() -> None:
+    text = (ROOT / "config" / "lab_aravis_esp301.toml").read_text()
+    for section in json_schema()["$defs"].values():
+        for key in section.get("properties", {}):
+            assert (
+                re.search(rf"^(# )?{key} = ", text, re.MULTILINE) or f"[stage.{key}." in text or f"[cam1.{key}]" in text
+            ), key
+
+
+def test_keys_behind_a_comment_sign_may_be_taken_in() -> None:
+    path = ROOT / "config" / "lab_aravis_esp301.toml"
+    text = re.sub(r"^# (\w+ = )", r"\1", path.read_text(), flags=re.MULTILINE)
+    assert text != path.read_text()
+    parse_config(text)
