@@ -15,25 +15,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.cameras.camera import Camera, RigidTransform
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
 from core.errors import InputError
 from sim.sensor import Lighting, Sensor
 
 CameraName = Literal["cam1", "cam2"]
 CAMERA_NAMES: tuple[CameraName, CameraName] = ("cam1", "cam2")
-_PARAMETERS = (
-    "phd_px",
-    "cx_px",
-    "cy_px",
-    "kappa_per_px2",
-    "aspect",
-    "alpha_rad",
-    "beta_rad",
-    "gamma_rad",
-    "x0_mm",
-    "y0_mm",
-    "z0_mm",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +182,7 @@ def _camera(known: Mapping[str, Any], true: Mapping[str, Any], noise: Mapping[st
         raise ValueError(f"stage_sign must be 1 or -1, got {sign}")
     sensor = Sensor(bit_depth=int(known.get("bit_depth", 8)), **{k: float(v) for k, v in noise.items()})
     return SimCamera(
-        camera=Camera.from_paper(**{name: _finite(true, name) for name in _PARAMETERS}),
+        camera=Camera.from_paper(**{name: _finite(true, name) for name in ELEVEN_PARAMETER_NAMES}),
         size_px=(columns, rows),
         sensor=sensor,
         lighting=Lighting(

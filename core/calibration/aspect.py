@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.cameras.camera import Camera
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
 from core.cameras.lens import Float
 from core.errors import CalibrationInputError
 from core.grid.view import GridView
@@ -30,19 +30,6 @@ _KAPPA_PRIOR = 0.1  # kappa r^2 at the image's corner
 _SIGMA_FLOOR_PX = 1e-4
 _LEAST_MOVED = 3
 _LEAST_SCALE_CHANGE = 1e-3
-_NAMES = (
-    "phd_px",
-    "cx_px",
-    "cy_px",
-    "kappa_per_px2",
-    "aspect",
-    "alpha_rad",
-    "beta_rad",
-    "gamma_rad",
-    "x0_mm",
-    "y0_mm",
-    "z0_mm",
-)
 
 
 @dataclass(frozen=True)
@@ -172,17 +159,17 @@ def _refine(views: Sequence[GridView], dz: Float, first: float) -> tuple[float, 
     scale = np.array([start[0] * 1e-2, 10.0, 10.0, 0.01 / corner2, 1e-3, 1e-3, 1e-3, 1e-3, 0.1, 0.1, start[10] * 1e-2])
 
     def camera(p: Float) -> Camera:
-        return Camera.from_paper(**dict(zip(_NAMES, (start + p * scale).tolist(), strict=True)))
+        return Camera.from_paper(**dict(zip(ELEVEN_PARAMETER_NAMES, (start + p * scale).tolist(), strict=True)))
 
     def residuals(p: Float) -> Float:
         cam = camera(p)
         parts = [((cam.moved(z).project(points).xy - m) / s).ravel() for z, m, s in zip(dz, xy, sigma, strict=True)]
         full = start + p * scale
-        parts.append(np.array([(full[_NAMES.index(k)] - mean) / sd for k, (mean, sd) in prior.items()]))
+        parts.append(np.array([(full[ELEVEN_PARAMETER_NAMES.index(k)] - mean) / sd for k, (mean, sd) in prior.items()]))
         return np.asarray(np.nan_to_num(np.concatenate(parts), nan=1e6))
 
-    fit = least_squares(residuals, np.zeros(len(_NAMES)), method="lm", xtol=1e-12, ftol=1e-12)
-    dof = max(residuals(fit.x).size - len(_NAMES), 1)
+    fit = least_squares(residuals, np.zeros(len(ELEVEN_PARAMETER_NAMES)), method="lm", xtol=1e-12, ftol=1e-12)
+    dof = max(residuals(fit.x).size - len(ELEVEN_PARAMETER_NAMES), 1)
     left, jac = np.asarray(fit.fun), np.asarray(fit.jac)
     variance = max(1.0, float(left @ left) / dof)
     covariance = np.linalg.inv(jac.T @ jac) * variance

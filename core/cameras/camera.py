@@ -17,6 +17,7 @@ from core.cameras.lens import Bool, Float, LensModel, MappedPoints, SeidelLens
 
 POSE_NAMES = ("alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm")
 TEN_PARAMETER_NAMES = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", *POSE_NAMES)
+ELEVEN_PARAMETER_NAMES = (*SeidelLens.parameter_names, *POSE_NAMES)
 
 
 class SpacePoints(NamedTuple):

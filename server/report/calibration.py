@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from server.formats.calibrations.recognise import PARAMETER_NAMES
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES
 from server.report.items import plain
 from server.report.page import Cell, Markup, element, note, table
 from server.report.source import CAMERAS, Source
@@ -96,7 +96,7 @@ def _made(content: Mapping[str, Any]) -> Markup:
 def _parameters(content: Mapping[str, Any]) -> Markup:
     sigma = content.get("sigma") or {}
     rows, keys = [], []
-    for name in PARAMETER_NAMES:
+    for name in ELEVEN_PARAMETER_NAMES:
         unit = next((told for end, told in _UNITS.items() if name.endswith(f"_{end}")), "")
         if name.endswith("per_px2"):
             unit = _UNITS["px2"]

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 import xarray
 
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES
 from server.cli import main
 from tests.support.independent_rig import FLAT, LineGrid, PlainCamera, Waves, render
 
@@ -44,23 +45,10 @@ aspect = 0.9617
 
 def calibration_file(folder: Path) -> Path:
     """A file that holds only what the format asks for."""
-    names = (
-        "phd_px",
-        "cx_px",
-        "cy_px",
-        "kappa_per_px2",
-        "aspect",
-        "alpha_rad",
-        "beta_rad",
-        "gamma_rad",
-        "x0_mm",
-        "y0_mm",
-        "z0_mm",
-    )
     cams = {}
     for name, cam in (("cam1", CAM1), ("cam2", CAM2)):
         values = list(asdict(cam).values())[1:]
-        cams[name] = dict(zip(names, values, strict=True))
+        cams[name] = dict(zip(ELEVEN_PARAMETER_NAMES, values, strict=True))
     path = folder / "true.json"
     path.write_text(json.dumps(cams))
     return path

@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import uvicorn
 
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES
 from server.api.app import create_app
 from server.config.rig_file import RigConfig, parse_config
 from server.workflows.service import Service
@@ -42,20 +43,7 @@ def tiny_config(**replacements: str) -> RigConfig:
 def true_cameras(text: str) -> dict[str, dict[str, float]]:
     """A simulated rig's own cameras as a calibration file, so that nothing need be calibrated."""
     world = tomllib.loads(text)["sim"]
-    names = (
-        "phd_px",
-        "cx_px",
-        "cy_px",
-        "kappa_per_px2",
-        "aspect",
-        "alpha_rad",
-        "beta_rad",
-        "gamma_rad",
-        "x0_mm",
-        "y0_mm",
-        "z0_mm",
-    )
-    return {cam: {name: world[cam][name] for name in names} for cam in ("cam1", "cam2")}
+    return {cam: {name: world[cam][name] for name in ELEVEN_PARAMETER_NAMES} for cam in ("cam1", "cam2")}
 
 
 @contextlib.contextmanager

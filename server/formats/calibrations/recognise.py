@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from core.cameras.camera import Camera
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from server.formats.calibrations.dice_xml import looks_like_dice, parse_dice_xml
@@ -19,19 +19,6 @@ from server.formats.calibrations.matchid_caldat import looks_like_caldat, parse_
 from server.formats.calibrations.opencv_yaml import looks_like_opencv, parse_opencv
 from server.formats.calibrations.vic3d_xml import looks_like_vic3d, parse_vic3d
 
-PARAMETER_NAMES = (
-    "phd_px",
-    "cx_px",
-    "cy_px",
-    "kappa_per_px2",
-    "aspect",
-    "alpha_rad",
-    "beta_rad",
-    "gamma_rad",
-    "x0_mm",
-    "y0_mm",
-    "z0_mm",
-)
 _MAX_BYTES = 64 << 20
 _LEAST_BASELINE = 1e-6  # of the stand-off
 
@@ -106,11 +93,11 @@ def _nested_deeper(value: Any, limit: int) -> bool:
 def _camera(name: str, which: str, content: Any) -> Camera:
     if not isinstance(content, dict):
         raise unreadable(name, f"{which} is missing" if content is None else f"{which} is not an object")
-    missing = [key for key in PARAMETER_NAMES if key not in content]
+    missing = [key for key in ELEVEN_PARAMETER_NAMES if key not in content]
     if missing:
         raise unreadable(name, f"{which} lacks {', '.join(missing)}")
     values: dict[str, float] = {}
-    for key in PARAMETER_NAMES:
+    for key in ELEVEN_PARAMETER_NAMES:
         value = content[key]
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise unreadable(name, f"{key} of {which} is {value!r}, not a number")

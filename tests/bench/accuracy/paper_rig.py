@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.camera import Camera, RigidTransform
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 from sim.render import RenderOptions, material_points, render
 from sim.scene import UPRIGHT, Scene
@@ -17,19 +17,6 @@ from sim.surface import flat
 from sim.texture import Texture, speckle
 
 ROOT = Path(__file__).resolve().parents[3]
-ELEVEN = (
-    "phd_px",
-    "cx_px",
-    "cy_px",
-    "kappa_per_px2",
-    "aspect",
-    "alpha_rad",
-    "beta_rad",
-    "gamma_rad",
-    "x0_mm",
-    "y0_mm",
-    "z0_mm",
-)
 DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255
 
 Float = NDArray[np.float64]
@@ -71,7 +58,7 @@ def load_rig(name: str = "sim_paper") -> Rig:
     """Read the true cameras of ``config/<name>.toml``."""
     table = tomllib.loads((ROOT / "config" / f"{name}.toml").read_text())
     sim = table["sim"]
-    cams = [Camera.from_paper(**{k: sim[c][k] for k in ELEVEN}) for c in ("cam1", "cam2")]
+    cams = [Camera.from_paper(**{k: sim[c][k] for k in ELEVEN_PARAMETER_NAMES}) for c in ("cam1", "cam2")]
     width, height = table["cam1"]["image_size_px"]
     return Rig(StereoPair(*cams), (width, height), sim["speckle_mm"], sim["blur_px"])
 
