@@ -27,7 +27,7 @@ SLOW = 200_000
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("calibrate") / "data")
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("calibrate") / "data").start()
     yield made
     made.close()
 
