@@ -439,3 +439,23 @@ def test_cancelled_raises_in_the_phase(bench: Bench) -> None:
     bench.jobs.cancel(job.id)
     assert bench.end_of(job)["state"] == "cancelled"
     assert seen == [True]
+
+
+def test_a_service_that_was_only_made_has_opened_nothing(tmp_path: Path) -> None:
+    threads = threading.active_count()
+    service = Service(tiny_config(), tmp_path / "data")
+    assert threading.active_count() == threads
+    assert list(tmp_path.iterdir()) == []
+    service.close()
+
+
+def test_a_start_that_fails_closes_what_was_opened_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> list[str]:
+        raise StorageError("The index cannot be made.")
+
+    monkeypatch.setattr("server.workflows.service.rebuild", broken)
+    threads = threading.active_count()
+    with pytest.raises(StorageError), Service(tiny_config(), tmp_path / "data"):
+        pass
+    assert threading.active_count() == threads
+    DataFolder(tmp_path / "data").open().close()
