@@ -25,7 +25,6 @@ from server.api.routes.service import jobs, session, system
 from server.api.routes.tests import facts, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
-from server.workflows.retention import Retention
 from server.workflows.service import Service
 from server.workflows.watch import Watches
 
@@ -61,9 +60,7 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        retention = Retention(service)
         yield
-        retention.close()
         audit.close()
         if close_service:
             service.close()

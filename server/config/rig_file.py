@@ -6,6 +6,7 @@ key that is not known is an error, not a silent nothing; errors are one line tha
 
 from __future__ import annotations
 
+import logging
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from core.errors import FileFormatError
 from server.config.camera_facts import Above, CameraFacts, LensFacts, Text
+
+_log = logging.getLogger("stereorig.config")
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -250,11 +253,6 @@ class ServiceSection(_Closed):
     event_streams: int = Field(
         200, ge=1, le=2000, description="Streams of server-sent events that may be open at once; beyond it 503."
     )
-    retention_days: Annotated[float, Field(ge=1.0, le=36500.0)] | None = Field(
-        None,
-        description="A test goes to the trash so many days after its export was acknowledged, if nothing was added to "
-        "it since; other tests stay. Left out: nothing goes by itself.",
-    )
     require_key: bool = Field(
         False, description="Ask for a key on loopback too; on other addresses one is always asked for."
     )
@@ -266,6 +264,18 @@ class ServiceSection(_Closed):
     requests_per_s: Positive = Field(
         500.0, description="Requests that one address may make for ever; ten times as many at once."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _ignore_retention(cls, section: Any) -> Any:
+        # a machine that runs by itself must come up again after an upgrade; what it did not delete is lost to nobody
+        if isinstance(section, dict) and "retention_days" in section:
+            _log.warning(
+                "[service] retention_days is ignored: the service moves nothing to the trash by itself any more. Take "
+                "the line out of the rig file; delete old tests by DELETE /tests/{id}."
+            )
+            return {name: value for name, value in section.items() if name != "retention_days"}
+        return section
 
 
 class ComputeSection(_Closed):

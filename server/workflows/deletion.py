@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from core.errors import StateError, StereorigError
@@ -13,25 +12,15 @@ from server.store.trash import Kind
 from server.workflows.service import Service
 
 
-def delete(
-    service: Service,
-    kind: Kind,
-    ids: dict[str, Any],
-    *,
-    by: str,
-    why: str = "asked for",
-    if_still: Callable[[], bool] | None = None,
-) -> dict[str, Any] | None:
+def delete(service: Service, kind: Kind, ids: dict[str, Any], *, by: str) -> dict[str, Any]:
     """Move something into the trash; return the trash's entry.
 
     Parameters
     ----------
     kind, ids
         As of `server.store.trash.Trash.put`.
-    by, why
-        Who asks, and on what occasion.
-    if_still
-        Asked once nothing can change any more; on False nothing is deleted, and None is returned.
+    by
+        Who asks.
 
     Raises
     ------
@@ -45,10 +34,8 @@ def delete(
     name = _name(service, kind, ids)  # that it exists
     with service.tests.still():
         _check_unused(service, kind, ids)
-        if if_still is not None and not if_still():
-            return None
         name = _name(service, kind, ids)
-        trash_id = service.trash.put(service.folder, kind, ids, name=name, by=by, why=why)
+        trash_id = service.trash.put(service.folder, kind, ids, name=name, by=by, why="asked for")
     if kind != "noise":
         entry_id = f"{ids['n']:04d}" if kind == "step" else str(ids[f"{kind}_id"])
         parent = ids["test_id"] if kind in ("step", "analysis") else ""

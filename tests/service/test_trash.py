@@ -1,4 +1,4 @@
-"""Deleting goes to the trash, whole and back; retention takes only what was acknowledged as copied elsewhere."""
+"""Deleting goes to the trash, whole and back; nothing goes there by itself."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from server.store.index import rebuild
 from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.store.verify import verify
-from server.workflows.retention import sweep
 from server.workflows.service import Service
 from tests.service.test_service_api import assert_problem
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
@@ -281,41 +280,24 @@ def test_the_command_lists_restores_and_empties(folder: DataFolder, capsys: pyte
     assert "the trash is empty" in capsys.readouterr().out
 
 
-# retention ------------------------------------------------------------------------------------------------------
+# copies elsewhere ------------------------------------------------------------------------------------------------
 
 
-def test_only_what_was_acknowledged_as_copied_and_is_old_enough_goes_by_itself(tmp_path: Path) -> None:
-    config = tiny_config(compute_queue="compute_queue = 2\nretention_days = 30.0")
-    service = Service(config, tmp_path / "data")
+def test_a_copy_is_acknowledged_only_where_it_holds_what_the_test_has(tmp_path: Path) -> None:
+    service = Service(tiny_config(), tmp_path / "data")
     try:
         with served(service) as client:
-            kept, grown, gone, young = (new_test(client, name=name) for name in ("kept", "grown", "gone", "young"))
-            for test_id in (kept, grown, gone):
-                add_step(client, test_id, 1)
-            too_little = client.post(f"{API}/tests/{gone}/exported", json={"steps": 0, "results": 0})
+            test_id = new_test(client)
+            add_step(client, test_id, 1)
+            too_little = client.post(f"{API}/tests/{test_id}/exported", json={"steps": 0, "results": 0})
             problem = assert_problem(too_little, 409, "export_differs")
             assert problem["steps"] == 1
-            for test_id in (grown, gone):
-                answer = client.post(f"{API}/tests/{test_id}/exported", json={"steps": 1, "results": 0})
-                assert answer.status_code == 200
-                assert client.get(f"{API}/tests/{test_id}").json()["exported"]["steps"] == 1
-            add_step(client, grown, 2)
-            later = datetime.now(UTC) + timedelta(days=29.9)
-            assert sweep(service, now=lambda: later) == []
-            # a clock that went back makes nothing old
-            assert sweep(service, now=lambda: datetime(1980, 1, 1, tzinfo=UTC)) == []
-            later += timedelta(days=0.2)
-            with service.gate.hold("the capture of a step", test_id=gone):
-                assert sweep(service, now=lambda: later) == []
-            assert sweep(service, now=lambda: later) == [gone]
-            assert [t["id"] for t in client.get(f"{API}/tests").json()["tests"]] == [kept, grown, young]
-            entry = client.get(f"{API}/trash").json()["trash"][0]
-            assert (entry["test_id"], entry["why"], entry["deleted_by"]) == (gone, "retention", "stereorig")
-            assert client.post(f"{API}/trash/{entry['id']}/restore").status_code == 200
+            answer = client.post(f"{API}/tests/{test_id}/exported", json={"steps": 1, "results": 0})
+            assert answer.status_code == 200
+            assert client.get(f"{API}/tests/{test_id}").json()["exported"]["steps"] == 1
+            assert client.get(f"{API}/trash").json()["trash"] == []
     finally:
         service.close()
-    service.config.service.__dict__["retention_days"] = None
-    assert sweep(service) == []
 
 
 def test_restoring_over_what_is_there_is_refused(folder: DataFolder) -> None:

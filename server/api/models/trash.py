@@ -1,4 +1,4 @@
-"""The trash, and what may go there by itself, as they travel."""
+"""The trash, and the acknowledgement of copies, as they travel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TrashEntry(Reply):
     noise_id: str | None = Field(None, description="Id of a noise measurement.")
     deleted_utc: str | None = Field(None, description="When it was deleted.")
     deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
-    why: str | None = Field(None, description="`asked for`, or `retention`.")
+    why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")
     size_bytes: int | None = Field(None, description="Room that emptying frees.")
 
 

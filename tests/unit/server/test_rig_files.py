@@ -119,3 +119,12 @@ def test_keys_behind_a_comment_sign_may_be_taken_in() -> None:
     text = re.sub(r"^# (\w+ = )", r"\1", path.read_text(), flags=re.MULTILINE)
     assert text != path.read_text()
     parse_config(text)
+
+
+def test_a_file_of_the_time_of_retention_is_taken_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    text = FILES[0].read_text()
+    assert "[service]" not in text
+    config = parse_config(f"{text}\n[service]\nretention_days = 30.0\nlive_views = 3\n")
+    assert config.service.live_views == 3
+    assert not hasattr(config.service, "retention_days")
+    assert "retention_days is ignored" in caplog.text

@@ -1,4 +1,4 @@
-"""Deleting into the trash, the trash, and the acknowledgement that lets old tests go there by themselves."""
+"""Deleting into the trash, the trash, and the acknowledgement that a copy lies elsewhere."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from server.api.protocol.dependencies import AnalysisId, CalibrationId, ServiceD
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.api.routes.calibrations.noise import NoiseId
+from server.store.copies import acknowledge_export
 from server.store.trash import Kind
 from server.workflows.deletion import delete, restore
-from server.workflows.retention import acknowledge_export
 from server.workflows.service import Service
 
 router = APIRouter(tags=["trash"])
@@ -22,9 +22,7 @@ _ERRORS = errors(404, 409, 507)
 
 
 def _delete(service: Service, request: Request, kind: Kind, **ids: Any) -> dict[str, Any]:
-    deleted = delete(service, kind, ids, by=person_name(request))
-    assert deleted is not None
-    return deleted
+    return delete(service, kind, ids, by=person_name(request))
 
 
 @router.delete("/tests/{test_id}", summary="Delete a test", response_model=TrashEntry, responses=_ERRORS)
@@ -98,9 +96,8 @@ def remove_trash(service: ServiceDep, trash_id: TrashId) -> None:
 def acknowledge_exported(
     service: ServiceDep, request: Request, test_id: TestId, body: ExportedRequest
 ) -> dict[str, Any]:
-    """Say that all of the test was copied elsewhere; where `retention_days` is set, it may go to the trash then.
+    """Say that all of the test was copied elsewhere; the test shows it as `exported`, and nothing is deleted.
 
-    What the copy holds is compared with what is there: a test that has grown meanwhile is refused. What is added
-    afterwards ends the acknowledgement.
+    What the copy holds is compared with what is there: a test that has grown meanwhile is refused.
     """
-    return acknowledge_export(service, test_id, steps=body.steps, results=body.results, by=person_name(request))
+    return acknowledge_export(service.tests, test_id, steps=body.steps, results=body.results, by=person_name(request))

@@ -1,0 +1,51 @@
+"""Acknowledgement that a copy of a test lies elsewhere: kept with the test, for whoever frees room by hand."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+from core.errors import StateError
+from server.formats.files import known_sha256, recorded_sha256
+from server.store.folder import now_utc
+from server.store.tests import TestStore
+
+
+def content_of(tests: TestStore, test_id: str) -> dict[str, Any]:
+    """Return how many complete steps and result files a test has, and the SHA-256 of all their checksums."""
+    digest = hashlib.sha256()
+    steps = tests.step_numbers(test_id)
+    for n in steps:
+        digest.update(f"{n} {sorted(tests.step(test_id, n).document['sha256'].items())}\n".encode())
+    results = 0
+    for analysis_id in tests.analysis_ids(test_id):
+        for n in tests.finished_steps(test_id, analysis_id):
+            path = tests.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
+            digest.update(f"{analysis_id} {n} {recorded_sha256(path) or known_sha256(path)}\n".encode())
+            results += 1
+    return {"steps": len(steps), "results": results, "sha256": digest.hexdigest()}
+
+
+def acknowledge_export(tests: TestStore, test_id: str, *, steps: int, results: int, by: str) -> dict[str, Any]:
+    """Keep with the test that a copy of it lies elsewhere; return what was kept.
+
+    Raises
+    ------
+    NotFoundError
+        There is no such test.
+    StateError
+        ``export_differs`` when the copy cannot hold all of it.
+    """
+    content = content_of(tests, test_id)
+    if (content["steps"], content["results"]) != (steps, results):
+        raise StateError(
+            f"The copy holds {steps} steps and {results} results, test {test_id} has {content['steps']} and "
+            f"{content['results']}.",
+            code="export_differs",
+            remedy="Copy it again, then acknowledge that.",
+            steps=content["steps"],
+            results=content["results"],
+        )
+    exported = {"utc": now_utc(), "by": by, **content}
+    tests.update(test_id, {"exported": exported})
+    return exported
