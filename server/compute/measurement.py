@@ -135,8 +135,8 @@ def measure_step(task: StepTask) -> dict[str, Any]:
         starts_file(_result_path(task, task.previous)).unlink(missing_ok=True)  # nobody starts from there any more
     # the next step needs the reference's field and this one, and reads this one as any other process would
     context.fields = {n: f for n, f in context.fields.items() if n == task.reference and n != task.n}
-    summary = summarise(marked, rbe_px=context.rbe_px, reference=task.reference)
-    summary["strain"] = None if strain is None else summarise_strain(strain)
+    summary = summarise(marked, rbe_px=context.rbe_px, reference=task.reference).document()
+    summary["strain"] = None if strain is None else summarise_strain(strain).document()
     return {**summary, "compute_s": round(computed - began, 3), "write_s": round(time.perf_counter() - computed, 3)}
 
 

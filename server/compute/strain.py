@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -55,39 +56,76 @@ def strain_of_step(field: Field, options: StrainOptions | None, *, subset_px: in
     return surface_strain(field, options, subset_px=subset_px)
 
 
-def summarise_strain(strain: StrainField) -> dict[str, Any]:
-    """Summarise one step's strain.
+@dataclass(frozen=True)
+class PatchStrain:
+    """Strain of the patches themselves, and what it differs by from that over the window; microstrain by component."""
 
-    Returns
-    -------
-    dict
-        Options, ``gauge_px``, ``gauge_mm`` (of smoothed displacements with the smoothing's window), ``points`` with
-        strain and ``status`` (counts), and in microstrain of exx, eyy, exy: ``mean_microstrain``, ``sd_microstrain``
-        over the field, ``noise_floor_microstrain`` (median of the standard deviation that the points' covariances
-        predict); of the patches' own strain ``patch``: its mean, and mean and sd of what it differs by. What cannot be
-        told is None.
+    mean_microstrain: dict[str, float | None]
+    difference_mean_microstrain: dict[str, float | None]
+    difference_sd_microstrain: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class StrainSummary:
+    """One step's strain in a few numbers; what cannot be told is None.
+
+    Attributes
+    ----------
+    window, order, tensor
+        Its options.
+    gauge_px, gauge_mm
+        Width of the strain gauge; of smoothed displacements with the smoothing's window.
+    points, status
+        How many points have strain, and the counts by state.
+    mean_microstrain, sd_microstrain
+        Over the field, of exx, eyy, exy.
+    noise_floor_microstrain
+        Median of the standard deviation that the points' covariances predict.
+    patch
+        Strain of the patches themselves.
     """
-    valid = strain.valid
-    summary: dict[str, Any] = {
-        **(strain_settings(strain.options) or {}),
-        "gauge_px": strain.gauge_px,
-        "gauge_mm": strain.gauge_mm if np.isfinite(strain.gauge_mm) else None,
-        "points": int(valid.sum()),
-        "status": {s.name.lower(): int((strain.status == s).sum()) for s in StrainStatus if (strain.status == s).any()},
-        "mean_microstrain": _figures(strain.strain[valid], np.mean),
-        "sd_microstrain": _figures(strain.strain[valid], np.std),
-        "noise_floor_microstrain": _figures(strain.sigma[valid], np.median),
-        "patch": None,
-    }
+
+    window: int
+    order: int
+    tensor: str
+    gauge_px: float
+    gauge_mm: float | None
+    points: int
+    status: dict[str, int]
+    mean_microstrain: dict[str, float | None]
+    sd_microstrain: dict[str, float | None]
+    noise_floor_microstrain: dict[str, float | None]
+    patch: PatchStrain | None
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return asdict(self)
+
+
+def summarise_strain(strain: StrainField) -> StrainSummary:
+    """Summarise one step's strain."""
+    valid, patch = strain.valid, None
     if strain.patch is not None:
         both = valid & np.isfinite(strain.patch).all(axis=-1)
         apart = strain.patch[both] - strain.strain[both]
-        summary["patch"] = {
-            "mean_microstrain": _figures(strain.patch[both], np.mean),
-            "difference_mean_microstrain": _figures(apart, np.mean),
-            "difference_sd_microstrain": _figures(apart, np.std),
-        }
-    return summary
+        patch = PatchStrain(
+            mean_microstrain=_figures(strain.patch[both], np.mean),
+            difference_mean_microstrain=_figures(apart, np.mean),
+            difference_sd_microstrain=_figures(apart, np.std),
+        )
+    return StrainSummary(
+        window=strain.options.window,
+        order=strain.options.order,
+        tensor=strain.options.tensor,
+        gauge_px=strain.gauge_px,
+        gauge_mm=strain.gauge_mm if np.isfinite(strain.gauge_mm) else None,
+        points=int(valid.sum()),
+        status={s.name.lower(): int((strain.status == s).sum()) for s in StrainStatus if (strain.status == s).any()},
+        mean_microstrain=_figures(strain.strain[valid], np.mean),
+        sd_microstrain=_figures(strain.strain[valid], np.std),
+        noise_floor_microstrain=_figures(strain.sigma[valid], np.median),
+        patch=patch,
+    )
 
 
 def _figures(values: NDArray[np.float64], figure: Any) -> dict[str, float | None]:

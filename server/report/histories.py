@@ -39,12 +39,12 @@ def _own(measured: Measured) -> Markup:
     for name in sorted({name for s in steps for name in s.channels})[:4]:
         data = course(x, {name: ([s.channels.get(name) for s in steps], None)}, x_label=label, y_label=name, title=name)
         drawn.append(picture(data, SVG, f"{name} over the steps", f"{name} as recorded with the steps", half=True))
-    moved = [(xi, s) for xi, s in zip(x, steps, strict=True) if s.summary.get("displacement_mm")]
+    moved = [(xi, s) for xi, s in zip(x, steps, strict=True) if s.summary.displacement_mm]
     if moved:
         lines: dict[str, Any] = {}
         for component in ("u", "v", "w"):
-            told = [s.summary["displacement_mm"][component] for _, s in moved]
-            lines[component.upper()] = ([None if t is None else 1e3 * t["mean"] for t in told], None)
+            told = [(s.summary.displacement_mm or {})[component] for _, s in moved]
+            lines[component.upper()] = ([None if t is None else 1e3 * t.mean for t in told], None)
         data = course(
             [xi for xi, _ in moved],
             lines,
@@ -55,9 +55,9 @@ def _own(measured: Measured) -> Markup:
         drawn.append(
             picture(data, SVG, "mean displacement over the steps", "Mean of U, V, W over all valid points", half=True)
         )
-    strained = [(xi, s.strain) for xi, s in zip(x, steps, strict=True) if s.strain and s.strain["points"]]
+    strained = [(xi, s.strain) for xi, s in zip(x, steps, strict=True) if s.strain and s.strain.points]
     if strained:
-        lines = {e: ([s["mean_microstrain"][e] for _, s in strained], None) for e in STRAINS}
+        lines = {e: ([s.mean_microstrain[e] for _, s in strained], None) for e in STRAINS}
         data = course(
             [xi for xi, _ in strained],
             lines,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from core.field.checks.epipolar_offset import EpipolarCheck
 from server.report import calibration
 from server.report.floor import LENGTHS, STRAINS, Floor
 from server.report.items import Item, Value, plain
@@ -72,10 +72,10 @@ def _boxes(source: Source, measured: Measured) -> list[Markup]:
         )
     ]
     worst = worst_epipolar(measured)
-    level = None if worst is None else str(worst["level"])
-    off = "" if worst is None else f"{worst['offset_px']:.3f} px off the epipolar lines"
+    level = None if worst is None else worst.level
+    off = "" if worst is None else f"{worst.offset_px:.3f} px off the epipolar lines"
     boxes.append(_box("Cameras since then", level or "not told", off, level))
-    shares = [s.summary["valid_fraction"] for s in measured.steps if s.summary["valid_fraction"] is not None]
+    shares = [s.summary.valid_fraction for s in measured.steps if s.summary.valid_fraction is not None]
     share = min(shares) if shares else 0.0
     boxes.append(_box("Valid points, least of the steps", f"{100.0 * share:.1f} %", _of_points(measured), None))
     floor = measured.floor.get("W") or measured.floor.get("Z")
@@ -89,7 +89,7 @@ def _boxes(source: Source, measured: Measured) -> list[Markup]:
 
 
 def _of_points(measured: Measured) -> str:
-    return f"of {measured.steps[0].summary['points']} in the region"
+    return f"of {measured.steps[0].summary.points} in the region"
 
 
 def _box(name: str, value: str, small: str, level: str | None) -> Markup:
@@ -102,10 +102,10 @@ def _box(name: str, value: str, small: str, level: str | None) -> Markup:
     )
 
 
-def worst_epipolar(measured: Measured) -> dict[str, Any] | None:
+def worst_epipolar(measured: Measured) -> EpipolarCheck | None:
     """The step's check that is furthest off; None where none could be made."""
-    checks = [s.summary["epipolar_check"] for s in measured.steps if s.summary.get("epipolar_check")]
-    return max(checks, key=lambda c: float(c["offset_px"]), default=None)
+    checks = [s.summary.epipolar_check for s in measured.steps if s.summary.epipolar_check is not None]
+    return max(checks, key=lambda c: c.offset_px, default=None)
 
 
 def the_test(source: Source, measured: Measured) -> tuple[Markup, list[Item]]:
@@ -241,11 +241,11 @@ def calibration_record(source: Source, measured: Measured) -> tuple[Markup, list
     if worst is None:
         missing.append(("Epipolar check of the analysis", "needs at least four measured points"))
     else:
-        text = f"Epipolar check of the analysis, furthest of all steps: {worst['level']}; {worst['reason']}."
-        parts.append(element("p", text, id="epipolar-check", data_value=repr(float(worst["offset_px"]))))
-    outside = [s for s in measured.steps if s.summary["status"].get("extrapolated")]
+        text = f"Epipolar check of the analysis, furthest of all steps: {worst.level}; {worst.reason}."
+        parts.append(element("p", text, id="epipolar-check", data_value=repr(float(worst.offset_px))))
+    outside = [s for s in measured.steps if s.summary.status.get("extrapolated")]
     if outside:
-        most = max(int(s.summary["status"]["extrapolated"]) for s in outside)
+        most = max(int(s.summary.status["extrapolated"]) for s in outside)
         text = f"Up to {most} points of a step lie outside the calibrated volume and are marked as extrapolated."
         parts.append(element("p", text))
     return section("Calibration", "calibration", *parts), missing
@@ -282,9 +282,9 @@ def steps_table(measured: Measured, *, loads: bool) -> Markup:
     rows = []
     for s in measured.steps:
         summary = s.summary
-        sigma = summary["sigma_median_mm"]
-        check = summary.get("epipolar_check") or {}
-        zncc = [v for v in summary["zncc_median"].values() if v is not None]
+        sigma = summary.sigma_median_mm
+        check = summary.epipolar_check
+        zncc = [v for v in summary.zncc_median.values() if v is not None]
         rows.append(
             [
                 f"{s.n}{' (static)' if s.static else ''}",
@@ -292,12 +292,12 @@ def steps_table(measured: Measured, *, loads: bool) -> Markup:
                 *([_fixed(s.load_n, "g")] if loads else []),
                 *(_fixed(s.channels.get(name), "g") for name in channels),
                 *([_fixed(s.seconds, ".3f")] if any_time else []),
-                Cell(f"{summary['valid']}/{summary['points']}", float(summary["valid"])),
+                Cell(f"{summary.valid}/{summary.points}", float(summary.valid)),
                 _fixed(min(zncc) if zncc else None, ".4f"),
-                _fixed(summary["epipolar_residual_rms_px"], ".4f"),
-                check.get("level", ""),
+                _fixed(summary.epipolar_residual_rms_px, ".4f"),
+                "" if check is None else check.level,
                 *(
-                    _fixed(None if sigma.get(k) is None else 1e3 * sigma[k], ".3g")
+                    _fixed(None if (mm := sigma.get(k)) is None else 1e3 * mm, ".3g")
                     for k in ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
                 ),
                 *([_fixed(s.skew_ms, ".3g")] if any_skew else []),
@@ -309,7 +309,7 @@ def steps_table(measured: Measured, *, loads: bool) -> Markup:
 
 def motion_table(measured: Measured) -> Markup | None:
     """Return what the steps' fields come to: displacement and strain."""
-    moved = [s for s in measured.steps if s.summary.get("displacement_mm")]
+    moved = [s for s in measured.steps if s.summary.displacement_mm]
     if not moved:
         return None
     strains = any(s.strain for s in moved)
@@ -322,15 +322,15 @@ def motion_table(measured: Measured) -> Markup | None:
     for s in moved:
         cells: list[object] = [str(s.n)]
         for component in ("u", "v", "w"):
-            told = s.summary["displacement_mm"][component]
+            told = (s.summary.displacement_mm or {})[component]
             if told is None:
                 cells.append("")
                 continue
-            mean, low, high = (1e3 * told[name] for name in ("mean", "min", "max"))
-            cells.append(Cell(f"{mean:.4g} ({low:.4g}, {high:.4g})", told["mean"]))
+            mean, low, high = (1e3 * v for v in (told.mean, told.min, told.max))
+            cells.append(Cell(f"{mean:.4g} ({low:.4g}, {high:.4g})", told.mean))
         if strains:
-            mean = (s.strain or {}).get("mean_microstrain") or {}
-            cells += [_fixed(mean.get(e), ".4g") for e in STRAINS]
+            means = {} if s.strain is None else s.strain.mean_microstrain
+            cells += [_fixed(means.get(e), ".4g") for e in STRAINS]
         rows.append(cells)
     return table(
         columns, rows, key="motion-table", keys=[f"motion.{s.n}" for s in moved], caption="Over all valid points"

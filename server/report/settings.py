@@ -36,7 +36,7 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
 
     needs = "the result files do not say it: measure again with this program"
     blur = settings.get("prefilter_px")
-    smoothing = measured.steps[-1].summary.get("smoothing")
+    smoothing = measured.steps[-1].summary.smoothing
     update = settings.get("reference_update")
     return [
         Item(
@@ -115,43 +115,41 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
                 Value("none", None, SETTINGS)
                 if not smoothing
                 else Value(
-                    f"polynomial of order {smoothing['order']} over {smoothing['window']} x {smoothing['window']}"
-                    f" points; {smoothing['resolution_px']:g} px"
-                    + ("" if smoothing["resolution_mm"] is None else f" ({smoothing['resolution_mm']:.3g} mm)")
+                    f"polynomial of order {smoothing.order} over {smoothing.window} x {smoothing.window}"
+                    f" points; {smoothing.resolution_px:g} px"
+                    + ("" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)")
                     + " are told apart",
-                    float(smoothing["resolution_px"]),
+                    float(smoothing.resolution_px),
                     SETTINGS,
                 ),
             ),
         ),
         *_strain_items(source, measured),
         Item("frame", "Coordinate system", (Value(str(head.get("frame", "")), None, "written in the results"),)),
-        Item("points", "Points", (Value(_points(measured), float(measured.steps[0].summary["points"]), MEASURED),)),
+        Item("points", "Points", (Value(_points(measured), float(measured.steps[0].summary.points), MEASURED),)),
         Item("region", "Region", (_region(settings),), needs),
     ]
 
 
 def _shape_function(measured: Measured, settings: Mapping[str, Any]) -> Value | None:
-    choice = measured.steps[-1].summary.get("patch")
-    name = choice["patch"] if choice else settings.get("patch")
+    choice = measured.steps[-1].summary.patch
+    name = choice.patch if choice else settings.get("patch")
     if name is None:
         return None
-    asked = f"; {choice['reason']}" if choice and choice.get("asked") == "auto" else ""
+    asked = f"; {choice.reason}" if choice and choice.asked == "auto" else ""
     return Value(f"{name}: {_SHAPES.get(name, '')}{asked}", None, SETTINGS)
 
 
 def _matched(measured: Measured) -> str:
-    others = sorted(
-        {s.summary["reference_step"] for s in measured.steps if s.summary.get("reference_step") is not None}
-    )
+    others = sorted({s.summary.reference_step for s in measured.steps if s.summary.reference_step is not None})
     return "" if not others else f"matched against step {', '.join(map(str, others))}"
 
 
 def _points(measured: Measured) -> str:
-    first, least = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary["valid"])
+    first, least = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary.valid)
     return (
-        f"{first['points']} in the region; valid in the reference {first['valid']}, "
-        f"fewest {least.summary['valid']} in step {least.n}"
+        f"{first.points} in the region; valid in the reference {first.valid}, "
+        f"fewest {least.summary.valid} in step {least.n}"
     )
 
 
@@ -176,16 +174,16 @@ def _strain_items(source: Source, measured: Measured) -> list[Item]:
     settings = source.settings.get("strain")
     if strain is None:
         text = "no strain was computed" if not settings else "no strain: no window of points was whole enough"
-        if all(not s.summary.get("displacement_mm") for s in measured.steps):
+        if all(not s.summary.displacement_mm for s in measured.steps):
             text = "no displacement was measured, so no strain"
         return [Item("strain", "Strain", (Value(text, None, SETTINGS),))]
-    mm = strain["gauge_mm"]
-    window = strain["window"]
+    mm = strain.gauge_mm
+    window = strain.window
     return [
         Item(
             "strain",
             "Strain formulation",
-            (Value(_TENSORS.get(strain["tensor"], strain["tensor"]), None, SETTINGS),),
+            (Value(_TENSORS.get(strain.tensor, strain.tensor), None, SETTINGS),),
             "",
             "in the reference's tangent plane; shear is the tensor's, half of the engineering shear",
         ),
@@ -194,7 +192,7 @@ def _strain_items(source: Source, measured: Measured) -> list[Item]:
             "Strain window",
             (
                 Value(
-                    f"{window} x {window} points, polynomial of order {strain['order']} through their displacements",
+                    f"{window} x {window} points, polynomial of order {strain.order} through their displacements",
                     float(window),
                     SETTINGS,
                 ),
@@ -205,8 +203,8 @@ def _strain_items(source: Source, measured: Measured) -> list[Item]:
             "Virtual strain gauge size",
             (
                 Value(
-                    f"{strain['gauge_px']:g} px" + ("" if mm is None else f" = {mm:.4g} mm"),
-                    float(strain["gauge_px"]),
+                    f"{strain.gauge_px:g} px" + ("" if mm is None else f" = {mm:.4g} mm"),
+                    float(strain.gauge_px),
                     SETTINGS,
                 ),
             ),

@@ -11,11 +11,11 @@ import numpy as np
 
 from core.field.points.result import Field
 from core.strain import StrainField
-from server.compute.strain import summarise_strain
+from server.compute.strain import StrainSummary, summarise_strain
 from server.formats.calibrations.volume import rbe_of
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
-from server.formats.results.summary import summarise
+from server.formats.results.summary import StepSummary, summarise
 from server.report.floor import Floor, FloorKeeper, static_steps, told_sigma
 from server.report.source import Source
 from server.results.reader import library
@@ -55,8 +55,8 @@ class StepFigures:
     channels: dict[str, float]
     seconds: float | None
     captured_utc: str | None
-    summary: dict[str, Any]
-    strain: dict[str, Any] | None
+    summary: StepSummary
+    strain: StrainSummary | None
     skew_ms: float | None
     quality: dict[str, Any] | None
     static: bool
@@ -64,10 +64,8 @@ class StepFigures:
     @property
     def largest_mm(self) -> float | None:
         """Largest component of any point's displacement; None for a shape."""
-        moved = self.summary.get("displacement_mm")
-        if not moved:
-            return None
-        ends = [abs(v) for component in moved.values() if component for v in (component["min"], component["max"])]
+        moved = self.summary.displacement_mm or {}
+        ends = [abs(v) for component in moved.values() if component for v in (component.min, component.max)]
         return max(ends) if ends else None
 
 

@@ -281,8 +281,8 @@ class _Runner:
             "cam1": str(pair.files.cam1),
             "cam2": str(pair.files.cam2),
             "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]},
-            **summarise(result, rbe_px=self._rbe_px, reference=self._number(0)),
-            "strain": None if strain is None else summarise_strain(strain),
+            **summarise(result, rbe_px=self._rbe_px, reference=self._number(0)).document(),
+            "strain": None if strain is None else summarise_strain(strain).document(),
             "seconds": round(time.monotonic() - started, 3),
         }
         rms = summary["epipolar_residual_rms_px"]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.checks.epipolar_offset import check_epipolar
+from core.field.checks.epipolar_offset import EpipolarCheck, check_epipolar
+from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
+from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
 from server.formats.results.layout import COMPARISONS
 
@@ -26,7 +29,73 @@ def _rms(values: NDArray[np.float64]) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Span:
+    """Mean, smallest and largest of a displacement's component, mm."""
+
+    mean: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
+class StepSummary:
+    """One field in a few numbers; what cannot be told is None.
+
+    Attributes
+    ----------
+    kind
+        ``shape`` or ``displacement``.
+    points, valid, valid_fraction
+        Points in the region, those of them with numbers, and their share.
+    status
+        Counts by the state's name.
+    epipolar_offset_mean_px, epipolar_offset_rms_px, epipolar_offset_sd_px
+        Of the full offset across the epipolar line in camera 2, ``epipolar_px``: its mean (what the calibration is
+        off), its root mean square, its standard deviation about the mean.
+    epipolar_residual_rms_px
+        The error left in each image when both cameras share the misfit equally: half of ``epipolar_offset_rms_px``.
+    epipolar_check
+        Whether the cameras still stand as calibrated.
+    plane_residual_rms_mm
+        Of the reference positions.
+    zncc_median, sigma_median_mm
+        By comparison, and by coordinate (``x_mm`` ...).
+    smoothing
+        How the displacement was smoothed and what can still be told apart.
+    patch
+        What the field was measured with, why, and the numbers of the choice.
+    reference_step, points_by_reference, displacement_mm
+        Of displacements alone: what the step was matched against, valid points by what they were matched against, and
+        the components' spans.
+    """
+
+    kind: Literal["shape", "displacement"]
+    points: int
+    valid: int
+    valid_fraction: float | None
+    status: dict[str, int]
+    epipolar_offset_mean_px: float | None
+    epipolar_offset_rms_px: float | None
+    epipolar_offset_sd_px: float | None
+    epipolar_residual_rms_px: float | None
+    epipolar_check: EpipolarCheck | None
+    plane_residual_rms_mm: float | None
+    zncc_median: dict[str, float | None]
+    sigma_median_mm: dict[str, float | None]
+    smoothing: Smoothing | None
+    patch: PatchChoice | None
+    reference_step: int | None = None
+    points_by_reference: dict[str, int] | None = None
+    displacement_mm: dict[str, Span | None] | None = None
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values; a shape has no entries for what only displacements have."""
+        of_motion = ("reference_step", "points_by_reference", "displacement_mm")
+        return {k: v for k, v in asdict(self).items() if self.kind == "displacement" or k not in of_motion}
+
+
+def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0) -> StepSummary:
     """Summarise one field.
 
     Parameters
@@ -37,66 +106,50 @@ def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0)
         The calibration's own reprojection error, where it is known.
     reference
         Number of the sequence's reference.
-
-    Returns
-    -------
-    dict
-        ``points`` (in the region), ``valid``, ``valid_fraction``, ``status`` (counts by name), then of the full offset
-        across the epipolar line in camera 2, ``epipolar_px``: ``epipolar_offset_mean_px`` (what the calibration is
-        off), ``epipolar_offset_rms_px`` and ``epipolar_offset_sd_px`` (about the mean); ``epipolar_residual_rms_px``
-        (the error left in each image when both cameras share the misfit equally: half of
-        ``epipolar_offset_rms_px``), ``epipolar_check`` (whether the cameras still stand as calibrated, see
-        :class:`EpipolarCheck`), ``plane_residual_rms_mm`` (of the reference positions),
-        ``zncc_median`` and ``sigma_median_mm``, ``patch`` (what the field was measured with, why, and the numbers of
-        the choice; see :class:`PatchChoice`), ``smoothing`` (how the displacement was smoothed and
-        what can still be told apart; see :class:`core.field.points.smoothing_record.Smoothing`), for displacements also
-        ``displacement_mm`` (mean, min, max of u, v, w), ``reference_step`` (what the step was matched against) and
-        ``points_by_reference`` (valid points by what they were matched against).
-        What cannot be told is None.
     """
     status = result.status
     valid = result.valid
     points = int((status != PointStatus.MASKED).sum())
     n = int(valid.sum())
     epipolar = result.epipolar_px[valid]
-    check = check_epipolar(result, rbe_px)
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
-    summary: dict[str, Any] = {
-        "kind": "displacement" if result.has_motion else "shape",
-        "points": points,
-        "valid": n,
-        "valid_fraction": n / points if points else None,
-        "status": {s.name.lower(): int((status == s).sum()) for s in PointStatus if (status == s).any()},
-        "epipolar_offset_mean_px": float(epipolar.mean()) if n else None,
-        "epipolar_offset_rms_px": _rms(epipolar),
-        "epipolar_offset_sd_px": float(epipolar.std()) if n else None,
-        "epipolar_residual_rms_px": _rms(epipolar / 2),
-        "epipolar_check": None if check is None else check.document(),
-        "plane_residual_rms_mm": _rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
-        "zncc_median": {
+    summary = StepSummary(
+        kind="displacement" if result.has_motion else "shape",
+        points=points,
+        valid=n,
+        valid_fraction=n / points if points else None,
+        status={s.name.lower(): int((status == s).sum()) for s in PointStatus if (status == s).any()},
+        epipolar_offset_mean_px=float(epipolar.mean()) if n else None,
+        epipolar_offset_rms_px=_rms(epipolar),
+        epipolar_offset_sd_px=float(epipolar.std()) if n else None,
+        epipolar_residual_rms_px=_rms(epipolar / 2),
+        epipolar_check=check_epipolar(result, rbe_px),
+        plane_residual_rms_mm=_rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
+        zncc_median={
             name: float(np.median(result.zncc[valid][:, k])) if n else None
             for k, name in enumerate(COMPARISONS[: result.zncc.shape[-1]])
         },
-        "sigma_median_mm": {
+        sigma_median_mm={
             name: float(np.sqrt(np.median(result.covariance[valid][:, k, k]))) if n else None
             for k, name in enumerate(names)
         },
-    }
-    summary["smoothing"] = None if result.smoothing is None else result.smoothing.document()
-    summary["patch"] = None if result.patch is None else result.patch.document()
-    if result.uvw_mm is not None:
-        matched = result.references
-        summary["reference_step"] = reference if matched is None else matched.step
-        steps, counts = np.unique(
-            np.full(n, reference) if matched is None else matched.steps[valid], return_counts=True
-        )
-        summary["points_by_reference"] = {str(k): int(c) for k, c in zip(steps, counts, strict=True)}
-        uvw = result.uvw_mm[valid]
-        summary["displacement_mm"] = {
-            name: {"mean": float(a.mean()), "min": float(a.min()), "max": float(a.max())} if n else None
+        smoothing=result.smoothing,
+        patch=result.patch,
+    )
+    if result.uvw_mm is None:
+        return summary
+    matched = result.references
+    steps, counts = np.unique(np.full(n, reference) if matched is None else matched.steps[valid], return_counts=True)
+    uvw = result.uvw_mm[valid]
+    return replace(
+        summary,
+        reference_step=reference if matched is None else matched.step,
+        points_by_reference={str(k): int(c) for k, c in zip(steps, counts, strict=True)},
+        displacement_mm={
+            name: Span(float(a.mean()), float(a.min()), float(a.max())) if n else None
             for name, a in zip(("u", "v", "w"), uvw.T, strict=True)
-        }
-    return summary
+        },
+    )
 
 
 def to_json(document: Any) -> bytes:

@@ -97,7 +97,7 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool)
     assert attributes["label"] == "Größe 1"
     assert attributes["step"] == 7
     assert attributes.get("patch_reason") == ("curved: Gründe" if curved else None)
-    assert summarise(field)["patch"] == (field.patch.document() if field.patch else None)
+    assert summarise(field).document()["patch"] == (field.patch.document() if field.patch else None)
 
 
 def test_xarray_understands_the_file(tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_the_summary_counts_and_measures() -> None:
     field = a_field(motion=True)
-    summary = summarise(field)
+    summary = summarise(field).document()
     assert summary["points"] == ROWS * COLS - 1  # one is masked
     assert summary["valid"] == ROWS * COLS - 2
     assert summary["status"] == {"ok": ROWS * COLS - 3, "masked": 1, "low_correlation": 1, "extrapolated": 1}
@@ -227,12 +227,12 @@ def test_plane_residual_of_a_tilted_plane_with_known_noise() -> None:
     a, b = np.array([0.8, 0.0, -0.6]), np.array([0.0, 1.0, 0.0])
     xyz = 5.0 * i[..., None] * a + 5.0 * j[..., None] * b + off[..., None] * normal + 100.0
     whole = dataclasses.replace(field, xyz_mm=xyz, status=np.zeros((ROWS, COLS), np.int8))
-    assert summarise(whole)["plane_residual_rms_mm"] == pytest.approx(0.01, rel=1e-3)
+    assert summarise(whole).plane_residual_rms_mm == pytest.approx(0.01, rel=1e-3)
 
 
 def test_a_field_without_valid_points_has_a_summary() -> None:
     field = dataclasses.replace(a_field(motion=True), status=np.full((ROWS, COLS), PointStatus.NOT_SEEDED, np.int8))
-    summary = json.loads(to_json(summarise(field)))
+    summary = json.loads(to_json(summarise(field).document()))
     assert summary["valid"] == 0
     assert summary["epipolar_offset_rms_px"] is None
     assert summary["displacement_mm"] == {"u": None, "v": None, "w": None}
