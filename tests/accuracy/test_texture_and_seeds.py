@@ -15,8 +15,7 @@ from core.cameras.stereo import StereoPair
 from core.field.seeding.seeds import Seed
 from server.compute.seeds import seeds_of
 from server.results.texture import errors_at, texture_verdict
-from tests.service.test_service_chain import SMALL
-from tests.support.service_rig import new_test, true_cameras
+from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(180)
 API = "/api/v1"

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from server.workflows.service import Service
-from tests.browser.test_page_results import ENDS, LINE, Bench, bench, given, page, shown  # noqa: F401
 from tests.support.page_bench import Watched, watched
+from tests.support.results_page import ENDS, LINE, Bench, bench, given, page, shown  # noqa: F401
 from tests.support.service_rig import served, tiny_config, wait_for_rig
 
 if os.environ.get("CI", "").lower() != "true":

@@ -22,10 +22,9 @@ import pytest
 
 from server.config.rig_file import parse_config
 from sim.rig import SimRig
-from tests.service.test_service_chain import SMALL
 from tests.support.namespace import Namespace, NamespaceTransport, namespaces_missing
 from tests.support.requirements import missing
-from tests.support.service_rig import TINY, new_test, wait_for_job
+from tests.support.service_rig import SMALL, TINY, new_test, wait_for_job
 
 ROOT = Path(__file__).resolve().parents[2]
 API = "/api/v1"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.crash.test_fuzz import IN_CI, judge
+from tests.support.fuzz_verdict import IN_CI, judge
 
 
 @pytest.mark.slow

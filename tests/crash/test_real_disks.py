@@ -21,7 +21,7 @@ from core.errors import StateError, StorageError
 from server.jobs.job import Phase
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from tests.service.test_service_jobs import Bench
+from tests.support.job_bench import Bench
 from tests.support.requirements import missing
 from tests.support.service_rig import TINY
 
@@ -61,7 +61,7 @@ from server.config.rig_file import load_config
 from server.workflows.service import Service
 from server.store.verify import verify
 from service_rig import new_test, served, wait_for_job, wait_for_rig
-from tests.crash.test_service_kill import write_test_folder
+from tests.support.copied_tests import write_test_folder
 
 write_test_folder(data / "tests" / "t000007-abcdef", 12)
 (data / "ballast").write_bytes(bytes(1_600_000))

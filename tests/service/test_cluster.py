@@ -20,9 +20,9 @@ import pytest
 
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.crash.test_service_kill import CONFIG, write_test_folder
-from tests.service.test_continue_follow import API, BODY, begin, contents, folder_of, wait_for_steps
+from tests.support.copied_tests import CONFIG, write_test_folder
 from tests.support.requirements import missing
+from tests.support.running_analyses import API, BODY, begin, contents, folder_of, wait_for_steps
 from tests.support.service_rig import a_second, served, wait_for_job
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -293,7 +293,10 @@ def test_a_simulated_controller_can_be_run_apart(driver: str, pty_too: tuple[str
                 stage.close()
         finally:
             process.send_signal(signal.SIGINT)
-            assert process.wait(10) == 130
+            try:
+                assert process.wait(10) == 130
+            finally:
+                process.kill()
 
 
 @pytest.mark.parametrize("options", [["--axes", "4"], ["--travel", "1", "5"], ["--port", "70000"]])

@@ -25,8 +25,8 @@ from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.store.verify import verify
 from server.workflows.service import Service
-from tests.service.test_service_api import assert_problem
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
+from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, served, tiny_config
 
 API = "/api/v1"

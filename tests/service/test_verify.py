@@ -23,8 +23,7 @@ from server.store.folder import DataFolder
 from server.store.repair import repair
 from server.store.verify import verify
 from server.workflows.service import Service
-from tests.service.test_service_chain import SMALL
-from tests.support.service_rig import new_test, served, wait_for_job, wait_for_rig
+from tests.support.service_rig import SMALL, new_test, served, wait_for_job, wait_for_rig
 
 API = "/api/v1"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -24,25 +23,10 @@ from sim.catalog import make_scene
 from sim.render import RenderOptions, render
 from sim.rig import CAMERA_NAMES, SimRig
 from sim.truth import truth_at
+from tests.support.measure_command import SIZE, command
 
 ROOT = Path(__file__).resolve().parents[3]
-SIZE = (230, 200)
 LOADS = (0.0, 0.5, 1.0)
-ROI = "50,45,180,155"
-
-
-def small_rig() -> SimRig:
-    """The paper's rig with smaller sensors: the same rays, fewer pixels."""
-    tables = tomllib.loads((ROOT / "config" / "sim_paper.toml").read_text())
-    for name in CAMERA_NAMES:
-        tables[name]["image_size_px"] = list(SIZE)
-        tables["sim"][name] |= {"cx_px": SIZE[0] / 2 + 3.0, "cy_px": SIZE[1] / 2 - 2.0}
-    return SimRig.from_dict(tables)
-
-
-@pytest.fixture(scope="module")
-def rig() -> SimRig:
-    return small_rig()
 
 
 @pytest.fixture(scope="module")
@@ -66,23 +50,6 @@ def folder(originals: Path, tmp_path: Path) -> Path:
     """A copy to spoil."""
     shutil.copytree(originals, tmp_path / "in")
     return tmp_path / "in"
-
-
-def command(folder: Path, results: Path, **changes: str | list[str] | None) -> list[str]:
-    options: dict[str, Any] = {
-        "cam1": str(folder / "cam1_*.tif"),
-        "cam2": str(folder / "cam2_*.tif"),
-        "calibration": str(folder / "calibration.json"),
-        "roi": ROI,
-        "subset": "21",
-        "out": str(results),
-    }
-    options.update(changes)
-    arguments = ["measure"]
-    for name, value in options.items():
-        if value is not None:
-            arguments += [f"--{name}", *([value] if isinstance(value, str) else value)]
-    return arguments
 
 
 @pytest.fixture(scope="module")

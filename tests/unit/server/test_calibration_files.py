@@ -15,7 +15,7 @@ from server.formats.calibrations.native import covariance_in, write_calibration
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.target_toml import read_rig, read_target
 from server.formats.views import find_views
-from tests.unit.core.test_calibration import HELD, NOMINAL, make_views
+from tests.support.calibration_truth import HELD, NOMINAL, make_views
 
 TARGET = "pitch_mm = 1.0\nlines = [11, 11]\nline_width_mm = 0.03\nnode_tolerance_mm = 0.004\ndark_lines = true\n"
 CAMERA = "image_size_px = [512, 480]\nphd_px = 12000\nstandoff_mm = 400.0\nangle_deg = -30\naspect = 0.9617\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-TINY = (Path(__file__).resolve().parents[3] / "config" / "sim_tiny.toml").read_text(encoding="utf-8")
+TINY = (Path(__file__).resolve().parents[2] / "config" / "sim_tiny.toml").read_text(encoding="utf-8")
 
 
 def tiny_rig(**replacements: str) -> str:
