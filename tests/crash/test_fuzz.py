@@ -13,7 +13,6 @@ import pytest
 from tests.support.fuzz_verdict import judge
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(2400)
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.fault(52)

@@ -22,10 +22,8 @@ from server.jobs.job import Phase
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from tests.support.job_bench import Bench
-from tests.support.requirements import missing
+from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import TINY
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
@@ -111,7 +109,6 @@ print(json.dumps(out))
 
 
 @pytest.mark.fault(3)
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_disk_that_fills_up_while_it_captures_and_analyses(tmp_path: Path) -> None:
     out = run_with_mounts(FULL, tmp_path)

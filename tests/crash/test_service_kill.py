@@ -12,9 +12,8 @@ import httpx
 import pytest
 
 from tests.support.copied_tests import CONFIG, write_test_folder
+from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def start(tmp_path: Path) -> tuple[subprocess.Popen[str], httpx.Client]:

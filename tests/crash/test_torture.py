@@ -27,7 +27,6 @@ KILLS = int(os.environ.get("STEREORIG_KILLS", "200" if os.environ.get("CI") == "
 
 @pytest.mark.fault(1)
 @pytest.mark.fault(2)
-@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_killed_at_any_instant_it_loses_nothing_and_is_soon_ready(tmp_path: Path) -> None:
     seed = random.SystemRandom().randrange(10**6)

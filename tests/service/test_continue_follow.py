@@ -87,7 +87,6 @@ def assert_same_results(place: Place, one: str, two: str) -> None:
 
 
 @pytest.mark.fault(43)
-@pytest.mark.flaky(reruns=2)  # the second is by the clock, and the machine may be busy
 @pytest.mark.parametrize("update", ["auto", "always"])
 def test_a_cancelled_analysis_goes_on_as_if_nothing_had_been(
     place: Place, test_url: str, plain: str, update: str
@@ -247,7 +246,6 @@ def test_an_analysis_follows_its_test_and_leaves_the_lane_to_others(
 
 
 @pytest.mark.fault(43)
-@pytest.mark.flaky(reruns=2)
 def test_a_follower_that_waits_is_cancelled_at_once_and_goes_on_when_asked(
     place: Place, taken: Path, plain: str, growing: str
 ) -> None:

@@ -27,9 +27,8 @@ from server.workflows.service import Service
 from server.workflows.waiting import run_task
 from tests.support import worker_functions as work
 from tests.support.job_bench import Bench
+from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY, new_test, served, tiny_config, wait_for_job, wait_for_rig
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture

@@ -26,7 +26,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.requirements import ROOT
+
 CACHE = ROOT / ".cache" / "guest"
 _PYTEST = (sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "tests.support.guest_report")
 #: the modules that are loaded, in this order, each after what it depends on

@@ -25,7 +25,6 @@ from sim.rig import CAMERA_NAMES, SimRig
 from sim.truth import truth_at
 from tests.support.measure_command import SIZE, command
 
-ROOT = Path(__file__).resolve().parents[3]
 LOADS = (0.0, 0.5, 1.0)
 
 

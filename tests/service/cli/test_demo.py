@@ -33,8 +33,8 @@ from server.formats.images import read_image
 from sim.plate import CircularPlate
 from sim.rig import SimRig
 from tests.support.demo_field import field_of
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 PRESSURES = [200.0, 400.0, 689.0]
 
 
@@ -197,7 +197,6 @@ def answers(port: int) -> bool:
         return False
 
 
-@pytest.mark.slow
 def test_the_service_ends_with_the_block_whatever_ends_it(tmp_path: Path) -> None:
     config = demo.find_config("sim_paper.toml")
     with contextlib.suppress(ZeroDivisionError), running_service(config, tmp_path / "data", tmp_path / "log") as url:
@@ -207,7 +206,6 @@ def test_the_service_ends_with_the_block_whatever_ends_it(tmp_path: Path) -> Non
     assert not answers(port)
 
 
-@pytest.mark.slow
 def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "server.cli", "demo", "--out", str(out)]
@@ -256,7 +254,6 @@ def test_no_triangle_of_a_picture_reaches_over_a_crack() -> None:
     assert gone == {2 * cols + c for c in range(5)} | {3 * cols + c for c in range(4)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("experiment", ["plate", "steel", "panel"])
 def test_every_experiment_keeps_its_limits(tmp_path: Path, experiment: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--experiment", experiment, "--out", str(tmp_path)]) == 0

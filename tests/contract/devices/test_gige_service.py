@@ -23,10 +23,9 @@ import pytest
 from server.config.rig_file import parse_config
 from sim.rig import SimRig
 from tests.support.namespace import Namespace, NamespaceTransport, namespaces_missing
-from tests.support.requirements import missing
+from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import SMALL, TINY, new_test, wait_for_job
 
-ROOT = Path(__file__).resolve().parents[2]
 API = "/api/v1"
 ADDRESSES = ("127.0.0.1", "127.0.0.2")
 

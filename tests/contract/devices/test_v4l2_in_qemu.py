@@ -11,8 +11,8 @@ from tests.support.requirements import missing
 from tests.support.v4l2_guest import Missing, Outcome, Report, collect, run_in_guest
 
 _TESTS = (
-    "tests/contract/v4l2_vivid_guest.py",
-    "tests/contract/v4l2_usb_guest.py",
+    "tests/contract/devices/v4l2_vivid_guest.py",
+    "tests/contract/devices/v4l2_usb_guest.py",
     "tests/contract/test_camera_contract.py",
 )
 # A boot without KVM takes half a minute, the tests a minute and a half; a machine with other work takes its time

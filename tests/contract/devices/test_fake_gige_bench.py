@@ -19,9 +19,8 @@ import pytest
 from server.cli import main
 from server.doctor import Check, Report
 from server.rig.devices import DeviceListing
-from tests.support.requirements import missing
+from tests.support.requirements import ROOT, missing
 
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config" / "bench_fake_gige.toml"
 # root needs no user namespace, which containers often forbid
 NETWORK = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--user", "--map-root-user", "--net"]
