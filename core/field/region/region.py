@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.cameras.lens import Bool, Float
 from core.errors import RegionError
 from core.field.region.cuts import Cuts
+from core.settings import SUBSET_PX
 
 _MOST_POINTS = 20_000_000
 
@@ -246,11 +247,11 @@ def check_region(
 
 def check_subset(subset_px: int) -> None:
     """Refuse an even or tiny subset, ``subset_invalid``."""
-    if isinstance(subset_px, bool) or int(subset_px) != subset_px or subset_px < 9 or subset_px % 2 == 0:
+    if not SUBSET_PX.holds(subset_px):
         raise RegionError(
-            f"the subset is {subset_px} px wide; it must be an odd whole number of 9 or more.",
+            f"the subset is {subset_px} px wide; it must be {SUBSET_PX}.",
             code="subset_invalid",
-            remedy="Give 33, for example; a subset should hold three speckles across or more.",
+            remedy=f"Give {SUBSET_PX.default}, for example; a subset should hold three speckles across or more.",
         )
 
 

@@ -24,7 +24,6 @@ from core.field.points.assemble import assemble
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field, References
-from core.field.reference_update import ReferenceUpdate
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals
 from core.field.sequence.propagated import HandedOn, pattern_share
@@ -33,6 +32,7 @@ from core.field.settings import MeasureOptions
 from core.matching.fit import no_motion
 from core.matching.geometry import plane_from_angles
 from core.progress import CancelToken, Progress
+from core.settings import ReferenceUpdate
 from core.status import PointStatus
 
 Pair = tuple[MeasureImage, MeasureImage]
