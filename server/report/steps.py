@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from server.formats.results.summary import StepSummary, summarise
 from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, static_steps, told_sigma
 from server.report.records import QualityRecord
 from server.report.source import Source
-from server.results.reader import library
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +157,7 @@ def read_steps(source: Source) -> Measured:
     loads = {n: _load(source, n) for n in source.files}
     by_load = all(load is not None for load in loads.values()) and len(set(loads.values())) > 1
     for n, path in source.files.items():
-        field, strain = _read(path)
+        field, strain = read_field(path), read_strain(path)
         if n in static:
             keeper.add(n, field, strain)
         step = _figures(source, n, field, strain, rbe, labels[n], static=n in static)
@@ -194,11 +192,6 @@ def read_steps(source: Source) -> Measured:
         told=told,
         noise_grey=float(np.median(grey)) if grey.size else None,
     )
-
-
-def _read(path: Path) -> tuple[Field, StrainField | None]:
-    with library:
-        return read_field(path), read_strain(path)
 
 
 def _label(source: Source, n: int) -> str:

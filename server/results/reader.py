@@ -3,46 +3,57 @@
 from __future__ import annotations
 
 import json
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError
 from core.status import PointStatus
 from server.base.errors import NotFoundError
-
-# the netCDF and HDF5 libraries are not built for several threads at once
-library = threading.Lock()
+from server.formats.results.netcdf import opened
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of a result file: values with NaN where there are none."""
+    """One variable of a result file.
+
+    Attributes
+    ----------
+    values
+        As stored; NaN where there is no number.
+    units, long_name, dimensions
+        As stored.
+    flags
+        Name of each value of a variable of states.
+    parts
+        Names along the third axis, where the file has them.
+    """
 
     values: NDArray[Any]
     units: str
     long_name: str
     dimensions: tuple[str, ...] = ()
+    flags: dict[int, str] | None = None
+    parts: tuple[str, ...] = ()
 
-
-def _open(path: Path) -> netCDF4.Dataset:
-    try:
-        return netCDF4.Dataset(path, "r")
-    except OSError as error:
-        raise FileFormatError(f"{path.name} cannot be read: {error}.", file=path.name) from error
-
-
-def _values(variable: Any) -> NDArray[Any]:
-    values = variable[:]
-    if np.ma.isMaskedArray(values):
-        filled = values.filled(np.nan) if np.issubdtype(values.dtype, np.floating) else values.filled()
-        return np.asarray(filled)
-    return np.asarray(values)
+    @staticmethod
+    def of(variable: Any) -> Variable:
+        """Read a variable of an open file."""
+        flags = None
+        if "flag_meanings" in variable.ncattrs():
+            numbers = np.atleast_1d(variable.flag_values)
+            flags = {int(v): name for v, name in zip(numbers, variable.flag_meanings.split(), strict=True)}
+        parts = next((str(getattr(variable, a)) for a in ("comparisons", "components") if a in variable.ncattrs()), "")
+        return Variable(
+            np.asarray(variable[...]),
+            str(getattr(variable, "units", "1")),
+            str(getattr(variable, "long_name", "")),
+            tuple(variable.dimensions),
+            flags,
+            tuple(parts.split()),
+        )
 
 
 def read_variable(path: Path, name: str) -> Variable:
@@ -53,7 +64,7 @@ def read_variable(path: Path, name: str) -> Variable:
     NotFoundError
         ``field_missing``, with the names that there are.
     """
-    with library, _open(path) as data:
+    with opened(path) as data:
         if name not in data.variables:
             raise NotFoundError(
                 f"{path.name} has no variable {name!r}.",
@@ -61,13 +72,7 @@ def read_variable(path: Path, name: str) -> Variable:
                 remedy="Use one of `available`.",
                 available=sorted(data.variables),
             )
-        variable = data.variables[name]
-        return Variable(
-            _values(variable),
-            str(getattr(variable, "units", "1")),
-            str(getattr(variable, "long_name", "")),
-            tuple(variable.dimensions),
-        )
+        return Variable.of(data.variables[name])
 
 
 def list_variables(path: Path) -> list[dict[str, Any]]:
@@ -75,7 +80,7 @@ def list_variables(path: Path) -> list[dict[str, Any]]:
 
     ``flags`` names the values of a status, ``comparisons`` those of the correlation's last axis.
     """
-    with library, _open(path) as data:
+    with opened(path) as data:
         return [
             {
                 "name": name,
@@ -91,10 +96,10 @@ def list_variables(path: Path) -> list[dict[str, Any]]:
 
 def read_cut_pieces(path: Path) -> list[list[float]]:
     """Return the straight pieces [x0, y0, x1, y1] of a result's cuts, px of camera 1's reference image."""
-    with library, _open(path) as data:
+    with opened(path) as data:
         if "cut_line" not in data.variables:
             return []
-        x, y, line = (_values(data.variables[name]) for name in ("cut_x_px", "cut_y_px", "cut_line"))
+        x, y, line = (data.variables[name][...] for name in ("cut_x_px", "cut_y_px", "cut_line"))
     same = line[1:] == line[:-1]
     return [[float(v) for v in piece] for piece in np.stack([x[:-1], y[:-1], x[1:], y[1:]], axis=1)[same]]
 
@@ -112,19 +117,19 @@ def _meanings(variable: Any) -> dict[str, Any]:
 
 def read_point_positions(path: Path) -> NDArray[np.float64]:
     """Return (rows, cols, 3) where each point is at the step, mm; NaN where it was not measured."""
-    with library, _open(path) as data:
+    with opened(path) as data:
         held = data.variables
-        position = np.stack([_values(held[f"{axis}_mm"]) for axis in "xyz"], axis=-1)
+        position = np.stack([held[f"{axis}_mm"][...] for axis in "xyz"], axis=-1)
         if "u_mm" in held:
-            position = position + np.stack([_values(held[f"{axis}_mm"]) for axis in "uvw"], axis=-1)
-        measured = np.isin(_values(held["status"]), (PointStatus.OK, PointStatus.EXTRAPOLATED))
+            position = position + np.stack([held[f"{axis}_mm"][...] for axis in "uvw"], axis=-1)
+        measured = np.isin(held["status"][...], (PointStatus.OK, PointStatus.EXTRAPOLATED))
     return np.asarray(np.where(measured[..., None], position, np.nan), dtype=np.float64)
 
 
 def read_residuals(path: Path) -> dict[str, Any]:
     """Return a calibration's residuals: for each view its facts, and lists of found places and residuals."""
-    with library, _open(path) as data:
-        found, residual = _values(data.variables["found_px"]), _values(data.variables["residual_px"])
+    with opened(path) as data:
+        found, residual = data.variables["found_px"][...], data.variables["residual_px"][...]
         facts = json.loads(data.getncattr("views"))
     views = [
         {**fact, "found_px": _number(xy), "residual_px": _number(r)}
@@ -135,8 +140,8 @@ def read_residuals(path: Path) -> dict[str, Any]:
 
 def probe_result(path: Path, x_px: float, y_px: float) -> dict[str, Any]:
     """Return the point nearest to a pixel: place, status, and every number of two-dimensional variables."""
-    with library, _open(path) as data:
-        arrays = {name: _values(v) for name, v in data.variables.items() if len(v.dimensions) >= 2}
+    with opened(path) as data:
+        arrays = {name: v[...] for name, v in data.variables.items() if len(v.dimensions) >= 2}
         units = {name: str(getattr(data.variables[name], "units", "1")) for name in arrays}
     distance = np.hypot(arrays["x_px"] - x_px, arrays["y_px"] - y_px)
     row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))

@@ -17,7 +17,6 @@ from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
 from server.results.gauges.request import GaugeRequest
-from server.results.reader import library
 
 _CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
 
@@ -65,8 +64,7 @@ class FieldWriter:
         motion: RigidMotionReading | None,
     ) -> None:
         """Write one step; strain, where the result has it, is made anew along the new axes."""
-        with library:
-            strain = read_strain(path)
+        strain = read_strain(path)
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)
         extra = {name: str(attributes[name]) for name in _CARRIED if name in attributes}
@@ -94,6 +92,5 @@ class FieldWriter:
             extra=extra,
         )
         to = self._folder / path.name
-        with library:
-            write_field(to, field, provenance, strain)
+        write_field(to, field, provenance, strain)
         self.written.append(to)

@@ -42,7 +42,7 @@ from server.formats.version import software_version
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
-from server.results.reader import library, read_variable
+from server.results.reader import read_variable
 from server.results.staleness import stale_results
 
 Float = NDArray[np.float64]
@@ -174,8 +174,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _read(path: Path) -> _Step:
-    with library:
-        attributes, field = read_attributes(path), read_field(path)
+    attributes, field = read_attributes(path), read_field(path)
     subset = attributes.get("settings", {}).get("subset_px")
     if not isinstance(subset, int | float):
         raise InputError(
