@@ -41,17 +41,13 @@ class Variable:
     @staticmethod
     def of(variable: Any) -> Variable:
         """Read a variable of an open file."""
-        flags = None
-        if "flag_meanings" in variable.ncattrs():
-            numbers = np.atleast_1d(variable.flag_values)
-            flags = {int(v): name for v, name in zip(numbers, variable.flag_meanings.split(), strict=True)}
         parts = next((str(getattr(variable, a)) for a in ("comparisons", "components") if a in variable.ncattrs()), "")
         return Variable(
             np.asarray(variable[...]),
             str(getattr(variable, "units", "1")),
             str(getattr(variable, "long_name", "")),
             tuple(variable.dimensions),
-            flags,
+            _flags(variable),
             tuple(parts.split()),
         )
 
@@ -75,23 +71,49 @@ def read_variable(path: Path, name: str) -> Variable:
         return Variable.of(data.variables[name])
 
 
-def list_variables(path: Path) -> list[dict[str, Any]]:
-    """Return name, unit, meaning and dimensions of every variable of a result file.
+@dataclass(frozen=True)
+class VariableHead:
+    """What there is to know of a variable without its values.
 
-    ``flags`` names the values of a status, ``comparisons`` those of the correlation's last axis.
+    Attributes
+    ----------
+    flags
+        Name of each value of a status.
+    comparisons
+        Of a correlation: which images its last axis compares.
     """
+
+    name: str
+    units: str
+    long_name: str
+    dimensions: list[str]
+    shape: list[int]
+    flags: dict[str, str] | None
+    comparisons: list[str] | None
+
+
+def list_variables(path: Path) -> list[VariableHead]:
+    """Return every variable of a result file."""
     with opened(path) as data:
         return [
-            {
-                "name": name,
-                "units": str(getattr(variable, "units", "1")),
-                "long_name": str(getattr(variable, "long_name", "")),
-                "dimensions": list(variable.dimensions),
-                "shape": list(variable.shape),
-                **_meanings(variable),
-            }
+            VariableHead(
+                name=name,
+                units=str(getattr(variable, "units", "1")),
+                long_name=str(getattr(variable, "long_name", "")),
+                dimensions=list(variable.dimensions),
+                shape=list(variable.shape),
+                flags=None if (flags := _flags(variable)) is None else {str(v): word for v, word in flags.items()},
+                comparisons=str(variable.comparisons).split() if "comparisons" in variable.ncattrs() else None,
+            )
             for name, variable in data.variables.items()
         ]
+
+
+def _flags(variable: Any) -> dict[int, str] | None:
+    if "flag_meanings" not in variable.ncattrs():
+        return None
+    words = str(variable.flag_meanings).split()
+    return {int(v): word for v, word in zip(np.atleast_1d(variable.flag_values), words, strict=True)}
 
 
 def read_cut_pieces(path: Path) -> list[list[float]]:
@@ -102,17 +124,6 @@ def read_cut_pieces(path: Path) -> list[list[float]]:
         x, y, line = (data.variables[name][...] for name in ("cut_x_px", "cut_y_px", "cut_line"))
     same = line[1:] == line[:-1]
     return [[float(v) for v in piece] for piece in np.stack([x[:-1], y[:-1], x[1:], y[1:]], axis=1)[same]]
-
-
-def _meanings(variable: Any) -> dict[str, Any]:
-    told = variable.ncattrs()
-    meanings: dict[str, Any] = {}
-    if "flag_values" in told:
-        words = str(variable.flag_meanings).split()
-        meanings["flags"] = {str(int(v)): w for v, w in zip(np.atleast_1d(variable.flag_values), words, strict=True)}
-    if "comparisons" in told:
-        meanings["comparisons"] = str(variable.comparisons).split()
-    return meanings
 
 
 def read_point_positions(path: Path) -> NDArray[np.float64]:
@@ -126,38 +137,72 @@ def read_point_positions(path: Path) -> NDArray[np.float64]:
     return np.asarray(np.where(measured[..., None], position, np.nan), dtype=np.float64)
 
 
-def read_residuals(path: Path) -> dict[str, Any]:
-    """Return a calibration's residuals: for each view its facts, and lists of found places and residuals."""
+@dataclass(frozen=True)
+class ViewResiduals:
+    """The residuals of one view of a calibration.
+
+    Attributes
+    ----------
+    found_px, residual_px
+        Rows of lines of pairs: where each intersection was found, and measured minus projected place; None: not seen.
+    """
+
+    name: str
+    camera: str
+    dz_mm: float
+    held_out: bool
+    rbe_px: float | None
+    raz_mm: float | None
+    nsce: float | None
+    found_px: list[Any]
+    residual_px: list[Any]
+
+
+def read_residuals(path: Path) -> list[ViewResiduals]:
+    """Return a calibration's residuals, view by view."""
     with opened(path) as data:
         found, residual = data.variables["found_px"][...], data.variables["residual_px"][...]
         facts = json.loads(data.getncattr("views"))
-    views = [
-        {**fact, "found_px": _number(xy), "residual_px": _number(r)}
+    return [
+        ViewResiduals(**fact, found_px=_number(xy), residual_px=_number(r))
         for fact, xy, r in zip(facts, found, residual, strict=True)
     ]
-    return {"views": views}
 
 
-def probe_result(path: Path, x_px: float, y_px: float) -> dict[str, Any]:
-    """Return the point nearest to a pixel: place, status, and every number of two-dimensional variables."""
+@dataclass(frozen=True)
+class ProbeValue:
+    """A number, or several, of a point; None where it failed."""
+
+    value: Any
+    units: str
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A measurement point with all that is known of it; ``distance_px`` from the pixel that was asked for."""
+
+    row: int
+    col: int
+    distance_px: float
+    status: str
+    values: dict[str, ProbeValue]
+
+
+def probe_result(path: Path, x_px: float, y_px: float) -> Probe:
+    """Return the point nearest to a pixel; the covariance is left out, it is read as a field."""
     with opened(path) as data:
-        arrays = {name: v[...] for name, v in data.variables.items() if len(v.dimensions) >= 2}
-        units = {name: str(getattr(data.variables[name], "units", "1")) for name in arrays}
-    distance = np.hypot(arrays["x_px"] - x_px, arrays["y_px"] - y_px)
+        variables = {name: Variable.of(v) for name, v in data.variables.items() if len(v.dimensions) >= 2}
+    distance = np.hypot(variables["x_px"].values - x_px, variables["y_px"].values - y_px)
     row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
-    values: dict[str, Any] = {}
-    for name, array in arrays.items():
-        if array.ndim > 3:
-            continue  # the covariance is read as a field
-        here = array[row, col]
-        values[name] = {"value": _number(here), "units": units[name]}
-    return {
-        "row": row,
-        "col": col,
-        "distance_px": float(distance[row, col]),
-        "status": PointStatus(int(arrays["status"][row, col])).name.lower(),
-        "values": values,
-    }
+    return Probe(
+        row=row,
+        col=col,
+        distance_px=float(distance[row, col]),
+        status=PointStatus(int(variables["status"].values[row, col])).name.lower(),
+        values={
+            n: ProbeValue(_number(v.values[row, col]), v.units) for n, v in variables.items() if v.values.ndim <= 3
+        },
+    )
 
 
 def _number(value: Any) -> Any:
