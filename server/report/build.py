@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.points.result import Field
+from core.names import CAMERAS
 from server.formats.version import software_version
 from server.report import pictures, sections
 from server.report.floor import STRAINS
@@ -17,7 +18,7 @@ from server.report.hardware import hardware, image_sizes
 from server.report.histories import histories
 from server.report.page import Markup, document, element, picture, policy_of, section, style_of
 from server.report.settings import analysis
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 from server.report.steps import Measured, Shown, read_steps
 
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES
+from core.names import CAMERAS
 from server.report.items import plain
 from server.report.page import Cell, Markup, element, note, table
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 
 _CHECKS = (
     ("rbe_px", "RBE (mean distance of found and projected intersections)", "px"),

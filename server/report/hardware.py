@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from core.names import CAMERAS
 from core.pattern import PatternSize, pattern_size
 from server.config.camera_facts import CameraFacts, merged
 from server.report.geometry import Geometry
 from server.report.items import CALIBRATION, MEASURED, RECORD, TOLD, Item, Value, of_number, of_text
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 from server.report.steps import Measured
 
 

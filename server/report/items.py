@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from server.report.source import CAMERAS
+from core.names import CAMERAS
 
 CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
     "from the calibration",

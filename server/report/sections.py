@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.field.checks.epipolar_offset import EpipolarCheck
+from core.names import CAMERAS
 from server.report import calibration
 from server.report.floor import LENGTHS, STRAINS, Floor
 from server.report.items import Item, Value, plain
@@ -344,7 +345,7 @@ def quality_table(measured: Measured) -> Markup | None:
         return None
     rows = []
     for s in known:
-        one, two = ((s.quality or {}).get(cam) or {} for cam in ("cam1", "cam2"))
+        one, two = ((s.quality or {}).get(cam) or {} for cam in CAMERAS)
         rows.append(
             [
                 str(s.n),
