@@ -100,7 +100,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     from server.workflows.service import Service
     from tests.support.service_rig import tiny_config
 
-    made = Service(tiny_config(), tmp_path_factory.mktemp("service") / "data")
+    made = Service(tiny_config(), tmp_path_factory.mktemp("service") / "data").start()
     yield made
     made.close()
 

@@ -96,7 +96,7 @@ class Metrics:
         self._jobs: dict[str, dict[str, float]] = {}
 
     def text(self) -> bytes:
-        """Return everything in the text format of Prometheus."""
+        """Return what was counted, in the text format of Prometheus."""
         return generate_latest(self.registry)
 
     def on_event(self, name: str, data: dict[str, Any]) -> None:

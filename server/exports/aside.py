@@ -44,12 +44,15 @@ class ExportProcess:
 
     def __init__(self, data: Path) -> None:
         self._folder = data / FOLDER
-        shutil.rmtree(self._folder, ignore_errors=True)  # what a kill left
         self._lock = threading.Lock()
         self._worker: ComputeWorker | None = None
         self._waiting = 0
         self._rest: threading.Timer | None = None
         self._closed = False
+
+    def clear(self) -> None:
+        """Remove what a kill left."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def new_folder(self) -> Path:
         """Make a folder for one export; who asked removes it."""

@@ -32,17 +32,19 @@ class EventHub:
     ----------
     keep
         How many events a reader may be behind.
-    start
-        The events' numbers begin after it.
     """
 
-    def __init__(self, keep: int = 2000, *, start: int = 0) -> None:
+    def __init__(self, keep: int = 2000) -> None:
         self._lock = threading.Lock()
         self._ring: deque[Event] = deque(maxlen=keep)
-        self._number = start
+        self._number = 0
         self._waiters: dict[asyncio.Event, asyncio.AbstractEventLoop] = {}
         self._closed = False
         self._listeners: list[Callable[[str, dict[str, Any]], None]] = []
+
+    def number_from(self, start: int) -> None:
+        """Let the events' numbers begin after ``start``; call it before the first event."""
+        self._number = start
 
     def listen(self, listener: Callable[[str, dict[str, Any]], None]) -> None:
         """Call ``listener`` with name and data of each event, in the publisher's thread: it must be quick."""

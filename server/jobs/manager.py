@@ -54,8 +54,11 @@ class JobManager:
         self._reserved = 0  # jobs that will come to the compute lane after their hardware phase
         self._wake = threading.Condition(self._lock)
         self._closing = False
-        self._interrupt_left_overs()
         self._thread = threading.Thread(target=self._run_compute, name="compute-jobs", daemon=True)
+
+    def start(self) -> None:
+        """Say of what the last service left running that it was interrupted, and begin to work."""
+        self._interrupt_left_overs()
         self._thread.start()
 
     def _interrupt_left_overs(self) -> None:

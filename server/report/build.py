@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.points.result import Field
+from core.names import CAMERAS
 from server.formats.version import software_version
 from server.report import pictures
 from server.report.calibration import CalibrationPart, calibration_gaps
@@ -20,7 +21,7 @@ from server.report.histories import courses, gauges
 from server.report.items import Item, Missing, Value, plain
 from server.report.page import PNG, Picture, render
 from server.report.settings import analysis
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 from server.report.steps import Measured, Shown, read_steps
 
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))

@@ -7,10 +7,11 @@ from dataclasses import dataclass, fields, is_dataclass
 import numpy as np
 
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES
+from core.names import CAMERAS
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.record import CalibrationRecord, Measures
 from server.report.items import Missing, Value
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 from server.report.steps import Measured
 
 _CHECKS = (

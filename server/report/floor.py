@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.strain import StrainField
-
-Float = NDArray[np.float64]
 
 UM = "\u00b5m"
 LENGTHS = ("U", "V", "W", "X", "Y", "Z")

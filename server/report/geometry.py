@@ -8,13 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
-
-Float = NDArray[np.float64]
+from core.names import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,8 @@ def geometry(
     middle = middle - ((middle - points.mean(axis=0)) @ normal) * normal  # onto the plane
     sights = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
     directions = [s / np.linalg.norm(s) for s in sights]
-    views = {}
-    for name, camera, size in zip(("cam1", "cam2"), (pair.cam1, pair.cam2), sizes, strict=True):
+    views: dict[str, View] = {}
+    for name, camera, size in zip(CAMERAS, (pair.cam1, pair.cam2), sizes, strict=True):
         view = _view(camera, middle, normal, size)
         if view is None:
             return None

@@ -7,13 +7,14 @@ from typing import Literal
 
 import numpy as np
 
+from core.names import CAMERAS, CameraName
 from core.pattern import PatternSize, pattern_size
 from server.config.camera_facts import CameraFacts, LensFacts, merged
 from server.formats.calibrations.record import CameraIdentity
 from server.report.geometry import Geometry, View
 from server.report.items import CALIBRATION, MEASURED, RECORD, TOLD, Item, Value, each, of_number, of_text, one
 from server.report.records import CameraRecord
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 from server.report.steps import Measured
 
 _FACTS = "PUT /tests/{id}/facts or facts.toml"
@@ -45,19 +46,19 @@ def hardware(source: Source, measured: Measured, found: Geometry | None) -> list
     ]
 
 
-def _camera_items(source: Source, cameras: dict[str, CameraFacts]) -> list[Item]:
+def _camera_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> list[Item]:
     step, sizes = source.reference_step, _sizes(source)
     identity = step.cameras
     if not identity and source.calibration is not None:
         identity = source.calibration.record.provenance.cameras
 
-    def device(cam: str, name: Literal["model", "serial"]) -> Value | None:
+    def device(cam: CameraName, name: Literal["model", "serial"]) -> Value | None:
         return of_text(getattr(identity.get(cam, CameraIdentity()), name), "from the camera itself")
 
-    def fact(name: Literal["maker", "model", "sensor"], cam: str) -> Value | None:
+    def fact(name: Literal["maker", "model", "sensor"], cam: CameraName) -> Value | None:
         return of_text(getattr(cameras[cam], name), _IN_FILE)
 
-    def size(cam: str) -> Value | None:
+    def size(cam: CameraName) -> Value | None:
         found = sizes[cam]
         return None if found is None else Value(f"{found[0][0]} x {found[0][1]} px", None, found[1])
 
@@ -87,16 +88,16 @@ def _camera_items(source: Source, cameras: dict[str, CameraFacts]) -> list[Item]
     ]
 
 
-def _lens_items(source: Source, cameras: dict[str, CameraFacts]) -> list[Item]:
+def _lens_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> list[Item]:
     nothing = LensFacts.model_validate({})
     lenses = {cam: camera.lens or nothing for cam, camera in cameras.items()}
     where = f"in [camN.lens] of {_RIG_FILE}"
 
-    def aperture(cam: str) -> Value | None:
+    def aperture(cam: CameraName) -> Value | None:
         number = lenses[cam].f_number
         return None if number is None else Value(f"f/{number:g}", number, _IN_FILE)
 
-    def pinhole(cam: Literal["cam1", "cam2"] | str) -> Value | None:
+    def pinhole(cam: CameraName) -> Value | None:
         if source.calibration is None:
             return None
         lens, pixel = getattr(source.calibration.pair, cam).lens, cameras[cam].pixel_um
@@ -125,18 +126,18 @@ def _lens_items(source: Source, cameras: dict[str, CameraFacts]) -> list[Item]:
 def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
     views: dict[str, View] = {} if found is None else found.views
 
-    def field_of_view(cam: str) -> Value | None:
+    def field_of_view(cam: CameraName) -> Value | None:
         seen = views[cam].field_of_view_mm if views else None
         return None if seen is None else Value("{:.4g} x {:.4g} mm".format(*seen), seen[0], CALIBRATION)
 
-    def scale(cam: str) -> Value | None:
+    def scale(cam: CameraName) -> Value | None:
         if not views:
             return None
         mean, (rows, columns) = views[cam].mean_scale_mm_per_px, views[cam].scale_mm_per_px
         text = f"{mean:.5g} mm/px ({rows:.5g} along rows, {columns:.5g} down columns; {1.0 / mean:.4g} px/mm)"
         return Value(text, mean, CALIBRATION)
 
-    def stand_off(cam: str) -> Value | None:
+    def stand_off(cam: CameraName) -> Value | None:
         return of_number(views[cam].standoff_mm, ".2f", "mm", CALIBRATION) if views else None
 
     items = [

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from server.report.source import CAMERAS
+from core.names import CAMERAS, CameraName
 
 CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
     "from the calibration",
@@ -79,7 +79,7 @@ def one(key: str, label: str, value: Value | None, remedy: str = "", comment: st
     return Item(key, label, (value,), remedy, comment)
 
 
-def each(key: str, label: str, of: Callable[[str], Value | None], remedy: str = "", comment: str = "") -> Item:
+def each(key: str, label: str, of: Callable[[CameraName], Value | None], remedy: str = "", comment: str = "") -> Item:
     """An item of each camera."""
     return Item(key, label, tuple(of(cam) for cam in CAMERAS), remedy, comment)
 

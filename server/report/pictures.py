@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageChops
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
@@ -20,7 +21,6 @@ from core.strain import StrainField
 from server.formats.figure import Picture, draw
 from server.formats.figure_options import Look
 
-Float = NDArray[np.float64]
 #: by name, values and their standard deviations
 Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
 _HALF = Look(width_px=960, dots_per_inch=210)

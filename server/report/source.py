@@ -21,8 +21,6 @@ from server.results.metadata import TestFacts, parse_facts
 from server.results.staleness import stale_results
 from server.store.durable import known_json
 
-CAMERAS = ("cam1", "cam2")
-
 
 @dataclass(frozen=True)
 class Source:

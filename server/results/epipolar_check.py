@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError, InputError
 from server.formats.calibrations.plausibility import Residual
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.results.steps import calibration_of, read_step
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from core.errors import StorageError
 
@@ -46,10 +46,20 @@ class Catalog:
             queue.SimpleQueue()
         )
         self.was_reset = False
-        opened: Future[None] = Future()
-        self._thread = threading.Thread(target=self._run, args=(opened,), name="catalog", daemon=True)
+        self._opened: Future[None] = Future()
+        self._thread = threading.Thread(target=self._run, name="catalog", daemon=True)
+
+    def open(self) -> Self:
+        """Open the file and start the writer.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be opened, nor begun anew.
+        """
         self._thread.start()
-        opened.result()
+        self._opened.result()
+        return self
 
     def _open(self) -> sqlite3.Connection:
         connection = sqlite3.connect(self._path, isolation_level=None)
@@ -75,13 +85,13 @@ class Catalog:
             self.was_reset = True
             return self._open()
 
-    def _run(self, opened: Future[None]) -> None:
+    def _run(self) -> None:
         try:
             connection = self._open_or_reset()
         except (sqlite3.Error, OSError) as error:
-            opened.set_exception(StorageError(f"The catalogue cannot be opened: {error}."))
+            self._opened.set_exception(StorageError(f"The catalogue cannot be opened: {error}."))
             return
-        opened.set_result(None)
+        self._opened.set_result(None)
         while (item := self._work.get()) is not None:
             function, future = item
             try:

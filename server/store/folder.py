@@ -11,7 +11,7 @@ import socket
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
 
 from core.errors import FileFormatError, StateError, StorageError
 from server.formats.files import storage_error
@@ -69,22 +69,25 @@ class IdMaker:
 
 
 class DataFolder:
-    """An opened and locked data folder.
-
-    Raises
-    ------
-    StateError
-        ``data_folder_locked`` if another service holds it.
-    StorageError
-        ``data_folder_unusable`` if files cannot be written, fsynced and renamed there.
-    FileFormatError
-        ``data_format_newer`` if a newer version wrote it.
-    """
+    """A data folder; nothing is read or written there before :meth:`open`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
         self.ids = IdMaker()
         self._lock_file: IO[str] | None = None
+
+    def open(self) -> Self:
+        """Make it where there is none, lock and check it.
+
+        Raises
+        ------
+        StateError
+            ``data_folder_locked`` if another service holds it.
+        StorageError
+            ``data_folder_unusable`` if files cannot be written, fsynced and renamed there.
+        FileFormatError
+            ``data_format_newer`` if a newer version wrote it.
+        """
         try:
             for folder in (self.root, self.calibrations, self.tests):
                 folder.mkdir(parents=True, exist_ok=True)
@@ -98,6 +101,7 @@ class DataFolder:
         except BaseException:
             self.close()
             raise
+        return self
 
     @property
     def calibrations(self) -> Path:

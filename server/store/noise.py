@@ -24,8 +24,11 @@ class NoiseStore:
 
     def __init__(self, folder: DataFolder) -> None:
         self._folder = folder
+
+    def end_unfinished(self) -> None:
+        """Take note of the ids that exist, and say of every unfinished measurement that it failed."""
         for noise_id in self.ids():
-            folder.ids.seen(noise_id)
+            self._folder.ids.seen(noise_id)
             with contextlib.suppress(FileFormatError):  # one that is damaged must not keep the service from starting
                 if self.read(noise_id)["state"] == "unfinished":
                     # nobody works on it any more: the job that did ended with the last service

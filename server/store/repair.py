@@ -49,15 +49,15 @@ def repair(root: Path) -> Repair:
     """
     require_data_folder(root)
     done = [f"removed the half-written {path.relative_to(root)}" for path in sorted(root.rglob(".*.part"))]
-    folder = DataFolder(root)  # takes the lock, and removes those
+    folder = DataFolder(root).open()  # takes the lock, and removes those
     try:
         tests = TestStore(folder)
         done += _tidy(root.absolute(), tests)
-        catalog = Catalog(folder.root / "catalog.sqlite")
+        catalog = Catalog(folder.root / "catalog.sqlite").open()
         try:
             if catalog.was_reset:
                 done.append("the catalogue could not be read; it was set aside and begun anew")
-            NoiseStore(folder)  # says of unfinished measurements that they ended
+            NoiseStore(folder).end_unfinished()
             done += rebuild(catalog, folder, CalibrationStore(folder), tests)
         finally:
             catalog.close()

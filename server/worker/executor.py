@@ -18,7 +18,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Self
 
 from core.compiling import COMPILING
 from core.errors import Cancelled, MeasurementError
@@ -70,7 +70,7 @@ class TaskFuture(Future[Any]):
 
 
 class ComputeWorker(Executor):
-    """One spawned process that runs one task at a time.
+    """One process that runs one task at a time; spawned by :meth:`start` or with the first task.
 
     Parameters
     ----------
@@ -99,7 +99,21 @@ class ComputeWorker(Executor):
         self.ready = threading.Event()
         self.compiling = threading.Event()  # since the process began; until it is ready
         self._thread = threading.Thread(target=self._run, name="compute-worker", daemon=True)
-        self._thread.start()
+        self._started = False
+
+    def start(self) -> None:
+        """Spawn the process and warm it up, without waiting for it; nothing where that was done before."""
+        with self._state_lock:
+            self._start_once()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def _start_once(self) -> None:
+        if not self._started and not self._closing.is_set():
+            self._started = True
+            self._thread.start()
 
     @property
     def width(self) -> int:
@@ -118,6 +132,7 @@ class ComputeWorker(Executor):
         with self._state_lock:
             if self._closing.is_set():
                 raise RuntimeError("the compute worker is shut down")
+            self._start_once()
             self._next_id += 1
             self._tasks.put(_Task(self._next_id, future, fn, args, kwargs))
         return future
@@ -127,13 +142,13 @@ class ComputeWorker(Executor):
         with self._state_lock:
             self._closing.set()
             self._tasks.put(None)
-        if wait:
+        if wait and self._started:
             self._thread.join(timeout=10.0)
 
     # the thread that owns the process --------------------------------------------------------------------------
 
     def _run(self) -> None:
-        self._start()
+        self._spawn()
         while True:
             task = self._next_task()
             if task is None or self._closing.is_set():
@@ -161,7 +176,7 @@ class ComputeWorker(Executor):
                 # one that cannot even start must not be started five times a second
                 self._restart_at = now + _RESTART_PAUSE_S
                 _log.warning("the idle compute worker ended (exit code %s); starting it again", self._process.exitcode)
-                self._start()
+                self._spawn()
 
     def _drain_idle(self) -> None:
         connection = self._connection
@@ -178,7 +193,7 @@ class ComputeWorker(Executor):
         elif message[0] == "log":
             logging.getLogger(message[1].name).handle(message[1])
 
-    def _start(self) -> None:
+    def _spawn(self) -> None:
         self._end_process()
         self._held_mib = None
         self.ready.clear()
@@ -217,11 +232,11 @@ class ComputeWorker(Executor):
         else:
             task.future.set_result(result)
         if self._process is None and not self._closing.is_set():
-            self._start()  # only now: whoever waits for the task does not wait for that
+            self._spawn()  # only now: whoever waits for the task does not wait for that
 
     def _exchange(self, task: _Task) -> Any:
         if self._process is None or not self._process.is_alive():
-            self._start()
+            self._spawn()
         connection, process = self._connection, self._process
         assert connection is not None
         assert process is not None
@@ -285,7 +300,7 @@ class ComputeWorker(Executor):
         out_of_memory = self._kills.killed_since()
         how = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=held_mib)
         _log.error("the compute worker ended during a task, %s; starting it again", how.rstrip("."))
-        self._start()
+        self._spawn()
         raise WorkerDiedError(
             f"The compute process ended while it worked, {how}",
             exit_code=code,
@@ -295,6 +310,13 @@ class ComputeWorker(Executor):
         )
 
 
+def make_worker(threads: int | None) -> ComputeWorker:
+    """Make the worker of a service, not yet started."""
+    return ComputeWorker(threads=threads, warm_up="server.worker.tasks:warm_up")
+
+
 def start_worker(threads: int | None) -> ComputeWorker:
     """Start the worker of a service; its process loads and warms the kernels while the service goes on starting."""
-    return ComputeWorker(threads=threads, warm_up="server.worker.tasks:warm_up")
+    worker = make_worker(threads)
+    worker.start()
+    return worker

@@ -6,17 +6,15 @@ import logging
 import os
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from core.errors import DeviceError, StereorigError
 from drivers.stages.protocol import AxisState
 from server.formats.version import software_version
-
-if TYPE_CHECKING:
-    from server.workflows.service import Service
+from server.workflows.service import Service
 
 _log = logging.getLogger("stereorig.metrics")
 _MIB = 2**20
@@ -26,15 +24,18 @@ def _gauge(name: str, text: str, value: float) -> GaugeMetricFamily:
     return GaugeMetricFamily(f"stereorig_{name}", text, value=value)
 
 
+def metrics_text(service: Service) -> bytes:
+    """Return what was counted and how things stand now, in the text format of Prometheus."""
+    state = CollectorRegistry()
+    state.register(StateCollector(service))
+    return service.metrics.text() + generate_latest(state)
+
+
 class StateCollector(Collector):
     """Reads the service when Prometheus asks; a part that cannot be read is left out, never given as zero."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
-
-    def describe(self) -> list[Metric]:
-        """Return nothing: the names are only known once they are collected."""
-        return []
 
     def collect(self) -> Iterator[Metric]:
         """Yield every figure."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
@@ -9,7 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from core.errors import StereorigError, StorageError
 from server.base.logs import log_job_event
@@ -33,8 +34,7 @@ from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
-from server.worker.executor import ComputeWorker, start_worker
-from server.workflows.metrics_state import StateCollector
+from server.worker.executor import ComputeWorker, make_worker
 
 _log = logging.getLogger("stereorig.service")
 _OPEN_WAIT_S = 5.0
@@ -44,14 +44,14 @@ _END_MOTION_S = 2.0
 
 
 class Service:
-    """Rig, store, jobs and worker of one running service.
+    """Rig, store, jobs and worker of one service; nothing is opened before :meth:`start`.
 
     Parameters
     ----------
     config
         The rig file.
     data
-        The data folder; locked while the service runs.
+        The data folder; locked from the start to the close.
     record
         File that gets a transcript of the stage's wire.
     worker
@@ -64,21 +64,14 @@ class Service:
         check_config(config)
         self.config = config
         self.folder = DataFolder(data)
-        try:
-            self.catalog = Catalog(self.folder.root / "catalog.sqlite")
-        except BaseException:
-            self.folder.close()
-            raise
+        self.catalog = Catalog(self.folder.root / "catalog.sqlite")
         self.calibrations = CalibrationStore(self.folder)
         self.tests = TestStore(self.folder)
         self.noise = NoiseStore(self.folder)
         self.trash = Trash(self.folder.root)
-        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
-        for line in self.differences:
-            _log.info("catalogue: %s", line)
+        self.differences: list[str] = []
         self.metrics = Metrics()
-        # the clock alone may step back, and the catalogue alone may be lost
-        self.hub = EventHub(start=_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
+        self.hub = EventHub()
         self.hub.listen(self.metrics.on_event)
         self.hub.listen(log_job_event)
         self.streams = Streams(live_view=config.service.live_views, events=config.service.event_streams)
@@ -86,7 +79,7 @@ class Service:
         self.jobs = JobManager(
             self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
         )
-        self.worker = worker or start_worker(config.service.kernel_threads)
+        self.worker = worker or make_worker(config.service.kernel_threads)
         self.executor: ComputeWorker | ClusterExecutor = self.worker  # of analyses
         if config.compute.scheduler is not None:
             self.executor = ClusterExecutor(
@@ -102,9 +95,62 @@ class Service:
         self.closing = False
         #: held from the look at a thing to its change, where a client says which state it means
         self.changes = threading.Lock()
-        self.metrics.registry.register(StateCollector(self))
-        self._effects = OneEffect(self.catalog)
         self.continuing = threading.Lock()
+        self._effects = OneEffect(self.catalog)
+        self._end: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._end_thread = threading.Thread(target=self._await_end, name="end", daemon=True)
+        self._parts = contextlib.ExitStack()
+
+    def start(self) -> Self:
+        """Open folder and catalogue, start jobs and worker, open the rig.
+
+        What was opened before a part that fails is closed again. A rig that cannot be opened does not fail: it is shown
+        as a fault.
+
+        Raises
+        ------
+        StateError, StorageError, FileFormatError
+            As `server.store.folder.DataFolder.open` and `server.store.catalog.Catalog.open`.
+        """
+        with contextlib.ExitStack() as parts:  # closed from the last to the first
+            self.folder.open()
+            parts.callback(self.folder.close)
+            self.catalog.open()
+            parts.callback(self.catalog.close)
+            self.noise.end_unfinished()
+            self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
+            for line in self.differences:
+                _log.info("catalogue: %s", line)
+            # the clock alone may step back, and the catalogue alone may be lost
+            self.hub.number_from(_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
+            parts.callback(self.abort_thread.shutdown, wait=False)
+            parts.callback(self.stop_thread.shutdown, wait=False)
+            parts.callback(self.rig.close)
+            parts.callback(self.gate.close)
+            self.exports.clear()
+            parts.callback(self.exports.close)
+            self.worker.start()
+            parts.callback(self.worker.shutdown)
+            if self.executor is not self.worker:
+                parts.callback(self.executor.shutdown)
+            self.jobs.start()
+            parts.callback(self.jobs.close)
+            self._end_thread.start()
+            parts.callback(self._end_thread.join, timeout=_END_MOTION_S + 2.0)
+            parts.callback(self.begin_end)
+            parts.callback(self.stop_streams)
+            self._open_rig()
+            self._parts = parts.pop_all()
+        return self
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open_rig(self) -> None:
+        """Open the rig on its owner thread, so that the first request finds it; one that hangs is left to itself."""
         opened = threading.Event()
         token = self.gate.claim("the opening of the rig")
 
@@ -115,11 +161,7 @@ class Service:
                 self.gate.release(token)
                 opened.set()
 
-        self._end: queue.SimpleQueue[bool] = queue.SimpleQueue()
-        self._end_thread = threading.Thread(target=self._await_end, name="end", daemon=True)
-        self._end_thread.start()
         self.gate.start(open_rig)
-        # so that the first request finds the rig; a device that hangs must not keep the service from starting
         opened.wait(timeout=_OPEN_WAIT_S)
 
     def require_room(self) -> None:
@@ -199,21 +241,8 @@ class Service:
         self.hub.close()
 
     def close(self) -> None:
-        """Stop the stage first, then jobs, worker, rig and files."""
-        self.stop_streams()
-        self.begin_end()
-        self._end_thread.join(timeout=_END_MOTION_S + 2.0)
-        self.jobs.close()
-        if self.executor is not self.worker:
-            self.executor.shutdown()
-        self.worker.shutdown()
-        self.exports.close()
-        self.gate.close()
-        self.rig.close()
-        self.stop_thread.shutdown(wait=False)
-        self.abort_thread.shutdown(wait=False)
-        self.catalog.close()
-        self.folder.close()
+        """Stop the stage first, then jobs, worker, rig and files; safe to call twice."""
+        self._parts.close()
 
     def once(
         self, scope: str, key: str | None, body_sha256: str, make: Callable[[], dict[str, Any]]

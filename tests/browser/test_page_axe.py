@@ -75,7 +75,7 @@ def test_axe_finds_what_is_wrong(page: Watched, audit: Audit) -> None:  # noqa: 
 
 
 def test_with_nothing_yet(chromium: Browser, tmp_path: Path) -> None:
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     try:
         with served(service) as client:
             wait_for_rig(client)

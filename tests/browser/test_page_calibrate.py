@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from core.names import CameraName
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from sim.rig import CameraName
 from tests.service.test_service_chain import SMALL
 from tests.support.page_bench import Watched, watched
 from tests.support.service_rig import wait_for_job, wait_for_rig
@@ -27,7 +27,7 @@ SLOW = 200_000
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("calibrate") / "data")
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("calibrate") / "data").start()
     yield made
     made.close()
 

@@ -49,7 +49,7 @@ class Made:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("job") / "data")
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("job") / "data").start()
     yield made
     made.close()
 

@@ -25,7 +25,7 @@ API = "/api/v1"
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("keys") / "data")
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("keys") / "data").start()
     yield made
     made.close()
 

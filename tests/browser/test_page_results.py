@@ -58,7 +58,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("results") / "data")
+    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("results") / "data").start()
     try:
         with served(service) as client:
             wait_for_rig(client)

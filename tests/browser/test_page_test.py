@@ -32,7 +32,7 @@ ON_SCREEN = "path => path.getBBox().width * path.getScreenCTM().a"
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("page") / "data")
+    made = Service(parse_config(SMALL), tmp_path_factory.mktemp("page") / "data").start()
     yield made
     made.close()
 

@@ -34,7 +34,7 @@ class Session:
     """A lab's day: a calibration, noise, a test with steps and an analysis; keeps what was acknowledged."""
 
     def __init__(self, root: Path) -> None:
-        self.folder = DataFolder(root)
+        self.folder = DataFolder(root).open()
         self.tests = TestStore(self.folder)
         self.calibrations = CalibrationStore(self.folder)
         self.noise = NoiseStore(self.folder)
@@ -126,7 +126,7 @@ def add_steps(tests: TestStore, test_id: str, images: dict[str, bytes]) -> None:
 
 @pytest.mark.fault(3)
 def test_after_the_disk_has_room_again_the_same_test_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = DataFolder(tmp_path / "data")
+    folder = DataFolder(tmp_path / "data").open()
     tests = TestStore(folder)
     test_id = tests.create({"name": "one"}, None)["id"]
     images = {cam: encode_tiff(image(int(cam[-1]))) for cam in ("cam1", "cam2")}
@@ -138,7 +138,7 @@ def test_after_the_disk_has_room_again_the_same_test_goes_on(tmp_path: Path, mon
         assert tests.add_step(test_id, images, {})["n"] == tests.step_numbers(test_id)[-1]
     numbers = tests.step_numbers(test_id)
     assert numbers == list(range(len(numbers))), "no number is lost to a full disk"
-    catalog = Catalog(folder.root / "catalog.sqlite")
+    catalog = Catalog(folder.root / "catalog.sqlite").open()
     rebuild(catalog, folder, CalibrationStore(folder), tests)
     catalog.close()
     folder.close()

@@ -156,7 +156,7 @@ def test_the_watchdog_is_not_told_that_it_lives_when_a_part_has_died(tmp_path: P
     from tests.support.service_rig import tiny_config
 
     heard = Listener(tmp_path / "notify")
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     inlet = socket.socket()
     inlet.bind(("127.0.0.1", 0))
     notifier = Notifier({"NOTIFY_SOCKET": str(heard.path), "WATCHDOG_USEC": "200000"})

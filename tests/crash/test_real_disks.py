@@ -65,7 +65,7 @@ from tests.crash.test_service_kill import write_test_folder
 
 write_test_folder(data / "tests" / "t000007-abcdef", 12)
 (data / "ballast").write_bytes(bytes(1_600_000))
-service = Service(load_config(folder / "rig.toml"), data)
+service = Service(load_config(folder / "rig.toml"), data).start()
 out = {}
 try:
     with served(service) as client:
@@ -138,8 +138,8 @@ data = folder / "data"
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 
-opened = DataFolder(data)
-Catalog(data / "catalog.sqlite").close()
+opened = DataFolder(data).open()
+Catalog(data / "catalog.sqlite").open().close()
 opened.close()
 subprocess.run(["mount", "--bind", str(data), str(data)], check=True)
 subprocess.run(["mount", "-o", "remount,ro,bind", str(data)], check=True)
@@ -178,7 +178,7 @@ def test_a_disk_without_locks_is_refused_and_not_taken_for_one_in_use(
 
     monkeypatch.setattr(fcntl, "flock", fails)
     with pytest.raises(StorageError) as caught:
-        DataFolder(tmp_path / "data")
+        DataFolder(tmp_path / "data").open()
     assert caught.value.code == "data_folder_unusable"
     assert os.strerror(number) in caught.value.cause
     assert caught.value.remedy
@@ -188,11 +188,11 @@ def test_a_disk_without_locks_is_refused_and_not_taken_for_one_in_use(
 def test_a_disk_whose_locks_keep_nobody_out_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", lambda *_: None)
     with pytest.raises(StorageError) as caught:
-        DataFolder(tmp_path / "data")
+        DataFolder(tmp_path / "data").open()
     assert caught.value.code == "data_folder_unusable"
     assert "lock" in caught.value.cause
     monkeypatch.undo()
-    DataFolder(tmp_path / "data").close()
+    DataFolder(tmp_path / "data").open().close()
 
 
 @pytest.mark.fault(8)
@@ -204,15 +204,15 @@ def test_a_disk_whose_rename_does_not_replace_is_refused(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(Path, "replace", stays)
     with pytest.raises(StorageError) as caught:
-        DataFolder(tmp_path / "data")
+        DataFolder(tmp_path / "data").open()
     assert caught.value.code == "data_folder_unusable"
 
 
 @pytest.mark.fault(6)
 def test_a_second_service_still_reads_as_such(tmp_path: Path) -> None:
-    first = DataFolder(tmp_path / "data")
+    first = DataFolder(tmp_path / "data").open()
     with pytest.raises(StateError) as caught:
-        DataFolder(tmp_path / "data")
+        DataFolder(tmp_path / "data").open()
     assert caught.value.code == "data_folder_locked"
     assert caught.value.context["holder"] == f"process {os.getpid()} on {os.uname().nodename}"
     first.close()
@@ -250,7 +250,7 @@ def test_a_job_that_ended_with_the_disk_full_never_reads_as_running(
 
 @pytest.mark.fault(3)
 def test_a_catalogue_whose_commit_failed_works_again_once_there_is_room(tmp_path: Path) -> None:
-    catalog = Catalog(tmp_path / "catalog.sqlite")
+    catalog = Catalog(tmp_path / "catalog.sqlite").open()
     catalog.put_job("j000001-abcdef", "running", {"id": "j000001-abcdef"})
 
     def limit(pages: int) -> None:

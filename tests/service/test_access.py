@@ -212,7 +212,7 @@ def test_a_client_that_asks_without_end_is_slowed_and_a_stop_never(tmp_path: Pat
     text = TINY.replace("compute_queue = 2", "compute_queue = 2\nrequests_per_s = 2.0")
     from server.config.rig_file import parse_config
 
-    made = Service(parse_config(text), tmp_path / "data")
+    made = Service(parse_config(text), tmp_path / "data").start()
     key = KeyFile(made.folder.root).add("one", "operator")
     try:
         with guarded(made) as url, httpx.Client(base_url=url, trust_env=False, timeout=30.0) as client:
@@ -350,7 +350,7 @@ def test_it_serves_by_https(tmp_path: Path) -> None:
 
 def test_on_loopback_nobody_is_asked_unless_the_rig_file_says_so(tmp_path: Path) -> None:
     config = tiny_config(compute_queue="compute_queue = 2\nrequire_key = true")
-    made = Service(config, tmp_path / "data")
+    made = Service(config, tmp_path / "data").start()
     try:
         app = create_app(made, close_service=False)
         listener = socket.socket()

@@ -12,9 +12,9 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.conversion import fit_opencv, fit_seidel
 from core.cameras.lens import OpenCVLens, SeidelLens
@@ -28,7 +28,6 @@ from server.formats.calibrations.recognise import LoadedCalibration, load_calibr
 from server.formats.results.writing import Provenance, write_field
 from server.results.epipolar_check import check_against
 
-Float = NDArray[np.float64]
 SIZE = (1280, 1024)
 PAPER = {
     "cam1": {

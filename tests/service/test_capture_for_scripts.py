@@ -279,7 +279,7 @@ def again(tmp_path: Path) -> Iterator[Any]:
 
     def start() -> tuple[Service, httpx.Client]:
         stop()
-        service = Service(tiny_config(), tmp_path / "data")
+        service = Service(tiny_config(), tmp_path / "data").start()
         context = served(service)
         client = context.__enter__()
         running[:] = [service, context]

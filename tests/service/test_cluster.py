@@ -101,7 +101,7 @@ class Place:
 
     def __init__(self, data: Path, compute: str) -> None:
         self.data = data
-        self.service = Service(parse_config(f"{CONFIG}\n{compute}"), data)
+        self.service = Service(parse_config(f"{CONFIG}\n{compute}"), data).start()
         self._context = served(self.service)
         self.client: httpx.Client = self._context.__enter__()
 

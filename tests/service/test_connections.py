@@ -27,7 +27,7 @@ END_S = 30.0  # a second would do on a machine that does nothing else
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    made = Service(tiny_config(), tmp_path_factory.mktemp("connections") / "data")
+    made = Service(tiny_config(), tmp_path_factory.mktemp("connections") / "data").start()
     yield made
     made.close()
 
@@ -243,7 +243,7 @@ def test_what_is_no_proper_http_is_refused_and_the_connection_ends(port: int, da
 
 
 def test_settings_are_kept_to(tmp_path: Path) -> None:
-    made = Service(tiny_config(compute_queue="compute_queue = 2\nconnections = 40"), tmp_path / "data")
+    made = Service(tiny_config(compute_queue="compute_queue = 2\nconnections = 40"), tmp_path / "data").start()
     try:
         server = OrderlyServer(create_app(made, close_service=False), made)
         assert server._keeper.limits.most == 40

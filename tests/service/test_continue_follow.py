@@ -44,7 +44,7 @@ class Place:
 
     def start(self) -> httpx.Client:
         self.stop()
-        self.service = Service(parse_config(CONFIG), self.data)
+        self.service = Service(parse_config(CONFIG), self.data).start()
         self._context = served(self.service)
         self.client = self._context.__enter__()
         return self.client

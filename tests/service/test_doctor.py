@@ -368,7 +368,7 @@ def test_a_folder_that_takes_no_files_fails() -> None:
 
 
 def test_a_data_folder_in_use_names_its_holder(tmp_path: Path) -> None:
-    folder = DataFolder(tmp_path / "data")
+    folder = DataFolder(tmp_path / "data").open()
     try:
         book = Notebook()
         check_disk(book, tmp_path / "data", image_bytes=4096, pairs_per_s=None)

@@ -51,7 +51,8 @@ def collect(hub: EventHub, after: int, count: int) -> list[Event]:
 
 
 def test_a_reader_goes_on_where_it_was() -> None:
-    hub = EventHub(keep=10, start=700)
+    hub = EventHub(keep=10)
+    hub.number_from(700)
     for n in range(5):
         hub.publish("step", {"n": n})
     assert [e.data["n"] for e in collect(hub, 700, 5)] == [0, 1, 2, 3, 4]
@@ -62,7 +63,8 @@ def test_a_reader_goes_on_where_it_was() -> None:
 
 @pytest.mark.parametrize("seen", [0, 650, 702, 99_999])
 def test_a_reader_that_lost_events_is_told_and_gets_the_rest(seen: int) -> None:
-    hub = EventHub(keep=3, start=700)  # events 703 to 705 are kept
+    hub = EventHub(keep=3)
+    hub.number_from(700)  # events 703 to 705 are kept
     for n in range(5):
         hub.publish("step", {"n": n})
     if seen == 702:  # the next one is the oldest that is kept
@@ -76,7 +78,7 @@ def test_a_reader_that_lost_events_is_told_and_gets_the_rest(seen: int) -> None:
 def test_a_counter_grows_over_restarts_also_where_the_clock_steps_back(tmp_path: Path) -> None:
     counts = []
     for clock in (1000, 2000, 50, 51, 3000):
-        catalog = Catalog(tmp_path / "catalog.sqlite")
+        catalog = Catalog(tmp_path / "catalog.sqlite").open()
         counts.append(catalog.count_up("starts", clock))
         catalog.close()
     assert counts == [1000, 2000, 2001, 2002, 3000]
@@ -120,7 +122,7 @@ def test_streams_resume_over_a_restart(tmp_path: Path) -> None:
     ids: list[int] = []
     job_id = ""
     for start in range(2):
-        service = Service(tiny_config(), tmp_path / "data")
+        service = Service(tiny_config(), tmp_path / "data").start()
         try:
             with served(service) as client:
                 wait_for_rig(client)

@@ -160,6 +160,7 @@ def test_what_a_kill_left_is_removed_at_the_start(tmp_path: Path) -> None:
     (tmp_path / FOLDER / "tmpabc").mkdir(parents=True)
     (tmp_path / FOLDER / "tmpabc" / "half.zip").write_bytes(b"x")
     made = ExportProcess(tmp_path)
+    made.clear()
     assert not (tmp_path / FOLDER).exists()
     made.close()
 

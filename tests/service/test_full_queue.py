@@ -23,7 +23,7 @@ BODY: dict[str, Any] = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px"
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     data = tmp_path_factory.mktemp("queue") / "data"
     write_test_folder(data / "tests" / TEST, 30)
-    service = Service(tiny_config(), data)
+    service = Service(tiny_config(), data).start()
     try:
         with served(service) as made:
             wait_for_rig(made)

@@ -120,7 +120,7 @@ class Jumping(datetime):
 @pytest.mark.fault(7)
 def test_order_stands_when_the_clock_steps_back_and_forward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server.store.folder, "datetime", Jumping)
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     jumps = [0, -3600, 86400 * 365 * 10, -86400 * 365 * 40, 1, 0]
     tests: list[str] = []
     try:
@@ -150,7 +150,7 @@ def test_order_stands_when_the_clock_steps_back_and_forward(tmp_path: Path, monk
         service.close()
     # a service that starts while the clock is in the past goes on where it was
     Jumping.ahead = timedelta(days=-20000)
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -169,22 +169,22 @@ def test_order_stands_when_the_clock_steps_back_and_forward(tmp_path: Path, monk
 @pytest.mark.fault(10)
 @pytest.mark.parametrize("content", [None, '{"format": 0}', '{"format": 1, "written_by": "stereorig 0.0"}'])
 def test_a_folder_of_an_older_format_opens(tmp_path: Path, content: str | None) -> None:
-    DataFolder(tmp_path / "data").close()
+    DataFolder(tmp_path / "data").open().close()
     path = tmp_path / "data" / "format.json"
     path.unlink()
     if content is not None:
         path.write_text(content)
-    DataFolder(tmp_path / "data").close()
+    DataFolder(tmp_path / "data").open().close()
     assert verify(tmp_path / "data").sound
 
 
 @pytest.mark.fault(10)
 @pytest.mark.parametrize("content", ['{"format": 2}', '{"format": "new"}', "{}", '{"format": 1e9}', '{"format": true}'])
 def test_a_folder_of_a_newer_format_is_refused_by_every_command(tmp_path: Path, content: str) -> None:
-    DataFolder(tmp_path / "data").close()
+    DataFolder(tmp_path / "data").open().close()
     (tmp_path / "data" / "format.json").write_text(content)
     with pytest.raises(FileFormatError) as caught:
-        DataFolder(tmp_path / "data")
+        DataFolder(tmp_path / "data").open()
     assert caught.value.code == "data_format_newer"
     with pytest.raises(FileFormatError):
         verify(tmp_path / "data")

@@ -48,7 +48,7 @@ def described() -> Json:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory, described: Json) -> Iterator[Session]:
     """Every operation called once, as tests/bench/documents/api_examples.py does."""
-    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("examples") / "data")
+    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("examples") / "data").start()
     try:
         with served(service) as client:
             yield run(client, described)

@@ -153,7 +153,7 @@ def captured(client: httpx.Client, test_id: str, body: dict[str, Any]) -> None:
 @pytest.fixture(scope="module")
 def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Measurement]:
     """A plate: reference, three more at rest, two under pressure; measured with strain over five points."""
-    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("report") / "data")
+    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("report") / "data").start()
     try:
         with served(service) as client:
             wait_for_rig(client)

@@ -44,7 +44,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def guarded(place: Path) -> Iterator[tuple[Service, int]]:
-    service = Service(tiny_config(), place / "data")
+    service = Service(tiny_config(), place / "data").start()
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.bind(("127.0.0.1", 0))
     server = OrderlyServer(create_app(service, close_service=False), service)

@@ -547,7 +547,7 @@ def test_a_jammed_axis_ends_move_and_calibration_with_a_fault(service: Service, 
 
 @pytest.mark.fault(23)
 def test_moves_before_homing_are_refused(tmp_path: Path) -> None:
-    made = Service(tiny_config(settle_ms="settle_ms = 0\nhome_at_start = false"), tmp_path / "data")
+    made = Service(tiny_config(settle_ms="settle_ms = 0\nhome_at_start = false"), tmp_path / "data").start()
     try:
         with served(made) as own:
             # the simulated controller powers up with its motors off and knows no position

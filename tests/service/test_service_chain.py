@@ -26,7 +26,7 @@ RECTANGLE = [60, 60, 180, 170]
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("chain") / "data")
+    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("chain") / "data").start()
     try:
         with served(service) as made:
             wait_for_rig(made)

@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def client(folder: Path) -> Iterator[httpx.Client]:
-    service = Service(tiny_config(), folder)
+    service = Service(tiny_config(), folder).start()
     try:
         with served(service) as made:
             yield made

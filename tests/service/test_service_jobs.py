@@ -37,10 +37,11 @@ class Bench:
     """Jobs without a rig."""
 
     def __init__(self, folder: Path, queue_limit: int = 2) -> None:
-        self.catalog = Catalog(folder / "catalog.sqlite")
+        self.catalog = Catalog(folder / "catalog.sqlite").open()
         self.gate = HardwareGate()
         self.hub = EventHub()
         self.jobs = JobManager(self.catalog, self.hub, self.gate, IdMaker(), queue_limit=queue_limit)
+        self.jobs.start()
 
     def close(self) -> None:
         self.jobs.close()
@@ -213,7 +214,7 @@ def test_what_ran_at_a_crash_reads_interrupted_after_the_next_start(tmp_path: Pa
 def test_a_corrupt_catalogue_is_set_aside(tmp_path: Path) -> None:
     path = tmp_path / "catalog.sqlite"
     path.write_bytes(b"no database" * 500)
-    catalog = Catalog(path)
+    catalog = Catalog(path).open()
     assert catalog.was_reset
     assert catalog.jobs() == []
     catalog.close()
@@ -225,27 +226,27 @@ def test_a_corrupt_catalogue_is_set_aside(tmp_path: Path) -> None:
 
 @pytest.mark.fault(6)
 def test_second_service_on_a_data_folder_is_told_who_has_it(tmp_path: Path) -> None:
-    first = DataFolder(tmp_path)
+    first = DataFolder(tmp_path).open()
     with pytest.raises(StateError, match=r"process [0-9]+ on ") as caught:
-        DataFolder(tmp_path)
+        DataFolder(tmp_path).open()
     assert caught.value.code == "data_folder_locked"
     first.close()
-    DataFolder(tmp_path).close()
+    DataFolder(tmp_path).open().close()
 
 
 @pytest.mark.fault(10)
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
-    DataFolder(tmp_path).close()
+    DataFolder(tmp_path).open().close()
     (tmp_path / "format.json").write_text('{"format": 2}')
     with pytest.raises(FileFormatError, match="format 2"):
-        DataFolder(tmp_path)
+        DataFolder(tmp_path).open()
 
 
 @pytest.mark.fault(8)
 def test_an_unusable_data_folder_is_refused_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(StorageError, match="cannot be used") as caught:
-        DataFolder(tmp_path / "file")
+        DataFolder(tmp_path / "file").open()
     assert caught.value.code == "data_folder_unusable"
 
 
@@ -259,10 +260,10 @@ def test_a_data_folder_whose_disk_does_not_keep_its_promises_is_refused(
 
     monkeypatch.setattr(os, call, fails)
     with pytest.raises(StorageError, match="Read-only") as caught:
-        DataFolder(tmp_path)
+        DataFolder(tmp_path).open()
     assert caught.value.code == "data_folder_unusable"
     monkeypatch.undo()
-    DataFolder(tmp_path).close()  # the refusal let go of the lock
+    DataFolder(tmp_path).open().close()  # the refusal let go of the lock
 
 
 # the whole service ----------------------------------------------------------------------------------------------
@@ -271,7 +272,7 @@ def test_a_data_folder_whose_disk_does_not_keep_its_promises_is_refused(
 @pytest.mark.fault(5)
 def test_index_is_rebuilt_and_keys_still_count_after_the_catalogue_is_lost(tmp_path: Path) -> None:
     key = {"Idempotency-Key": "only-once"}
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -284,7 +285,7 @@ def test_index_is_rebuilt_and_keys_still_count_after_the_catalogue_is_lost(tmp_p
     half = tmp_path / "data" / "tests" / test_id / "steps" / "0001"
     half.mkdir()
     (half / "cam1.tif").write_bytes(b"half a step")
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     try:
         assert any("was not in the catalogue" in line for line in service.differences)
         with served(service) as client:
@@ -301,7 +302,7 @@ def test_index_is_rebuilt_and_keys_still_count_after_the_catalogue_is_lost(tmp_p
 
 
 def test_killed_worker_fails_its_job_and_is_started_again(tmp_path: Path) -> None:
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -438,3 +439,23 @@ def test_cancelled_raises_in_the_phase(bench: Bench) -> None:
     bench.jobs.cancel(job.id)
     assert bench.end_of(job)["state"] == "cancelled"
     assert seen == [True]
+
+
+def test_a_service_that_was_only_made_has_opened_nothing(tmp_path: Path) -> None:
+    threads = threading.active_count()
+    service = Service(tiny_config(), tmp_path / "data")
+    assert threading.active_count() == threads
+    assert list(tmp_path.iterdir()) == []
+    service.close()
+
+
+def test_a_start_that_fails_closes_what_was_opened_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> list[str]:
+        raise StorageError("The index cannot be made.")
+
+    monkeypatch.setattr("server.workflows.service.rebuild", broken)
+    threads = threading.active_count()
+    with pytest.raises(StorageError), Service(tiny_config(), tmp_path / "data"):
+        pass
+    assert threading.active_count() == threads
+    DataFolder(tmp_path / "data").open().close()

@@ -63,7 +63,7 @@ def test_a_task_that_compiles_kernels_says_so(worker: ComputeWorker) -> None:
 def test_a_task_that_waits_for_kernels_to_be_compiled_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # nothing is on disk there
     seen: list[tuple[str, int, int]] = []
-    with ComputeWorker(threads=1, warm_up="worker_functions:warm_up") as made:
+    with ComputeWorker(threads=1, warm_up="tests.support.worker_functions:warm_up") as made:
         future = made.submit(work.add, 1, 2)
         future.on_progress = lambda *report: seen.append(report)
         assert future.result(timeout=60) == 3

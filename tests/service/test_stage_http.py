@@ -388,7 +388,7 @@ def test_a_stage_that_is_not_there_says_so_everywhere(tmp_path_factory: pytest.T
     from tests.support.service_rig import served
     from tests.support.stage_service import rig
 
-    service = Service(rig(url='"/dev/no-such-port"'), tmp_path_factory.mktemp("none") / "data")
+    service = Service(rig(url='"/dev/no-such-port"'), tmp_path_factory.mktemp("none") / "data").start()
     try:
         with served(service) as client:
             wait_until(lambda: (client.get(f"{API}/rig").json()["fault"] or {}).get("code") == "stage_lost")

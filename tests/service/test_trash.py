@@ -174,7 +174,7 @@ def _camera(k: int) -> dict[str, float]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> DataFolder:
-    return DataFolder(tmp_path / "data")
+    return DataFolder(tmp_path / "data").open()
 
 
 def small_test(folder: DataFolder, steps: int = 2) -> str:
@@ -191,7 +191,7 @@ def test_a_disk_that_fails_while_something_is_deleted_keeps_all_of_it_somewhere(
     way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for n in range(1, 100):
-        folder = DataFolder(tmp_path / f"{n}")
+        folder = DataFolder(tmp_path / f"{n}").open()
         test_id = small_test(folder)
         before = hashes(folder.tests / test_id)
         trash = Trash(folder.root)
@@ -227,7 +227,7 @@ def test_a_kill_between_the_renames_is_put_in_order_at_the_next_start(folder: Da
     doomed = trash.put(folder, "test", {"test_id": test_id}, name="one", by="me", why="asked for")
     (folder.root / "trash" / doomed / "content").rename(folder.root / "trash" / doomed / "removing")
     assert trash.ids() == []
-    catalog = Catalog(folder.root / "catalog.sqlite")
+    catalog = Catalog(folder.root / "catalog.sqlite").open()
     try:
         lines = rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder))
     finally:
@@ -284,7 +284,7 @@ def test_the_command_lists_restores_and_empties(folder: DataFolder, capsys: pyte
 
 
 def test_a_copy_is_acknowledged_only_where_it_holds_what_the_test_has(tmp_path: Path) -> None:
-    service = Service(tiny_config(), tmp_path / "data")
+    service = Service(tiny_config(), tmp_path / "data").start()
     try:
         with served(service) as client:
             test_id = new_test(client)

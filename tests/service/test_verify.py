@@ -33,7 +33,7 @@ API = "/api/v1"
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with a calibration, a test of three steps and an analysis, its service ended."""
     data = tmp_path_factory.mktemp("verify") / "data"
-    service = Service(parse_config(SMALL), data)
+    service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -123,7 +123,7 @@ def test_a_flipped_bit_names_the_file_and_no_other(
 @pytest.mark.fault(4)
 def test_a_spoiled_result_is_refused_by_the_service_and_the_others_stand(data: Path) -> None:
     flip(only(data, "tests/*/analyses/*/step_0002.nc"))
-    service = Service(parse_config(SMALL), data)
+    service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
             test_id = client.get(f"{API}/tests").json()["tests"][0]["id"]
@@ -208,7 +208,7 @@ def test_incomplete_steps_are_set_aside_and_the_numbers_stay(data: Path) -> None
     assert outcome.after.findings == ()
     again = repair(data)
     assert again.done == ()
-    service = Service(parse_config(SMALL), data)
+    service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -224,7 +224,7 @@ def test_a_test_whose_every_step_is_incomplete_begins_at_zero_again(data: Path) 
     for step in sorted((test / "steps").iterdir()):
         (step / "step.json").unlink()
     repair(data)
-    service = Service(parse_config(SMALL), data)
+    service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -235,7 +235,7 @@ def test_a_test_whose_every_step_is_incomplete_begins_at_zero_again(data: Path) 
 
 @pytest.mark.fault(6)
 def test_no_repair_under_a_running_service(data: Path) -> None:
-    folder = DataFolder(data)
+    folder = DataFolder(data).open()
     try:
         with pytest.raises(StateError) as caught:
             repair(data)
@@ -249,7 +249,7 @@ def test_no_repair_under_a_running_service(data: Path) -> None:
 def test_what_a_running_service_is_writing_is_no_finding_and_what_stays_is(data: Path) -> None:
     test = only(data, "tests/*")
     under_way, left = test / ".test.json.0a1b2c3d.part", test / ".test.json.4e5f6071.part"
-    folder = DataFolder(data)
+    folder = DataFolder(data).open()
     try:
         for path in (under_way, left):
             path.write_text("{")
@@ -301,7 +301,7 @@ def everything_else(client: httpx.Client) -> None:
 
 
 def test_a_folder_that_holds_everything_has_no_false_finding_and_hides_no_true_one(data: Path) -> None:
-    service = Service(parse_config(SMALL), data)
+    service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
             wait_for_rig(client)

@@ -174,7 +174,7 @@ def running_service(folder: Path) -> Iterator[Service]:
     """The service on a fast tiny rig."""
     lines = tiny_rig(**FAST).splitlines()
     lines.insert(lines.index("[service]") + 1, "requests_per_s = 100000.0")
-    service = Service(parse_config("\n".join(lines)), folder / "data")
+    service = Service(parse_config("\n".join(lines)), folder / "data").start()
     try:
         yield service
     finally:

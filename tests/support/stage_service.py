@@ -112,7 +112,7 @@ def stage_service(
     controller = make_controller(driver, (1, 2), **{"time_scale": 10.0, "start_mm": 3.0, **controller_options})
     with ControllerServer(controller, transport) as server:
         config = rig(driver=f'"{driver}"', url=f'"{server.url}"', reply_timeout_ms="250", **(stage or {}))
-        service = Service(config, data, record=record)
+        service = Service(config, data, record=record).start()
         try:
             with served(service) as client:
                 wait_until(lambda: client.get(f"{API}/rig").json()["connected"])

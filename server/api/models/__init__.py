@@ -1,5 +1,6 @@
 """Wire models: what goes over HTTP, apart from what the code works with inside."""
 
+from core.names import CameraName
 from server.api.models.analyses import (
     AnalysisAccepted,
     AnalysisList,
@@ -63,7 +64,6 @@ from server.api.models.tests import (
     WatchRequest,
 )
 from server.base.models import (
-    CameraName,
     Channels,
     JobState,
     Label,

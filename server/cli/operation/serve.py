@@ -197,7 +197,7 @@ def run(args: argparse.Namespace) -> int:
         from server.http.server import OrderlyServer
         from server.workflows.service import Service
 
-        service = Service(config, args.data, record=args.record, worker=worker)
+        service = Service(config, args.data, record=args.record, worker=worker).start()
     except BaseException:
         worker.shutdown()
         listener.close()

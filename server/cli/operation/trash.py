@@ -58,14 +58,16 @@ def run(args: argparse.Namespace) -> int:
 def _restore(data: Path, ids: list[str]) -> int:
     if not ids:
         raise InputError("'trash restore' needs an ID.", remedy="See stereorig trash list.")
-    folder = DataFolder(data)
+    folder = DataFolder(data).open()
     try:
         trash = Trash(folder.root)
         for trash_id in ids:
             print(f"restored {_what(trash.restore(trash_id))}")
-        catalog = Catalog(folder.root / "catalog.sqlite")
+        catalog = Catalog(folder.root / "catalog.sqlite").open()
         try:
-            rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), NoiseStore(folder))
+            noise = NoiseStore(folder)
+            noise.end_unfinished()
+            rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), noise)
         finally:
             catalog.close()
     finally:

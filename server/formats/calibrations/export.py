@@ -14,6 +14,7 @@ from core.cameras.conversion import LensFit, fit_opencv, fit_seidel
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
+from core.names import CAMERAS
 from server.formats.calibrations.dice_xml import dice_text
 from server.formats.calibrations.matchid_caldat import caldat_text
 from server.formats.calibrations.opencv_yaml import opencv_text
@@ -220,7 +221,7 @@ def _paper(
                 remedy="Check the calibration and the image sizes.",
             )
         to_sys = pair.cam1.sys_from_cam @ RigidTransform(np.eye(3), np.array([0.0, 0.0, depth]))
-    for name, camera, fit in zip(("cam1", "cam2"), (pair.cam1, pair.cam2), fits, strict=True):
+    for name, camera, fit in zip(CAMERAS, (pair.cam1, pair.cam2), fits, strict=True):
         content[name] = Camera(fit.lens, camera.cam_from_sys @ to_sys).paper_parameters()
     if sizes is not None:
         content["image_size_px"] = {f"cam{k + 1}": list(size) for k, size in enumerate(sizes)}

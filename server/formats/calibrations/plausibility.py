@@ -7,15 +7,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.conversion import image_places
 from core.cameras.lens import OpenCVLens, SeidelLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from server.formats.calibrations.recognise import LoadedCalibration
 
-Float = NDArray[np.float64]
 MOST_RESIDUAL_PX = 1e-3  # of a carried-over model against an independent projection; rounding is 1e-9
 _ACROSS = (13, 11)
 _DEPTHS = np.geomspace(0.3, 300.0, 61)  # of the baseline

@@ -14,6 +14,7 @@ import numpy as np
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
+from core.names import CAMERAS
 from server.formats.calibrations.dice_xml import looks_like_dice, parse_dice_xml
 from server.formats.calibrations.imported_pair import invalid, unreadable
 from server.formats.calibrations.matchid_caldat import looks_like_caldat, parse_caldat
@@ -169,11 +170,11 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
         raise unreadable(name, "it is none of the known kinds") from error
     if not isinstance(content, dict) or not {"cam1", "cam2"} & content.keys():
         raise unreadable(name, "it is JSON, but has no cam1 and cam2")
-    cam1, cam2 = (_camera(name, which, content.get(which)) for which in ("cam1", "cam2"))
+    cam1, cam2 = (_camera(name, which, content.get(which)) for which in CAMERAS)
     pair = StereoPair(cam1, cam2)
     if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
         raise invalid(name, "both cameras stand at the same place")
-    sizes = [_size(content, which) for which in ("cam1", "cam2")]
+    sizes = [_size(content, which) for which in CAMERAS]
     return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
 
 

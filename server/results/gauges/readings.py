@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import InputError, MeasurementError, StateError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -45,7 +45,6 @@ from server.results.gauges.variables import STRAIN_NAMES, Variables, component_o
 from server.results.reader import read_variable
 from server.results.staleness import stale_results
 
-Float = NDArray[np.float64]
 _Placed = dict[str | None, list[tuple[float, float]]]
 MOST_NUMBERS = 3_000_000
 _CALIBRATION = ("calibration", "calibration.json")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -18,7 +19,6 @@ from server.formats.results.layout import COVARIANCE_NAMES, field_variable
 from server.formats.results.strain import read_strain
 from server.results.reader import Variable, read_variable
 
-Float = NDArray[np.float64]
 STRAIN_NAMES = ("exx", "eyy", "exy")
 
 

@@ -42,7 +42,7 @@ def examples_of(session: Session) -> dict[str, dict[str, object]]:
 def main() -> None:
     """Run the session and write the file."""
     with tempfile.TemporaryDirectory() as folder:
-        service = Service(parse_config(SMALL), Path(folder) / "data")
+        service = Service(parse_config(SMALL), Path(folder) / "data").start()
         try:
             with served(service) as client:
                 session = run(client, bare_app().openapi())

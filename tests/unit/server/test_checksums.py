@@ -30,7 +30,7 @@ def image() -> np.ndarray:
 
 @pytest.mark.fault(4)
 def test_only_what_was_changed_is_refused_and_the_next_service_still_starts(tmp_path: Path) -> None:
-    folder = DataFolder(tmp_path / "data")
+    folder = DataFolder(tmp_path / "data").open()
     calibrations, noise = CalibrationStore(folder), NoiseStore(folder)
     bad, good = (calibrations.add_imported({"label": ""}, {"baseline_mm": 400.25}) for _ in range(2))
     noises = [noise.create({"frames": 2, "label": ""}) for _ in range(2)]
@@ -65,8 +65,8 @@ def test_only_what_was_changed_is_refused_and_the_next_service_still_starts(tmp_
     assert calibrations.view_file(taken, 1, "cam1").is_file()
 
     folder.close()
-    folder = DataFolder(tmp_path / "data")
-    catalog = Catalog(folder.root / "catalog.sqlite")
+    folder = DataFolder(tmp_path / "data").open()
+    catalog = Catalog(folder.root / "catalog.sqlite").open()
     lines = rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), NoiseStore(folder))
     assert any(bad in line and "checksum" in line for line in lines)
     assert [entry["id"] for entry in catalog.entries("calibration")] == [good, taken]
@@ -76,13 +76,13 @@ def test_only_what_was_changed_is_refused_and_the_next_service_still_starts(tmp_
 
 @pytest.mark.fault(4)
 def test_a_step_whose_document_cannot_be_read_takes_no_other_with_it(tmp_path: Path) -> None:
-    folder = DataFolder(tmp_path / "data")
+    folder = DataFolder(tmp_path / "data").open()
     tests = TestStore(folder)
     test_id = tests.create({"name": "one"}, None)["id"]
     for _ in range(4):
         tests.add_step(test_id, {"cam1": b"1", "cam2": b"2"}, {})
     (tests.path(test_id) / "steps" / "0001" / "step.json").write_text('{"n": 1, ')
-    catalog = Catalog(folder.root / "catalog.sqlite")
+    catalog = Catalog(folder.root / "catalog.sqlite").open()
     lines = rebuild(catalog, folder, CalibrationStore(folder), tests)
     assert any("step 1 of test" in line for line in lines)
     assert [entry["n"] for entry in catalog.entries("step", test_id)] == [0, 2, 3]

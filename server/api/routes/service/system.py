@@ -15,6 +15,7 @@ from server.api.protocol.dependencies import ServiceDep
 from server.api.protocol.problems import RETRY_AFTER_S, errors, problem_response
 from server.base.metrics import CONTENT_TYPE
 from server.formats.version import software_version
+from server.workflows.metrics_state import metrics_text
 
 router = APIRouter(tags=["system"])
 LastEventId = Annotated[
@@ -73,7 +74,7 @@ def readyz(service: ServiceDep) -> object:
 @router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)
 def metrics(service: ServiceDep) -> Response:
     """Return the text format of Prometheus: requests, captures, jobs, queue, cameras, disk, worker, stage, process."""
-    return Response(service.metrics.text(), media_type=CONTENT_TYPE)
+    return Response(metrics_text(service), media_type=CONTENT_TYPE)
 
 
 def _event_stream(service: ServiceDep) -> None:
