@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.arrays import Float32
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
+from core.names import CAMERAS, CameraName
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, CameraName, SimCamera, SimRig
+from sim.rig import SimCamera, SimRig
 from sim.scene import Scene
 from sim.truth import Truth, truth_at
 
@@ -51,11 +53,11 @@ class SimWorld:
         self._position_mm = position_mm
         self._options = RenderOptions(blur_px=rig.blur_px, threads=threads)
         self._state = threading.Lock()  # scene, tilts and cache; never held while rendering
-        self._rendering = {name: threading.Lock() for name in CAMERA_NAMES}  # so that nobody renders the same twice
+        self._rendering = {name: threading.Lock() for name in CAMERAS}  # so that nobody renders the same twice
         self._scene = make_scene(rig, "grid")
         self._scene_key: tuple[Any, ...] = ("grid", 0.0)
-        self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERA_NAMES}
-        self._cache: OrderedDict[tuple[Any, ...], NDArray[np.float32]] = OrderedDict()
+        self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERAS}
+        self._cache: OrderedDict[tuple[Any, ...], Float32] = OrderedDict()
 
     @property
     def rig(self) -> SimRig:
@@ -89,7 +91,7 @@ class SimWorld:
 
     def true_pair(self) -> StereoPair:
         """Return the true pair with both stages at their zero: what a calibration ought to find."""
-        return StereoPair(*(self._rig.camera(name).camera for name in CAMERA_NAMES))
+        return StereoPair(*(self._rig.camera(name).camera for name in CAMERAS))
 
     def truth(
         self, xy_px: ArrayLike, name: str, *, load: float = 0.0, reference_load: float = 0.0, **params: Any
@@ -111,7 +113,7 @@ class SimWorld:
             raise InputError(f"There is no camera {cam!r}.", code="unknown_camera", remedy="Use cam1 or cam2.")
         return self._cameras[cam]
 
-    def _brightness(self, cam: CameraName) -> tuple[NDArray[np.float32], SimCamera]:
+    def _brightness(self, cam: CameraName) -> tuple[Float32, SimCamera]:
         with self._state:
             sim = self._sim_camera(cam)
         with self._rendering[cam]:
@@ -129,7 +131,7 @@ class SimWorld:
                 self._remember(key, known)
         return known, sim
 
-    def _remember(self, key: tuple[Any, ...], brightness: NDArray[np.float32]) -> None:
+    def _remember(self, key: tuple[Any, ...], brightness: Float32) -> None:
         with self._state:
             self._cache[key] = brightness
             while len(self._cache) > 2 and sum(a.nbytes for a in self._cache.values()) > _CACHE_BYTES:

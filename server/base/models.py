@@ -89,7 +89,6 @@ Timestamp = Annotated[
     PlainSerializer(utc_text, return_type=str),
     Field(examples=["2026-03-01T12:00:00.250Z"]),
 ]
-CameraName = Literal["cam1", "cam2"]
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
 
 

@@ -15,14 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CameraError, StateError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.pairing import Pair, PairingAccount
 from drivers.cameras.protocol import CameraSettings, Frame, Pixels
 from server.config.rig_file import SKEW_PX
 from server.rig.image_speed import ImageMotion, image_motion
 from server.rig.pairs import PairSource
-from server.rig.unit import CAMERAS, Cam, CameraUnit
+from server.rig.unit import CameraUnit
 
-__all__ = ["CAMERAS", "Cam", "CameraPair", "CameraUnit", "PairShot"]
+__all__ = ["CameraPair", "CameraUnit", "PairShot"]
 
 #: where there is nothing older to show, a look waits this long behind another one or a capture
 _FIRST_FRAME_S = 5.0
@@ -73,7 +74,7 @@ class CameraPair:
     def __init__(
         self, cam1: CameraUnit, cam2: CameraUnit, *, make_source: Callable[[], PairSource], skew_is_set: bool = False
     ) -> None:
-        self.units: dict[Cam, CameraUnit] = {"cam1": cam1, "cam2": cam2}
+        self.units: dict[CameraName, CameraUnit] = {"cam1": cam1, "cam2": cam2}
         self._make_source = make_source
         self._skew_is_set = skew_is_set
         self._earlier = PairingAccount()
@@ -145,7 +146,7 @@ class CameraPair:
             None if motion is None else motion.speed_px_s,
         )
 
-    def live(self, cam: Cam, max_age_s: float, after: int | None = None) -> Frame:
+    def live(self, cam: CameraName, max_age_s: float, after: int | None = None) -> Frame:
         """Return a frame for looking at, at most ``max_age_s`` old where recording allows it.
 
         ``after`` is the number of the frame that the caller has: it is given another one, unless a capture goes on or
@@ -177,7 +178,7 @@ class CameraPair:
             )
         return frame
 
-    def configure(self, cam: Cam, settings: CameraSettings) -> CameraSettings:
+    def configure(self, cam: CameraName, settings: CameraSettings) -> CameraSettings:
         """Change one camera's settings between captures."""
         with self._lock:
             self._source.stop()
@@ -186,11 +187,11 @@ class CameraPair:
             finally:
                 self._restart_source()
 
-    def lost(self) -> list[Cam]:
+    def lost(self) -> list[CameraName]:
         """Cameras that cannot be used."""
         return [cam for cam in CAMERAS if self.units[cam].fault is not None]
 
-    def reopen(self, cam: Cam) -> None:
+    def reopen(self, cam: CameraName) -> None:
         """Connect a lost camera again, with its settings; raises when that fails."""
         unit = self.units[cam]
         unit.reconnect()

@@ -17,11 +17,11 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.errors import StereorigError
+from core.names import CAMERAS
 from drivers.cameras.protocol import FoundDevice
 from drivers.registry import CAMERA_DRIVERS, discover_cameras
 from drivers.stages.serial_ports import discover_ports
 from server.rig import Rig
-from server.rig.cameras import CAMERAS
 
 #: name of the search for serial ports among those of the camera drivers
 SERIAL = "serial"

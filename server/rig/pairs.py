@@ -10,13 +10,14 @@ from collections.abc import Callable, Mapping
 from typing import Literal, Protocol
 
 from core.errors import CameraError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.counter_offset import AlignedPairing
 from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
 from drivers.cameras.protocol import Frame, FrameStatus
-from server.rig.unit import CAMERAS, Cam, CameraUnit
+from server.rig.unit import CameraUnit
 
 Check = Callable[[], None]
-Units = Mapping[Cam, CameraUnit]
+Units = Mapping[CameraName, CameraUnit]
 
 # A frame that was lost or damaged on its way is asked for again; a camera that is dead is not
 _ATTEMPTS = 3
@@ -63,7 +64,7 @@ class TriggeredPairs:
         CameraError
             ``frame_incomplete`` or ``pair_incomplete`` when three triggers in a row made no whole pair.
         """
-        damaged: Cam | None = None
+        damaged: CameraName | None = None
         for attempt in range(_ATTEMPTS):
             if check is not None:
                 check()
@@ -106,9 +107,9 @@ class TriggeredPairs:
         if self._pairing is not None:
             self._pairing.finish()
 
-    def _fire(self) -> dict[Cam, int]:
+    def _fire(self) -> dict[CameraName, int]:
         readers = {cam: self._units[cam].reader for cam in CAMERAS}  # neither is fired when one is lost
-        numbers: dict[Cam, int] = {}
+        numbers: dict[CameraName, int] = {}
         for cam, reader in readers.items():
             number = reader.trigger()
             if number is None:
@@ -130,7 +131,7 @@ class TriggeredPairs:
         self._pairing.triggered(numbers["cam1"] - self._origin + 1)
         return numbers
 
-    def _collect(self, cam: Cam, number: int, fired: float, periods: float) -> tuple[Pair | None, bool]:
+    def _collect(self, cam: CameraName, number: int, fired: float, periods: float) -> tuple[Pair | None, bool]:
         """Take a camera's frames up to that of one trigger; whether the last of them was incomplete."""
         unit, pairing = self._units[cam], self._pairing
         assert pairing is not None
@@ -187,7 +188,7 @@ class StreamedPairs:
         for thread in self._threads:
             thread.start()
 
-    def _pump(self, cam: Cam) -> None:
+    def _pump(self, cam: CameraName) -> None:
         unit = self._units[cam]
         try:
             reader = unit.reader

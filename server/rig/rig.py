@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import CameraError, DeviceError, InputError, StageError, StateError, StereorigError
+from core.names import CAMERAS, CameraName
 from drivers.cameras.protocol import CameraSettings
 from drivers.stages.protocol import MoveResult
 from server.base.problem import problem_of
-from server.config.rig_file import CameraName, RigConfig
+from server.config.rig_file import RigConfig
 from server.jobs.hardware import HardwareGate
 from server.rig.build import Devices, first_settings, open_devices
-from server.rig.cameras import CAMERAS, Cam, CameraPair, PairShot
+from server.rig.cameras import CameraPair, PairShot
 from server.rig.reconnect import ReconnectWatch
 from server.rig.shared import SharedReading
 from server.rig.stage_controls import StageControls
@@ -113,11 +114,11 @@ class Rig:
             scene = dict(self.scene)
             self.set_scene(scene.pop("scene"), load=scene.pop("load"), **scene)
 
-    def _lost(self, cam: Cam, error: CameraError) -> None:
+    def _lost(self, cam: CameraName, error: CameraError) -> None:
         _log.warning("%s was lost: %s", cam, error)
         self._announce("camera", {"camera": cam, "state": "lost", "problem": problem_of(error)})
 
-    def _came_back(self, cam: Cam) -> None:
+    def _came_back(self, cam: CameraName) -> None:
         _log.warning("%s is connected again", cam)
         self._announce("camera", {"camera": cam, "state": "connected"})
 

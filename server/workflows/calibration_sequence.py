@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from core.errors import CalibrationInputError
+from core.names import CAMERAS
 from server.config.rig_file import RigConfig
 from server.jobs.job import Job
-from server.rig.cameras import CAMERAS
 from server.store.index import calibration_entry
 from server.worker.tasks import FitTask, fit_calibration
 from server.workflows.service import Service

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from core.errors import ImageError
+from core.names import CAMERAS
 from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode_image, encode_tiff
 from server.results.quality import image_quality, pair_quality
 from server.rig import Rig
-from server.rig.cameras import CAMERAS, PairShot
+from server.rig.cameras import PairShot
 from server.store.folder import now_utc
 from server.store.index import step_entry
 from server.workflows.camera_identity import check_same_cameras

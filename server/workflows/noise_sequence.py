@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from core.names import CAMERAS
 from server.jobs.job import Job
-from server.rig.cameras import CAMERAS
 from server.worker.tasks import NoiseTask, fit_noise
 from server.workflows.service import Service
 from server.workflows.waiting import run_task

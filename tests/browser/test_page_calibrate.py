@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from core.names import CameraName
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from sim.rig import CameraName
 from tests.support.page_bench import Watched, watched
 from tests.support.service_rig import SMALL, wait_for_job, wait_for_rig
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from sim.rig import CAMERA_NAMES, SimRig
+from core.names import CAMERAS
+from sim.rig import SimRig
 from tests.support.requirements import ROOT
 
 SIZE = (230, 200)
@@ -20,7 +21,7 @@ ROI = "50,45,180,155"
 def small_rig() -> SimRig:
     """The paper's rig with smaller sensors: the same rays, fewer pixels."""
     tables = tomllib.loads((ROOT / "config" / "sim_paper.toml").read_text())
-    for name in CAMERA_NAMES:
+    for name in CAMERAS:
         tables[name]["image_size_px"] = list(SIZE)
         tables["sim"][name] |= {"cx_px": SIZE[0] / 2 + 3.0, "cy_px": SIZE[1] / 2 - 2.0}
     return SimRig.from_dict(tables)

@@ -1,5 +1,6 @@
 """Wire models: what goes over HTTP, apart from what the code works with inside."""
 
+from core.names import CameraName
 from server.api.models.analyses import (
     AnalysisAccepted,
     AnalysisList,
@@ -62,7 +63,7 @@ from server.api.models.tests import (
     WatchReply,
     WatchRequest,
 )
-from server.base.models import CameraName, Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
+from server.base.models import Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
 
 __all__ = [
     "Accepted",

@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
+from core.names import CameraName
 from core.settings import Real, Whole
-from server.base.models import AxisValues, CameraName, Number, Reply, Request, any_of, one_of
+from server.base.models import AxisValues, Number, Reply, Request, any_of, one_of
 
 
 class SettingsPatch(Request):

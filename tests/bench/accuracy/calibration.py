@@ -7,7 +7,6 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
 from core.calibration.aspect import measure_aspect
 from core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
@@ -16,15 +15,15 @@ from core.cameras.camera import Camera, RigidTransform, rotation_from_angles
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.grid import Localiser, detect_grid
+from core.names import CAMERAS
 from core.target import GridTarget
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, SimRig
+from sim.rig import SimRig
 from sim.world import SimWorld
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 POSITIONS = (0.0, 5.0, 2.0, 4.0)
 HELD_OUT = (2.0, 4.0)
 NODE_SEEDS = (11, 12, 13)
@@ -49,7 +48,7 @@ def _calibrate(
     images = []
     for dz in POSITIONS:
         stage[1] = stage[2] = dz
-        for name in CAMERA_NAMES:
+        for name in CAMERAS:
             shots = [world.expose(name, exposure_ms=10.0, rng=rng) for _ in range(frames)]
             mean = shots[0] if frames == 1 else np.mean(shots, axis=0, dtype=np.float32)
             images.append(ImageOfTarget(name, dz, mean))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 from sim.render import RenderOptions, material_points, render
@@ -17,8 +18,6 @@ from sim.texture import Texture, speckle
 from tests.support.requirements import ROOT
 
 DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
