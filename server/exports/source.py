@@ -84,7 +84,7 @@ def source_of(folder: Path, files: list[Path]) -> Source:
 
 def _mask(folder: Path, head: dict[str, Any]) -> Path | None:
     """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
-    named = head["settings"].get("mask") if isinstance(head.get("settings"), dict) else None
+    named = head["settings"].get("region", {}).get("mask")
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):
         if path.is_file():
             return path

@@ -17,12 +17,12 @@ from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.files import sha256_of
 from server.formats.results.netcdf import opened
+from server.formats.results.settings import current_inputs, current_settings
 from server.formats.version import software_version
 from server.results.reader import Variable
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
 _GRID = ("row", "col")
-_CALIBRATION = ("calibration", "calibration.json")  # as stereorig measure and the service name it
 
 
 @dataclass(frozen=True)
@@ -171,6 +171,8 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
         cuts = from_arrays(points, np.asarray(data.variables["cut_line"][...], dtype=np.int32))
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
+    for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
+        attributes[name] = json.dumps(current(json.loads(attributes.get(name, "{}"))))
     return StepResult(int(attributes.get("step", number_of(path))), variables, attributes, cuts)
 
 
@@ -218,8 +220,8 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
 
 def calibration_of(step: StepResult) -> str | None:
     """Return the SHA-256 of the calibration that a step was measured with; None where the file does not say."""
-    inputs = json.loads(step.attributes.get("inputs_sha256", "{}"))
-    return next((str(inputs[name]) for name in _CALIBRATION if name in inputs), None)
+    inputs: dict[str, str] = json.loads(step.attributes["inputs_sha256"])
+    return inputs.get("calibration")
 
 
 def notes_of(document: dict[str, Any]) -> list[str]:

@@ -13,12 +13,14 @@ from concurrent.futures import Future
 from typing import Any
 
 from core.errors import Cancelled, FileFormatError, MeasurementError, StereorigError, StorageError
-from core.settings import StoredSettings
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
 from server.formats.files import sha256_of
-from server.formats.results.settings import current_settings
+from server.formats.results.settings import stored_settings
+from server.formats.results.summary import SequenceSummary
+from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
+from server.store.folder import now_utc
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
@@ -205,7 +207,8 @@ class AnalysisRun:
     def _note(self, job: Job, n: int, summary: dict[str, Any], started: float) -> None:
         """A step is finished: durable first, then told."""
         service, analysis_id = self._service, self._document["id"]
-        summary = without_nan({"n": n, **summary, "wall_s": round(time.monotonic() - started, 3)})
+        seconds = round(time.monotonic() - started, 3)
+        summary = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
         service.tests.put_step_summary(self._test_id, analysis_id, n, summary)
         self._summaries[n] = summary
         self._done[n] = service.tests.step(self._test_id, n)
@@ -261,7 +264,7 @@ def task_of(
             )
     if sha256_of(service.tests.calibration_file(test_id)) != document["inputs"]["calibration_sha256"]:
         raise calibration_changed(f"of test {test_id}, on which the analysis rests,")
-    settings = StoredSettings.model_validate(current_settings(document["settings"]))
+    settings = stored_settings(document["settings"])
     earlier: dict[int, StepFiles] = {}
     if displacement and settings.reference_update != "never":
         earlier = {k: step for k, step in done.items() if k != reference}
@@ -298,16 +301,20 @@ def images_of(n: int, step: StepFiles) -> StepImages:
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
     """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
-    found = job.result or {}
-    document = {
-        "analysis_id": analysis_id,
-        "state": state,
-        "job_id": job.id,
-        "problem": job.problem,
-        "steps": found.get("steps", []),
-        "steps_failed": found.get("steps_failed", {}),
-    }
-    service.tests.put_summary(test_id, analysis_id, document)
+    found, document = job.result or {}, service.tests.analysis(test_id, analysis_id)
+    steps = found.get("steps", [])
+    summary = SequenceSummary(
+        state=state,
+        software_version=software_version(),
+        created=now_utc(),
+        calibration={"sha256": document["inputs"]["calibration_sha256"]},
+        settings=document["settings"],
+        seconds=round(sum(step.get("wall_s", 0.0) for step in steps), 3),
+        steps=steps,
+        steps_failed=found.get("steps_failed", {}),
+    ).document()
+    summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": job.problem}
+    service.tests.put_summary(test_id, analysis_id, summary)
     if state == "succeeded":
         service.tests.drop_starts(test_id, analysis_id)
     else:

@@ -28,8 +28,7 @@ from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.files import make_folder, sha256_of, write_bytes
 from server.formats.images import read_mask
 from server.formats.noise_json import LoadedNoise
-from server.formats.results.layout import FORMAT_VERSION
-from server.formats.results.summary import to_json
+from server.formats.results.summary import SequenceSummary, to_json
 from server.formats.version import software_version
 from server.worker.tasks import StepImages
 
@@ -93,21 +92,19 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
                 runner.measure(images)
         steps = written.finish()
     seconds = round(time.monotonic() - started, 3)
-    summary = {
-        "format_version": FORMAT_VERSION,
-        "state": "succeeded",
-        "software_version": software_version(),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "calibration": {
+    summary = SequenceSummary(
+        state="succeeded",
+        software_version=software_version(),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        calibration={
             "file": str(job.calibration_file),
             "sha256": job.calibration.sha256,
             "source": job.calibration.source,
         },
-        "settings": job.settings.model_dump(),
-        "seconds": seconds,
-        "steps": steps,
-        "steps_failed": {},
-    }
+        settings=job.settings.model_dump(),
+        seconds=seconds,
+        steps=steps,
+    ).document()
     write_bytes(job.out / "summary.json", to_json(summary))
     progress.note(f"{len(steps)} steps in {duration(seconds)}: {job.out / 'summary.json'}")
     return summary

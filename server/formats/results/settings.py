@@ -11,22 +11,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from core.settings import StoredSettings
+
 _INPUTS = {"calibration.json": "calibration", "noise.json": "noise", "step_cam1": "cam1", "step_cam2": "cam2"}
-_REGION = ("rectangle", "polygon", "cracks", "holes", "mask")
+_CUTS_AND_MASK = ("cracks", "holes", "mask")
 #: of settings that came later, what measurements did before
-_BEFORE = {"reference_update": "never", "prefilter_px": 0.0, "smoothing_window": None, "start_from": "previous"}
+_BEFORE = {"reference_update": "never", "strain": None}
 
 
 def current_settings(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored settings in today's form; see :class:`core.settings.StoredSettings`."""
-    settings = {name: value for name, value in document.items() if name not in ("roi", *_REGION)}
-    region = dict(document.get("region") or {})
-    if "roi" in document:
-        region = {"rectangle": document["roi"], **{name: document.get(name) for name in _REGION[2:]}}
-    if region:
-        cuts = {name: region.get(name) or [] for name in ("cracks", "holes")}
-        settings["region"] = {**dict.fromkeys(_REGION), **region, **cuts}
-    return {**_BEFORE, **settings}
+    """Return a result's settings in today's form."""
+    if "roi" not in document:
+        return dict(document)
+    region = {"rectangle": document["roi"], **{name: document.get(name) for name in _CUTS_AND_MASK}}
+    settings = {name: value for name, value in document.items() if name not in ("roi", *_CUTS_AND_MASK)}
+    return {**settings, "region": region}
+
+
+def stored_settings(document: Mapping[str, Any]) -> StoredSettings:
+    """Return the settings of an analysis, whichever version began it."""
+    return StoredSettings.model_validate({**_BEFORE, **current_settings(document)})
 
 
 def current_inputs(inputs: Mapping[str, str]) -> dict[str, str]:
