@@ -19,7 +19,7 @@ from core.names import CAMERAS
 from core.target import GridTarget
 from server.formats.calibrations.native import calibration_content
 from server.formats.images import GrayImage, read_image
-from server.formats.results.writing import written_dataset
+from server.formats.results.netcdf import written_dataset
 from server.formats.version import software_version
 from server.store.calibrations import REJECTED
 from server.store.durable import write_json

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from server.formats.calibrations.dice_xml import looks_like_dice, parse_dice_xml
 from server.formats.calibrations.imported_pair import invalid, unreadable
 from server.formats.calibrations.matchid_caldat import looks_like_caldat, parse_caldat
 from server.formats.calibrations.opencv_yaml import looks_like_opencv, parse_opencv
+from server.formats.calibrations.record import CalibrationRecord
 from server.formats.calibrations.vic3d_xml import looks_like_vic3d, parse_vic3d
 
 _MAX_BYTES = 64 << 20
@@ -48,6 +50,11 @@ class LoadedCalibration:
     source: str
     sha256: str
     details: dict[str, Any]
+
+    @cached_property
+    def record(self) -> CalibrationRecord:
+        """How the cameras were calibrated; empty where the file does not say."""
+        return CalibrationRecord.model_validate(self.details)
 
 
 IMPORTED = "imported"
