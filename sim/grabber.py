@@ -10,16 +10,15 @@ import threading
 import time
 import weakref
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from core.errors import CameraError
-from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
+from drivers.cameras.protocol import CameraDescription, CameraName, CameraSettings, Frame, FrameStatus, Pixels
 
 _NICE = 5
 
-CameraName = Literal["cam1", "cam2"]
 
 # A trigger call within this time of another camera's belongs to the same pulse
 _SAME_PULSE_S = 1.0

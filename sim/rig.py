@@ -11,16 +11,14 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
 from core.errors import InputError
+from drivers.cameras.protocol import CAMERAS, CameraName
 from sim.sensor import Lighting, Sensor
-
-CameraName = Literal["cam1", "cam2"]
-CAMERA_NAMES: tuple[CameraName, CameraName] = ("cam1", "cam2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +101,7 @@ class SimRig:
 
     def camera(self, name: CameraName) -> SimCamera:
         """Return one of the two by name."""
-        if name not in CAMERA_NAMES:
+        if name not in CAMERAS:
             raise InputError(f"There is no camera {name!r}.", code="unknown_camera", remedy="Use cam1 or cam2.")
         return self.cam1 if name == "cam1" else self.cam2
 

@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
+from drivers.cameras.protocol import CAMERAS, CameraName
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, CameraName, SimCamera, SimRig
+from sim.rig import SimCamera, SimRig
 from sim.scene import Scene
 from sim.truth import Truth, truth_at
 
@@ -51,10 +52,10 @@ class SimWorld:
         self._position_mm = position_mm
         self._options = RenderOptions(blur_px=rig.blur_px, threads=threads)
         self._state = threading.Lock()  # scene, tilts and cache; never held while rendering
-        self._rendering = {name: threading.Lock() for name in CAMERA_NAMES}  # so that nobody renders the same twice
+        self._rendering = {name: threading.Lock() for name in CAMERAS}  # so that nobody renders the same twice
         self._scene = make_scene(rig, "grid")
         self._scene_key: tuple[Any, ...] = ("grid", 0.0)
-        self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERA_NAMES}
+        self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERAS}
         self._cache: OrderedDict[tuple[Any, ...], NDArray[np.float32]] = OrderedDict()
 
     @property
@@ -89,7 +90,7 @@ class SimWorld:
 
     def true_pair(self) -> StereoPair:
         """Return the true pair with both stages at their zero: what a calibration ought to find."""
-        return StereoPair(*(self._rig.camera(name).camera for name in CAMERA_NAMES))
+        return StereoPair(*(self._rig.camera(name).camera for name in CAMERAS))
 
     def truth(
         self, xy_px: ArrayLike, name: str, *, load: float = 0.0, reference_load: float = 0.0, **params: Any

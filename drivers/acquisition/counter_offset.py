@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from drivers.acquisition.pairing import Cam, NumberPairing, Pair, PairingAccount, TimePairing
-from drivers.cameras.protocol import Frame
+from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
+from drivers.cameras.protocol import CameraName, Frame
 
 
 class AlignedPairing:
@@ -43,7 +43,7 @@ class AlignedPairing:
         now = self._finder.account if self._numbers is None else self._numbers.account
         return _sum(self._earlier, now)
 
-    def feed(self, cam: Cam, frame: Frame) -> Pair | None:
+    def feed(self, cam: CameraName, frame: Frame) -> Pair | None:
         """Take a frame, complete or not, in the order of its camera; returns a pair when it makes one."""
         if self._numbers is None:
             pair = self._finder.feed(cam, frame)

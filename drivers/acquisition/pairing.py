@@ -15,10 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from core.errors import CameraError
-from drivers.cameras.protocol import Frame, FrameStatus
-
-Cam = Literal["cam1", "cam2"]
-CAMS: tuple[Cam, Cam] = ("cam1", "cam2")
+from drivers.cameras.protocol import CAMERAS, CameraName, Frame, FrameStatus
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +39,9 @@ class Pair:
     number: int
     skew_ms: float
     max_skew_ms: float
+
+    def __getitem__(self, cam: CameraName) -> Frame:
+        return self.cam1 if cam == "cam1" else self.cam2
 
     @property
     def accepted(self) -> bool:
@@ -82,7 +82,7 @@ class PairingAccount:
 @dataclass(eq=False)
 class _Slot:
     number: int
-    frames: dict[Cam, Frame]
+    frames: dict[CameraName, Frame]
 
     def fate(self) -> str:
         if any(frame.status is not FrameStatus.OK for frame in self.frames.values()):
@@ -114,7 +114,7 @@ class _Pairing:
             return frame.device_ns
         return frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
 
-    def _pair(self, frames: Mapping[Cam, Frame], number: int) -> Pair:
+    def _pair(self, frames: Mapping[CameraName, Frame], number: int) -> Pair:
         one, two = frames["cam1"], frames["cam2"]
         skew = (self._time_ns(two) - self._time_ns(one)) / 1e6
         pair = Pair(one, two, number, skew, self._max_skew_ms)
@@ -151,12 +151,12 @@ class NumberPairing(_Pairing):
         by: Literal["trigger", "frame"],
         max_skew_ms: float,
         common_clock: bool,
-        origin: Mapping[Cam, int] | None = None,
+        origin: Mapping[CameraName, int] | None = None,
         depth: int = 8,
     ) -> None:
         super().__init__(max_skew_ms=max_skew_ms, common_clock=common_clock)
         self._by = by
-        self._origin = dict(origin) if origin is not None else dict.fromkeys(CAMS, 0)
+        self._origin = dict(origin) if origin is not None else dict.fromkeys(CAMERAS, 0)
         self._depth = depth
         self._open: dict[int, _Slot] = {}
         self._done: set[int] = set()
@@ -167,7 +167,7 @@ class NumberPairing(_Pairing):
         """Say that ``count`` triggers were fired up to now; those whose frames never come are then known too."""
         self._see(count)
 
-    def feed(self, cam: Cam, frame: Frame) -> Pair | None:
+    def feed(self, cam: CameraName, frame: Frame) -> Pair | None:
         """Take a frame, complete or not; returns a pair when it makes one."""
         raw = frame.trigger if self._by == "trigger" else frame.sequence
         if raw is None:
@@ -187,7 +187,7 @@ class NumberPairing(_Pairing):
             self._count("late")
             return None
         slot.frames[cam] = frame
-        if len(slot.frames) < len(CAMS):
+        if len(slot.frames) < len(CAMERAS):
             return None
         pair: Pair | None = None
         if slot.fate() == "paired":
@@ -244,12 +244,12 @@ class TimePairing(_Pairing):
             raise ValueError(f"period_ms must be positive, got {period_ms}")
         self._window_ns = round(period_ms * 1e6 / 2)
         self._depth = depth
-        self._waiting: dict[Cam, list[Frame]] = {"cam1": [], "cam2": []}
+        self._waiting: dict[CameraName, list[Frame]] = {"cam1": [], "cam2": []}
         self._number = 0
 
-    def feed(self, cam: Cam, frame: Frame) -> Pair | None:
+    def feed(self, cam: CameraName, frame: Frame) -> Pair | None:
         """Take a frame, complete or not, in the order of its camera; returns a pair when it makes one."""
-        other: Cam = "cam2" if cam == "cam1" else "cam1"
+        other: CameraName = "cam2" if cam == "cam1" else "cam1"
         now = self._time_ns(frame)
         # the other camera's frames are in order: what lies before this frame's window can find no partner any more
         while self._waiting[other] and self._time_ns(self._waiting[other][0]) < now - self._window_ns:
@@ -274,12 +274,12 @@ class TimePairing(_Pairing):
 
     def finish(self) -> PairingAccount:
         """Close what still waits and return what became of each."""
-        for cam in CAMS:
+        for cam in CAMERAS:
             while self._waiting[cam]:
                 self._close(cam)
         return self.account
 
-    def _close(self, cam: Cam) -> None:
+    def _close(self, cam: CameraName) -> None:
         frame = self._waiting[cam].pop(0)
         self._count(_Slot(self._number, {cam: frame}).fate())
         self._number += 1

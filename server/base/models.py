@@ -96,7 +96,6 @@ Timestamp = Annotated[
     PlainSerializer(utc_text, return_type=str),
     Field(examples=["2026-03-01T12:00:00.250Z"]),
 ]
-CameraName = Literal["cam1", "cam2"]
 Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from core.errors import FileFormatError
+from drivers.cameras.protocol import CameraName
 from server.config.camera_facts import Above, CameraFacts, LensFacts, Text
 
 _log = logging.getLogger("stereorig.config")
@@ -21,7 +22,6 @@ _log = logging.getLogger("stereorig.config")
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Whole = Annotated[int, Field(ge=0, le=65535)]
-CameraName = Literal["cam1", "cam2"]
 
 # Skew may shift one image against the other by this much, a third of what correlation scatters by
 SKEW_PX = 0.01

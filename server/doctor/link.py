@@ -5,9 +5,10 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
+from drivers.acquisition.unit import CameraUnit
+from drivers.cameras.protocol import CAMERAS, CameraName
 from server.doctor.cameras import Watch
 from server.doctor.report import Notebook
-from server.rig.unit import CAMERAS, Cam, CameraUnit
 
 #: counts of the drivers that grow only when something goes wrong on the way
 _TROUBLES = (
@@ -55,14 +56,14 @@ def check_link(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
 
 def check_network(
     book: Notebook,
-    units: dict[Cam, CameraUnit],
+    units: dict[CameraName, CameraUnit],
     seen: Watch,
     *,
     proc: Path = Path("/proc"),
     sys: Path = Path("/sys/class/net"),
 ) -> None:
     """Look at the interfaces that GigE Vision cameras hang on, and at the buffers for their packets."""
-    on: dict[str, list[Cam]] = {}
+    on: dict[str, list[CameraName]] = {}
     for cam in CAMERAS:
         address = units[cam].description.extra.get("address", "")
         if units[cam].description.extra.get("protocol") == "GigE Vision" and address:
@@ -98,7 +99,7 @@ def interface_of(address: str, proc: Path) -> str | None:
 
 
 def _check_interface(
-    book: Notebook, name: str, cams: list[Cam], units: dict[Cam, CameraUnit], seen: Watch, sys: Path
+    book: Notebook, name: str, cams: list[CameraName], units: dict[CameraName, CameraUnit], seen: Watch, sys: Path
 ) -> None:
     speed, mtu = _number(sys / name / "speed"), _number(sys / name / "mtu")
     mib_per_s = sum(seen.bytes_per_s(cam) for cam in cams) / 2**20

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.errors import StereorigError
+from drivers.cameras.protocol import CAMERAS
 from drivers.stages.serial_ports import port_problem
 from server.config.rig_file import RigConfig, load_config
 from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch
@@ -17,7 +18,6 @@ from server.doctor.report import Check, Notebook, Report
 from server.doctor.stage import check_stage
 from server.formats.version import software_version
 from server.rig.build import Devices, check_config, first_settings, make_unit, open_configured_stage, open_devices
-from server.rig.cameras import CAMERAS
 from server.rig.devices import DeviceFinder, DeviceListing, is_called
 
 

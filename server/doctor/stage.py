@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 
+from drivers.cameras.protocol import CAMERAS
 from drivers.stages.protocol import AxisState, Stage
 from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile
-from server.rig.cameras import CAMERAS
 
 _QUERIES = 50
 _STOPS = 20

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import CameraError, StageError
-from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber
+from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
+from drivers.acquisition.unit import CameraUnit
+from drivers.cameras.protocol import CAMERAS, CameraName, CameraOptions, CameraSettings, FrameGrabber
 from drivers.registry import make_camera, open_stage
 from drivers.stages.protocol import AxisOptions, Stage
-from server.config.rig_file import CameraName, RigConfig
-from server.rig.cameras import CAMERAS, Cam, CameraPair, CameraUnit
-from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
+from server.config.rig_file import RigConfig
+from server.rig.cameras import CameraPair
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
@@ -24,7 +25,7 @@ from sim.grabber import SimFrameGrabber
 from sim.rig import SimRig
 from sim.world import SimWorld
 
-OnLost = Callable[[Cam, CameraError], None]
+OnLost = Callable[[CameraName, CameraError], None]
 
 _RENDER_S_PER_PIXEL = 100e-6
 # The first view also compiles the renderer, behind whatever else this process compiles: numba does one at a time
@@ -99,7 +100,7 @@ def open_devices(
         if config.rig.kind == "simulated":
             where = reader if controller is None else controller.true_position_mm
             world = SimWorld(SimRig.from_dict(_tables(config)), where)
-        units: dict[Cam, CameraUnit] = {}
+        units: dict[CameraName, CameraUnit] = {}
         for cam in CAMERAS:
             unit = make_unit(config, cam, world, on_lost)
             stack.callback(unit.release)
@@ -112,6 +113,7 @@ def open_devices(
             skew_is_set=config.rig.max_skew_ms is not None,
         )
         stack.callback(pair.close)
+        pair.start()
         stage = open_configured_stage(config, url, record=record, dynamics=dynamics)
         stack.callback(stage.close)
         reader.stage = stage
@@ -134,7 +136,7 @@ def make_unit(
     )
 
 
-def _pair_source(config: RigConfig, units: Mapping[Cam, CameraUnit]) -> PairSource:
+def _pair_source(config: RigConfig, units: Mapping[CameraName, CameraUnit]) -> PairSource:
     section = config.rig
     if section.trigger == "software":
         return TriggeredPairs(units, max_skew_ms=section.skew_bound_ms)

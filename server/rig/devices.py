@@ -17,11 +17,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.errors import StereorigError
-from drivers.cameras.protocol import FoundDevice
+from drivers.cameras.protocol import CAMERAS, FoundDevice
 from drivers.registry import CAMERA_DRIVERS, discover_cameras
 from drivers.stages.serial_ports import discover_ports
 from server.rig import Rig
-from server.rig.cameras import CAMERAS
 
 #: name of the search for serial ports among those of the camera drivers
 SERIAL = "serial"
@@ -113,7 +112,9 @@ class _Search:
         self._found: list[FoundDevice] = []
         self._error: Exception | None = None
         self.done = threading.Event()
-        threading.Thread(target=self._run, name=f"search for {name}", daemon=True).start()
+
+    def start(self) -> None:
+        threading.Thread(target=self._run, name=f"search for {self.name}", daemon=True).start()
 
     def _run(self) -> None:
         try:
@@ -191,6 +192,7 @@ class DeviceFinder:
         if running is None or running.done.is_set():
             look = self._ports if name == SERIAL else lambda: self._discover(name)
             running = self._searches[name] = _Search(name, look)
+            running.start()
         return running
 
 

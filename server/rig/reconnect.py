@@ -7,7 +7,8 @@ import threading
 from collections.abc import Callable
 
 from core.errors import CameraError
-from server.rig.cameras import Cam, CameraPair
+from drivers.cameras.protocol import CameraName
+from server.rig.cameras import CameraPair
 
 _log = logging.getLogger("stereorig.rig")
 # A camera that is back must work within three seconds, of which finding and setting it takes one or two
@@ -25,11 +26,14 @@ class ReconnectWatch:
         Called when one works again.
     """
 
-    def __init__(self, pair: CameraPair, came_back: Callable[[Cam], None]) -> None:
+    def __init__(self, pair: CameraPair, came_back: Callable[[CameraName], None]) -> None:
         self._pair = pair
         self._came_back = came_back
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="reconnect", daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
         self._thread.start()
 
     def stop(self) -> None:

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import CameraError, DeviceError, InputError, StageError, StateError, StereorigError
-from drivers.cameras.protocol import CameraSettings
+from drivers.cameras.protocol import CAMERAS, CameraName, CameraSettings
 from drivers.stages.protocol import MoveResult
 from server.base.problem import problem_of
-from server.config.rig_file import CameraName, RigConfig
+from server.config.rig_file import RigConfig
 from server.jobs.hardware import HardwareGate
 from server.rig.build import Devices, first_settings, open_devices
-from server.rig.cameras import CAMERAS, Cam, CameraPair, PairShot
+from server.rig.cameras import CameraPair
 from server.rig.reconnect import ReconnectWatch
 from server.rig.shared import SharedReading
 from server.rig.stage_controls import StageControls
@@ -79,6 +79,7 @@ class Rig:
             self.controls.collect(self._devices.stage)
             if self.config.rig.auto_reconnect:
                 self._watch = ReconnectWatch(self._devices.pair, self._came_back)
+                self._watch.start()
             if self._devices.world is not None and self.scene is None:
                 self.scene = {"scene": "grid", "load": 0.0}
             if self.config.home_at_start:
@@ -113,11 +114,11 @@ class Rig:
             scene = dict(self.scene)
             self.set_scene(scene.pop("scene"), load=scene.pop("load"), **scene)
 
-    def _lost(self, cam: Cam, error: CameraError) -> None:
+    def _lost(self, cam: CameraName, error: CameraError) -> None:
         _log.warning("%s was lost: %s", cam, error)
         self._announce("camera", {"camera": cam, "state": "lost", "problem": problem_of(error)})
 
-    def _came_back(self, cam: Cam) -> None:
+    def _came_back(self, cam: CameraName) -> None:
         _log.warning("%s is connected again", cam)
         self._announce("camera", {"camera": cam, "state": "connected"})
 
@@ -270,10 +271,6 @@ class Rig:
         taken = self.gate.call(lambda: pair.configure(cam, settings))
         self._settings[cam] = pair.units[cam].wanted
         return taken
-
-    def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
-        """Capture ``frames`` pairs; call on the owner thread, with the hold."""
-        return self.pair.shoot(frames, check)
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> dict[str, Any]:
         """Put something else before a simulated rig's cameras."""

@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from core.errors import CalibrationInputError
+from drivers.cameras.protocol import CAMERAS
 from server.config.rig_file import RigConfig
 from server.jobs.job import Job
-from server.rig.cameras import CAMERAS
 from server.store.index import calibration_entry
 from server.worker.tasks import FitTask, fit_calibration
 from server.workflows.service import Service
@@ -93,7 +93,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
         job.progress("views", index, len(stops))
         moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)))
         job.check()
-        shot = rig.shoot(plan.frames, job.check)
+        shot = rig.pair.shoot(plan.frames, job.check)
         role = _role(plan, dz, last=index == len(stops) - 1)
         for cam in CAMERAS:
             axis = rig.config.camera(cam).stage_axis

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from drivers.cameras.protocol import CameraName
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from sim.rig import CameraName
 from tests.service.test_service_chain import SMALL
 from tests.support.page_bench import Watched, watched
 from tests.support.service_rig import wait_for_job, wait_for_rig

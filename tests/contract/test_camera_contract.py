@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from core.errors import CameraError
-from drivers.acquisition.pairing import CAMS, TimePairing
-from drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, TriggerMode
+from drivers.acquisition.pairing import TimePairing
+from drivers.cameras.protocol import CAMERAS, CameraSettings, FrameGrabber, FrameStatus, TriggerMode
 from tests.support.camera_bench import (
     LOSSES,
     SPOILS,
@@ -468,7 +468,7 @@ def test_frames_of_both_cameras_make_pairs_by_time_with_their_skew(bench: Camera
             end = time.monotonic() + 10.0
             while len(pairs) < 10:
                 assert time.monotonic() < end
-                for cam in CAMS:
+                for cam in CAMERAS:
                     frame = readers[cam].take(0.05)
                     made = None if frame is None else pairing.feed(cam, frame)
                     if made is not None:

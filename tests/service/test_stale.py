@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from core.errors import FileFormatError
+from drivers.cameras.protocol import CAMERAS
 from server.cli import main
 from server.formats.images import write_image
 from server.workflows import analysis_start
@@ -24,7 +25,7 @@ from server.workflows.analysis_run import task_of
 from server.workflows.service import Service
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, SimRig
+from sim.rig import SimRig
 from tests.service.cli.test_cli_measure import rig as rig
 from tests.support.service_rig import wait_for_job
 
@@ -35,7 +36,7 @@ ARGUMENTS = ["--roi", "60,60,120,110", "--subset", "21", "--strain", "off"]
 
 def commit(folder: Path) -> None:
     """Write a step's record, last, as the service does."""
-    sha256 = {cam: hashlib.sha256((folder / f"{cam}.tif").read_bytes()).hexdigest() for cam in CAMERA_NAMES}
+    sha256 = {cam: hashlib.sha256((folder / f"{cam}.tif").read_bytes()).hexdigest() for cam in CAMERAS}
     record = {"n": int(folder.name), "label": "", "load_n": None, "source": "import", "sha256": sha256}
     (folder / "step.json").write_text(json.dumps(record))
 
@@ -49,12 +50,12 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig: SimRig) -> Path:
         step = test / "steps" / f"{n:04d}"
         step.mkdir(parents=True)
         scene = make_scene(rig, "block", load=load)
-        for name in CAMERA_NAMES:
+        for name in CAMERAS:
             sim = rig.camera(name)
             seen = render(scene, sim.camera, sim.size_px, options=RenderOptions(blur_px=rig.blur_px, threads=1))
             write_image(step / f"{name}.tif", sim.sensor.expose(sim.lighting.apply(seen), rng, exposure=1.0))
         commit(step)
-    calibration = json.dumps({name: rig.camera(name).camera.paper_parameters() for name in CAMERA_NAMES})
+    calibration = json.dumps({name: rig.camera(name).camera.paper_parameters() for name in CAMERAS})
     (test / "calibration.json").write_text(calibration)
     record = {"id": test.name, "calibration_sha256": hashlib.sha256(calibration.encode()).hexdigest()}
     (test / "test.json").write_text(json.dumps(record))
@@ -85,7 +86,7 @@ def spoil(test: Path, what: str) -> None:
         shutil.copy2(steps / "0003" / "cam2.tif", steps / "0002" / "cam2.tif")
         commit(steps / "0002")
     elif what == "the reference was taken again":
-        for cam in CAMERA_NAMES:
+        for cam in CAMERAS:
             shutil.copy2(steps / "0001" / f"{cam}.tif", steps / "0000" / f"{cam}.tif")
         commit(steps / "0000")
     elif what == "the calibration was replaced":
@@ -305,7 +306,7 @@ def test_results_elsewhere_know_their_calibration_and_images(taken: Path, tmp_pa
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     for n in (0, 3):
-        for cam in CAMERA_NAMES:
+        for cam in CAMERAS:
             shutil.copy2(taken / "steps" / f"{n:04d}" / f"{cam}.tif", folder / f"{cam}_{n}.tif")
     shutil.copy2(taken / "calibration.json", folder)
     assert (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from drivers.cameras.protocol import CameraOptions, FrameGrabber
+from drivers.cameras.protocol import CameraName, CameraOptions, FrameGrabber
 from drivers.registry import make_camera
-from tests.support.camera_bench import Cam, CameraBench
+from tests.support.camera_bench import CameraBench
 from tests.support.fake_gige import FakeCamera, small_sensor_xml
 
 
@@ -24,29 +24,29 @@ class AravisBench(CameraBench):
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="stereorig-gige-")
         xml = small_sensor_xml()
-        self.cameras: dict[Cam, FakeCamera] = {
+        self.cameras: dict[CameraName, FakeCamera] = {
             "cam1": FakeCamera("a", xml, Path(self._folder.name)),
             "cam2": FakeCamera("b", xml, Path(self._folder.name)),
         }
         self._made: list[FrameGrabber] = []
-        self._how: dict[Cam, str] = {}
+        self._how: dict[CameraName, str] = {}
 
-    def make(self, cam: Cam) -> FrameGrabber:
+    def make(self, cam: CameraName) -> FrameGrabber:
         options = CameraOptions(device=self.cameras[cam].device, trigger_source="Line0")
         self._made.append(make_camera("aravis", options))
         return self._made[-1]
 
-    def lose(self, cam: Cam, how: str) -> None:
+    def lose(self, cam: CameraName, how: str) -> None:
         camera = self.cameras[cam]
         self._how[cam] = how
         {"killed": camera.kill, "stopped": camera.stop, "cable": camera.unplug}[how]()
 
-    def bring_back(self, cam: Cam) -> None:
+    def bring_back(self, cam: CameraName) -> None:
         camera = self.cameras[cam]
         {"killed": camera.start, "stopped": camera.resume, "cable": camera.plug}[self._how.pop(cam)]()
         camera.await_answer()
 
-    def spoil(self, cam: Cam, what: str, grabber: FrameGrabber) -> None:
+    def spoil(self, cam: CameraName, what: str, grabber: FrameGrabber) -> None:
         if what == "incomplete":
             self.cameras[cam].narrow()
         else:  # it begins to count at 65400, so that it wraps by itself soon

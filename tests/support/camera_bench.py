@@ -11,17 +11,14 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Literal
 
 import numpy as np
 
 from core.errors import CameraError
 from drivers.acquisition.frame_counter import SequenceReader
 from drivers.acquisition.reader import CameraReader
-from drivers.cameras.protocol import CameraSettings, Frame, FrameGrabber, Pixels, TriggerMode
+from drivers.cameras.protocol import CameraName, CameraSettings, Frame, FrameGrabber, Pixels, TriggerMode
 from sim.grabber import SimFrameGrabber, TriggerLine
-
-Cam = Literal["cam1", "cam2"]
 
 #: set inside the virtual machine, where only the V4L2 part of the contract runs
 IN_GUEST = "STEREORIG_V4L2_GUEST"
@@ -67,19 +64,19 @@ class CameraBench(ABC):
     region_px: tuple[int, int, int, int] | None = None
 
     @abstractmethod
-    def make(self, cam: Cam) -> FrameGrabber:
+    def make(self, cam: CameraName) -> FrameGrabber:
         """A new grabber of that camera, not opened."""
 
     @abstractmethod
-    def lose(self, cam: Cam, how: str) -> None:
+    def lose(self, cam: CameraName, how: str) -> None:
         """Take the camera away, in one of the ways of `LOSSES`."""
 
     @abstractmethod
-    def bring_back(self, cam: Cam) -> None:
+    def bring_back(self, cam: CameraName) -> None:
         """Make it reachable again; returns when it is."""
 
     @abstractmethod
-    def spoil(self, cam: Cam, what: str, grabber: FrameGrabber) -> None:
+    def spoil(self, cam: CameraName, what: str, grabber: FrameGrabber) -> None:
         """Begin a disturbance of an armed camera, in one of the ways of `SPOILS`.
 
         ``wrap`` makes the frame counter wrap within the next seconds; the others spoil a share of the frames, or some.
@@ -93,7 +90,7 @@ class CameraBench(ABC):
 class _Corridor:
     """A world that knows nothing but noise, so that no two frames are alike."""
 
-    def expose(self, cam: Cam, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
+    def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         assert rng is not None
         return rng.integers(0, 4000, size=(48, 64)).astype(np.uint16)
 
@@ -109,21 +106,21 @@ class SimBench(CameraBench):
         self.line = TriggerLine()
         self.made: list[SimFrameGrabber] = []
 
-    def make(self, cam: Cam) -> FrameGrabber:
+    def make(self, cam: CameraName) -> FrameGrabber:
         grabber = SimFrameGrabber(
             self.world, cam, image_size_px=(64, 48), bit_depth=12, sequence_bits=6, line=self.line, latency_s=0.0
         )
         self.made.append(grabber)
         return grabber
 
-    def lose(self, cam: Cam, how: str) -> None:
+    def lose(self, cam: CameraName, how: str) -> None:
         setattr(self.line.faults_of(cam), how, True)
 
-    def bring_back(self, cam: Cam) -> None:
+    def bring_back(self, cam: CameraName) -> None:
         faults = self.line.faults_of(cam)
         faults.gone = faults.silent = False
 
-    def spoil(self, cam: Cam, what: str, grabber: FrameGrabber) -> None:
+    def spoil(self, cam: CameraName, what: str, grabber: FrameGrabber) -> None:
         assert isinstance(grabber, SimFrameGrabber)
         if what != "wrap":  # the counter has six bits: it wraps by itself
             setattr(grabber.faults, what, 2)  # three lost in a row would be silence
@@ -141,7 +138,7 @@ def first_settings(bench: CameraBench, trigger: TriggerMode = "free") -> CameraS
 
 
 @contextmanager
-def opened(bench: CameraBench, cam: Cam, trigger: TriggerMode = "free") -> Iterator[FrameGrabber]:
+def opened(bench: CameraBench, cam: CameraName, trigger: TriggerMode = "free") -> Iterator[FrameGrabber]:
     """A camera opened and configured, closed afterwards."""
     grabber = bench.make(cam)
     grabber.open()
@@ -154,7 +151,7 @@ def opened(bench: CameraBench, cam: Cam, trigger: TriggerMode = "free") -> Itera
 
 @contextmanager
 def reading(
-    bench: CameraBench, grabber: FrameGrabber, cam: Cam, *, buffer_frames: int = 8, period_s: float | None = None
+    bench: CameraBench, grabber: FrameGrabber, cam: CameraName, *, buffer_frames: int = 8, period_s: float | None = None
 ) -> Iterator[CameraReader]:
     """A reader in free run; a longer period than the camera's makes its watchdog more patient."""
     first, last = grabber.describe().counter_range
@@ -194,7 +191,7 @@ def seconds_until(condition: Callable[[], bool], limit_s: float) -> float:
     return time.monotonic() - begin
 
 
-def opens(bench: CameraBench, cam: Cam) -> FrameGrabber | None:
+def opens(bench: CameraBench, cam: CameraName) -> FrameGrabber | None:
     """A new grabber, opened; None when the camera cannot be opened now."""
     grabber = bench.make(cam)
     try:

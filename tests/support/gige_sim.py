@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from drivers.cameras.protocol import CAMERAS, CameraName
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.server import ControllerServer
-from sim.rig import CameraName, SimRig
+from sim.rig import SimRig
 from sim.world import SimWorld
 
-CAMS: tuple[CameraName, CameraName] = ("cam1", "cam2")
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )  # buffer, data, exposure in us, gain, pixel format
@@ -86,7 +86,7 @@ def _look_ahead(world: SimWorld, controller: SimESP301, ending: threading.Event)
     while not ending.wait(0.05):
         now = [controller.true_position_mm(axis) for axis in (1, 2)]
         if now == before:
-            for cam in CAMS:
+            for cam in CAMERAS:
                 world.expose(cam, exposure_ms=10.0, rng=None)
         before = now
 
@@ -96,18 +96,18 @@ def main(rig_file: str, *addresses: str) -> None:
     rig = SimRig.from_toml(Path(rig_file))
     controller = SimESP301(axes=2, travel_mm=(-12.0, 12.0), time_scale=2.5)
     world = SimWorld(rig, controller.true_position_mm)
-    for cam in CAMS:
+    for cam in CAMERAS:
         world.expose(cam, exposure_ms=10.0, rng=None)  # compiles, and renders where the stage stands
     lib = _library()
     ending = threading.Event()
     threading.Thread(target=_look_ahead, args=(world, controller, ending), daemon=True).start()
     with ControllerServer(controller) as server:
-        cameras = [WorldCamera(lib, world, cam, address) for cam, address in zip(CAMS, addresses, strict=True)]
+        cameras = [WorldCamera(lib, world, cam, address) for cam, address in zip(CAMERAS, addresses, strict=True)]
         print(json.dumps({"stage": server.url, "cameras": len(cameras)}), flush=True)
         for line in sys.stdin:
             order: dict[str, Any] = json.loads(line)
             world.set_scene(order.pop("scene"), load=order.pop("load", 0.0), **order)
-            for cam in CAMS:
+            for cam in CAMERAS:
                 world.expose(cam, exposure_ms=10.0, rng=None)
             print(json.dumps({"done": True}), flush=True)
     ending.set()

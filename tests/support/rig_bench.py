@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from core.errors import CameraError
-from drivers.cameras.protocol import CameraSettings, FrameGrabber, Pixels, TriggerMode
+from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
+from drivers.acquisition.unit import CameraUnit
+from drivers.cameras.protocol import CAMERAS, CameraName, CameraSettings, FrameGrabber, Pixels, TriggerMode
 from server.rig.cameras import CameraPair
-from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
-from server.rig.unit import CAMERAS, Cam, CameraUnit
 from sim.grabber import SimFrameGrabber, TriggerLine
 
 SIZE = (64, 48)
@@ -31,7 +31,7 @@ class MovingWorld:
         rng = np.random.default_rng(7)
         self._waves = [(*rng.uniform(-1.2, 1.2, 2), rng.uniform(0, 2 * np.pi)) for _ in range(60)]
 
-    def expose(self, cam: Cam, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
+    def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         assert rng is not None
         y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
         x -= self.speed_px_s * (time.monotonic() - self._began)
@@ -58,8 +58,8 @@ class Bench:
         self.line = TriggerLine()
         self.world = MovingWorld(speed_px_s)
         self.latency_s = latency_s
-        self.lost: list[tuple[Cam, CameraError]] = []
-        self.units: dict[Cam, CameraUnit] = {
+        self.lost: list[tuple[CameraName, CameraError]] = []
+        self.units: dict[CameraName, CameraUnit] = {
             cam: CameraUnit(
                 cam,
                 partial(self.grabber, cam),
@@ -85,8 +85,9 @@ class Bench:
         for unit in self.units.values():
             unit.open(CameraSettings(exposure_ms=5.0))
         self.pair = CameraPair(self.units["cam1"], self.units["cam2"], make_source=source, skew_is_set=skew_is_set)
+        self.pair.start()
 
-    def grabber(self, cam: Cam) -> FrameGrabber:
+    def grabber(self, cam: CameraName) -> FrameGrabber:
         return SimFrameGrabber(
             self.world, cam, image_size_px=SIZE, bit_depth=8, line=self.line, latency_s=self.latency_s
         )

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.cameras.protocol import CameraOptions, CameraSettings, FeatureValue, FrameGrabber
+from drivers.cameras.protocol import CameraName, CameraOptions, CameraSettings, FeatureValue, FrameGrabber
 from drivers.cameras.v4l2 import make
 from drivers.cameras.v4l2.controls import Controls
 from drivers.cameras.v4l2.device import Device
-from tests.support.camera_bench import Cam, CameraBench
+from tests.support.camera_bench import CameraBench
 
-NODES: dict[Cam, str] = {"cam1": "/dev/video0", "cam2": "/dev/video1"}
+NODES: dict[CameraName, str] = {"cam1": "/dev/video0", "cam2": "/dev/video1"}
 
 #: what the tests may have changed, as vivid has it when it is loaded
 _CALM: dict[str, FeatureValue] = {
@@ -35,7 +35,7 @@ _CALM: dict[str, FeatureValue] = {
 @contextmanager
 def controls_of(node: str) -> Iterator[Controls]:
     """The controls of a device that another one may be streaming from."""
-    device = Device(node)
+    device = Device(node).open()
     try:
         with device.use():
             yield Controls(device)
@@ -61,18 +61,18 @@ class V4L2Bench(CameraBench):
         self._made: list[FrameGrabber] = []
         self.reset()
 
-    def make(self, cam: Cam) -> FrameGrabber:
+    def make(self, cam: CameraName) -> FrameGrabber:
         grabber = make(CameraOptions(device=NODES[cam], buffers=8))
         self._made.append(grabber)
         return grabber
 
-    def lose(self, cam: Cam, how: str) -> None:
+    def lose(self, cam: CameraName, how: str) -> None:
         put(NODES[cam], **{"disconnect" if how == "unplugged" else "inject_fatal_streaming_error": True})
 
-    def bring_back(self, cam: Cam) -> None:
+    def bring_back(self, cam: CameraName) -> None:
         """Vivid plugs itself in again when the last one has closed it."""
 
-    def spoil(self, cam: Cam, what: str, grabber: FrameGrabber) -> None:
+    def spoil(self, cam: CameraName, what: str, grabber: FrameGrabber) -> None:
         if what == "drop":
             put(NODES[cam], percentage_of_dropped_buffers=30)
         elif what == "incomplete":

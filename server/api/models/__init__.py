@@ -63,7 +63,6 @@ from server.api.models.tests import (
     WatchRequest,
 )
 from server.base.models import (
-    CameraName,
     Channels,
     JobState,
     Label,
@@ -89,7 +88,6 @@ __all__ = [
     "CalibrationList",
     "CalibrationReply",
     "CalibrationRequest",
-    "CameraName",
     "CameraReply",
     "CameraSet",
     "CameraStats",

@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from server.base.models import AxisValues, CameraName, Number, Real, Reply, Request, Whole, any_of, one_of
+from drivers.cameras.protocol import CameraName
+from server.base.models import AxisValues, Number, Real, Reply, Request, Whole, any_of, one_of
 
 
 class SettingsPatch(Request):

@@ -6,10 +6,11 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
+from drivers.cameras.protocol import CameraName
 from drivers.stages.protocol import AxisState
 from server.api.models.jobs import JobProblem
 from server.api.models.rig import DynamicsReply
-from server.base.models import CameraName, Reply
+from server.base.models import Reply
 from server.config.rig_file import CalibrationSection, CameraSection, TargetSection
 
 Range = tuple[float, float]

@@ -9,7 +9,7 @@ from fastapi import Depends, Header, Path, Request
 from pydantic import BaseModel
 from starlette.convertors import StringConvertor, register_url_convertor
 
-from server.base.models import CameraName
+from drivers.cameras.protocol import CameraName
 from server.jobs.idempotency import RequestMark
 from server.workflows.service import Service
 

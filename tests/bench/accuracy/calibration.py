@@ -17,9 +17,10 @@ from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.grid import Localiser, detect_grid
 from core.target import GridTarget
+from drivers.cameras.protocol import CAMERAS
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, SimRig
+from sim.rig import SimRig
 from sim.world import SimWorld
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
@@ -49,7 +50,7 @@ def _calibrate(
     images = []
     for dz in POSITIONS:
         stage[1] = stage[2] = dz
-        for name in CAMERA_NAMES:
+        for name in CAMERAS:
             shots = [world.expose(name, exposure_ms=10.0, rng=rng) for _ in range(frames)]
             mean = shots[0] if frames == 1 else np.mean(shots, axis=0, dtype=np.float32)
             images.append(ImageOfTarget(name, dz, mean))

@@ -16,13 +16,14 @@ from PIL import Image
 
 from core.field.smoothed import smoothed_displacement
 from core.measure import MeasureOptions
+from drivers.cameras.protocol import CAMERAS
 from server.cli import main
 from server.cli.measurement import measure
 from server.formats.images import read_image, write_image
 from server.formats.results.reading import read_field, read_measured
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, SimRig
+from sim.rig import SimRig
 from sim.truth import truth_at
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -34,7 +35,7 @@ ROI = "50,45,180,155"
 def small_rig() -> SimRig:
     """The paper's rig with smaller sensors: the same rays, fewer pixels."""
     tables = tomllib.loads((ROOT / "config" / "sim_paper.toml").read_text())
-    for name in CAMERA_NAMES:
+    for name in CAMERAS:
         tables[name]["image_size_px"] = list(SIZE)
         tables["sim"][name] |= {"cx_px": SIZE[0] / 2 + 3.0, "cy_px": SIZE[1] / 2 - 2.0}
     return SimRig.from_dict(tables)
@@ -52,11 +53,11 @@ def originals(rig: SimRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(1)
     for n, load in enumerate(LOADS):
         scene = make_scene(rig, "block", load=load)
-        for name in CAMERA_NAMES:
+        for name in CAMERAS:
             sim = rig.camera(name)
             seen = render(scene, sim.camera, sim.size_px, options=RenderOptions(blur_px=rig.blur_px, threads=1))
             write_image(folder / f"{name}_{n}.tif", sim.sensor.expose(sim.lighting.apply(seen), rng, exposure=1.0))
-    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERA_NAMES}
+    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERAS}
     (folder / "calibration.json").write_text(json.dumps(calibration))
     return folder
 
@@ -208,7 +209,7 @@ def test_a_test_folder_copied_by_hand(folder: Path, tmp_path: Path, measured: Pa
     for n in range(2):
         step = test / "steps" / f"{n:04d}"
         step.mkdir(parents=True)
-        for cam in CAMERA_NAMES:
+        for cam in CAMERAS:
             shutil.copy(folder / f"{cam}_{n}.tif", step / f"{cam}.tif")
         (step / "step.json").write_text(json.dumps({"n": n, "sha256": hashes[n]["sha256"]}))
     shutil.copy(folder / "calibration.json", test)
@@ -223,7 +224,7 @@ def test_a_test_folder_copied_by_hand(folder: Path, tmp_path: Path, measured: Pa
 def test_a_flipped_bit_in_a_test_folder_is_named(folder: Path, tmp_path: Path, capfd: Any) -> None:
     step = tmp_path / "t" / "steps" / "0000"
     step.mkdir(parents=True)
-    for cam in CAMERA_NAMES:
+    for cam in CAMERAS:
         shutil.copy(folder / f"{cam}_0.tif", step / f"{cam}.tif")
     (step / "step.json").write_text(json.dumps({"sha256": {"cam1": "0" * 64}}))
     shutil.copy(folder / "calibration.json", tmp_path / "t")
@@ -381,7 +382,7 @@ def test_swapped_cameras_are_refused(folder: Path, tmp_path: Path, capfd: Any) -
 
 def test_noise_without_texture_is_refused(folder: Path, tmp_path: Path, capfd: Any) -> None:
     rng = np.random.default_rng(2)
-    for cam in CAMERA_NAMES:
+    for cam in CAMERAS:
         write_image(folder / f"{cam}_0.tif", rng.normal(120, 2, (SIZE[1], SIZE[0])).round().astype(np.uint8))
     fails(command(folder, tmp_path / "out"), "image_blank", "noise only", capfd)
     assert not (tmp_path / "out").exists()

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from drivers.cameras.protocol import CAMERAS
 from server.cli import main
 from server.formats.images import write_image
 from server.formats.results.reading import read_field
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
-from sim.rig import CAMERA_NAMES, SimRig
+from sim.rig import SimRig
 from sim.scene import UPRIGHT, Scene
 from sim.surface import sphere
 from sim.truth import truth_at
@@ -43,11 +44,11 @@ def folder(rig: SimRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sphere")
     rng = np.random.default_rng(1)
     for n, state in enumerate(STATES):
-        for name in CAMERA_NAMES:
+        for name in CAMERAS:
             sim = rig.camera(name)
             seen = render(scene(rig, state), sim.camera, sim.size_px, options=RenderOptions(blur_px=rig.blur_px))
             write_image(folder / f"{name}_{n}.tif", sim.sensor.expose(sim.lighting.apply(seen), rng, exposure=1.0))
-    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERA_NAMES}
+    calibration = {name: rig.camera(name).camera.paper_parameters() for name in CAMERAS}
     (folder / "calibration.json").write_text(json.dumps(calibration))
     return folder
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from drivers.acquisition.clocks import DeviceClock
 from drivers.acquisition.counter_offset import AlignedPairing
-from drivers.acquisition.pairing import Cam
-from drivers.cameras.protocol import Frame
+from drivers.cameras.protocol import CameraName, Frame
 
 PERIOD_NS = 50_000_000
 PIXELS = np.zeros((2, 2), np.uint8)
@@ -29,7 +28,7 @@ def frame(number: int, pulse: int, jitter_ns: int = 0) -> Frame:
     seed=st.integers(0, 1000),
 )
 def test_no_pair_ever_holds_two_pulses(
-    armed: tuple[int, int], missed: list[tuple[Cam, int]], lost: list[tuple[Cam, int]], seed: int
+    armed: tuple[int, int], missed: list[tuple[CameraName, int]], lost: list[tuple[CameraName, int]], seed: int
 ) -> None:
     """Missed pulses are not counted by the camera; lost frames are. Arrivals jitter by less than half a period."""
     rng = np.random.default_rng(seed)
@@ -37,7 +36,7 @@ def test_no_pair_ever_holds_two_pulses(
     numbers = {"cam1": 7, "cam2": 1000}
     good = 0
     for pulse in range(70):
-        order: list[Cam] = ["cam1", "cam2"] if rng.random() < 0.5 else ["cam2", "cam1"]
+        order: list[CameraName] = ["cam1", "cam2"] if rng.random() < 0.5 else ["cam2", "cam1"]
         for cam in order:
             if pulse < armed[int(cam[-1]) - 1] or (cam, pulse) in missed:
                 continue

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from core.errors import CameraError
 from drivers.acquisition.frame_counter import Arrival, SequenceReader
-from drivers.acquisition.pairing import CAMS, Cam, NumberPairing, Pair, TimePairing
-from drivers.cameras.protocol import Frame, FrameStatus
+from drivers.acquisition.pairing import NumberPairing, Pair, TimePairing
+from drivers.cameras.protocol import CAMERAS, CameraName, Frame, FrameStatus
 
 PERIOD_NS = 100_000_000
 
@@ -110,10 +110,10 @@ def test_triggered_is_the_sum_of_its_fates_and_pairs_are_right(
     fates: list[tuple[str, str]], starts: tuple[int, int], interleave: object
 ) -> None:
     # What a camera sends, in order: its own 16-bit counter from anywhere, one number a trigger
-    sent: dict[Cam, list[tuple[int, Frame]]] = {"cam1": [], "cam2": []}
-    arrived: dict[Cam, set[int]] = {"cam1": set(), "cam2": set()}
+    sent: dict[CameraName, list[tuple[int, Frame]]] = {"cam1": [], "cam2": []}
+    arrived: dict[CameraName, set[int]] = {"cam1": set(), "cam2": set()}
     damaged: set[int] = set()
-    for which, cam in enumerate(CAMS):
+    for which, cam in enumerate(CAMERAS):
         for number, both in enumerate(fates):
             fate = both[which]
             if fate == "drop":
@@ -131,17 +131,17 @@ def test_triggered_is_the_sum_of_its_fates_and_pairs_are_right(
             if fate == "repeat":
                 sent[cam].append((number, made))
     # The reader before the pairing takes out repeats and late frames, and unwraps the counter
-    unwrap = {cam: SequenceReader() for cam in CAMS}
-    for which, cam in enumerate(CAMS):
+    unwrap = {cam: SequenceReader() for cam in CAMERAS}
+    for which, cam in enumerate(CAMERAS):
         unwrap[cam].read(starts[which])  # the number the first trigger would have, so that origins are known
     pairs = NumberPairing(
-        by="frame", max_skew_ms=1.0, common_clock=True, origin=dict(zip(CAMS, starts, strict=True)), depth=100
+        by="frame", max_skew_ms=1.0, common_clock=True, origin=dict(zip(CAMERAS, starts, strict=True)), depth=100
     )
     made_pairs: list[Pair] = []
-    kept: dict[Cam, set[int]] = {"cam1": set(), "cam2": set()}
-    queues = {cam: list(sent[cam]) for cam in CAMS}
+    kept: dict[CameraName, set[int]] = {"cam1": set(), "cam2": set()}
+    queues = {cam: list(sent[cam]) for cam in CAMERAS}
     while queues["cam1"] or queues["cam2"]:
-        cam = interleave.choice([cam for cam in CAMS if queues[cam]])  # type: ignore[attr-defined]
+        cam = interleave.choice([cam for cam in CAMERAS if queues[cam]])  # type: ignore[attr-defined]
         number, made = queues[cam].pop(0)
         reading = unwrap[cam].read(made.sequence)
         if reading.arrival is Arrival.LATE or (reading.arrival is Arrival.DUPLICATE and number != 0):
@@ -165,8 +165,8 @@ def test_triggered_is_the_sum_of_its_fates_and_pairs_are_right(
     assert account.unpaired == len((kept["cam1"] ^ kept["cam2"]) - bad)
 
 
-def _damaged_and_kept(number: int, fates: list[tuple[str, str]], kept: dict[Cam, set[int]]) -> bool:
-    return any(fates[number][which] == "incomplete" and number in kept[cam] for which, cam in enumerate(CAMS))
+def _damaged_and_kept(number: int, fates: list[tuple[str, str]], kept: dict[CameraName, set[int]]) -> bool:
+    return any(fates[number][which] == "incomplete" and number in kept[cam] for which, cam in enumerate(CAMERAS))
 
 
 @settings(max_examples=200)
@@ -179,8 +179,8 @@ def test_pairing_by_time_never_mixes_two_occasions(
     fates: list[tuple[str, str]], offset_ns: int, jitter: object
 ) -> None:
     pairs = TimePairing(period_ms=PERIOD_NS / 1e6, max_skew_ms=60.0, common_clock=True, depth=100)
-    queues: dict[Cam, list[Frame]] = {"cam1": [], "cam2": []}
-    for which, cam in enumerate(CAMS):
+    queues: dict[CameraName, list[Frame]] = {"cam1": [], "cam2": []}
+    for which, cam in enumerate(CAMERAS):
         for number, both in enumerate(fates):
             if both[which] == "drop":
                 continue
@@ -192,7 +192,7 @@ def test_pairing_by_time_never_mixes_two_occasions(
     expected = sum(both != ("drop", "drop") for both in fates)
     made = []
     while queues["cam1"] or queues["cam2"]:
-        cam = jitter.choice([cam for cam in CAMS if queues[cam]])  # type: ignore[attr-defined]
+        cam = jitter.choice([cam for cam in CAMERAS if queues[cam]])  # type: ignore[attr-defined]
         if (pair := pairs.feed(cam, queues[cam].pop(0))) is not None:
             made.append(pair)
     account = pairs.finish()

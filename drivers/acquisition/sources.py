@@ -1,4 +1,4 @@
-"""Where pairs come from: software triggers fired for each one, or two streams of frames matched all the time."""
+"""Sources of pairs: software triggers fired for each one, or two streams of frames matched all the time."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Literal, Protocol
 from core.errors import CameraError
 from drivers.acquisition.counter_offset import AlignedPairing
 from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
-from drivers.cameras.protocol import Frame, FrameStatus
-from server.rig.unit import CAMERAS, Cam, CameraUnit
+from drivers.acquisition.unit import CameraUnit
+from drivers.cameras.protocol import CAMERAS, CameraName, Frame, FrameStatus
 
 Check = Callable[[], None]
-Units = Mapping[Cam, CameraUnit]
+Units = Mapping[CameraName, CameraUnit]
 
 # A frame that was lost or damaged on its way is asked for again; a camera that is dead is not
 _ATTEMPTS = 3
@@ -25,7 +25,10 @@ _KEPT_PAIRS = 8
 
 
 class PairSource(Protocol):
-    """Delivers pairs of frames that belong together."""
+    """Delivers pairs of frames that belong together, once it was started."""
+
+    def start(self) -> None:
+        """Begin to take the cameras' frames."""
 
     def next_pair(self, check: Check | None = None) -> Pair:
         """Return a pair exposed after this call; ``check`` may raise while it waits."""
@@ -55,6 +58,9 @@ class TriggeredPairs:
         self._pairing: NumberPairing | None = None
         self._origin = 0
 
+    def start(self) -> None:
+        """Nothing to do: frames come when they are asked for."""
+
     def next_pair(self, check: Check | None = None) -> Pair:
         """See `PairSource`.
 
@@ -63,7 +69,7 @@ class TriggeredPairs:
         CameraError
             ``frame_incomplete`` or ``pair_incomplete`` when three triggers in a row made no whole pair.
         """
-        damaged: Cam | None = None
+        damaged: CameraName | None = None
         for attempt in range(_ATTEMPTS):
             if check is not None:
                 check()
@@ -106,9 +112,9 @@ class TriggeredPairs:
         if self._pairing is not None:
             self._pairing.finish()
 
-    def _fire(self) -> dict[Cam, int]:
+    def _fire(self) -> dict[CameraName, int]:
         readers = {cam: self._units[cam].reader for cam in CAMERAS}  # neither is fired when one is lost
-        numbers: dict[Cam, int] = {}
+        numbers: dict[CameraName, int] = {}
         for cam, reader in readers.items():
             number = reader.trigger()
             if number is None:
@@ -130,7 +136,7 @@ class TriggeredPairs:
         self._pairing.triggered(numbers["cam1"] - self._origin + 1)
         return numbers
 
-    def _collect(self, cam: Cam, number: int, fired: float, periods: float) -> tuple[Pair | None, bool]:
+    def _collect(self, cam: CameraName, number: int, fired: float, periods: float) -> tuple[Pair | None, bool]:
         """Take a camera's frames up to that of one trigger; whether the last of them was incomplete."""
         unit, pairing = self._units[cam], self._pairing
         assert pairing is not None
@@ -181,13 +187,16 @@ class StreamedPairs:
         self._pairs: deque[Pair] = deque(maxlen=_KEPT_PAIRS)
         self._changed = threading.Condition()
         self._ending = False
-        self._threads = [
-            threading.Thread(target=self._pump, args=(cam,), name=f"pairs {cam}", daemon=True) for cam in CAMERAS
-        ]
-        for thread in self._threads:
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Take both cameras' frames, each in a thread of its own."""
+        for cam in CAMERAS:
+            thread = threading.Thread(target=self._pump, args=(cam,), name=f"pairs {cam}", daemon=True)
+            self._threads.append(thread)
             thread.start()
 
-    def _pump(self, cam: Cam) -> None:
+    def _pump(self, cam: CameraName) -> None:
         unit = self._units[cam]
         try:
             reader = unit.reader

@@ -5,15 +5,20 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Any, Literal
+from typing import Any
 
 from core.errors import CameraError
 from drivers.acquisition.frame_counter import SequenceReader
 from drivers.acquisition.reader import CameraReader
-from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, TriggerMode
-
-Cam = Literal["cam1", "cam2"]
-CAMERAS: tuple[Cam, Cam] = ("cam1", "cam2")
+from drivers.cameras.protocol import (
+    CameraDescription,
+    CameraName,
+    CameraSettings,
+    Frame,
+    FrameCounters,
+    FrameGrabber,
+    TriggerMode,
+)
 
 # From a trigger to its frame, beyond the exposure: a generous read-out, and the slowest usual line
 _READ_OUT_S = 0.2
@@ -46,16 +51,16 @@ class CameraUnit:
 
     def __init__(
         self,
-        name: Cam,
+        name: CameraName,
         make: Callable[[], FrameGrabber],
         *,
         trigger: TriggerMode = "software",
         rate_hz: float | None = None,
         serial: str | None = None,
         size_px: tuple[int, int] | None = None,
-        on_lost: Callable[[Cam, CameraError], None] | None = None,
+        on_lost: Callable[[CameraName, CameraError], None] | None = None,
     ) -> None:
-        self.name: Cam = name
+        self.name: CameraName = name
         self.trigger: TriggerMode = trigger
         self.rate_hz = rate_hz
         self.latest: Frame | None = None
