@@ -181,7 +181,7 @@ def run(args: argparse.Namespace) -> int:
     from server.base.priority import raise_file_limit, raise_service
     from server.config.rig_file import load_config
     from server.http.systemd import Notifier
-    from server.worker.executor import start_worker
+    from server.worker.embedded import start_worker
 
     keep_memory_steady()
     hurry()
