@@ -7,10 +7,11 @@ usual one. Linux may share the processors out by session first (autogroups), and
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import multiprocessing
 import os
+import signal
 import sys
-import threading
-from multiprocessing.connection import wait
 from pathlib import Path
 
 import psutil
@@ -18,6 +19,7 @@ import psutil
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
 _SWITCH_S = 0.001
+_PR_SET_PDEATHSIG = 1
 _AUTOGROUP = Path("/proc/self/autogroup")
 
 
@@ -53,19 +55,14 @@ def raise_file_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
-def end_with_parent(pipe: int) -> None:
+def end_with_parent() -> None:
     """End this process at once when the one that started it is gone, killed or not.
 
-    A worker whose service was killed must not write where the next one's does.
-
-    Parameters
-    ----------
-    pipe
-        File descriptor of a pipe whose other end the parent holds, and writes nothing to.
+    A worker whose service was killed must not write where the next one's does. A thread that watches a pipe of the
+    parent's would be plainer, and late: it waits for the interpreter, and a result is written meanwhile.
     """
-
-    def watch() -> None:
-        wait([pipe])
-        os._exit(1)
-
-    threading.Thread(target=watch, name="parent", daemon=True).start()
+    parent = multiprocessing.parent_process()
+    with contextlib.suppress(OSError, AttributeError):  # not on every system; elsewhere it ends with its task
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if parent is not None and os.getppid() != parent.pid:
+        os._exit(1)  # gone already

@@ -43,7 +43,7 @@ class CompileAside:
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__, self._degree],
             env=environment,
-            stdin=subprocess.PIPE,  # nothing comes: its end is the parent's
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -61,14 +61,14 @@ class CompileAside:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if self._process is not None:
-            with self._process:  # closes the pipe, and waits
-                self._process.terminate()
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.wait()
 
 
 def main() -> int:
     """Fit one point that has no start, and judge it: compiled code is needed to find that out."""
-    end_with_parent(sys.stdin.fileno())
+    end_with_parent()
     from core.cameras.camera import Camera
     from core.cameras.stereo import StereoPair
     from core.matching.fit import fit_motion

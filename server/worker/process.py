@@ -12,7 +12,6 @@ import faulthandler
 import gc
 import importlib
 import logging
-import multiprocessing
 import os
 import signal
 import threading
@@ -91,9 +90,7 @@ def serve(
     global _current
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to handle
     faulthandler.enable()  # a fault in compiled code leaves its place on the terminal
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    end_with_parent(parent.sentinel)
+    end_with_parent()
     pin_threads(threads)
     import cv2
 

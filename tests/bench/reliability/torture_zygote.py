@@ -9,7 +9,6 @@ spared, of the service's modules and of its worker's.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import multiprocessing
 import os
@@ -19,6 +18,7 @@ import time
 import types
 from typing import Any
 
+from server.base.priority import end_with_parent
 from server.worker.process import pin_threads
 
 
@@ -61,7 +61,7 @@ def serve(order: dict[str, Any]) -> None:
     status = 70
     try:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG: no pipe leads to the parent of a fork
+        end_with_parent()
         os.setsid()
         for fd, path in ((1, order["out"]), (2, order["err"])):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), fd)
