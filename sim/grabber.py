@@ -15,7 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from core.errors import CameraError
-from drivers.cameras.protocol import CameraDescription, CameraName, CameraSettings, Frame, FrameStatus, Pixels
+from core.names import CameraName
+from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
 
 _NICE = 5
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
 from core.errors import InputError
-from drivers.cameras.protocol import CAMERAS, CameraName
+from core.names import CAMERAS, CameraName
 from sim.sensor import Lighting, Sensor
 
 

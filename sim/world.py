@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
-from drivers.cameras.protocol import CAMERAS, CameraName
+from core.names import CAMERAS, CameraName
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
 from sim.rig import SimCamera, SimRig

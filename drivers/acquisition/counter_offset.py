@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+from core.names import CameraName
 from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
-from drivers.cameras.protocol import CameraName, Frame
+from drivers.cameras.protocol import Frame
 
 
 class AlignedPairing:

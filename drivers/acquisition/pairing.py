@@ -15,7 +15,8 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from core.errors import CameraError
-from drivers.cameras.protocol import CAMERAS, CameraName, Frame, FrameStatus
+from core.names import CAMERAS, CameraName
+from drivers.cameras.protocol import Frame, FrameStatus
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,11 @@ from collections.abc import Callable, Mapping
 from typing import Literal, Protocol
 
 from core.errors import CameraError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.counter_offset import AlignedPairing
 from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
 from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CAMERAS, CameraName, Frame, FrameStatus
+from drivers.cameras.protocol import Frame, FrameStatus
 
 Check = Callable[[], None]
 Units = Mapping[CameraName, CameraUnit]

@@ -8,17 +8,10 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from core.errors import CameraError
+from core.names import CameraName
 from drivers.acquisition.frame_counter import SequenceReader
 from drivers.acquisition.reader import CameraReader
-from drivers.cameras.protocol import (
-    CameraDescription,
-    CameraName,
-    CameraSettings,
-    Frame,
-    FrameCounters,
-    FrameGrabber,
-    TriggerMode,
-)
+from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, TriggerMode
 
 # From a trigger to its frame, beyond the exposure: a generous read-out, and the slowest usual line
 _READ_OUT_S = 0.2

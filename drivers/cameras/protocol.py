@@ -15,8 +15,6 @@ from core.errors import CameraError
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 TriggerMode = Literal["free", "software", "hardware"]
 FeatureValue = bool | int | float | str
-CameraName = Literal["cam1", "cam2"]
-CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
 
 
 class FrameStatus(StrEnum):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from core.errors import FileFormatError
-from drivers.cameras.protocol import CameraName
+from core.names import CameraName
 from server.config.camera_facts import Above, CameraFacts, LensFacts, Text
 
 _log = logging.getLogger("stereorig.config")

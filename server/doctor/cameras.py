@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from core.errors import CameraError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.sources import common_clock
 from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CAMERAS, CameraName
 from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile
 from server.results.quality import image_quality

@@ -5,8 +5,8 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CAMERAS, CameraName
 from server.doctor.cameras import Watch
 from server.doctor.report import Notebook
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.errors import StereorigError
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from drivers.stages.serial_ports import port_problem
 from server.config.rig_file import RigConfig, load_config
 from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch

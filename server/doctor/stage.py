@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from drivers.stages.protocol import AxisState, Stage
 from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile

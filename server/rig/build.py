@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import CameraError, StageError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
 from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CAMERAS, CameraName, CameraOptions, CameraSettings, FrameGrabber
+from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber
 from drivers.registry import make_camera, open_stage
 from drivers.stages.protocol import AxisOptions, Stage
 from server.config.rig_file import RigConfig

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CameraError, StateError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.pairing import Pair, PairingAccount
 from drivers.acquisition.sources import PairSource
 from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CAMERAS, CameraName, CameraSettings, Frame, Pixels
+from drivers.cameras.protocol import CameraSettings, Frame, Pixels
 from server.config.rig_file import SKEW_PX
 from server.rig.image_speed import ImageMotion, image_motion
 

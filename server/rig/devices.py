@@ -17,7 +17,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.errors import StereorigError
-from drivers.cameras.protocol import CAMERAS, FoundDevice
+from core.names import CAMERAS
+from drivers.cameras.protocol import FoundDevice
 from drivers.registry import CAMERA_DRIVERS, discover_cameras
 from drivers.stages.serial_ports import discover_ports
 from server.rig import Rig

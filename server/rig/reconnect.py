@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 
 from core.errors import CameraError
-from drivers.cameras.protocol import CameraName
+from core.names import CameraName
 from server.rig.cameras import CameraPair
 
 _log = logging.getLogger("stereorig.rig")

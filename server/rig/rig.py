@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import CameraError, DeviceError, InputError, StageError, StateError, StereorigError
-from drivers.cameras.protocol import CAMERAS, CameraName, CameraSettings
+from core.names import CAMERAS, CameraName
+from drivers.cameras.protocol import CameraSettings
 from drivers.stages.protocol import MoveResult
 from server.base.problem import problem_of
 from server.config.rig_file import RigConfig

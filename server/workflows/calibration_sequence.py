@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from core.errors import CalibrationInputError
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from server.config.rig_file import RigConfig
 from server.jobs.job import Job
 from server.store.index import calibration_entry

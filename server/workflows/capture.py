@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from core.errors import ImageError
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode_image, encode_tiff

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from server.jobs.job import Job
 from server.worker.tasks import NoiseTask, fit_noise
 from server.workflows.service import Service

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from drivers.cameras.protocol import CameraName
+from core.names import CameraName
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.service.test_service_chain import SMALL

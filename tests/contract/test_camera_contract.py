@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from core.errors import CameraError
+from core.names import CAMERAS
 from drivers.acquisition.pairing import TimePairing
-from drivers.cameras.protocol import CAMERAS, CameraSettings, FrameGrabber, FrameStatus, TriggerMode
+from drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, TriggerMode
 from tests.support.camera_bench import (
     LOSSES,
     SPOILS,

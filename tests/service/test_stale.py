@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from core.errors import FileFormatError
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from server.cli import main
 from server.formats.images import write_image
 from server.workflows import analysis_start

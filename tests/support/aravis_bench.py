@@ -5,7 +5,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from drivers.cameras.protocol import CameraName, CameraOptions, FrameGrabber
+from core.names import CameraName
+from drivers.cameras.protocol import CameraOptions, FrameGrabber
 from drivers.registry import make_camera
 from tests.support.camera_bench import CameraBench
 from tests.support.fake_gige import FakeCamera, small_sensor_xml

@@ -15,9 +15,10 @@ from contextlib import contextmanager
 import numpy as np
 
 from core.errors import CameraError
+from core.names import CameraName
 from drivers.acquisition.frame_counter import SequenceReader
 from drivers.acquisition.reader import CameraReader
-from drivers.cameras.protocol import CameraName, CameraSettings, Frame, FrameGrabber, Pixels, TriggerMode
+from drivers.cameras.protocol import CameraSettings, Frame, FrameGrabber, Pixels, TriggerMode
 from sim.grabber import SimFrameGrabber, TriggerLine
 
 #: set inside the virtual machine, where only the V4L2 part of the contract runs

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.cameras.protocol import CAMERAS, CameraName
+from core.names import CAMERAS, CameraName
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.server import ControllerServer
 from sim.rig import SimRig

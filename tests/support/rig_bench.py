@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from core.errors import CameraError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
 from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CAMERAS, CameraName, CameraSettings, FrameGrabber, Pixels, TriggerMode
+from drivers.cameras.protocol import CameraSettings, FrameGrabber, Pixels, TriggerMode
 from server.rig.cameras import CameraPair
 from sim.grabber import SimFrameGrabber, TriggerLine
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.cameras.protocol import CameraName, CameraOptions, CameraSettings, FeatureValue, FrameGrabber
+from core.names import CameraName
+from drivers.cameras.protocol import CameraOptions, CameraSettings, FeatureValue, FrameGrabber
 from drivers.cameras.v4l2 import make
 from drivers.cameras.v4l2.controls import Controls
 from drivers.cameras.v4l2.device import Device

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from drivers.cameras.protocol import CameraName
+from core.names import CameraName
 from server.base.models import AxisValues, Number, Real, Reply, Request, Whole, any_of, one_of
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from drivers.cameras.protocol import CameraName
+from core.names import CameraName
 from drivers.stages.protocol import AxisState
 from server.api.models.jobs import JobProblem
 from server.api.models.rig import DynamicsReply

@@ -9,7 +9,7 @@ from fastapi import Depends, Header, Path, Request
 from pydantic import BaseModel
 from starlette.convertors import StringConvertor, register_url_convertor
 
-from drivers.cameras.protocol import CameraName
+from core.names import CameraName
 from server.jobs.idempotency import RequestMark
 from server.workflows.service import Service
 

@@ -16,8 +16,8 @@ from core.cameras.camera import Camera, RigidTransform, rotation_from_angles
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.grid import Localiser, detect_grid
+from core.names import CAMERAS
 from core.target import GridTarget
-from drivers.cameras.protocol import CAMERAS
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
 from sim.rig import SimRig

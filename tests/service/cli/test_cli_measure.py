@@ -16,7 +16,7 @@ from PIL import Image
 
 from core.field.smoothed import smoothed_displacement
 from core.measure import MeasureOptions
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from server.cli import main
 from server.cli.measurement import measure
 from server.formats.images import read_image, write_image

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from drivers.cameras.protocol import CAMERAS
+from core.names import CAMERAS
 from server.cli import main
 from server.formats.images import write_image
 from server.formats.results.reading import read_field

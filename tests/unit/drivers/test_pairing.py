@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.errors import CameraError
+from core.names import CAMERAS, CameraName
 from drivers.acquisition.frame_counter import Arrival, SequenceReader
 from drivers.acquisition.pairing import NumberPairing, Pair, TimePairing
-from drivers.cameras.protocol import CAMERAS, CameraName, Frame, FrameStatus
+from drivers.cameras.protocol import Frame, FrameStatus
 
 PERIOD_NS = 100_000_000
 

@@ -1,0 +1,8 @@
+"""Names of the two cameras, as files, messages and replies spell them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+CameraName = Literal["cam1", "cam2"]
+CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
