@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.arrays import Bool, Float, Float32
 from core.errors import ImageError, InputError
-
-Float = NDArray[np.float64]
 
 LARGEST_SHIFT_PX = 0.1
 """Frames that moved further from one to the next are no still scene: the first-order correction would not hold."""
@@ -173,7 +172,7 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
         differences.append(rest.astype(np.float32))
     if shift > LARGEST_SHIFT_PX:
         raise _not_static(f"they move by {shift:.2f} px from one frame to the next")
-    square: NDArray[np.float32] = np.float32(0.5) * np.stack(differences) ** 2
+    square: Float32 = np.float32(0.5) * np.stack(differences) ** 2
     levels, variances, sds, excess, excess_sd = _binned(mean, square, free, steep)
     if excess > LARGEST_EXCESS and excess > _SURE * excess_sd:
         raise _not_static(f"steep places vary by {100 * excess:.0f} % more than flat ones of the same grey level")
@@ -258,7 +257,7 @@ def _full_scale(frames: Sequence[ArrayLike], images: list[NDArray[Any]]) -> floa
     return 65535.0 if images[0].dtype == np.uint16 else np.inf
 
 
-def _unclipped(images: list[NDArray[Any]], full_scale: float) -> NDArray[np.bool_]:
+def _unclipped(images: list[NDArray[Any]], full_scale: float) -> Bool:
     low, high = np.minimum.reduce(images), np.maximum.reduce(images)
     bottom = 0.0 if images[0].dtype.kind == "u" else -np.inf
     free = (low > bottom) & (high < full_scale)
@@ -271,7 +270,7 @@ def _unclipped(images: list[NDArray[Any]], full_scale: float) -> NDArray[np.bool
     return np.asarray(free)
 
 
-def _still(difference: Float, basis: Float, free: NDArray[np.bool_]) -> tuple[Float, float, float]:
+def _still(difference: Float, basis: Float, free: Bool) -> tuple[Float, float, float]:
     """A difference of two frames without change of brightness and shift; the relative change, and the shift in px."""
     A, d = basis[free], difference[free]
     x = np.zeros(basis.shape[-1])
@@ -288,9 +287,7 @@ def _still(difference: Float, basis: Float, free: NDArray[np.bool_]) -> tuple[Fl
     return difference - basis @ x, float(gain), float(np.hypot(x[2], x[3]))
 
 
-def _binned(
-    mean: Float, square: NDArray[np.float32], free: NDArray[np.bool_], steep: Float
-) -> tuple[Float, Float, Float, float, float]:
+def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> tuple[Float, Float, Float, float, float]:
     """Mean grey levels, variances and their sd by bins; excess of the steep places and its sd."""
     g, v, s = mean[free], square[:, free], steep[free]
     order = np.argsort(g, kind="stable")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-Float = NDArray[np.float64]
+from core.arrays import Bool, Float
 
 _TILE_PX = 256
 _MOST_TILES = 64
@@ -44,7 +44,7 @@ class PatternSize:
     tiles: int
 
 
-def pattern_size(image: NDArray[np.generic], inside: NDArray[np.bool_] | None = None) -> PatternSize | None:
+def pattern_size(image: NDArray[np.generic], inside: Bool | None = None) -> PatternSize | None:
     """Measure a pattern.
 
     Parameters
@@ -83,7 +83,7 @@ def pattern_size(image: NDArray[np.generic], inside: NDArray[np.bool_] | None = 
     return PatternSize(float(np.sqrt(width_x * width_y)), width_x, width_y, float(np.sqrt(height)), tiles)
 
 
-def _covariance(grey: NDArray[np.generic], chosen: NDArray[np.bool_]) -> tuple[Float, Float, int]:
+def _covariance(grey: NDArray[np.generic], chosen: Bool) -> tuple[Float, Float, int]:
     """Sums of products at each shift and their counts, over tiles that lie in the region for the most part."""
     starts = [_starts(n) for n in grey.shape]
     places = [(r, c) for r in starts[0] for c in starts[1]]

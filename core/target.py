@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.errors import TargetError
 
 _LEAST_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature

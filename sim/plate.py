@@ -20,11 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from sim.surface import PLATE, Surface
-
-Float = NDArray[np.float64]
 
 PAPER_PRESSURES_KPA = tuple(round(68.9 * n, 1) for n in range(1, 11))
 

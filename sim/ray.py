@@ -9,9 +9,8 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from core.arrays import Float
 
 _SEIDEL: Final = 0.0
 _STEPS: Final = 30

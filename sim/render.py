@@ -20,15 +20,14 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import erf
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from sim.ray import rays
 from sim.scene import Scene
 from sim.texture import GRID
-
-Float = NDArray[np.float64]
 
 _BLUR_REACH: Final = 5.0  # the Gaussian is cut at five sd, where 6e-7 of it is left
 _BAND_ROWS: Final = 32  # rows of one piece of work: small enough for the cache, large against the blur

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Float = NDArray[np.float64]
+from core.arrays import Float, Float32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ class Lighting:
     gradient: tuple[float, float] = (0.0, 0.0)
     ambient: float = 0.0
 
-    def apply(self, brightness: NDArray[np.floating]) -> NDArray[np.float32]:
+    def apply(self, brightness: NDArray[np.floating]) -> Float32:
         """Light a rendered image (rows, columns)."""
         rows, columns = brightness.shape
         u = np.linspace(-1.0, 1.0, columns)

@@ -14,11 +14,8 @@ asked. The lattices repeat after 128 nodes (115 mm across in the coarse one).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.surface import HEIGHT, Surface
-
-Float = NDArray[np.float64]
 
 PAPER_RA_UM = 1.775
 COARSE_MM = (0.9, 4.0)

@@ -20,11 +20,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from sim import surface_kernels as kernels
-
-Float = NDArray[np.float64]
 
 FLAT: Final = 0
 HEIGHT: Final = 1

@@ -10,9 +10,8 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from core.arrays import Float
 
 _SPHERE_REACH_RAD: Final = 1.4  # beyond it a sphere is seen too flatly to be worth a texture
 

@@ -16,9 +16,9 @@ from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from core.arrays import Float
 
 SPECKLE: Final = 0
 GRID: Final = 1

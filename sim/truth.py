@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from sim.render import material_points
 from sim.scene import Scene
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.arrays import Float32
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
@@ -56,7 +57,7 @@ class SimWorld:
         self._scene = make_scene(rig, "grid")
         self._scene_key: tuple[Any, ...] = ("grid", 0.0)
         self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERAS}
-        self._cache: OrderedDict[tuple[Any, ...], NDArray[np.float32]] = OrderedDict()
+        self._cache: OrderedDict[tuple[Any, ...], Float32] = OrderedDict()
 
     @property
     def rig(self) -> SimRig:
@@ -112,7 +113,7 @@ class SimWorld:
             raise InputError(f"There is no camera {cam!r}.", code="unknown_camera", remedy="Use cam1 or cam2.")
         return self._cameras[cam]
 
-    def _brightness(self, cam: CameraName) -> tuple[NDArray[np.float32], SimCamera]:
+    def _brightness(self, cam: CameraName) -> tuple[Float32, SimCamera]:
         with self._state:
             sim = self._sim_camera(cam)
         with self._rendering[cam]:
@@ -130,7 +131,7 @@ class SimWorld:
                 self._remember(key, known)
         return known, sim
 
-    def _remember(self, key: tuple[Any, ...], brightness: NDArray[np.float32]) -> None:
+    def _remember(self, key: tuple[Any, ...], brightness: Float32) -> None:
         with self._state:
             self._cache[key] = brightness
             while len(self._cache) > 2 and sum(a.nbytes for a in self._cache.values()) > _CACHE_BYTES:

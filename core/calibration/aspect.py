@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
-from core.cameras.lens import Float
 from core.errors import CalibrationInputError
 from core.grid.view import GridView
 from core.target import GridTarget

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.fit.adjust import covariance_of
 from core.calibration.fit.model import N_CAMERA, camera_at, camera_of, collect
 from core.calibration.inputs import (
-    CAMERAS,
     CalibrationOptions,
     CalibrationView,
     NominalCamera,
@@ -23,9 +23,9 @@ from core.calibration.prepare import EXPECTED_NOISE_PX
 from core.calibration.result import COVARIANCE_NAMES, TEN_OF_BOTH
 from core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
 from core.cameras.camera import TEN_PARAMETER_NAMES
-from core.cameras.lens import Float
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
+from core.names import CAMERAS
 
 LineModel = Literal["straight", "parabola", "local"]
 _PER_LINE = {"straight": 2, "parabola": 3}

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.inputs import CAMERAS, CalibrationOptions, CalibrationView, CameraName, NominalCamera
+from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera
 from core.calibration.prepare import check_hold_out
 from core.calibration.result import CalibrationResult
 from core.calibration.solve import calibrate
 from core.errors import ImageError, StereorigError
 from core.grid import GridOptions, GridView, Localiser, detect_grid
+from core.names import CAMERAS, CameraName
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.target import GridTarget
 

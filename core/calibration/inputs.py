@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.errors import CalibrationInputError
+from core.names import CameraName
 
-CameraName = Literal["cam1", "cam2"]
 _SMALLEST_SPREAD_PX = 5.0  # rms over the narrower direction
-CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
 
 
 class TargetLike(Protocol):

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.checks.positions import PositionCheck, check_positions
 from core.calibration.fit.adjust import covariance_of
 from core.calibration.fit.model import N_CAMERA, camera_of, collect
 from core.calibration.fit.start import start_values
 from core.calibration.inputs import (
-    CAMERAS,
     CalibrationOptions,
     CalibrationView,
     NominalCamera,
@@ -22,9 +22,9 @@ from core.calibration.inputs import (
     is_held_out,
 )
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
-from core.cameras.lens import Float
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError, CalibrationInputError
+from core.names import CAMERAS
 
 EXPECTED_NOISE_PX = 0.005  # of a localiser, for predictions before any residual is known
 _SAME_POSITION_MM = 1e-6

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from core.calibration.checks.positions import PositionCheck
 from core.calibration.fit.adjust import Adjustment
@@ -22,7 +23,6 @@ from core.calibration.prepare import Views
 from core.calibration.result import TEN_OF_BOTH, CalibrationResult, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 from core.calibration.verdict import checks_made, judge
-from core.cameras.lens import Float
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
 

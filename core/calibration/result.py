@@ -7,13 +7,14 @@ from typing import Literal
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.checks.measures import CheckMeasures
 from core.calibration.checks.positions import PositionCheck
-from core.calibration.inputs import CAMERAS, CalibrationOptions, CameraName, NominalCamera
+from core.calibration.inputs import CalibrationOptions, NominalCamera
 from core.calibration.uncertainty import VolumeUncertainty
 from core.cameras.camera import TEN_PARAMETER_NAMES
-from core.cameras.lens import Float
 from core.cameras.stereo import StereoPair
+from core.names import CAMERAS, CameraName
 
 COVARIANCE_NAMES = tuple(f"{camera}.{name}" for camera in CAMERAS for name in TEN_PARAMETER_NAMES)
 TEN_OF_BOTH = np.r_[0:10, 12:22]  # where the ten parameters of both cameras lie among the adjustment's 24

@@ -6,24 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.checks.angles import check_angles
 from core.calibration.fit.adjust import Adjustment, adjust
 from core.calibration.fit.model import N_CAMERA, camera_of, collect
 from core.calibration.fit.single import fit_single
 from core.calibration.fit.start import start_values
-from core.calibration.inputs import (
-    CAMERAS,
-    CalibrationOptions,
-    CalibrationView,
-    NominalCamera,
-    TargetLike,
-    inner_nodes_mm,
-)
+from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, TargetLike, inner_nodes_mm
 from core.calibration.prepare import Views, compare_positions, predict_or_refuse, sort_views, split_hold_out
 from core.calibration.report import build_result
 from core.calibration.result import CalibrationResult
-from core.cameras.lens import Float
 from core.errors import CalibrationError
+from core.names import CAMERAS
 
 
 def calibrate(

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.fit.model import N_CAMERA
 from core.calibration.inputs import TargetLike, extent_mm
-from core.cameras.lens import Float
 from core.cameras.stereo import StereoPair
 
 

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.checks.measures import CheckMeasures
 from core.calibration.inputs import CalibrationOptions
 from core.calibration.result import CheckDone, Level, Verdict, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty
-from core.cameras.lens import Float
+from core.names import CAMERAS
 
 GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
 #: lenses sit within some per cent of the sensor's centre; a share of the image's diagonal
@@ -53,7 +54,7 @@ def judge(
         judged, word = fitted, "Fitted"
     else:
         judged, word = held_out, "Held-out"
-    for name, part in zip(("cam1", "cam2"), judged.per_camera, strict=True):
+    for name, part in zip(CAMERAS, judged.per_camera, strict=True):
         this = band(part.rbe_px)
         level = worst(level, this)
         limit = GOOD_RBE_PX if this in ("good", "warning") else USABLE_RBE_PX
@@ -83,7 +84,7 @@ def judge(
                 f"Node corrections reach {1e3 * largest:.1f} um against a tolerance of {1e3 * node_tolerance_mm:.1f} "
                 "um: the target, its tolerance or the aspect ratio may be wrong."
             )
-    for name, (camera, size) in zip(("cam1", "cam2"), centres, strict=False):
+    for name, (camera, size) in zip(CAMERAS, centres, strict=False):
         off = np.hypot(camera["cx_px"] - 0.5 * (size[0] - 1), camera["cy_px"] - 0.5 * (size[1] - 1))
         if off > CENTRE_SHARE * np.hypot(*size):
             # an axis off the optical axis moves the principal point by phd * angle, and no residual shows it

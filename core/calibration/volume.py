@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from core.arrays import Bool, Float
 from core.calibration.fit.model import N_CAMERA
 from core.calibration.uncertainty import point_derivatives
 from core.cameras.camera import Camera
-from core.cameras.lens import Bool, Float
 from core.cameras.stereo import StereoPair
 
 _FEWEST_POINTS = 8

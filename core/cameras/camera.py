@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.cameras.lens import Bool, Float, LensModel, MappedPoints, SeidelLens
+from core.arrays import Bool, Float
+from core.cameras.lens import LensModel, MappedPoints, SeidelLens
 
 POSE_NAMES = ("alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm")
 TEN_PARAMETER_NAMES = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", *POSE_NAMES)

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from core.cameras.lens import Float, LensModel, OpenCVLens, SeidelLens
+from core.arrays import Float
+from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 from core.errors import CalibrationError
 
 _ACROSS = 41  # places across the image, each way

@@ -14,10 +14,9 @@ from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from core.arrays import Bool, Float
 
 SEIDEL = 0.0
 OPENCV = 1.0

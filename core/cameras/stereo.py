@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
-from core.cameras.lens import Float
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Bool, Float
 from core.errors import MeasurementError, RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.gauge.sampling import sample
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 _STRAIGHT = 1e-6
 _ROUNDS = 20

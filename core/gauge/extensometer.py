@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.reading import MISSING, Reading
 from core.gauge.sampling import Samples, sample
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

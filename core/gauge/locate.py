@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import steps_px
 from core.gauge.sampling import sample
-
-Float = NDArray[np.float64]
 
 _ROUNDS = 20
 _REFINED = 5  # each round takes the bend of a cell out of the next digits

@@ -12,23 +12,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from core.arrays import Bool, Float
 from core.errors import InputError, MeasurementError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
 _FEWEST = 3
 _ROUNDS = 50
 _OUTER_ROUNDS = 30
 _EXTRA_SETTLED = 1e-3
 _CONVERGED = 1e-11
-_TUKEY = 4.685  # 95 % efficiency on normal errors
-_MAD = 1.4826
 _LINE = 1e-6  # spread across a line of points, relative to the spread along it
 
 
@@ -120,7 +116,7 @@ def rigid_motion(
         for _ in range(_ROUNDS):
             noise, r = _residuals(arm, moved - centre, cov, R, d)
             W = np.asarray(np.linalg.inv(noise + extra * np.eye(3)), dtype=np.float64)
-            weight = _biweight(np.einsum("na,nab,nb->n", r, W, r)) if robust else weight
+            weight = _robust_weight(np.einsum("na,nab,nb->n", r, W, r)) if robust else weight
             A = np.concatenate([-skew(arm @ R.T), np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
             WA = weight[:, None, None] * (W @ A)
             H = np.einsum("nai,naj->ij", A, WA)
@@ -222,11 +218,9 @@ def _unweighted(arm: Float, moved: Float) -> tuple[Float, Float]:
     return R, d
 
 
-def _biweight(distance2: Float) -> Float:
-    distance = np.sqrt(distance2 / 3.0)
-    scale = _MAD * float(np.median(np.abs(distance))) + 1e-30
-    u2 = np.minimum(distance2 / 3.0 / (_TUKEY * scale) ** 2, 1.0)
-    return np.asarray((1.0 - u2) ** 2)
+def _robust_weight(distance2: Float) -> Float:
+    scale = MAD_TO_SIGMA * float(np.median(np.sqrt(distance2 / 3.0))) + 1e-30
+    return biweight(distance2 / 3.0 / (BIWEIGHT_REACH * scale) ** 2)
 
 
 def _vector_slope(v: Float) -> Float:

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
 from core.field.region.cuts import crosses
 from core.status import PointStatus
-
-Float = NDArray[np.float64]
 
 _ON_A_POINT = 1e-9
 _CUT = "cut"
@@ -52,7 +51,7 @@ class Samples:
     missing: tuple[str, ...]
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def found(self) -> Bool:
         """(m,) True where the place has values."""
         return np.isfinite(self.weight[:, 0])
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.grid.pieces import Pieces
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens

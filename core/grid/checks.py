@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
 from core.grid.lattice import Lattice, apply_homography, homography
 from core.grid.piece_table import PieceTable
 from core.grid.profile import IN, OUT
 from core.grid.view import GridOptions
+from core.robust import MAD_TO_SIGMA
 from core.target import GridTarget
 
 Cause = Literal["", "dirt", "glare"]
@@ -124,7 +125,7 @@ def saturation_level(image: NDArray[Any]) -> float:
     return float(top) if top in full and np.count_nonzero(array == top) > 20 else float("inf")
 
 
-def blame_glare(error: TargetError, grey: NDArray[np.float32], saturation: float) -> TargetError:
+def blame_glare(error: TargetError, grey: Float32, saturation: float) -> TargetError:
     """The same refusal, but named after the glare where saturated pixels can have hidden the lines."""
     expected, found = error.context.get("expected"), error.context.get("found")
     too_many = expected is not None and found is not None and sum(found) > sum(expected)
@@ -183,7 +184,7 @@ def _smooth(table: PieceTable, values: Float) -> Float:
             break
         out = J @ np.linalg.lstsq(J[keep], values[keep], rcond=None)[0]
         off = np.abs(values - out)
-        keep = np.isfinite(values) & (off < 4.0 * 1.4826 * np.median(off[keep]) + 1e-3 * abs(middle))
+        keep = np.isfinite(values) & (off < 4.0 * MAD_TO_SIGMA * np.median(off[keep]) + 1e-3 * abs(middle))
     return out
 
 

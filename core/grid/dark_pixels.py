@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.grid.piece_table import PieceTable
 from core.grid.profile import in_strip, strip_bounds
 
@@ -48,7 +47,7 @@ class Parabolas:
 
 @njit(cache=True, nogil=True)
 def _collect(
-    image: NDArray[np.float32],
+    image: Float32,
     rows: Float,
     fits: Float,
     use: Bool,
@@ -96,13 +95,7 @@ def _collect(
 
 
 def dark_pixel_lines(
-    image: NDArray[np.float32],
-    table: PieceTable,
-    fits: Float,
-    good: Bool,
-    *,
-    dark_lines: bool,
-    share: float = THRESHOLD,
+    image: Float32, table: PieceTable, fits: Float, good: Bool, *, dark_lines: bool, share: float = THRESHOLD
 ) -> Parabolas:
     """Fit each line's parabola to its dark pixels.
 

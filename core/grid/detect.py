@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
 from core.grid.checks import blame_glare, check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
@@ -19,6 +19,7 @@ from core.grid.pieces import directions
 from core.grid.profile import OUT, fit_pieces
 from core.grid.threshold import checked_image, coarse_factors, line_picture
 from core.grid.view import GridOptions, GridView, LineModel, Localiser
+from core.robust import MAD_TO_SIGMA
 from core.target import GridTarget
 
 _OUTLIER = 6.0  # standard deviations at which a line point is a blemish
@@ -122,7 +123,7 @@ def detect_grid(
     )
 
 
-def _coarse(grey: NDArray[np.float32], target: GridTarget) -> tuple[Lattice, float]:
+def _coarse(grey: Float32, target: GridTarget) -> tuple[Lattice, float]:
     """Find the lattice at the scale that shows all its lines; else the one with the most of them."""
     best: tuple[Lattice, float] | None = None
     failure: TargetError | None = None
@@ -159,7 +160,7 @@ class _Measured(NamedTuple):
 
 
 def _measure(
-    grey: NDArray[np.float32],
+    grey: Float32,
     nodes_px: Float,
     target: GridTarget,
     saturation: float,
@@ -187,7 +188,7 @@ def _measure(
         )
         z = np.abs(fit.residual_px) / np.sqrt(fit.variance_px2 + floor_px**2)
         # a grid worse than described spreads all points: judge by their own scatter then
-        limit = _OUTLIER * max(1.0, 1.4826 * float(np.median(z[used])))
+        limit = _OUTLIER * max(1.0, MAD_TO_SIGMA * float(np.median(z[used])))
         spoilt = np.unique(pp.piece[z > limit])
         fitting = good.copy()
         fitting[spoilt] = False

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.errors import TargetError
 from core.grid.chains import Chain, CoarseLine, link, order
 from core.grid.lines import meet_parabolas

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.grid.view import LineModel
 
 _BASE_TERMS = 5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.grid.lines import LinePoints
 from core.grid.profile import IN, INPUTS, OUT
 from core.target import GridTarget

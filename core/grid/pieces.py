@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from core.cameras.lens import Float
+from core.arrays import Bool, Float, Float32
 from core.grid.threshold import LinePicture
 
 _COHERENCE = 0.5
@@ -64,8 +64,8 @@ class Directions:
         Main directions, the strongest first.
     """
 
-    angle_rad: NDArray[np.float32]
-    usable: NDArray[np.bool_]
+    angle_rad: Float32
+    usable: Bool
     peaks_rad: tuple[float, ...]
 
 

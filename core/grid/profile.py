@@ -21,9 +21,8 @@ from math import erf, exp, sqrt
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float, Float32
 
 # columns of the table of pieces
 INPUTS = (
@@ -139,7 +138,7 @@ def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) 
 
 
 @njit(cache=True, nogil=True)
-def _search(image: NDArray[np.float32], piece: Float, guard: float, sign: float) -> float:
+def _search(image: Float32, piece: Float, guard: float, sign: float) -> float:
     """Where the strip's mean profile is deepest within the search range; matched with a box of the line's width."""
     search = piece[16]
     reach = search + 2.0 + piece[14]
@@ -205,7 +204,7 @@ def _solve(M: Float, b: Float, x: Float) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
+def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
     out[:] = np.nan
     out[15] = 0.0
     width, blur = piece[14], piece[15]
@@ -362,12 +361,12 @@ def _fit_piece(image: NDArray[np.float32], piece: Float, guard_blurs: float, sig
 
 
 @njit(cache=True, nogil=True)
-def _fit_pieces(image: NDArray[np.float32], pieces: Float, guard_blurs: float, sign: float, out: Float) -> None:
+def _fit_pieces(image: Float32, pieces: Float, guard_blurs: float, sign: float, out: Float) -> None:
     for k in range(pieces.shape[0]):
         _fit_piece(image, pieces[k], guard_blurs, sign, out[k])
 
 
-def fit_pieces(image: NDArray[np.float32], pieces: Float, *, dark_lines: bool, guard_blurs: float = 5.0) -> Float:
+def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: float = 5.0) -> Float:
     """Fit every piece of the table.
 
     Parameters

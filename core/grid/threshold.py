@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.errors import ImageError
 from core.target import GridTarget
 
@@ -42,14 +42,14 @@ class LinePicture:
         Full-size pixels per coarse pixel.
     """
 
-    depth: NDArray[np.float32]
+    depth: Float32
     mask: Bool
     threshold: float
     noise: float
     factor: float
 
 
-def checked_image(image: NDArray[Any]) -> NDArray[np.float32]:
+def checked_image(image: NDArray[Any]) -> Float32:
     """Return a 2-D gray image as float32.
 
     Raises
@@ -73,7 +73,7 @@ def checked_image(image: NDArray[Any]) -> NDArray[np.float32]:
     return grey
 
 
-def noise_level(grey: NDArray[np.float32]) -> float:
+def noise_level(grey: Float32) -> float:
     """Estimate the noise's standard deviation from second differences, blind to slopes and robust against edges."""
     d = grey[:, 2:] - 2.0 * grey[:, 1:-1] + grey[:, :-2]
     d = d[1::2] if d.size > 1_000_000 else d
@@ -93,7 +93,7 @@ def _widest_pitch_px(size_px: tuple[int, int], target: GridTarget) -> float:
     return max(size_px) / (min(target.lines) - 1)
 
 
-def line_picture(grey: NDArray[np.float32], target: GridTarget, factor: float) -> LinePicture:
+def line_picture(grey: Float32, target: GridTarget, factor: float) -> LinePicture:
     """Find what is thinner than the target's lines can be.
 
     Parameters
@@ -126,7 +126,7 @@ def line_picture(grey: NDArray[np.float32], target: GridTarget, factor: float) -
     return LinePicture(depth, depth > threshold, threshold, noise, factor)
 
 
-def _otsu(depth: NDArray[np.float32]) -> float:
+def _otsu(depth: Float32) -> float:
     """Otsu's threshold over the depths, on a histogram that a few glints cannot stretch."""
     top = float(np.quantile(depth[::2, ::2], 0.9995))
     if top <= 0.0:

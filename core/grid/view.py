@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.target import GridTarget
 
 Localiser = Literal["profile", "paper"]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera
-from core.cameras.lens import Float
 from core.errors import InputError
 from core.matching.image import PAD, ImageData
 from core.matching.options import SPLINE_ORDER, MatchOptions

@@ -19,11 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float, Float32
 from core.errors import InputError
 from core.matching.filters import correlate
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 _REACH_SD = 4.0  # the taps beyond hold 6e-5 of the kernel
 _EDGE_SD = 3.0

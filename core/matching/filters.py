@@ -15,10 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float, Float32
 from core.threads import run_ranges, threads
-
-Float32 = NDArray[np.float32]
-Float = NDArray[np.float64]
 
 CUT = 1e-8
 """Taps below this share of the largest are left out: less than float32 rounds."""

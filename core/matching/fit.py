@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.errors import ImageError, InputError
 from core.matching.arguments import (

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 
 
@@ -219,7 +219,7 @@ def _root2(m: Float) -> Float:
     return np.asarray((m + s[..., None, None] * np.eye(2)) / trace[..., None, None])
 
 
-def _rotation_vectors(rotation: NDArray[np.float64]) -> Float:
+def _rotation_vectors(rotation: Float) -> Float:
     """Axis times angle, through the quaternion, which keeps its digits at small and at large angles."""
     r = rotation
     skew = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1)

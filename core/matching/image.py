@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.arrays import Float32
 from core.errors import ImageError, InputError
 from core.matching.blur import Blur, fitted_share, spread_of
 from core.matching.filters import correlate, derivative, in_bands, prefilter
@@ -24,7 +25,6 @@ from core.noise import NoiseModel
 PAD = 4
 """Mirrored coefficients kept around the image, so that no tap needs a test (quintic: 2 left, 3 right, and rounding)."""
 
-Float32 = NDArray[np.float32]
 _ONE = np.ones(1)
 _SAMPLE = 4  # every fourth pixel is enough for a mean variance
 _LEVEL_PX = 0.5  # sd of the smoothing before a grey level weighs: more would take edges' levels for one another

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
 from core.matching.arguments import (
@@ -106,6 +106,6 @@ def observed_covariance(
     kernels, spaces = (observe_motion, observed_motion_space) if motion else (observe_shape, observed_shape_space)
     kernel, space = kernels[degree], one_a_thread(spaces[degree], options.subset_px)
     run_ranges(lambda first, last: kernel(first, last, *fixed, space(), out, status), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
-    known: NDArray[np.bool_] = status == 0
+    known: Bool = status == 0
     out[~known] = np.nan
     return out.reshape(n, q, q), known

@@ -20,11 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from core.arrays import Float, Float32
 from core.matching.blur import Blur
 from core.matching.filters import derivative, in_bands
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 REACH = 3
 """The filter is 7 x 7; 9 x 9 gains less than 0.05 % of the information."""

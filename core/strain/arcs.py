@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.region.window import fit_terms, window_offsets
 
 _FIRM = 1e-6

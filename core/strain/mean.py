@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.field.region.window import window_offsets

@@ -8,9 +8,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Bool, Float
 from core.strain.options import StrainOptions
-
-Float = NDArray[np.float64]
 
 
 class StrainStatus(IntEnum):
@@ -72,7 +71,7 @@ class StrainField:
     patch: Float | None = None
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Bool:
         """(r, c) True where there is a strain."""
         return np.asarray(self.status == StrainStatus.OK)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.strain.options import StrainTensor
 from core.strain.result import principal_of
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
 from core.field.region.window import fit_terms, points_seen, steps_of, ways_cut, window_offsets

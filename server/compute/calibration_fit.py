@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from core.calibration import CalibrationOptions, CalibrationResult, NominalCamera
 from core.calibration.from_images import ImageOfTarget, calibrate_views
-from core.calibration.inputs import CAMERAS
 from core.errors import CalibrationError
 from core.grid import GridOptions, GridView, detect_grid
+from core.names import CAMERAS
 from core.target import GridTarget
 from server.formats.calibrations.native import calibration_content
 from server.formats.images import GrayImage, read_image
-from server.formats.results.writing import written_dataset
+from server.formats.results.netcdf import written_dataset
 from server.formats.version import software_version
 from server.store.calibrations import REJECTED
 from server.store.durable import write_json

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import ImageError, InputError
+from core.names import CAMERAS
 from core.noise import NoiseModel, measure_noise
 from server.formats.noise_frames import read_frames
-from server.formats.noise_json import CAMERAS, noise_content, write_noise
+from server.formats.noise_json import noise_content, write_noise
 from server.worker.tasks import NoiseTask
 
 
@@ -24,7 +25,7 @@ def fit_noise(task: NoiseTask) -> dict[str, Any]:
     folder = Path(task.folder)
     document = json.loads((folder / "frames.json").read_text())
     models: dict[str, NoiseModel] = {}
-    sources = {}
+    sources: dict[str, object] = {}
     for cam in CAMERAS:
         files = [entry for entry in document["frames"] if entry["camera"] == cam]
         try:

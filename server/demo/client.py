@@ -10,11 +10,10 @@ from typing import Any
 
 import httpx
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import MeasurementError, StateError, StorageError
 
-Float = NDArray[np.float64]
 OnProgress = Callable[[str, int, int, float | None], None]
 
 _POLL_S = 0.25

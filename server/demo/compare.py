@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from server.demo.session import pixels_of
 from sim.catalog import make_scene
 from sim.rig import SimRig
 from sim.truth import Truth, truth_at
-
-Float = NDArray[np.float64]
 
 WRONG_PX = 0.1  # a matched point is off by hundredths of a pixel; a mismatch by tenths and more
 WRONG_SIGMA = 5.0

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Bool, Float
 from core.errors import FileFormatError
 from core.field.points.result import Field
 from core.strain import StrainField, surface_strain
@@ -15,8 +16,6 @@ from server.demo.session import Session
 from server.formats.results.strain import read_strain
 from sim.truth import Truth
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 MICRO = 1e6
 SAFE = 3.0  # standard deviations that chance is given
 

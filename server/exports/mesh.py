@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.region.cuts import Cuts, crosses
 
-Float = NDArray[np.float64]
 Places = NDArray[np.intp]
 
 

@@ -11,7 +11,7 @@ import netCDF4
 import numpy as np
 
 from server.formats.files import written_aside
-from server.results.reader import library
+from server.formats.results.netcdf import library
 from server.results.steps import Source, StepResult, chosen, each, provenance, require_same_grid
 
 _NO_STATE = -1  # of an integer variable in a step that does not have it

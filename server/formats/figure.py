@@ -21,10 +21,10 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.region.cuts import Cuts
 from server.formats.figure_options import Look
 
-Float = NDArray[np.float64]
 PictureForm = Literal["png", "svg"]
 
 MEDIA_TYPES: dict[PictureForm, str] = {"png": "image/png", "svg": "image/svg+xml"}

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError, StereorigError
+from core.names import CAMERAS
 from core.noise import NoiseModel
 from server.formats.files import write_bytes
 from server.formats.version import software_version
 
 FORMAT = "stereorig noise"
 FORMAT_VERSION = 1
-CAMERAS = ("cam1", "cam2")
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class LoadedNoise:
 
     def record(self) -> dict[str, Any]:
         """Return what a result file keeps of it: the numbers that were used, and where they come from."""
-        cameras = {
+        cameras: dict[str, object] = {
             cam: None if model is None else {"coefficients": list(model.coefficients), "frames": model.frames}
             for cam, model in zip(CAMERAS, self.models, strict=True)
         }

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from core.calibration.inputs import CAMERAS, CameraName
 from core.errors import InputError
+from core.names import CAMERAS, CameraName
 
 # read-back positions of the two stages may differ by some micrometres at what is one position
 PAIR_TOLERANCE_MM = 0.05

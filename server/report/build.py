@@ -1,7 +1,8 @@
-"""A report from top to bottom."""
+"""A report from top to bottom: everything gathered, then shown by the templates."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -9,18 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.points.result import Field
+from core.names import CAMERAS
 from server.formats.version import software_version
-from server.report import pictures, sections
-from server.report.floor import STRAINS
+from server.report import pictures
+from server.report.calibration import CalibrationPart, calibration_gaps
+from server.report.floor import STRAINS, UM
 from server.report.geometry import geometry
 from server.report.hardware import hardware, image_sizes
-from server.report.histories import histories
-from server.report.page import Markup, document, element, picture, policy_of, section, style_of
+from server.report.histories import courses, gauges
+from server.report.items import Item, Missing, Value, plain
+from server.report.page import PNG, Picture, render
 from server.report.settings import analysis
-from server.report.source import CAMERAS, Source
+from server.report.source import Source
 from server.report.steps import Measured, Shown, read_steps
 
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))
+_LEVELS = {"ok": "good", "good": "good", "warning": "warning", "failed": "failed"}
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,26 @@ class Report:
 
     page: bytes
     policy: str
-    missing: list[tuple[str, str]]
+    missing: list[Missing]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A figure at a glance; ``level`` colours it."""
+
+    name: str
+    value: str
+    small: str
+    level: str = ""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Settings and facts as they are on file, and by result file the checksums of what it was made from."""
+
+    settings: str
+    facts: str
+    inputs: list[tuple[str, list[tuple[str, str]]]]
 
 
 def make_report(source: Source) -> Report:
@@ -54,43 +78,127 @@ def make_report(source: Source) -> Report:
     found = None
     if source.calibration is not None:
         found = geometry(source.calibration.pair, measured.reference, image_sizes(source))
-    rig, settings = hardware(source, measured, found), analysis(source, measured, found)
-    test_part, test_items = sections.the_test(source, measured)
-    floor_part, floor_missing = sections.noise_floor(source, measured)
-    calibration_part, calibration_missing = sections.calibration_record(source, measured)
-    seen, seen_missing = _reference(source, measured)
-    loads = any(s.load_n is not None for s in measured.steps)
-    more = [*floor_missing, *calibration_missing, *seen_missing]
-    if not loads:
-        more.append(("Load of the steps", "give load_n with each step"))
+    test, rig, settings = (
+        the_test(source, measured),
+        hardware(source, measured, found),
+        analysis(source, measured, found),
+    )
+    seen, unseen = _reference(source, measured)
+    missing = [gap for item in (*test, *rig, *settings) for gap in item.missing]
+    missing += [*_floor_gaps(source, measured), *calibration_gaps(source, measured), *unseen]
+    if not measured.loaded:
+        missing.append(Missing("Load of the steps", "give load_n with each step"))
     if source.facts.gauges is None and len(measured.steps) > 1:
-        more.append(("Gauges", "name extensometers, points, areas or lines in `gauges` of the facts"))
-    listed = [*test_items, *rig, *settings]
-    missing = [*((name, item.remedy) for item in listed for name in item.missing), *more]
-    tables: list[object] = [sections.steps_table(measured, loads=loads)]
-    tables += [part for part in (sections.motion_table(measured), sections.quality_table(measured)) if part is not None]
+        remedy = "name extensometers, points, areas or lines in `gauges` of the facts"
+        missing.append(Missing("Gauges", remedy))
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    body = [
-        *sections.head(source, measured, made, software_version()),
-        test_part,
-        section("Hardware parameters", "hardware", sections.items_table(rig, "hardware-table")),
-        section("Analysis parameters", "analysis", sections.items_table(settings, "analysis-table")),
-        floor_part,
-        calibration_part,
-        section("What the cameras saw", "seen", *seen),
-        section("Fields", "fields", *_fields(measured)),
-        section("Steps", "steps", *tables),
-        section("Histories", "histories", *histories(source, measured)),
-        sections.not_stated(missing),
-        sections.provenance(source, source.facts),
+    page, policy = render(
+        f"{source.title}  \u00b7  stereorig {software_version()}  \u00b7  {made}",
+        source=source,
+        measured=measured,
+        under=_under(source, measured, made),
+        boxes=_boxes(source, measured),
+        test=test,
+        rig=rig,
+        settings=settings,
+        calibration=None if source.calibration is None else CalibrationPart(source.calibration),
+        worst=measured.worst_epipolar,
+        most_outside=max(s.summary.status.get("extrapolated", 0) for s in measured.steps),
+        seen=seen,
+        unseen=unseen,
+        fields=_fields(measured),
+        courses=courses(measured),
+        gauges=gauges(source, measured),
+        missing=missing,
+        origin=_origin(source),
+    )
+    return Report(page, policy, missing)
+
+
+def _under(source: Source, measured: Measured, made_utc: str) -> list[str]:
+    """What stands under the title."""
+    kind = "displacement" if any(s.largest_mm is not None for s in measured.steps) else "shape"
+    under = [f"Report of a {kind} measurement with two cameras", f"{len(measured.steps)} steps"]
+    under += [f"test {source.test_record.id}"] if source.test_record.id else []
+    under += [f"analysis {source.analysis.id}"] if source.analysis.id else []
+    under += [f"\u201c{source.analysis.label}\u201d"] if source.analysis.label else []
+    return [*under, f"made {made_utc} by stereorig {software_version()}"]
+
+
+def _boxes(source: Source, measured: Measured) -> list[Box]:
+    verdict, held = None, None
+    if source.calibration is not None:
+        record = source.calibration.record
+        verdict = record.verdict.level
+        held = None if record.checks is None or record.checks.held_out is None else record.checks.held_out.rbe_px
+    held_text = "" if held is None else f"held-out RBE {plain(held, 2)} px"
+    worst = measured.worst_epipolar
+    level = None if worst is None else worst.level
+    off = "" if worst is None else f"{worst.offset_px:.3f} px off the epipolar lines"
+    share = min((s.summary.valid_fraction for s in measured.steps if s.summary.valid_fraction is not None), default=0.0)
+    floor = measured.floor.get("W") or measured.floor.get("Z")
+    if floor is not None and floor.spatial_sd is not None:
+        noise, small = f"{1e3 * floor.spatial_sd:.2g} {UM}", f"sd of W over the points, {floor.steps} static steps"
+    else:
+        sigma = measured.told.get("W", measured.told.get("Z"))
+        noise, small = ("-" if sigma is None else f"{1e3 * sigma:.2g} {UM}"), "predicted, no static steps"
+    return [
+        Box("Calibration", verdict or "no record", held_text, _LEVELS.get(verdict or "", "")),
+        Box("Cameras since then", level or "not told", off, _LEVELS.get(level or "", "")),
+        Box(
+            "Valid points, least of the steps",
+            f"{100.0 * share:.1f} %",
+            f"of {measured.steps[0].summary.points} in the region",
+        ),
+        Box("Noise, out of plane", noise, small),
     ]
-    title = f"{source.title}: report"
-    style = style_of(f"{source.title}  \u00b7  stereorig {software_version()}  \u00b7  {made}")
-    return Report(document(title, style, body).encode(), policy_of(style), missing)
 
 
-def _reference(source: Source, measured: Measured) -> tuple[list[Markup], list[tuple[str, str]]]:
-    """Both cameras' reference images with the measured points."""
+def the_test(source: Source, measured: Measured) -> list[Item]:
+    """Return the items of the test."""
+    facts = source.facts
+    times = [s.captured_utc for s in measured.steps if s.captured_utc]
+
+    def told(name: str, label: str, value: str | None) -> Item:
+        known = Value(value, None, "as told") if value else None
+        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/facts or facts.toml")
+
+    taken = None
+    if times:
+        imported = any(step.source == "import" for step in source.steps.values())
+        origin = "import of the files, not their exposure" if imported else "recorded with the images"
+        taken = Value(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}", None, origin)
+    return [
+        told("purpose", "Purpose", facts.purpose),
+        told("specimen", "Specimen", facts.specimen or source.test_record.specimen),
+        told("material", "Material", facts.material),
+        told("loading", "Loading", facts.loading),
+        told("environment", "Environment", facts.environment),
+        told("laboratory", "Laboratory", facts.laboratory),
+        told("operator", "Operator", facts.operator),
+        Item("test.images_taken", "Images taken", (taken,), "is recorded when the service captures or imports"),
+    ]
+
+
+def _floor_gaps(source: Source, measured: Measured) -> list[Missing]:
+    if not measured.static:
+        remedy = (
+            "take steps before anything is loaded and name them in static_steps, or begin their labels with `static`"
+        )
+        return [Missing("Noise floor and bias of displacement and strain, from static steps", remedy)]
+    gaps = []
+    if len(measured.static) == 1:
+        gaps.append(Missing("Noise floor from step to step (temporal)", "take at least two static steps"))
+    lost = [n for n in source.facts.static_steps or [] if n not in source.files]
+    if lost:
+        gaps.append(Missing(f"Results of the static steps {', '.join(map(str, lost))}", "measure them too"))
+    if not any(n in measured.floor for n in "UVW"):
+        gaps.append(Missing("Noise floor and bias of displacement", "measure displacements of the static steps"))
+    return gaps
+
+
+def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[Missing]]:
+    """Both cameras' reference images with the measured points, and those that are not there."""
     field = measured.reference
     drawn, missing = [], []
     valid = field.valid.ravel()
@@ -99,7 +207,7 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Markup], list[t
         name = cam.replace("cam", "camera ")
         if image is None:
             remedy = "the file must lie where it was measured from, with the same checksum"
-            missing.append((f"Reference image of {name}", remedy))
+            missing.append(Missing(f"Reference image of {name}", remedy))
             continue
         if cam == "cam1":
             places = np.stack([field.x_px.ravel(), field.y_px.ravel()], axis=-1)
@@ -113,10 +221,9 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Markup], list[t
         data = pictures.region(image, places, chosen, f"{name}, step {source.reference}", cuts, outline)
         caption = f"{name.capitalize()}, reference: green where a point was measured, red where not"
         caption += ", yellow the region that was asked for" if outline is not None else ""
-        drawn.append(picture(data, pictures.PNG, f"reference image of {name} with the measured points", caption))
-    parts = [element("div", *drawn, class_="pair")] if drawn else []
-    parts += [element("p", f"{name} is not shown: {remedy}.", class_="missing") for name, remedy in missing]
-    return parts, missing
+        text = f"reference image of {name} with the measured points"
+        drawn.append(Picture(data, PNG, text, caption, half=False))
+    return drawn, missing
 
 
 def _outline(source: Source) -> NDArray[np.float64] | None:
@@ -131,28 +238,22 @@ def _outline(source: Source) -> NDArray[np.float64] | None:
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float64)
 
 
-def _fields(measured: Measured) -> list[Markup]:
-    """Maps of the reference's shape, of the steps that are shown, and of the points' states."""
-    text = "Colours end at the 1st and the 99th percentile. White: no value; nothing is filled in."
-    parts = [element("p", text, class_="note lead")]
+def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
+    """Maps of the reference's shape, of the steps that are drawn, and of the states; each set with its title."""
     reference = measured.reference
     height = pictures.field_map(reference, reference.xyz_mm[..., 2], "Z of the reference", "Shape, Z")
-    drawn = [picture(height, pictures.PNG, "map of the reference's Z", "Shape of the reference: Z", half=True)]
+    drawn = [Picture(height, PNG, "map of the reference's Z", "Shape of the reference: Z")]
     if not measured.shown:
         drawn.append(_status(reference, "the reference"))
-    parts.append(element("div", *drawn, class_="pair"))
-    for shown in measured.shown:
-        parts.append(element("h3", f"Step {shown.n}: {shown.why}"))
-        parts.append(element("div", *_maps(shown), class_="pair"))
-    return parts
+    return [("", drawn), *((f"Step {shown.n}: {shown.why}", _maps(shown)) for shown in measured.shown)]
 
 
-def _status(field: Field, what: str) -> Markup:
+def _status(field: Field, what: str) -> Picture:
     data = pictures.status_map(field, f"States of the points, {what}")
-    return picture(data, pictures.PNG, f"map of the points' states, {what}", f"States of the points, {what}", half=True)
+    return Picture(data, PNG, f"map of the points' states, {what}", f"States of the points, {what}")
 
 
-def _maps(shown: Shown) -> list[Markup]:
+def _maps(shown: Shown) -> list[Picture]:
     field, drawn = shown.field, []
     layers: list[tuple[str, NDArray[np.float64], bool]] = []
     if field.uvw_mm is not None:
@@ -162,13 +263,29 @@ def _maps(shown: Shown) -> list[Markup]:
     if shown.strain is not None and shown.strain.valid.any():
         layers += [(name, pictures.strain_values(shown.strain, k), True) for k, name in enumerate(STRAINS)]
     for name, values, strain in layers:
-        data = pictures.field_map(field, values, name, f"{name}, step {shown.n}", strain=strain)
-        drawn.append(
-            picture(data, pictures.PNG, f"map of {name} in step {shown.n}", f"{name}, step {shown.n}", half=True)
-        )
+        title = f"{name}, step {shown.n}"
+        data = pictures.field_map(field, values, name, title, strain=strain)
+        drawn.append(Picture(data, PNG, f"map of {name} in step {shown.n}", title))
     sigma, name = field.sigma_mm[..., -1], "W" if field.has_motion else "Z"
     data = pictures.field_map(field, sigma, "standard deviation", f"sigma of {name}, step {shown.n}")
-    alt = f"map of the predicted standard deviation in step {shown.n}"
-    drawn.append(picture(data, pictures.PNG, alt, f"Predicted standard deviation of {name}", half=True))
+    text = f"map of the predicted standard deviation in step {shown.n}"
+    drawn.append(Picture(data, PNG, text, f"Predicted standard deviation of {name}"))
     drawn.append(_status(field, f"step {shown.n}"))
     return drawn
+
+
+def _origin(source: Source) -> Origin:
+    first = source.heads[max(source.heads)]
+    inputs = {n: dict(head["inputs_sha256"]) for n, head in source.heads.items()}
+    common = {k: v for k, v in inputs[max(inputs)].items() if all(found.get(k) == v for found in inputs.values())}
+    rows = [("all steps", sorted(common.items()))]
+    for n, path in source.files.items():
+        written = str(source.heads[n].get("created", ""))
+        name = f"{path.name}, written {written}" if written else path.name
+        rows.append((name, sorted((k, v) for k, v in inputs[n].items() if k not in common)))
+    told = source.facts.document()
+    return Origin(
+        settings=json.dumps(first.get("settings", {}), sort_keys=True, ensure_ascii=False),
+        facts=json.dumps(told, ensure_ascii=False) if told else "",
+        inputs=rows,
+    )

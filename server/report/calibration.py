@@ -1,17 +1,18 @@
-"""The calibration's record in a report: checks, parameters with their uncertainty, target, positions, verdict."""
+"""The calibration in a report: checks, parameters with their uncertainty, target, or another program's lenses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
 
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES
-from server.report.items import plain
-from server.report.page import Cell, Markup, element, note, table
-from server.report.source import CAMERAS, Source
+from core.names import CAMERAS
+from server.formats.calibrations.recognise import LoadedCalibration
+from server.formats.calibrations.record import CalibrationRecord, Measures
+from server.report.items import Missing, Value
+from server.report.source import Source
+from server.report.steps import Measured
 
 _CHECKS = (
     ("rbe_px", "RBE (mean distance of found and projected intersections)", "px"),
@@ -19,108 +20,111 @@ _CHECKS = (
     ("nsce", "NSCE (the same over what a pixel's rounding would make of it)", ""),
 )
 _UNITS = {"px2": "1/px\u00b2", "px": "px", "rad": "rad", "mm": "mm"}
+_KINDS = {"dice_xml": "DICe XML", "opencv_yaml": "OpenCV YAML"}
 
 
-def record(source: Source) -> tuple[list[Markup], list[tuple[str, str]]]:
-    """Return the parts of the section, and what is missing from it with its remedy."""
-    loaded = source.calibration
-    if loaded is None:
-        remedy = "give the file that the results were measured with (--calibration)"
-        return [element("p", "The calibration was not found.", class_="missing")], [("Calibration record", remedy)]
-    if not loaded.details.get("checks"):
-        kind = {"dice_xml": "DICe XML", "opencv_yaml": "OpenCV YAML"}.get(loaded.source, loaded.source)
-        parts = [
-            element("p", f"Cameras from {_name(source)} ({kind}). The file has no record of how they were calibrated.")
+@dataclass(frozen=True)
+class Check:
+    """One measure over some positions: of both cameras, of camera 1, of camera 2."""
+
+    key: str
+    label: str
+    unit: str
+    values: tuple[float | None, ...]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One of the eleven parameters of both cameras."""
+
+    key: str
+    label: str
+    unit: str
+    values: tuple[Value, ...]
+
+
+class CalibrationPart:
+    """What a report shows of a calibration's file."""
+
+    def __init__(self, loaded: LoadedCalibration) -> None:
+        self._loaded, self._record = loaded, loaded.record
+        self.kind = _KINDS.get(loaded.source, loaded.source)
+
+    @property
+    def checks(self) -> list[Check]:
+        """The measures at fitted and at held-out positions."""
+        rows = []
+        for name, label, unit in _CHECKS:
+            for which, told in (("fitted", "positions that were fitted"), ("held_out", "held-out positions")):
+                found = getattr(self._record.checks, which)
+                each = {} if found is None else found.per_camera
+                measures = (found, *(each.get(cam) for cam in CAMERAS))
+                values = tuple(getattr(m, name) if isinstance(m, Measures) else None for m in measures)
+                rows.append(Check(f"calibration.{which}.{name}", f"{label}, {told}", unit, values))
+        return rows
+
+    @property
+    def made(self) -> list[str]:
+        """The checks that were made, and what the calibration leaves uncertain."""
+        assert self._record.checks is not None
+        lines = [f"{c.name.replace('_', ' ')}: {c.text}" for c in self._record.checks.made if c.text]
+        found = self._record.uncertainty
+        if found.shape_rms_mm is not None:
+            text = f"uncertainty that it leaves in shape: {1e3 * found.shape_rms_mm:.3g} \u00b5m rms"
+            if found.predicted_shape_rms_mm is not None:
+                text += f" ({1e3 * found.predicted_shape_rms_mm:.3g} \u00b5m were predicted)"
+            if found.scale is not None:
+                text += f", {1e6 * found.scale:.3g} ppm in scale"
+            lines.append(text)
+        return lines
+
+    @property
+    def parameters(self) -> list[Parameter]:
+        """The eleven parameters with their standard deviations."""
+        cameras = {"cam1": self._record.cam1, "cam2": self._record.cam2}
+        rows = []
+        for name in ELEVEN_PARAMETER_NAMES:
+            unit = next((told for end, told in _UNITS.items() if name.endswith(f"_{end}")), "")
+            label = name.split("_")[0] if name.endswith("px2") or not unit else name.rsplit("_", 1)[0]
+            values = tuple(
+                Value(_with_sd(found[name], self._record.sigma.get(f"{cam}.{name}")), found[name])
+                for cam, found in cameras.items()
+            )
+            rows.append(Parameter(f"parameter.{name}", label, unit, values))
+        return rows
+
+    @property
+    def target(self) -> str:
+        """The target, and how the calibration was made."""
+        target, told, tilt = self._record.target, self._record.provenance, self._record.settings.axis_tilt_sigma_rad
+        assert target is not None
+        more = [
+            f"localiser {told.localiser}" if told.localiser else "",
+            f"{told.frames} frames averaged at each position" if told.frames else "",
+            f"rig {told.rig!r}" if told.rig else "",
+            f"stereorig {told.software_version}" if told.software_version else "",
+            f"axis tilt prior {tilt:g} rad" if tilt else "",
         ]
-        parts.append(_cameras_alone(source))
-        remedy = "calibrate with this program, or file the other program's own record with this report"
-        return parts, [("Calibration checks (RBE, RAZ, NSCE), parameters' uncertainty, target, positions", remedy)]
-    content = loaded.details
-    missing = []
-    if content["checks"].get("held_out") is None:
-        missing.append(("Calibration checks at held-out positions", "calibrate with held_out_mm"))
-    parts = [
-        _verdict(content),
-        _checks(content),
-        _made(content),
-        _parameters(content),
-        _views(content),
-        _target(content),
-    ]
-    return [p for p in parts if p], missing
-
-
-def _name(source: Source) -> str:
-    return "" if source.calibration_file is None else source.calibration_file.name
-
-
-def _verdict(content: Mapping[str, Any]) -> Markup:
-    verdict = content.get("verdict") or {}
-    level = str(verdict.get("level", "not told"))
-    reasons = [element("li", reason) for reason in verdict.get("reasons", [])]
-    return element(
-        "div", element("p", "Verdict: ", element("b", level), id="calibration-verdict"), element("ul", *reasons)
-    )
-
-
-def _checks(content: Mapping[str, Any]) -> Markup:
-    rows, keys = [], []
-    for name, label, unit in _CHECKS:
-        for which, told in (("fitted", "positions that were fitted"), ("held_out", "held-out positions")):
-            measures = content["checks"].get(which)
-            values = [None, None, None]
-            if measures is not None:
-                each = measures.get("per_camera", {})
-                values = [measures.get(name), *((each.get(cam) or {}).get(name) for cam in CAMERAS)]
-            rows.append([f"{label}, {told}", *(_number(v, unit) for v in values)])
-            keys.append(f"calibration.{which}.{name}")
-    return table(
-        ["check", "both cameras", "camera 1", "camera 2"], rows, keys=keys, key="calibration-checks", caption="Checks"
-    )
-
-
-def _made(content: Mapping[str, Any]) -> Markup:
-    made = [c for c in content["checks"].get("made", []) if isinstance(c, dict) and c.get("text")]
-    lines = [element("li", f"{check['name'].replace('_', ' ')}: {check['text']}") for check in made]
-    found = content.get("uncertainty") or {}
-    if found.get("shape_rms_mm") is not None:
-        text = f"uncertainty that it leaves in shape: {1e3 * found['shape_rms_mm']:.3g} \u00b5m rms"
-        if found.get("predicted_shape_rms_mm") is not None:
-            text += f" ({1e3 * found['predicted_shape_rms_mm']:.3g} \u00b5m were predicted)"
-        if found.get("scale") is not None:
-            text += f", {1e6 * found['scale']:.3g} ppm in scale"
-        lines.append(element("li", text))
-    return element("ul", *lines) if lines else Markup("")
-
-
-def _parameters(content: Mapping[str, Any]) -> Markup:
-    sigma = content.get("sigma") or {}
-    rows, keys = [], []
-    for name in ELEVEN_PARAMETER_NAMES:
-        unit = next((told for end, told in _UNITS.items() if name.endswith(f"_{end}")), "")
-        if name.endswith("per_px2"):
-            unit = _UNITS["px2"]
-        cells: list[object] = []
-        for cam in CAMERAS:
-            value, sd = content[cam][name], sigma.get(f"{cam}.{name}")
-            cells.append(Cell(_with_sd(float(value), sd), float(value)))
-        rows.append(
-            [f"{name.rsplit('_', 1)[0] if unit and not name.endswith('px2') else name.split('_')[0]}", *cells, unit]
+        made = "; ".join(filter(None, more))
+        ground = "dark lines on bright ground" if target.dark_lines else "bright lines on dark ground"
+        return (
+            f"Target: grid of {target.lines[0]} x {target.lines[1]} lines, pitch {target.pitch_mm:g} mm, "
+            f"line width {target.line_width_mm:g} mm, maker's tolerance {target.node_tolerance_mm:g} mm, {ground}."
+            + (f" Made with {made}." if made else "")
         )
-        keys.append(f"parameter.{name}")
-    return Markup(
-        table(
-            ["parameter", "camera 1", "camera 2", "unit"],
-            rows,
-            keys=keys,
-            key="calibration-parameters",
-            caption="Parameters, value \u00b1 standard deviation",
-        )
-        + note(
-            "The aspect ratio is given, not fitted. Standard deviations are those of each parameter alone; the file "
-            "holds the full covariance."
-        )
-    )
+
+    @property
+    def lenses(self) -> list[tuple[str, str, str]]:
+        """Camera, lens model and parameters of a file without a record."""
+        rows = []
+        for name, camera in (("camera 1", self._loaded.pair.cam1), ("camera 2", self._loaded.pair.cam2)):
+            lens = camera.lens
+            told: list[tuple[str, object]] = (
+                [(f.name, getattr(lens, f.name)) for f in fields(lens)] if is_dataclass(lens) else []
+            )
+            values = ", ".join(f"{n} = {v:.8g}" for n, v in told if isinstance(v, int | float))
+            rows.append((name, type(lens).__name__, values))
+        return rows
 
 
 def _with_sd(value: float, sd: float | None) -> str:
@@ -135,59 +139,18 @@ def _with_sd(value: float, sd: float | None) -> str:
     return f"{value:.{places}f} \u00b1 {sd:.{places}f}"
 
 
-def _views(content: Mapping[str, Any]) -> Markup:
-    rows = []
-    for view in content.get("views", []):
-        rows.append(
-            [
-                str(view["camera"]).replace("cam", "camera "),
-                _number(view["dz_mm"], "mm"),
-                "held out" if view.get("held_out") else "fitted",
-                _number(view.get("rbe_px"), "px"),
-                _number(view.get("raz_mm"), "mm"),
-                _number(view.get("nsce"), ""),
-            ]
-        )
-    caption = "Positions of the cameras before the target"
-    return table(["camera", "dZ", "use", "RBE", "RAZ", "NSCE"], rows, caption=caption, key="calibration-views")
-
-
-def _target(content: Mapping[str, Any]) -> Markup:
-    target = content.get("target") or {}
-    if not target:
-        return Markup("")
-    told = content.get("provenance") or {}
-    tilt = (content.get("settings") or {}).get("axis_tilt_sigma_rad")
-    ground = "dark lines on bright ground" if target.get("dark_lines", True) else "bright lines on dark ground"
-    text = (
-        f"Target: grid of {target['lines'][0]} x {target['lines'][1]} lines, pitch {target['pitch_mm']:g} mm, "
-        f"line width {target['line_width_mm']:g} mm, maker's tolerance "
-        f"{target.get('node_tolerance_mm', 0.0):g} mm, {ground}."
-    )
-    more = [
-        f"localiser {told['localiser']}" if told.get("localiser") else "",
-        f"{told['frames']} frames averaged at each position" if told.get("frames") else "",
-        f"rig {told['rig']!r}" if told.get("rig") else "",
-        f"stereorig {told['software_version']}" if told.get("software_version") else "",
-        f"axis tilt prior {tilt:g} rad" if tilt else "",
-    ]
-    made = "; ".join(m for m in more if m)
-    return element("p", text, f" Made with {made}." if made else "", id="calibration-target")
-
-
-def _cameras_alone(source: Source) -> Markup:
-    assert source.calibration is not None
-    rows = []
-    pair = source.calibration.pair
-    for cam, camera in zip(CAMERAS, (pair.cam1, pair.cam2), strict=True):
-        lens = camera.lens
-        told: dict[str, Any] = {f.name: getattr(lens, f.name) for f in fields(lens)} if is_dataclass(lens) else {}
-        values = ", ".join(f"{n} = {v:.8g}" for n, v in told.items() if isinstance(v, int | float))
-        rows.append([cam.replace("cam", "camera "), type(lens).__name__, values])
-    return table(["camera", "lens model", "parameters"], rows, key="calibration-parameters")
-
-
-def _number(value: float | None, unit: str) -> object:
-    if value is None:
-        return element("span", "not stated", class_="missing")
-    return Cell(f"{plain(float(value), 3)} {unit}".strip(), float(value))
+def calibration_gaps(source: Source, measured: Measured) -> list[Missing]:
+    """What is missing from the calibration's record and the analysis' check of it."""
+    record = CalibrationRecord() if source.calibration is None else source.calibration.record
+    gaps = []
+    if source.calibration is None:
+        remedy = "give the file that the results were measured with (--calibration)"
+        gaps.append(Missing("Calibration record", remedy))
+    elif record.checks is None:
+        remedy = "calibrate with this program, or file the other program's own record with this report"
+        gaps.append(Missing("Calibration checks (RBE, RAZ, NSCE), parameters' uncertainty, target, positions", remedy))
+    elif record.checks.held_out is None:
+        gaps.append(Missing("Calibration checks at held-out positions", "calibrate with held_out_mm"))
+    if measured.worst_epipolar is None:
+        gaps.append(Missing("Epipolar check of the analysis", "needs at least four measured points"))
+    return gaps

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.strain import StrainField
 
-Float = NDArray[np.float64]
-
+UM = "\u00b5m"
 LENGTHS = ("U", "V", "W", "X", "Y", "Z")
 STRAINS = ("exx", "eyy", "exy")
 _STATIC = re.compile(r"\s*static\b", re.IGNORECASE)
@@ -64,6 +64,30 @@ class Floor:
     spatial_sd: float | None
     points: int
     steps: int
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """The noise of a quantity: over the static steps, and as the points' covariances predict it."""
+
+    name: str
+    floor: Floor | None
+    told: float | None
+
+    @property
+    def is_place(self) -> bool:
+        """Whether it is a position, of which nobody knows the truth."""
+        return self.name in "XYZ"
+
+    @property
+    def factor(self) -> float:
+        """From a length in mm or a pure number to ``unit``."""
+        return 1e6 if self.name in STRAINS else 1e3
+
+    @property
+    def unit(self) -> str:
+        """In which it reads well."""
+        return "microstrain" if self.name in STRAINS else UM
 
 
 class FloorKeeper:

@@ -8,13 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
-
-Float = NDArray[np.float64]
+from core.names import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -25,21 +24,15 @@ class View:
     ----------
     standoff_mm
         From the pinhole along the optical axis to the surface's plane.
-    distance_mm
-        From the pinhole to the middle of what was measured.
     scale_mm_per_px
         Along the rows and down the columns, on the surface, at its middle.
     field_of_view_mm
         Width and height of what the image shows of the plane, through the image's middle; None without image size.
-    tilt_rad
-        Angle between the line of sight to the middle and the surface's normal.
     """
 
     standoff_mm: float
-    distance_mm: float
     scale_mm_per_px: tuple[float, float]
     field_of_view_mm: tuple[float, float] | None
-    tilt_rad: float
 
     @property
     def mean_scale_mm_per_px(self) -> float:
@@ -61,16 +54,12 @@ class Geometry:
         Between the pinholes.
     views
         By camera.
-    middle_mm, normal
-        Of the surface, system frame.
     """
 
     stereo_angle_rad: float
     sight_angle_rad: float
     baseline_mm: float
     views: dict[str, View]
-    middle_mm: Float
-    normal: Float
 
 
 def geometry(
@@ -96,8 +85,8 @@ def geometry(
     middle = middle - ((middle - points.mean(axis=0)) @ normal) * normal  # onto the plane
     sights = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
     directions = [s / np.linalg.norm(s) for s in sights]
-    views = {}
-    for name, camera, size in zip(("cam1", "cam2"), (pair.cam1, pair.cam2), sizes, strict=True):
+    views: dict[str, View] = {}
+    for name, camera, size in zip(CAMERAS, (pair.cam1, pair.cam2), sizes, strict=True):
         view = _view(camera, middle, normal, size)
         if view is None:
             return None
@@ -107,8 +96,6 @@ def geometry(
         sight_angle_rad=float(np.arccos(np.clip(directions[0] @ directions[1], -1.0, 1.0))),
         baseline_mm=pair.baseline_mm,
         views=views,
-        middle_mm=middle,
-        normal=normal,
     )
 
 
@@ -133,11 +120,4 @@ def _view(camera: Camera, middle: Float, normal: Float, size: tuple[int, int] | 
         edges = on_plane(np.array([[-0.5, y], [width - 0.5, y], [x, -0.5], [x, height - 0.5]]))
         spans = float(np.linalg.norm(edges[1] - edges[0])), float(np.linalg.norm(edges[3] - edges[2]))
         seen = spans if np.isfinite(spans).all() else None
-    sight = (middle - centre) / np.linalg.norm(middle - centre)
-    return View(
-        standoff_mm=float(((middle - centre) @ normal) / slant),
-        distance_mm=float(np.linalg.norm(middle - centre)),
-        scale_mm_per_px=scale,
-        field_of_view_mm=seen,
-        tilt_rad=float(np.arccos(min(abs(float(sight @ normal)), 1.0))),
-    )
+    return View(standoff_mm=float(((middle - centre) @ normal) / slant), scale_mm_per_px=scale, field_of_view_mm=seen)

@@ -2,159 +2,180 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from core.errors import StereorigError
-from server.report.floor import STRAINS
-from server.report.page import Cell, Markup, element, note, picture, table
-from server.report.pictures import SVG, course
-from server.report.sections import UM, axis_of
+from server.formats.gauges.readings import LineReading, Number, StepReadings
+from server.report.floor import STRAINS, UM
+from server.report.items import Value
+from server.report.page import SVG, Picture
+from server.report.pictures import Lines, course
 from server.report.source import Source
-from server.report.steps import Measured
+from server.report.steps import Measured, StepFigures
 from server.results.gauges.readings import read_gauges
 
+#: a gauge's values in every step, and why there are none
+_Told = Sequence[tuple[Mapping[str, Number], str]]
 _EXTENSOMETER = ("elongation_mm", "strain")
 
 
-def histories(source: Source, measured: Measured) -> list[Markup]:
-    """Return pictures and tables over the steps."""
-    parts = [_own(measured)]
-    if source.facts.gauges is not None:
-        parts += _gauges(source, measured)
-    else:
-        parts.append(note("No gauges were asked for (`gauges` of the facts); the curves are means over all points."))
-    return [part for part in parts if part]
+@dataclass(frozen=True)
+class GaugeTable:
+    """A gauge over the steps; a value without a number says why there is none."""
+
+    name: str
+    title: str
+    columns: list[str]
+    rows: list[tuple[int, list[Value]]]
 
 
-def _own(measured: Measured) -> Markup:
+@dataclass(frozen=True)
+class Gauges:
+    """All gauges; the curves are None where they could not be read at all."""
+
+    curves: list[Picture] | None
+    problems: list[str]
+    tables: list[GaugeTable]
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """What courses are drawn over: time since the reference, or the step's number."""
+
+    places: list[float]
+    label: str
+
+    @staticmethod
+    def of(steps: Sequence[StepFigures]) -> _Axis:
+        times = [s.seconds for s in steps]
+        known = [t for t in times if t is not None]
+        if len(known) == len(times) and len(set(known)) == len(known) and np.isfinite(known).all():
+            return _Axis(known, "time since the reference, s")
+        return _Axis([float(s.n) for s in steps], "step")
+
+    def draw(self, lines: Lines, y_label: str, title: str, *, text: str, caption: str) -> Picture:
+        data = course(self.places, lines, x_label=self.label, y_label=y_label, title=title)
+        return Picture(data, SVG, f"{text} over the steps", caption)
+
+
+def courses(measured: Measured) -> list[Picture] | None:
+    """Draw loads, channels, and the means of displacement and strain; None with fewer than two steps."""
     steps = measured.steps
     if len(steps) < 2:
-        return Markup("")
-    x, label = axis_of(steps)
-    drawn: list[Markup] = []
-    if any(s.load_n is not None for s in steps):
-        data = course(x, {"load": ([s.load_n for s in steps], None)}, x_label=label, y_label="load, N", title="Load")
-        drawn.append(picture(data, SVG, "load over the steps", "Load as recorded with the steps", half=True))
-    for name in sorted({name for s in steps for name in s.channels})[:4]:
-        data = course(x, {name: ([s.channels.get(name) for s in steps], None)}, x_label=label, y_label=name, title=name)
-        drawn.append(picture(data, SVG, f"{name} over the steps", f"{name} as recorded with the steps", half=True))
-    moved = [(xi, s) for xi, s in zip(x, steps, strict=True) if s.summary.displacement_mm]
-    if moved:
-        lines: dict[str, Any] = {}
-        for component in ("u", "v", "w"):
-            told = [(s.summary.displacement_mm or {})[component] for _, s in moved]
-            lines[component.upper()] = ([None if t is None else 1e3 * t.mean for t in told], None)
-        data = course(
-            [xi for xi, _ in moved],
-            lines,
-            x_label=label,
-            y_label=f"mean displacement, {UM}",
-            title="Displacement, mean over the points",
-        )
-        drawn.append(
-            picture(data, SVG, "mean displacement over the steps", "Mean of U, V, W over all valid points", half=True)
-        )
-    strained = [(xi, s.strain) for xi, s in zip(x, steps, strict=True) if s.strain and s.strain.points]
-    if strained:
-        lines = {e: ([s.mean_microstrain[e] for _, s in strained], None) for e in STRAINS}
-        data = course(
-            [xi for xi, _ in strained],
-            lines,
-            x_label=label,
-            y_label="mean strain, microstrain",
-            title="Strain, mean over the points",
-        )
-        caption = "Mean of the strains over all points that have it"
-        drawn.append(picture(data, SVG, "mean strain over the steps", caption, half=True))
-    return element("div", *drawn, class_="pair")
-
-
-def _gauges(source: Source, measured: Measured) -> list[Markup]:
-    request = source.facts.gauges
-    assert request is not None
-    try:
-        document = read_gauges(list(source.files.values()), request)
-    except StereorigError as error:
-        return [element("p", f"The gauges could not be read: {error.cause}", class_="missing")]
-    steps = [s for s in document["steps"] if "problem" not in s]
-    parts = [
-        element("p", f"Step {s['n']}: {s['problem']['cause']}", class_="missing")
-        for s in document["steps"]
-        if "problem" in s
-    ]
-    figures = {s.n: s for s in measured.steps}
-    x, label = axis_of([figures[s["n"]] for s in steps]) if steps else ([], "step")
-    drawn: list[Markup] = []
-    for kind, title in (("extensometers", "Extensometer"), ("points", "Point"), ("areas", "Area")):
-        for k in range(len(steps[0][kind]) if steps else 0):
-            series = [s[kind][k] for s in steps]
-            name = f"{title} {series[0]['name']}"
-            values = [_of_area(g["values"]) if kind == "areas" else g["values"] for g in series]
-            wanted = [n for n in (_EXTENSOMETER if kind == "extensometers" else values[-1]) if n in values[-1]]
-            parts.append(_table(name, wanted, values, [s["n"] for s in steps], series))
-            curves = [wanted[-1]] if kind == "extensometers" else [n for n in wanted if n in ("u_mm", "v_mm", "w_mm")]
-            drawn += _curves(name, curves, values, x, label)
-    for k in range(len(steps[-1]["lines"]) if steps else 0):
-        drawn += _line(steps[-1]["lines"][k], steps[-1]["n"])
-    return [element("div", *drawn, class_="pair"), *parts]
-
-
-def _of_area(values: dict[str, Any]) -> dict[str, Any]:
-    return {n: {"value": v["mean"], "sigma": v["mean_sigma"], "units": v["units"]} for n, v in values.items()}
-
-
-def _curves(name: str, wanted: Sequence[str], values: list[dict[str, Any]], x: list[float], label: str) -> list[Markup]:
-    if not wanted:
-        return []
-    factor, unit = (1e3, UM) if wanted[0].endswith("_mm") else (1e6, "microstrain")
-    lines = {}
-    for n in wanted:
-        told = [v.get(n) or {} for v in values]
-        lines[n.removesuffix("_mm")] = tuple(
-            [None if t.get(part) is None else factor * t[part] for t in told] for part in ("value", "sigma")
-        )
-    data = course(x, lines, x_label=label, y_label=unit, title=name)  # type: ignore[arg-type]
-    return [picture(data, SVG, f"{name} over the steps", f"{name}; bars are \u00b1 1 standard deviation", half=True)]
-
-
-def _line(line: dict[str, Any], n: int) -> list[Markup]:
+        return None
+    axis = _Axis.of(steps)
     drawn = []
-    for name, told in list(line["values"].items())[:6]:
-        data = course(
-            line["distance_px"],
-            {name: (told["value"], None)},
-            x_label="distance along the line, px",
-            y_label=f"{name}, {told['units']}",
-            title=f"Line {line['name']}, step {n}",
-        )
-        drawn.append(
-            picture(
-                data, SVG, f"{name} along line {line['name']}", f"Line {line['name']}: {name} in step {n}", half=True
-            )
-        )
+    if measured.loaded:
+        lines: Lines = {"load": ([s.load_n for s in steps], None)}
+        drawn.append(axis.draw(lines, "load, N", "Load", text="load", caption="Load as recorded with the steps"))
+    for name in measured.channels:
+        lines = {name: ([s.channels.get(name) for s in steps], None)}
+        drawn.append(axis.draw(lines, name, name, text=name, caption=f"{name} as recorded with the steps"))
+
+    def over(chosen: Sequence[StepFigures]) -> _Axis:
+        numbers = {s.n for s in chosen}
+        return _Axis([x for x, s in zip(axis.places, steps, strict=True) if s.n in numbers], axis.label)
+
+    if measured.moved:
+        lines = {}
+        for component in ("u", "v", "w"):
+            spans = [(s.summary.displacement_mm or {})[component] for s in measured.moved]
+            lines[component.upper()] = ([None if t is None else 1e3 * t.mean for t in spans], None)
+        title, caption = "Displacement, mean over the points", "Mean of U, V, W over all valid points"
+        label = f"mean displacement, {UM}"
+        drawn.append(over(measured.moved).draw(lines, label, title, text="mean displacement", caption=caption))
+    strained = {s.n: s.strain for s in steps if s.strain is not None and s.strain.points}
+    if strained:
+        lines = {e: ([strain.mean_microstrain[e] for strain in strained.values()], None) for e in STRAINS}
+        title, caption = "Strain, mean over the points", "Mean of the strains over all points that have it"
+        chosen = [s for s in steps if s.n in strained]
+        drawn.append(over(chosen).draw(lines, "mean strain, microstrain", title, text="mean strain", caption=caption))
     return drawn
 
 
+def gauges(source: Source, measured: Measured) -> Gauges | None:
+    """Read the gauges of the facts in every step, and draw their courses; None where none were asked for."""
+    if source.facts.gauges is None:
+        return None
+    try:
+        readings = read_gauges(list(source.files.values()), source.facts.gauges)
+    except StereorigError as error:
+        return Gauges(None, [f"The gauges could not be read: {error.cause}"], [])
+    problems = [f"Step {s.n}: {s.problem.cause}" for s in readings.steps if s.problem is not None]
+    steps = readings.read
+    if not steps:
+        return Gauges([], problems, [])
+    figures = {s.n: s for s in measured.steps}
+    axis = _Axis.of([figures[s.n] for s in steps])
+    curves: list[Picture] = []
+    tables = []
+    for k, extensometer in enumerate(steps[0].extensometers):
+        told: _Told = [(s.extensometers[k].values, s.extensometers[k].missing) for s in steps]
+        title = f"Extensometer {extensometer.name}"
+        tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, told))
+        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in told], axis)
+    others: list[tuple[str | None, str, _Told]] = []
+    for k, point in enumerate(steps[0].points):
+        others.append((point.name, "Point", [(s.points[k].values, s.points[k].missing) for s in steps]))
+    for k, area in enumerate(steps[0].areas):
+        means = [({n: v.mean_number for n, v in s.areas[k].values.items()}, s.areas[k].missing) for s in steps]
+        others.append((area.name, "Area", means))
+    for name, kind, told in others:
+        last = told[-1][0]
+        tables.append(_table(name, f"{kind} {name}", list(last), steps, told))
+        moved = [n for n in last if n in ("u_mm", "v_mm", "w_mm")]
+        curves += _curves(f"{kind} {name}", moved, [values for values, _ in told], axis)
+    for line in steps[-1].lines:
+        curves += _line(line, steps[-1].n)
+    return Gauges(curves, problems, tables)
+
+
 def _table(
-    name: str, wanted: Sequence[str], values: list[dict[str, Any]], numbers: list[int], series: list[dict[str, Any]]
-) -> Markup:
-    rows = []
-    for n, told, gauge in zip(numbers, values, series, strict=True):
-        cells: list[object] = [str(n)]
-        for w in wanted:
-            t = told.get(w) or {}
-            if t.get("value") is None:
-                cells.append(element("span", gauge.get("missing") or "no value", class_="missing"))
-            else:
-                sd = "" if t.get("sigma") is None else f" \u00b1 {t['sigma']:.2g}"
-                cells.append(Cell(f"{t['value']:.6g}{sd}", t["value"]))
-        rows.append(cells)
-    units = {w: next((t[w]["units"] for t in values if w in t), "") for w in wanted}
-    columns = ["step", *(f"{w.removesuffix('_mm')}{'' if units[w] in ('', '1') else ', ' + units[w]}" for w in wanted)]
-    return table(
-        columns,
-        rows,
-        caption=f"{name}, value \u00b1 standard deviation",
-        keys=[f"gauge.{series[0]['name']}.{n}" for n in numbers],
-    )
+    name: str | None, title: str, wanted: Sequence[str], steps: Sequence[StepReadings], told: _Told
+) -> GaugeTable:
+    wanted = [n for n in wanted if n in told[-1][0]]
+    units = {n: next((values[n].units for values, _ in told if n in values), "") for n in wanted}
+    columns = [f"{n.removesuffix('_mm')}{'' if units[n] in ('', '1') else ', ' + units[n]}" for n in wanted]
+    rows = [
+        (step.n, [_value(values.get(n), missing) for n in wanted])
+        for step, (values, missing) in zip(steps, told, strict=True)
+    ]
+    return GaugeTable(str(name), title, ["step", *columns], rows)
+
+
+def _value(number: Number | None, missing: str) -> Value:
+    if number is None or number.value is None:
+        return Value(missing or "no value")
+    sd = "" if number.sigma is None else f" \u00b1 {number.sigma:.2g}"
+    return Value(f"{number.value:.6g}{sd}", number.value)
+
+
+def _curves(title: str, wanted: Sequence[str], told: Sequence[Mapping[str, Number]], axis: _Axis) -> list[Picture]:
+    if not wanted:
+        return []
+    factor, unit = (1e3, UM) if wanted[0].endswith("_mm") else (1e6, "microstrain")
+    lines: Lines = {}
+    for n in wanted:
+        numbers = [values.get(n) for values in told]
+        value = [None if v is None or v.value is None else factor * v.value for v in numbers]
+        sigma = [None if v is None or v.sigma is None else factor * v.sigma for v in numbers]
+        lines[n.removesuffix("_mm")] = (value, sigma)
+    caption = f"{title}; bars are \u00b1 1 standard deviation"
+    return [axis.draw(lines, unit, title, text=title, caption=caption)]
+
+
+def _line(line: LineReading, n: int) -> list[Picture]:
+    drawn = []
+    for name, told in list(line.values.items())[:6]:
+        data = course(
+            line.distance_px,
+            {name: (told.value, None)},
+            x_label="distance along the line, px",
+            y_label=f"{name}, {told.units}",
+            title=f"Line {line.name}, step {n}",
+        )
+        drawn.append(Picture(data, SVG, f"{name} along line {line.name}", f"Line {line.name}: {name} in step {n}"))
+    return drawn

@@ -1,12 +1,13 @@
-"""What an item of the report's tables is: value, where it comes from, or that nobody stated it."""
+"""The items of the report's tables: a value, where it comes from, or that nobody stated it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from server.report.source import CAMERAS
+from core.names import CAMERAS, CameraName
 
 CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
     "from the calibration",
@@ -15,6 +16,14 @@ CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
     "recorded with the images",
     "settings of the analysis",
 )
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Something that a reader may want and nobody stated, and how it can be stated."""
+
+    name: str
+    remedy: str
 
 
 @dataclass(frozen=True)
@@ -51,11 +60,28 @@ class Item:
     comment: str = ""
 
     @property
-    def missing(self) -> list[str]:
+    def remarks(self) -> str:
+        """Where its values come from, and the comment."""
+        origins = dict.fromkeys(v.origin for v in self.values if v is not None)
+        return "; ".join(text for text in (*origins, self.comment) if text)
+
+    @property
+    def missing(self) -> list[Missing]:
         """What is not stated: the item, or the cameras that lack it."""
         if all(v is None for v in self.values):
-            return [self.label]
-        return [f"{self.label}, {cam}" for cam, v in zip(CAMERAS, self.values, strict=False) if v is None]
+            return [Missing(self.label, self.remedy)]
+        lacking = [cam for cam, v in zip(CAMERAS, self.values, strict=False) if v is None]
+        return [Missing(f"{self.label}, {cam}", self.remedy) for cam in lacking]
+
+
+def one(key: str, label: str, value: Value | None, remedy: str = "", comment: str = "") -> Item:
+    """An item of the whole rig."""
+    return Item(key, label, (value,), remedy, comment)
+
+
+def each(key: str, label: str, of: Callable[[CameraName], Value | None], remedy: str = "", comment: str = "") -> Item:
+    """An item of each camera."""
+    return Item(key, label, tuple(of(cam) for cam in CAMERAS), remedy, comment)
 
 
 def of_text(value: str | None, origin: str) -> Value | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageChops
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
@@ -20,8 +21,8 @@ from core.strain import StrainField
 from server.formats.figure import Picture, draw
 from server.formats.figure_options import Look
 
-Float = NDArray[np.float64]
-PNG, SVG = "image/png", "image/svg+xml"
+#: by name, values and their standard deviations
+Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
 _HALF = Look(width_px=960, dots_per_inch=210)
 _MOST_PX = 900
 _COLOURS = ("#1b4f72", "#b9770e", "#7d3c98", "#1e8449", "#a93226", "#5d6d7e", "#2e86c1", "#6e2c00")
@@ -126,14 +127,7 @@ def region(
     return _png(figure)
 
 
-def course(
-    x: Sequence[float],
-    lines: Mapping[str, tuple[Sequence[float | None], Sequence[float | None] | None]],
-    *,
-    x_label: str,
-    y_label: str,
-    title: str,
-) -> bytes:
+def course(x: Sequence[float], lines: Lines, *, x_label: str, y_label: str, title: str) -> bytes:
     """Draw values over the steps; SVG.
 
     Parameters

@@ -7,7 +7,7 @@ from typing import Any
 
 from server.formats.version import software_version
 from server.report.geometry import Geometry
-from server.report.items import MEASURED, SETTINGS, Item, Value
+from server.report.items import MEASURED, SETTINGS, Item, Value, one
 from server.report.source import Source
 from server.report.steps import Measured
 
@@ -21,11 +21,20 @@ _TENSORS = {
     "infinitesimal": "infinitesimal, symmetric part of the displacement gradient",
     "hencky": "Hencky (logarithmic), ln(C) / 2",
 }
+_REFERENCES = {
+    "never": "the first for all steps (total)",
+    "always": "the step before (incremental), told as totals",
+    "auto": "the first, or a later one where that fails, told as totals",
+}
+_CRITERION = (
+    "zero-mean normalised sum of squared differences (ZNSSD), "
+    "camera 2 at the reference, camera 1 and camera 2 at the step against camera 1's reference subset"
+)
 
 
 def analysis(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
     """Return the analysis parameters."""
-    settings, head = source.settings, source.heads[max(source.heads)]
+    settings = source.settings
     scale = None if found is None else found.views["cam1"].mean_scale_mm_per_px
 
     def length(px: float | None, what: str = "") -> Value | None:
@@ -35,100 +44,52 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
         return Value(f"{px:g} px{mm}{what}", float(px), SETTINGS)
 
     needs = "the result files do not say it: measure again with this program"
-    blur = settings.get("prefilter_px")
-    smoothing = measured.steps[-1].summary.smoothing
-    update = settings.get("reference_update")
+    head = source.heads[max(source.heads)]
+    version = f"stereorig {head['software_version']} (results), stereorig {software_version()} (this report)"
+    interpolation = settings.get("interpolation")
     return [
-        Item(
-            "software",
-            "Software",
-            (
-                Value(
-                    f"stereorig {head['software_version']} (results), stereorig {software_version()} (this report)",
-                    None,
-                    "written in the results",
-                ),
-            ),
-        ),
-        Item(
-            "prefilter",
-            "Image filtering",
-            (
-                None
-                if blur is None
-                else Value(
-                    f"Gaussian, standard deviation {blur:g} px, on all images" if blur else "none",
-                    float(blur),
-                    SETTINGS,
-                ),
-            ),
-            needs,
-        ),
-        Item("subset", "Subset size", (length(settings.get("subset_px")),), needs, "width of the square subset"),
-        Item("step", "Step size", (length(settings.get("step_px")),), needs, "distance of the points"),
-        Item("shape_function", "Subset shape function", (_shape_function(measured, settings),), needs),
-        Item(
-            "criterion",
-            "Matching criterion",
-            (
-                Value(
-                    "zero-mean normalised sum of squared differences (ZNSSD), "
-                    "camera 2 at the reference, camera 1 and camera 2 at the step against camera 1's reference subset",
-                    None,
-                    "of this program",
-                ),
-            ),
-        ),
-        Item(
+        one("software", "Software", Value(version, None, "written in the results")),
+        one("prefilter", "Image filtering", _prefilter(settings), needs),
+        one("subset", "Subset size", length(settings.get("subset_px")), needs, "width of the square subset"),
+        one("step", "Step size", length(settings.get("step_px")), needs, "distance of the points"),
+        one("shape_function", "Subset shape function", _shape_function(measured, settings), needs),
+        one("criterion", "Matching criterion", Value(_CRITERION, None, "of this program")),
+        one(
             "interpolant",
             "Interpolant",
-            (
-                None
-                if settings.get("interpolation") is None
-                else Value(f"{settings['interpolation']} B-spline", None, SETTINGS),
-            ),
+            None if interpolation is None else Value(f"{interpolation} B-spline", None, SETTINGS),
             needs,
         ),
-        Item(
-            "reference_update",
-            "Reference",
-            (
-                None
-                if update is None
-                else Value(
-                    {
-                        "never": "the first for all steps (total)",
-                        "always": "the step before (incremental), told as totals",
-                        "auto": "the first, or a later one where that fails, told as totals",
-                    }.get(update, str(update)),
-                    None,
-                    SETTINGS,
-                ),
-            ),
-            needs,
-            _matched(measured),
-        ),
-        Item(
-            "smoothing",
-            "Smoothing of displacements",
-            (
-                Value("none", None, SETTINGS)
-                if not smoothing
-                else Value(
-                    f"polynomial of order {smoothing.order} over {smoothing.window} x {smoothing.window}"
-                    f" points; {smoothing.resolution_px:g} px"
-                    + ("" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)")
-                    + " are told apart",
-                    float(smoothing.resolution_px),
-                    SETTINGS,
-                ),
-            ),
-        ),
+        one("reference_update", "Reference", _reference(settings), needs, _matched(measured)),
+        one("smoothing", "Smoothing of displacements", _smoothing(measured)),
         *_strain_items(source, measured),
-        Item("frame", "Coordinate system", (Value(str(head.get("frame", "")), None, "written in the results"),)),
-        Item("points", "Points", (Value(_points(measured), float(measured.steps[0].summary.points), MEASURED),)),
-        Item("region", "Region", (_region(settings),), needs),
+        one("frame", "Coordinate system", Value(str(head.get("frame", "")), None, "written in the results")),
+        one("points", "Points", Value(_points(measured), float(measured.steps[0].summary.points), MEASURED)),
+        one("region", "Region", _region(settings), needs),
     ]
+
+
+def _prefilter(settings: Mapping[str, Any]) -> Value | None:
+    blur = settings.get("prefilter_px")
+    if blur is None:
+        return None
+    text = f"Gaussian, standard deviation {blur:g} px, on all images" if blur else "none"
+    return Value(text, float(blur), SETTINGS)
+
+
+def _reference(settings: Mapping[str, Any]) -> Value | None:
+    update = settings.get("reference_update")
+    return None if update is None else Value(_REFERENCES.get(update, str(update)), None, SETTINGS)
+
+
+def _smoothing(measured: Measured) -> Value:
+    smoothing = measured.steps[-1].summary.smoothing
+    if smoothing is None:
+        return Value("none", None, SETTINGS)
+    mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
+    text = f"polynomial of order {smoothing.order} over {smoothing.window} x {smoothing.window} points; "
+    text += f"{smoothing.resolution_px:g} px{mm} are told apart"
+    return Value(text, float(smoothing.resolution_px), SETTINGS)
 
 
 def _shape_function(measured: Measured, settings: Mapping[str, Any]) -> Value | None:
@@ -176,40 +137,25 @@ def _strain_items(source: Source, measured: Measured) -> list[Item]:
         text = "no strain was computed" if not settings else "no strain: no window of points was whole enough"
         if all(not s.summary.displacement_mm for s in measured.steps):
             text = "no displacement was measured, so no strain"
-        return [Item("strain", "Strain", (Value(text, None, SETTINGS),))]
-    mm = strain.gauge_mm
+        return [one("strain", "Strain", Value(text, None, SETTINGS))]
     window = strain.window
+    mm = "" if strain.gauge_mm is None else f" = {strain.gauge_mm:.4g} mm"
+    fit = f"{window} x {window} points, polynomial of order {strain.order} through their displacements"
     return [
-        Item(
+        one(
             "strain",
             "Strain formulation",
-            (Value(_TENSORS.get(strain.tensor, strain.tensor), None, SETTINGS),),
+            Value(_TENSORS.get(strain.tensor, strain.tensor), None, SETTINGS),
             "",
             "in the reference's tangent plane; shear is the tensor's, half of the engineering shear",
         ),
-        Item(
-            "strain.window",
-            "Strain window",
-            (
-                Value(
-                    f"{window} x {window} points, polynomial of order {strain.order} through their displacements",
-                    float(window),
-                    SETTINGS,
-                ),
-            ),
-        ),
-        Item(
+        one("strain.window", "Strain window", Value(fit, float(window), SETTINGS)),
+        one(
             "strain.gauge",
             "Virtual strain gauge size",
-            (
-                Value(
-                    f"{strain.gauge_px:g} px" + ("" if mm is None else f" = {mm:.4g} mm"),
-                    float(strain.gauge_px),
-                    SETTINGS,
-                ),
-            ),
+            Value(f"{strain.gauge_px:g} px{mm}", float(strain.gauge_px), SETTINGS),
             "",
             "(window - 1) x step + subset; the smoothing's window where displacements were smoothed",
         ),
-        Item("strain.filter", "Post-filtering of strain", (Value("none", None, "of this program"),)),
+        one("strain.filter", "Post-filtering of strain", Value("none", None, "of this program")),
     ]

@@ -1,13 +1,12 @@
-"""What a report is made from: result files, the records that lie about them, the calibration, the facts."""
+"""The sources of a report: result files, the records that lie about them, the calibration, the facts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError, StereorigError
@@ -17,11 +16,10 @@ from server.formats.calibrations.recognise import LoadedCalibration, load_calibr
 from server.formats.files import known_sha256
 from server.formats.images import read_image
 from server.formats.results.reading import read_attributes
+from server.report.records import AnalysisRecord, RigRecord, StepRecord, TestRecord
 from server.results.metadata import TestFacts, parse_facts
 from server.results.staleness import stale_results
 from server.store.durable import known_json
-
-CAMERAS = ("cam1", "cam2")
 
 
 @dataclass(frozen=True)
@@ -35,11 +33,11 @@ class Source:
     heads
         Their attributes, as :func:`server.formats.results.reading.read_attributes` gives them.
     test
-        The test's folder, None where the results lie alone; ``test_document`` is its ``test.json``.
+        The test's folder, None where the results lie alone; ``test_record`` is its ``test.json``.
     analysis
         ``analysis.json`` of the service, or ``summary.json`` of ``stereorig measure``; empty without either.
     steps
-        ``step.json`` by number, as far as there are any.
+        ``step.json`` of every file's step; empty where there is none.
     calibration, calibration_file
         None where it was not found or is not the one that was measured with.
     facts
@@ -53,9 +51,9 @@ class Source:
     files: dict[int, Path]
     heads: dict[int, dict[str, Any]]
     test: Path | None
-    test_document: dict[str, Any]
-    analysis: dict[str, Any]
-    steps: dict[int, dict[str, Any]]
+    test_record: TestRecord
+    analysis: AnalysisRecord
+    steps: dict[int, StepRecord]
     calibration: LoadedCalibration | None
     calibration_file: Path | None
     facts: TestFacts
@@ -69,6 +67,16 @@ class Source:
         return min(shapes) if shapes else int(self.settings.get("reference", 0))
 
     @property
+    def reference_step(self) -> StepRecord:
+        """The record of the reference."""
+        return self.steps.get(self.reference, StepRecord())
+
+    @property
+    def rig(self) -> RigRecord:
+        """The rig at the reference."""
+        return self.reference_step.rig
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Settings of the analysis, from the files themselves."""
         found = self.heads[max(self.heads)].get("settings", {})
@@ -77,7 +85,7 @@ class Source:
     @property
     def title(self) -> str:
         """Name of the test; without one, of the folder."""
-        return str(self.test_document.get("name") or self.files[min(self.files)].absolute().parent.name)
+        return self.test_record.name or self.files[min(self.files)].absolute().parent.name
 
     def reference_image(self, cam: str) -> NDArray[Any] | None:
         """Image of the reference; None where it is gone or not the one that was measured."""
@@ -140,24 +148,23 @@ def find_source(
     folder = folder.absolute()
     heads = {n: read_attributes(path) for n, path in sorted(files.items())}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
-    document = {} if home is None else known_json(home / "test.json")
-    made = known_json(folder / "analysis.json") or known_json(folder / "summary.json")
+    test_record, steps = TestRecord(), {n: StepRecord() for n in heads}
+    if home is not None:
+        test_record = TestRecord.model_validate(known_json(home / "test.json"))
+        steps = {n: StepRecord.model_validate(known_json(home / "steps" / f"{n:04d}" / "step.json")) for n in heads}
+    made = AnalysisRecord.model_validate(known_json(folder / "analysis.json") or known_json(folder / "summary.json"))
     doubts: list[str] = []
     loaded, file = _calibration(calibration, home, made, heads, doubts)
-    told = facts
-    if told is None:
-        told = parse_facts(document.get("facts") or {}, name="the facts of the test")
-    steps = {} if home is None else {n: known_json(home / "steps" / f"{n:04d}" / "step.json") for n in files}
     return Source(
         files=dict(sorted(files.items())),
         heads=heads,
         test=home,
-        test_document=document,
+        test_record=test_record,
         analysis=made,
-        steps={n: step for n, step in steps.items() if step},
+        steps=steps,
         calibration=loaded,
         calibration_file=file,
-        facts=told,
+        facts=parse_facts(test_record.facts, name="the facts of the test") if facts is None else facts,
         stale=stale_results(list(files.values()), heads.values()),
         doubts=doubts,
     )
@@ -215,7 +222,7 @@ def _one_analysis(test: Path, wanted: str | None) -> Path:
 def _calibration(
     given: Path | None,
     test: Path | None,
-    made: Mapping[str, Any],
+    made: AnalysisRecord,
     heads: Mapping[int, Mapping[str, Any]],
     doubts: list[str],
 ) -> tuple[LoadedCalibration | None, Path | None]:
@@ -225,8 +232,7 @@ def _calibration(
     places = [] if given is None else [given]
     if given is None:
         places += [] if test is None else [test / "calibration.json"]
-        named = made.get("calibration")
-        places += [Path(str(named["file"]))] if isinstance(named, dict) and named.get("file") else []
+        places += [] if made.calibration is None else [made.calibration.file]
     for path in places:
         if not path.is_file():
             continue
@@ -243,10 +249,3 @@ def _calibration(
     if given is not None:
         load_calibration(given)  # says what is wrong with it
     return None, None
-
-
-def median(values: Sequence[float] | NDArray[np.float64]) -> float | None:
-    """Median of what is finite; None of nothing."""
-    found = np.asarray(values, dtype=np.float64)
-    found = found[np.isfinite(found)]
-    return float(np.median(found)) if found.size else None

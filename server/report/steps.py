@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from core.field.checks.epipolar_offset import EpipolarCheck
 from core.field.points.result import Field
 from core.strain import StrainField
 from server.compute.strain import StrainSummary, summarise_strain
@@ -16,9 +15,9 @@ from server.formats.calibrations.volume import rbe_of
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
 from server.formats.results.summary import StepSummary, summarise
-from server.report.floor import Floor, FloorKeeper, static_steps, told_sigma
+from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, static_steps, told_sigma
+from server.report.records import QualityRecord
 from server.report.source import Source
-from server.results.reader import library
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +57,19 @@ class StepFigures:
     summary: StepSummary
     strain: StrainSummary | None
     skew_ms: float | None
-    quality: dict[str, Any] | None
+    quality: QualityRecord | None
     static: bool
+
+    @property
+    def least_zncc(self) -> float | None:
+        """Smallest of the comparisons' medians."""
+        return min((v for v in self.summary.zncc_median.values() if v is not None), default=None)
+
+    @property
+    def sigma_um(self) -> list[float | None]:
+        """Median standard deviations of X, Y, Z, U, V, W."""
+        medians = (self.summary.sigma_median_mm.get(f"{k}_mm") for k in "xyzuvw")
+        return [None if mm is None else 1e3 * mm for mm in medians]
 
     @property
     def largest_mm(self) -> float | None:
@@ -101,6 +111,36 @@ class Measured:
     told: dict[str, float | None]
     noise_grey: float | None
 
+    @property
+    def quantities(self) -> list[Quantity]:
+        """What is known of the noise of each quantity."""
+        return [
+            Quantity(name, self.floor.get(name), self.told.get(name))
+            for name in (*LENGTHS, *STRAINS)
+            if name in self.floor or name in self.told
+        ]
+
+    @property
+    def loaded(self) -> bool:
+        """Whether any step has a load."""
+        return any(s.load_n is not None for s in self.steps)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the first four channels that were recorded."""
+        return sorted({name for s in self.steps for name in s.channels})[:4]
+
+    @property
+    def moved(self) -> list[StepFigures]:
+        """Steps with displacements."""
+        return [s for s in self.steps if s.summary.displacement_mm]
+
+    @property
+    def worst_epipolar(self) -> EpipolarCheck | None:
+        """The step's check that is furthest off; None where none could be made."""
+        checks = [s.summary.epipolar_check for s in self.steps if s.summary.epipolar_check is not None]
+        return max(checks, key=lambda c: c.offset_px, default=None)
+
 
 def read_steps(source: Source) -> Measured:
     """Read every result file once; at most three fields are held at a time, and the static steps' values."""
@@ -117,7 +157,7 @@ def read_steps(source: Source) -> Measured:
     loads = {n: _load(source, n) for n in source.files}
     by_load = all(load is not None for load in loads.values()) and len(set(loads.values())) > 1
     for n, path in source.files.items():
-        field, strain = _read(path)
+        field, strain = read_field(path), read_strain(path)
         if n in static:
             keeper.add(n, field, strain)
         step = _figures(source, n, field, strain, rbe, labels[n], static=n in static)
@@ -154,55 +194,50 @@ def read_steps(source: Source) -> Measured:
     )
 
 
-def _read(path: Path) -> tuple[Field, StrainField | None]:
-    with library:
-        return read_field(path), read_strain(path)
-
-
 def _label(source: Source, n: int) -> str:
-    return str(source.steps.get(n, {}).get("label") or source.heads[n].get("label", ""))
+    return source.steps[n].label or str(source.heads[n].get("label", ""))
 
 
 def _load(source: Source, n: int) -> float | None:
-    found = source.steps.get(n, {}).get("load_n", source.heads[n].get("load_n"))
+    recorded = source.steps[n].load_n
+    if recorded is not None or "load_n" in source.steps[n].model_fields_set:
+        return recorded
     try:
-        return None if found is None else float(found)
-    except (TypeError, ValueError):
+        return float(source.heads[n]["load_n"])
+    except (KeyError, TypeError, ValueError):
         return None
 
 
 def _figures(
     source: Source, n: int, field: Field, strain: StrainField | None, rbe: float | None, label: str, *, static: bool
 ) -> StepFigures:
-    record = source.steps.get(n, {})
-    quality = record.get("quality")
-    captured = record.get("captured_utc")
+    record = source.steps[n]
     return StepFigures(
         n=n,
         label=label,
         load_n=_load(source, n),
-        channels=dict(record.get("channels") or {}),
+        channels=record.channels,
         seconds=_seconds(source, n),
-        captured_utc=captured if isinstance(captured, str) else None,
+        captured_utc=record.captured_utc,
         summary=summarise(field, rbe_px=rbe, reference=source.reference),
         strain=None if strain is None else summarise_strain(strain),
-        skew_ms=record.get("skew_ms"),
-        quality=quality if isinstance(quality, dict) else None,
+        skew_ms=record.skew_ms,
+        quality=record.quality,
         static=static,
     )
 
 
 def _seconds(source: Source, n: int) -> float | None:
     """Time since the reference, by the host's monotonic clock where both have it, else by the wall clock."""
-    one, two = source.steps.get(source.reference, {}), source.steps.get(n, {})
-    if one.get("source") == "import" or two.get("source") == "import":
+    one, two = source.reference_step, source.steps[n]
+    if "import" in (one.source, two.source):
         return None  # when a file was imported says nothing of when it was taken
-    begin, end = one.get("host_monotonic_ns"), two.get("host_monotonic_ns")
+    begin, end = one.host_monotonic_ns, two.host_monotonic_ns
     # the clock begins anew with the machine: only what also agrees with the order of the steps is used
-    if isinstance(begin, int) and isinstance(end, int) and (end - begin) * (n - source.reference) >= 0:
+    if begin is not None and end is not None and (end - begin) * (n - source.reference) >= 0:
         return (end - begin) / 1e9
     try:
-        times = [datetime.fromisoformat(str(step["captured_utc"])) for step in (one, two)]
-    except (KeyError, ValueError):
+        times = [datetime.fromisoformat(str(step.captured_utc)) for step in (one, two)]
+    except ValueError:
         return None
     return (times[1] - times[0]).total_seconds()

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError, InputError
 from server.formats.calibrations.plausibility import Residual
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.results.steps import calibration_of, read_step
 
-Float = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class EpipolarComparison:
+    """The epipolar residuals of two calibrations over the points of a result, whose file's name stands first."""
+
+    results: str
+    measured_with: Residual
+    this_calibration: Residual
 
 
-def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_with: Path) -> dict[str, Any]:
+def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_with: Path) -> EpipolarComparison:
     """Return the epipolar residual of a calibration over points that were measured with another.
 
     Parameters
@@ -53,11 +60,11 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
     xy1 = np.stack([variables[n].values[ok] for n in ("x_px", "y_px")], axis=1)
     xyz = np.stack([variables[n].values[ok] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
     xy2 = _seen_by_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
-    return {
-        "results": files[0].name,
-        "measured_with": Residual.of(own.pair.epipolar_residual_px(xy1, xy2)).document(),
-        "this_calibration": Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2)).document(),
-    }
+    return EpipolarComparison(
+        results=files[0].name,
+        measured_with=Residual.of(own.pair.epipolar_residual_px(xy1, xy2)),
+        this_calibration=Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2)),
+    )
 
 
 def _seen_by_camera2(pair: StereoPair, xy1: Float, xyz_mm: Float, offset_px: Float) -> Float:

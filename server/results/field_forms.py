@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError
-from server.results.reader import Variable, library
+from server.formats.results.netcdf import library
+from server.results.reader import Variable
 
 FieldForm = Literal["json", "npy", "csv", "nc", "f32", "png"]
 MEDIA_TYPES: dict[FieldForm, str] = {

@@ -10,10 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from core.names import CAMERAS
 from server.formats.files import known_sha256
 from server.store.durable import known_json
-
-CAMERAS = ("cam1", "cam2")
 
 
 def stale_inputs(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,35 +16,13 @@ from core.field.region.cuts import Cuts, from_arrays
 from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.files import sha256_of
+from server.formats.results.netcdf import opened
 from server.formats.version import software_version
-from server.results.reader import library
+from server.results.reader import Variable
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
 _GRID = ("row", "col")
 _CALIBRATION = ("calibration", "calibration.json")  # as stereorig measure and the service name it
-
-
-@dataclass(frozen=True)
-class StepVariable:
-    """One variable of a step over the grid of points.
-
-    Attributes
-    ----------
-    values
-        (r, c) or (r, c, ...), as stored; NaN where a point has no number.
-    units, long_name
-        As stored.
-    flags
-        Name of each value of a variable of states.
-    parts
-        Names along the third axis, where the file has them.
-    """
-
-    values: NDArray[Any]
-    units: str
-    long_name: str
-    flags: dict[int, str] | None = None
-    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,7 +42,7 @@ class StepResult:
     """
 
     n: int
-    variables: dict[str, StepVariable]
+    variables: dict[str, Variable]
     attributes: dict[str, Any]
     cuts: Cuts | None
 
@@ -170,14 +147,8 @@ def read_step(path: Path, names: Sequence[str] | None = None, *, always: Sequenc
     NotFoundError
         ``field_missing``, with the names that there are.
     """
-    if not path.exists():
-        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
-    try:
-        with library, netCDF4.Dataset(path, "r") as data:
-            data.set_auto_mask(False)
-            return _read(path, data, names, always)
-    except OSError as error:
-        raise FileFormatError(f"{path.name} cannot be read: {error}.", file=path.name) from error
+    with opened(path) as data:
+        return _read(path, data, names, always)
 
 
 def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[str]) -> StepResult:
@@ -194,28 +165,13 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
             available=sorted(over_grid),
         )
     wanted = set(over_grid) if names is None else {*always, *names}
-    variables = {name: _variable(data.variables[name]) for name in over_grid if name in wanted}
+    variables = {name: Variable.of(data.variables[name]) for name in over_grid if name in wanted}
     cuts = None
     if "cut_line" in data.variables:
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
         cuts = from_arrays(points, np.asarray(data.variables["cut_line"][...], dtype=np.int32))
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
     return StepResult(int(attributes.get("step", number_of(path))), variables, attributes, cuts)
-
-
-def _variable(variable: Any) -> StepVariable:
-    flags = None
-    if "flag_meanings" in variable.ncattrs():
-        numbers = np.atleast_1d(variable.flag_values)
-        flags = {int(v): name for v, name in zip(numbers, variable.flag_meanings.split(), strict=True)}
-    parts = next((str(getattr(variable, a)) for a in ("comparisons", "components") if a in variable.ncattrs()), "")
-    return StepVariable(
-        np.asarray(variable[...]),
-        str(getattr(variable, "units", "1")),
-        str(getattr(variable, "long_name", "")),
-        flags,
-        tuple(parts.split()),
-    )
 
 
 def _plain(value: Any) -> Any:
@@ -324,11 +280,8 @@ def require_known(files: Sequence[Path], names: Sequence[str] | None) -> None:
 
 def variables_of(path: Path) -> list[str]:
     """Return the names of a result file's variables over its points."""
-    try:
-        with library, netCDF4.Dataset(path, "r") as data:
-            return [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
-    except OSError as error:
-        raise FileFormatError(f"{path.name} cannot be read: {error}.", file=path.name) from error
+    with opened(path) as data:
+        return [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
 
 
 def require_same_grid(step: StepResult, first: StepResult) -> None:
@@ -350,9 +303,9 @@ def require_same_grid(step: StepResult, first: StepResult) -> None:
         )
 
 
-def columns_of(step: StepResult) -> dict[str, StepVariable]:
+def columns_of(step: StepResult) -> dict[str, Variable]:
     """Return a step's variables with one number a point each: comparisons apart, without covariance matrices."""
-    flat: dict[str, StepVariable] = {}
+    flat: dict[str, Variable] = {}
     for name, variable in step.variables.items():
         values = variable.values
         if values.ndim == 2:
@@ -360,7 +313,6 @@ def columns_of(step: StepResult) -> dict[str, StepVariable]:
         elif values.ndim == 3:
             for k in range(values.shape[2]):
                 part = variable.parts[k] if k < len(variable.parts) else str(k)
-                flat[f"{name}_{part}"] = StepVariable(
-                    values[..., k], variable.units, f"{variable.long_name}, {part}", variable.flags
-                )
+                long_name = f"{variable.long_name}, {part}"
+                flat[f"{name}_{part}"] = replace(variable, values=values[..., k], long_name=long_name, parts=())
     return flat

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -62,9 +63,53 @@ def errors_at(
     return out
 
 
+@dataclass(frozen=True)
+class SubsetShare:
+    """Shares of a region's subsets of one width whose error stays below the limits."""
+
+    subset_px: int
+    good_share: float
+    usable_share: float
+
+
+@dataclass(frozen=True)
+class TextureVerdict:
+    """How a region's texture carries subsets of a width, and which width would do.
+
+    Attributes
+    ----------
+    subset_px, subsets
+        Width that was asked about, and how many subsets were looked at.
+    noise_grey
+        Standard deviation of the noise that was reckoned with.
+    level
+        ``good``, ``usable`` or ``poor``.
+    median_error_px
+        Median of the predicted standard deviations of the match; None where there is no texture.
+    good_share, usable_share, good_px, usable_px
+        Shares of the subsets whose error stays below the limits, and these.
+    proposed_subset_px
+        Smallest width that would do; None: none would.
+    sizes
+        The shares of other widths.
+    """
+
+    subset_px: int
+    subsets: int
+    noise_grey: float
+    level: Literal["good", "usable", "poor"]
+    median_error_px: float | None
+    good_share: float
+    usable_share: float
+    good_px: float
+    usable_px: float
+    proposed_subset_px: int | None
+    sizes: list[SubsetShare]
+
+
 def texture_verdict(
     pixels: NDArray[Any], full_scale: float, xy_px: NDArray[np.float64], subset_px: int, noise_grey: float | None = None
-) -> dict[str, Any]:
+) -> TextureVerdict:
     """Say how a region's texture carries subsets of this width, and which width would do.
 
     Parameters
@@ -81,30 +126,27 @@ def texture_verdict(
     noise = NOISE_SHARE * full_scale if noise_grey is None else noise_grey
     told = errors_at(pixels, xy_px, noise, tuple(sorted({*SIZES, subset_px})))
     shares = {
-        size: {"good": float(np.mean(error <= GOOD_PX)), "usable": float(np.mean(error <= USABLE_PX))}
+        size: SubsetShare(size, float(np.mean(error <= GOOD_PX)), float(np.mean(error <= USABLE_PX)))
         for size, error in told.items()
     }
-    proposed = next((s for s in SIZES if shares[s]["good"] >= ENOUGH), None)
-    level = "good"
+    proposed = next((s for s in SIZES if shares[s].good_share >= ENOUGH), None)
     if proposed is None:
-        proposed = next((s for s in SIZES if shares[s]["usable"] >= ENOUGH), None)
+        proposed = next((s for s in SIZES if shares[s].usable_share >= ENOUGH), None)
     own = shares[subset_px]
-    if own["good"] < ENOUGH:
-        level = "usable" if own["usable"] >= ENOUGH else "poor"
+    level: Literal["good", "usable", "poor"] = "good"
+    if own.good_share < ENOUGH:
+        level = "usable" if own.usable_share >= ENOUGH else "poor"
     median = float(np.median(told[subset_px]))
-    return {
-        "subset_px": subset_px,
-        "subsets": len(xy_px),
-        "noise_grey": noise,
-        "level": level,
-        "median_error_px": median if np.isfinite(median) else None,
-        "good_share": own["good"],
-        "usable_share": own["usable"],
-        "good_px": GOOD_PX,
-        "usable_px": USABLE_PX,
-        "proposed_subset_px": proposed,
-        "sizes": [
-            {"subset_px": size, "good_share": shares[size]["good"], "usable_share": shares[size]["usable"]}
-            for size in SIZES
-        ],
-    }
+    return TextureVerdict(
+        subset_px=subset_px,
+        subsets=len(xy_px),
+        noise_grey=noise,
+        level=level,
+        median_error_px=median if np.isfinite(median) else None,
+        good_share=own.good_share,
+        usable_share=own.usable_share,
+        good_px=GOOD_PX,
+        usable_px=USABLE_PX,
+        proposed_subset_px=proposed,
+        sizes=[shares[size] for size in SIZES],
+    )

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import FileFormatError, StateError, StorageError
+from core.names import CAMERAS
 from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.store.durable import make_folder, read_json, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
-CAMERAS = ("cam1", "cam2")
 MAX_STEPS = 9999
 _STEP_FOLDER = re.compile(r"(?:incomplete-\d+-)?(\d{4})")
 _DELETED = re.compile(r"(\d{4})\.deleted")

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import FileFormatError, StorageError
+from core.names import CAMERAS
 from server.formats.files import recorded_sha256, sha256_of, storage_error
 from server.store.durable import read_json
 from server.store.folder import check_format, is_id, is_in_use
-from server.store.tests import CAMERAS, number_of
+from server.store.tests import number_of
 
 Level = Literal["damaged", "incomplete", "index", "foreign"]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import CameraError
+from core.names import CAMERAS
 from server.store.durable import read_json
 
 Identities = Mapping[str, Mapping[str, str]]
@@ -39,7 +40,7 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, what: str)
     known = calibrated_cameras(calibration)
     if known is None or not cameras:
         return
-    serials = {cam: (_serial(known, cam), _serial(cameras, cam)) for cam in ("cam1", "cam2")}
+    serials = {cam: (_serial(known, cam), _serial(cameras, cam)) for cam in CAMERAS}
     other = {cam: pair for cam, pair in serials.items() if None not in pair and pair[0] != pair[1]}
     if not other:
         return

@@ -11,11 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from core.errors import ImageError, TargetError
 from core.grid import GridView, detect_grid
 from core.target import GridTarget
-from tests.support.grid_images import PAPER_TARGET, Exposure, Float, expose, paper_camera, render_cover, truth_px
+from tests.support.grid_images import PAPER_TARGET, Exposure, expose, paper_camera, render_cover, truth_px
 
 pytestmark = pytest.mark.fault(29)
 

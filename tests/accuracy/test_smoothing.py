@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -17,8 +18,6 @@ from core.gauge.area import area_statistics
 from core.gauge.extensometer import extensometer
 from core.strain import StrainOptions, surface_strain
 from tests.support.gauge_field import STEP, SUBSET, make_field, pixel_noise
-
-Float = NDArray[np.float64]
 
 
 def quadratic(X: Float) -> Float:

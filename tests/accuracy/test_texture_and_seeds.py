@@ -50,20 +50,20 @@ def test_no_texture_is_no_texture_and_lines_are_not_enough() -> None:
     points = np.array([[x, y] for x in range(60, 200, 10) for y in range(60, 180, 10)], dtype=float)
     flat = 128.0 + np.random.default_rng(3).normal(0, 2.0, (HEIGHT, WIDTH))
     told = texture_verdict(flat, 255.0, points, 33)
-    assert (told["level"], told["proposed_subset_px"], told["good_share"]) == ("poor", None, 0.0)
+    assert (told.level, told.proposed_subset_px, told.good_share) == ("poor", None, 0.0)
     lines = np.tile(128.0 + 60.0 * np.sin(np.arange(WIDTH) / 2.0), (HEIGHT, 1))
-    assert texture_verdict(lines, 255.0, points, 33)["level"] == "poor"
+    assert texture_verdict(lines, 255.0, points, 33).level == "poor"
     good = texture_verdict(speckle(4), 255.0, points, 33)
-    assert good["level"] == "good"
+    assert good.level == "good"
     faint = texture_verdict(speckle(4, contrast=12.0), 255.0, points, 33)
-    assert faint["median_error_px"] > 3 * good["median_error_px"]
+    assert faint.median_error_px > 3 * good.median_error_px
     # the proposed size does what it is proposed for, and the next smaller one does not
-    sizes = {row["subset_px"]: row["good_share"] for row in faint["sizes"]}
-    proposed = faint["proposed_subset_px"]
+    sizes = {row.subset_px: row.good_share for row in faint.sizes}
+    proposed = faint.proposed_subset_px
     assert sizes[proposed] >= 0.95
     smaller = [share for size, share in sizes.items() if size < proposed]
     assert not smaller or smaller[-1] < 0.95
-    assert good["proposed_subset_px"] < proposed
+    assert good.proposed_subset_px < proposed
 
 
 def test_seeds_of_settings_old_and_new() -> None:

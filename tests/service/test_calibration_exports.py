@@ -12,9 +12,9 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.conversion import fit_opencv, fit_seidel
 from core.cameras.lens import OpenCVLens, SeidelLens
@@ -28,7 +28,6 @@ from server.formats.calibrations.recognise import LoadedCalibration, load_calibr
 from server.formats.results.writing import Provenance, write_field
 from server.results.epipolar_check import check_against
 
-Float = NDArray[np.float64]
 SIZE = (1280, 1024)
 PAPER = {
     "cam1": {
@@ -199,21 +198,21 @@ def test_other_readers_see_what_was_calibrated(form: Any, what: str) -> None:
     seen = seen_through(made.data, form, loaded.pair.cam1.cam_from_sys.apply(points))
     for k, camera in enumerate((loaded.pair.cam1, loaded.pair.cam2)):
         off = np.linalg.norm(seen[k] - camera.project(points).xy, axis=1).max()
-        assert off < made.report["lens"][f"cam{k + 1}"]["max_px"] * 1.02 + 1e-8
+        assert off < made.report.lens[f"cam{k + 1}"].max_px * 1.02 + 1e-8
     exact = what == "opencv" or form == "matchid" or (form != "vic3d" and what == "tangential")
-    left, back = made.report["lens"]["cam1"]["max_px"], made.report["read_back"]
+    left, back = made.report.lens["cam1"].max_px, made.report.read_back
     if what == "paper":  # its series goes on after r^6
         assert 0.0 < left < 1e-6
-        assert back["max_px"] < 1e-6
-        assert back["max_mm"] < 1e-7
+        assert back.max_px < 1e-6
+        assert back.max_mm < 1e-7
     elif exact:
-        assert made.report["exact"] is True
-        assert back["max_px"] < 1e-8
-        assert back["max_mm"] < 1e-8
+        assert made.report.exact is True
+        assert back.max_px < 1e-8
+        assert back.max_mm < 1e-8
     else:  # nothing is said to be exact that is not
-        assert made.report["exact"] is False
+        assert made.report.exact is False
         assert left > 1e-3
-        assert back["max_mm"] > 1e-6
+        assert back.max_mm > 1e-6
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -224,8 +223,8 @@ def test_a_calibration_comes_back(form: Any) -> None:
     assert again.pair.baseline_mm == pytest.approx(loaded.pair.baseline_mm, rel=1e-12)
     assert again.pair.stereo_angle_rad == pytest.approx(loaded.pair.stereo_angle_rad, abs=1e-9)
     assert again.image_size1_px == (None if form in ("matchid", "vic3d") else SIZE)
-    assert made.report["frame"] == ("target" if form in ("json", "paper") else "camera 1")
-    assert made.report["source_sha256"] == loaded.sha256
+    assert made.report.frame == ("target" if form in ("json", "paper") else "camera 1")
+    assert made.report.source_sha256 == loaded.sha256
 
 
 def test_an_imported_calibration_in_the_papers_parameters() -> None:
@@ -237,7 +236,7 @@ def test_an_imported_calibration_in_the_papers_parameters() -> None:
     points = shared_points(loaded.pair, SIZE, SIZE)
     here = again.pair.cam1.sys_from_cam.apply(points)
     off = np.linalg.norm(again.pair.cam2.project(here).xy - loaded.pair.cam2.project(points).xy, axis=1)
-    assert 1e-3 < off.max() < made.report["lens"]["cam2"]["max_px"] * 1.02
+    assert 1e-3 < off.max() < made.report.lens["cam2"].max_px * 1.02
 
 
 # lens fits ---------------------------------------------------------------------------------------------------------
@@ -303,8 +302,8 @@ def test_vic3d_cameras_look_at_one_place() -> None:
     assert np.linalg.norm(poses[0] - poses[1]) == pytest.approx(loaded.pair.baseline_mm, rel=1e-9)
     assert abs(poses[0] + poses[1])[:2].max() < 2.0
     checked = check_calibration(loaded)
-    assert checked["volume"]["points"] > 100
-    assert checked["volume"]["max_px"] < 1e-6
+    assert checked.volume.points > 100
+    assert checked.volume.max_px < 1e-6
 
 
 def test_a_newer_vic3d_file_reads_the_same() -> None:
@@ -327,7 +326,7 @@ def test_caldat_angles_and_prefixes() -> None:
     other = re.sub("Cam1_", "Cam2_", CALDAT).replace("Cam0_", "Cam1_").replace(" [pixels]", "").replace(";", " = ")
     again = parse_calibration(other.encode(), name="caldat")
     np.testing.assert_array_equal(again.pair.cam1.lens.kernel_parameters(), lens.kernel_parameters())
-    warned = check_calibration(loaded)["warnings"]
+    warned = check_calibration(loaded).warnings
     assert any("image size" in w for w in warned)
 
 
@@ -361,7 +360,7 @@ def test_cameras_that_see_nothing_in_common_are_warned_of() -> None:
     looks_past = json.loads(json.dumps(PAPER))
     looks_past["cam2"]["y0_mm"] += 600.0
     warned = check_calibration(parse_calibration(json.dumps(looks_past).encode(), name="x"))
-    assert any("in common" in w for w in warned["warnings"])
+    assert any("in common" in w for w in warned.warnings)
 
 
 # against measured points ------------------------------------------------------------------------------------------
@@ -406,8 +405,8 @@ def test_measured_points_tell_a_wrong_calibration(tmp_path: Path, capsys: pytest
     path = _measured(tmp_path / "results", own.pair, own.sha256, offset, x, y)
     found = check_against(own, [path], file)
     stored_rms = np.sqrt(np.mean(offset.astype("f4").astype(float) ** 2))
-    assert found["this_calibration"] == found["measured_with"]
-    assert found["this_calibration"]["rms_px"] == pytest.approx(stored_rms, rel=1e-6)
+    assert found.this_calibration == found.measured_with
+    assert found.this_calibration.rms_px == pytest.approx(stored_rms, rel=1e-6)
     # a camera turned by a milliradian about its axis of sight's normal: seen by the fundamental matrix too
     wrong = StereoPair(
         own.pair.cam1,
@@ -420,7 +419,7 @@ def test_measured_points_tell_a_wrong_calibration(tmp_path: Path, capsys: pytest
         ),
     )
     turned = LoadedCalibration(wrong, SIZE, SIZE, "opencv_yaml", "", {})
-    seen = check_against(turned, [path], file)["this_calibration"]
+    seen = check_against(turned, [path], file).this_calibration
     K = own.pair.cam1.lens.kernel_parameters()
     matrix = _matrix(K[1], K[2], K[4], K[5])
     pose = wrong.cam2_from_cam1
@@ -432,8 +431,8 @@ def test_measured_points_tell_a_wrong_calibration(tmp_path: Path, capsys: pytest
     lines = cv2.computeCorrespondEpilines(xy1.reshape(-1, 1, 2), 1, F).reshape(-1, 3)
     xy2 = own.pair.cam2.project(xyz).xy
     distance = np.sum(lines[:, :2] * xy2, axis=1) + lines[:, 2]
-    assert seen["rms_px"] == pytest.approx(np.sqrt(np.mean(distance**2)), rel=0.02)
-    assert seen["rms_px"] > 5.0
+    assert seen.rms_px == pytest.approx(np.sqrt(np.mean(distance**2)), rel=0.02)
+    assert seen.rms_px > 5.0
     other = convert_calibration(opencv_pair(k1=0.01), "opencv", b"")
     (tmp_path / "other.yaml").write_bytes(other.data)
     with pytest.raises(StereorigError) as caught:

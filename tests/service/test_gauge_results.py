@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.strain import StrainOptions, surface_strain
@@ -24,7 +25,7 @@ from server.formats.results.reading import read_attributes, read_field
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.workflows.service import Service
-from tests.support.gauge_field import SUBSET, Float, make_field, pixel_noise, surface
+from tests.support.gauge_field import SUBSET, make_field, pixel_noise, surface
 from tests.support.service_rig import new_test
 
 API = "/api/v1"

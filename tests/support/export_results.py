@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.region.cuts import Cuts
 from core.strain import surface_strain
 from core.strain.options import StrainOptions
 from server.formats.results.writing import Provenance, write_field
 from tests.support.gauge_field import SUBSET, make_field
 
-Float = NDArray[np.float64]
 ROWS, COLS = 24, 31  # x 40 to 250 px, y 60 to 221 px, 7 px apart
 RADIUS_MM, MM_PER_PX = 20.0, 0.02
 CRACK_X_PX = 148.3

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.inputs import NominalCamera
 from core.cameras.camera import angles_from_rotation
-from core.cameras.lens import Float
 from core.errors import CalibrationInputError
 
 _FLIP_DEG = 3.0  # how far a flipped camera's alpha may lie from the mirrored one of its partner

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.calibration.uncertainty import point_derivatives
-from core.cameras.lens import Float
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
 

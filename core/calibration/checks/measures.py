@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.arrays import Float
 from core.cameras.camera import Camera
-from core.cameras.lens import Float, SeidelLens
+from core.cameras.lens import SeidelLens
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.inputs import CalibrationView, NominalCamera
-from core.cameras.lens import Float
 from core.errors import CalibrationInputError
 
 _UNITS = ((1e3, "micrometres for millimetres"), (25.4, "mils or inches for millimetres"), (10.0, "a factor of ten"))

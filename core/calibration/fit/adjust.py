@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.arrays import Bool, Float
 from core.calibration.fit.model import N_CAMERA, Linearised, Observations, linearise
-from core.calibration.inputs import CAMERAS, CalibrationOptions, NominalCamera
-from core.cameras.lens import Bool, Float
+from core.calibration.inputs import CalibrationOptions, NominalCamera
 from core.errors import CalibrationError
+from core.names import CAMERAS
 
 _P = 2 * N_CAMERA
 _NOISE_ROUNDS = 4

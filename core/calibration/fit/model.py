@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from core.arrays import Bool, Float
 from core.calibration.inputs import CalibrationView
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera, RigidTransform
-from core.cameras.lens import Bool, Float
 
 N_CAMERA = 12  # ten parameters and the tilt of the stage axis in x and y
 TILT_NAMES = ("axis_tilt_x_rad", "axis_tilt_y_rad")

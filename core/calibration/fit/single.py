@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.fit.model import Observations, linearise
 from core.calibration.inputs import NominalCamera
-from core.cameras.lens import Float
 from core.errors import CalibrationError
 
 _OUTSIDE_PX = 1e6  # residual of a point that has no image, so that a step there is never taken

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from core.arrays import Float
 from core.calibration.inputs import CalibrationView, NominalCamera
-from core.cameras.lens import Float
 
 
 def affine_of_view(view: CalibrationView, nodes_mm: Float, aspect: float) -> tuple[Float, Float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.checks.unreached import leaves_an_image
 from core.field.points.fitter import Fitter, PointFits

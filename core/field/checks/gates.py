@@ -15,23 +15,22 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import PointFits
 from core.field.points.starts import depth_per_px
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
 from core.field.region.trend import smooth_terms
 from core.field.region.visibility import Sight
+from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, spread_indices
 from core.status import PointStatus
 from core.threads import run_ranges
 
-_MAD_TO_SIGMA = 1.4826
 _FEW = 12
 _NETWORK = sorting_network(24)
 _ROWS_AT_ONCE = 4
 _SETTLED = 0.01  # of the scatter: a robust fit that moves less has converged, far below what a limit of 5 sigma feels
 _TREND_POINTS = 3000  # carry a trend of seven terms: it then scatters by a twentieth of the points' own scatter
-_GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +144,7 @@ def _gate_epipolar(points: PointFits, terms: Float, options: GateOptions) -> Non
         # plain and robust scatter about the field's middle too: the figures that a reader recomputes from the file
         about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
         plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
-        scatter = _MAD_TO_SIGMA * float(np.median(about_median))
+        scatter = MAD_TO_SIGMA * float(np.median(about_median))
         middle = (about_median > options.epipolar_sigmas * scatter) & (about_median > options.epipolar_floor_px)
         bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
         if not bad.any():
@@ -208,10 +207,8 @@ def _gate_neighbours(
         d = np.abs(difference[heard, q])
         if len(d) == 0:
             continue
-        sigma = _MAD_TO_SIGMA * float(np.median(d))
-        limit = (
-            options.neighbour_sigmas * np.hypot(sigma, _MAD_TO_SIGMA * spread[heard, q]) + options.neighbour_floor_px
-        )
+        sigma = MAD_TO_SIGMA * float(np.median(d))
+        limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[heard, q]) + options.neighbour_floor_px
         bad[np.flatnonzero(heard)[d > limit]] = True
     if not few:
         bad |= ok & (count < 2)  # nothing near it that could confirm it
@@ -257,20 +254,18 @@ def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
     Of many points a few thousand carry the fit, spread over all of them by multiples of the golden section.
     """
     n = len(values)
-    some = slice(None) if n <= _TREND_POINTS else np.sort((n * (_GOLDEN * np.arange(_TREND_POINTS) % 1.0)).astype(int))
+    some = slice(None) if n <= _TREND_POINTS else np.sort(spread_indices(n, _TREND_POINTS))
     terms, wanted = design[some], values[some]
     part = wanted - np.median(wanted)
     for _ in range(6):
-        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(part - np.median(part)))), 1e-12)
-        u = part / (4.685 * sigma)
-        weight = np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
-        weighted = terms * weight[:, None]
+        sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(part - np.median(part)))), 1e-12)
+        weighted = terms * biweight((part / (BIWEIGHT_REACH * sigma)) ** 2)[:, None]
         solution = np.linalg.lstsq(weighted.T @ terms, weighted.T @ wanted, rcond=1e-9)[0]
         last, part = part, wanted - terms @ solution
         if np.abs(part - last).max() < _SETTLED * sigma:
             break
     residual = values - design @ solution
-    sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-12)
+    sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-12)
     return residual, sigma
 
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.field.checks.plane_error import PlaneError
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.patch import PatchChoice, UsedPatch, told_um

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.field.points.fitter import PointFits
 
 _FEWEST = 16

@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
 from core.matching.observed import observed_covariance
 from core.progress import CancelToken, raise_if_cancelled
+from core.robust import spread_indices
 from core.status import PointStatus
 
 _SAMPLE = 256
 _FEWEST = 30  # of a sample, to say something of a field
-_GOLDEN = 0.6180339887498949
 _MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent pulls
 _AS_NOISE = (0.8, 1.25)  # a sample's variance over the told one: within, nothing needs to be corrected
 _ONE_VOICE = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
@@ -99,7 +99,7 @@ def judge(
     energy = (1.0 - points.zncc[ok]) * texture[ok, None]
     unusual: Bool = np.asarray((energy > _UNUSUAL * np.median(energy, axis=0)).any(axis=1))
     usual = ok[~unusual]
-    sample = usual[np.unique((len(usual) * (_GOLDEN * np.arange(_SAMPLE) % 1.0)).astype(int))]
+    sample = usual[np.unique(spread_indices(len(usual), _SAMPLE))]
     own = _own_factors(fitter, points, sample, xy_px)
     own = own[np.isfinite(own).all(axis=1)]
     factor = nothing.factor

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import move_matrix, move_w
 from core.status import PointStatus

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.errors import SeedError
 from core.field.checks.edges import refuse_near_edges
 from core.field.checks.residual_test import judge

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.checks.edges import clear_of_edges
 from core.field.checks.gates import apply_gates

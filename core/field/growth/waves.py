@@ -12,11 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.points.fitter import PointFits
 from core.field.points.starts import move_matrix, move_w
 from core.field.region.visibility import Sight
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
+from core.robust import MAD_TO_SIGMA
 from core.status import PointStatus
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
@@ -56,7 +57,7 @@ def fit_in_batches(
     *,
     far_px: float,
     cancel: CancelToken | None = None,
-) -> NDArray[np.bool_]:
+) -> Bool:
     """Fit the points ``index`` from starts and write down what came; returns which stand.
 
     A fit that ends further than ``far_px`` from its start has left the basin it was started in.
@@ -196,5 +197,5 @@ def _least_parent(quality: Float) -> float:
     """Correlation of a point that may hand its values on: not far below the field's own."""
     standing = quality[quality > 0.0]
     middle = float(np.median(standing))
-    scatter = 1.4826 * float(np.median(np.abs(standing - middle)))
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(standing - middle)))
     return middle - max(0.15, 8.0 * scatter)

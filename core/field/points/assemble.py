@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import PointFits
 from core.field.points.patch import PatchChoice

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float, Float32
 from core.threads import run_ranges
 
 MAX_KEYPOINTS = 4000
@@ -41,7 +41,7 @@ class Features:
     """
 
     xy_px: Float
-    descriptors: NDArray[np.float32]
+    descriptors: Float32
     scale: int = 1
 
 
@@ -108,7 +108,7 @@ def detect_all(pictures: Sequence[Picture], *, scale: int = 1, max_keypoints: in
 
     run_ranges(shrink, len(pictures), 1)
     tiles = [(k, core) for k, picture in enumerate(small) for core in _tiles((picture.shape[0], picture.shape[1]))]
-    found: list[tuple[Float, NDArray[np.float32], Float]] = [(np.zeros((0, 2)),) * 3] * len(tiles)  # type: ignore[list-item]
+    found: list[tuple[Float, Float32, Float]] = [(np.zeros((0, 2)),) * 3] * len(tiles)  # type: ignore[list-item]
 
     def search(first: int, last: int) -> None:
         for i in range(first, last):
@@ -148,7 +148,7 @@ def _tiles(shape: tuple[int, int]) -> list[Box]:
     return [(x0, y0, x1, y1) for y0, y1 in pairwise(ys) for x0, x1 in pairwise(xs)]
 
 
-def _search(picture: NDArray[np.uint8], core: Box, most: int) -> tuple[Float, NDArray[np.float32], Float]:
+def _search(picture: NDArray[np.uint8], core: Box, most: int) -> tuple[Float, Float32, Float]:
     """Keypoints (n, 2) inside ``core``, their descriptors and strengths; what is around it helps the filters."""
     x0, y0, x1, y1 = _with_rim(Picture(picture, core), 1)
     sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=_LEAST_CONTRAST)  # type: ignore[attr-defined]

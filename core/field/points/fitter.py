@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.starts import depth_per_px, faces_both_cameras
 from core.field.region.visibility import Sight

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.errors import ImageError
 from core.field.points.features import Box, Features, Picture, detect_all
 from core.matching.blur import Blur

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Bool, Float
 from core.field.points.patch import PatchChoice
 from core.field.points.smoothing_record import Smoothing
 from core.field.points.starts import Starts
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ class Field:
         return self.uvw_mm is not None
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Bool:
         """(r, c) True where the point has numbers."""
         return np.isin(self.status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
 

@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from core.arrays import Float
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing, weight_products, weight_square
-
-Float = NDArray[np.float64]
 
 _P2_WEIGHT = -2.5  # (2 n + 1) P_n(0) of n = 2, beside 1 of n = 0
 _AT_ONCE = 256

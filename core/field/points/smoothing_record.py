@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.errors import InputError
 from core.field.region.window import fit_terms, window_offsets
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.region.line_crossings import cross
 from core.threads import run_ranges

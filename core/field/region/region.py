@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.region.cuts import Cuts
 
@@ -169,7 +169,7 @@ class PointGrid:
 
 def check_region(
     grid: PointGrid, *, image_shape: tuple[int, int], subset_px: int, mask_shape: tuple[int, int] | None = None
-) -> NDArray[np.bool_]:
+) -> Bool:
     """Check a grid against camera 1's image before anything is computed.
 
     Parameters

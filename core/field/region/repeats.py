@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
+from core.robust import spread_indices
 
 _ALIKE = 0.85  # correlation of a square, twice a subset wide, with another place; random speckles reach half of it
 _OWN_PEAK = 0.5  # what hangs together with the square's own place above this is its own peak
 _LEAST_HALF_PX = 12
 _TRIED = 24
-_GOLDEN = 0.6180339887498949
 
 
 def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
@@ -37,7 +37,7 @@ def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
     n = len(xy_px)
     if n == 0:
         return np.zeros(0, bool)
-    tried = np.unique((n * (_GOLDEN * np.arange(min(_TRIED, n)) % 1.0)).astype(int))
+    tried = np.unique(spread_indices(n, min(_TRIED, n)))
     found = np.array([_second_peak(pixels, xy_px[i], subset_px) > _ALIKE for i in tried])
     nearest = np.asarray(cKDTree(xy_px[tried]).query(xy_px)[1])
     return np.asarray(found[nearest])

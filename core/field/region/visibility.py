@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.field.region.line_crossings import find_near, look, part, parted_neighbours, variances
 from core.field.region.neighbours import REACH
 from core.field.region.region import PointGrid
@@ -100,7 +100,7 @@ class Sight:
         bit = place - (1 if place > wide * wide // 2 else 0)
         return np.asarray((self.parted.ravel() >> np.uint32(bit)) & np.uint32(1), dtype=bool)
 
-    def correct_variance(self, variance: Float, image: NDArray[np.float32]) -> Float:
+    def correct_variance(self, variance: Float, image: Float32) -> Float:
         """Return grey-level variances (n,) with those of cut subsets taken over the pixels that count alone."""
         index = np.flatnonzero(~self.whole)
         xy = np.ascontiguousarray(self.xy_px[index])

@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.region.cuts import Cuts, crosses
 
 

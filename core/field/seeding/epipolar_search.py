@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float, Float32
 from core.cameras.stereo import StereoPair
 
 _TILTS_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
@@ -160,7 +160,7 @@ def nominal_depth(pair: StereoPair) -> float:
     return 10.0 * pair.baseline_mm
 
 
-def _sample(image: NDArray[np.float32], xy: Float) -> Float:
+def _sample(image: Float32, xy: Float) -> Float:
     """Bilinear grey levels at (b, s, 2)."""
     maps = xy.astype(np.float32)
     return np.asarray(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.region.neighbours import least_median
 from core.threads import run_ranges
 

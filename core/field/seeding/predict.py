@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.points.starts import position_now
 from core.field.region.trend import smooth_terms
+from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
 _QUADRATIC_FROM, _LINEAR_FROM = 36, 12
 _ROUNDS = 4
@@ -47,8 +48,8 @@ def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], 
         left = np.linalg.norm(
             (change.reshape(len(sample), -1) - design @ solution).reshape(change.shape)[..., 0], axis=1
         )
-        reach = 4.685 * 1.4826 * max(float(np.median(left)), 1e-15)
-        weight = np.where(left < reach, (1.0 - (left / reach) ** 2) ** 2, 0.0)
+        reach = BIWEIGHT_REACH * MAD_TO_SIGMA * max(float(np.median(left)), 1e-15)
+        weight = biweight((left / reach) ** 2)
     moved = G + (terms @ solution).reshape(G.shape)
     seen = [_images(pair, w_now, g) for g in (G_now, G[sample], moved[sample])]
     before, after = (float(np.median(np.linalg.norm(seen[0] - s, axis=-1).max(axis=0))) for s in seen[1:])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import ImageError
 from core.field.points.features import Box, Features, match

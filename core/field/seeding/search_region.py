@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.points.features import Box
 from core.field.seeding.epipolar_search import DEPTH_SPAN, nominal_depth

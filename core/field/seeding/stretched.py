@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.field.points.features import Box, Features, detect, reduced, with_rim
 
 _RATIO = 1.75  # of the axes: what is off by half of it or twice it is still matched

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.cameras.lens import Bool, Float
+from core.arrays import Bool, Float
 from core.field.region.region import PointGrid
 from core.field.region.visibility import MARGIN_PX, Sight, keep_sight, patches_seen, sight_of
 from core.matching.arguments import VisiblePixels

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from core.matching.geometry import plane_from_angles, tangent_frames

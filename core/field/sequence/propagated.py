@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.lens import Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from core.field.sequence.compose import Totals, common_share, image_slopes, in_step

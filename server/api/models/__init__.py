@@ -1,5 +1,6 @@
 """Wire models: what goes over HTTP, apart from what the code works with inside."""
 
+from core.names import CameraName
 from server.api.models.analyses import (
     AnalysisAccepted,
     AnalysisList,
@@ -88,6 +89,7 @@ __all__ = [
     "CalibrationList",
     "CalibrationReply",
     "CalibrationRequest",
+    "CameraName",
     "CameraReply",
     "CameraSet",
     "CameraStats",

@@ -11,6 +11,7 @@ from pathlib import Path
 from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationResult, Measures
 from core.calibration.from_images import ImageOfTarget, calibrate_views
 from core.errors import CalibrationError, InputError
+from core.names import CAMERAS
 from server.cli.terminal import ProgressLine
 from server.formats.calibrations.native import write_calibration
 from server.formats.calibrations.target_toml import read_rig, read_target
@@ -137,7 +138,7 @@ def report(result: CalibrationResult) -> str:
     for label, check in (("fitted", result.fitted), ("held out", result.held_out)):
         if check is not None:
             lines.append(_row(label, check.mean))
-            lines.extend(_row(f"  {n}", m) for n, m in zip(("cam1", "cam2"), check.per_camera, strict=True))
+            lines.extend(_row(f"  {n}", m) for n, m in zip(CAMERAS, check.per_camera, strict=True))
             if result.node_corrections_mm is not None:
                 lines.append(_row("  nominal grid", check.nominal_mean))
     lines.append("")

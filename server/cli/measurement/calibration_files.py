@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from core.errors import InputError
 from server.exports.source import results_in
-from server.formats.calibrations.export import FORMS, convert_calibration
-from server.formats.calibrations.plausibility import check_calibration
+from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
+from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
 from server.formats.images import read_file
-from server.results.epipolar_check import check_against
+from server.results.epipolar_check import EpipolarComparison, check_against
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,25 +48,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert or check; print what was found."""
     loaded = load_calibration(args.file)
-    checked = check_calibration(loaded)
+    checked, points = check_calibration(loaded), None
     if args.points is not None:
-        checked["points"] = _against(loaded, args.points, args.measured_with)
+        points = _against(loaded, args.points, args.measured_with)
     elif args.measured_with is not None:
         raise InputError("--measured-with is given without --points.", code="option_conflict", remedy="Give both.")
     if args.action == "convert":
         made = convert_calibration(loaded, args.to, read_file(args.file))
         make_folder(args.out.absolute().parent)
         write_bytes(args.out, made.data)
-        report = {**made.report, "import_check": checked}
+        check = asdict(checked) | ({} if points is None else {"points": asdict(points)})
+        report = {**asdict(made.report), "import_check": check}
         write_bytes(args.out.with_name(f"{args.out.name}.report.json"), (json.dumps(report, indent=1) + "\n").encode())
         _print_conversion(made.report)
-    _print_check(checked)
+    _print_check(checked, points)
     if args.action == "convert":
         print(f"written: {args.out}")
     return 0
 
 
-def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None) -> dict[str, Any]:
+def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None) -> EpipolarComparison:
     places = [folder, folder / "exports" / "measure", *sorted((folder / "analyses").glob("*"))]
     files = next((found for place in places if (found := results_in(place))), None)
     if files is None:
@@ -86,34 +87,30 @@ def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None
     return check_against(loaded, files, measured_with)
 
 
-def _print_conversion(report: dict[str, Any]) -> None:
-    for cam, fit in report["lens"].items():
-        left = f"fitted, residual {fit['rms_px']:.3g} px rms, {fit['max_px']:.3g} px at most"
-        print(f"{cam}: lens {'exact' if report['exact'] else left}")
-    back = report["read_back"]
-    if back["points"]:
-        print(f"read back: {_said(back)}; in space {back['rms_mm']:.3g} mm rms, {back['max_mm']:.3g} mm at most")
-    for note in report["notes"]:
+def _print_conversion(report: ConversionReport) -> None:
+    for cam, fit in report.lens.items():
+        left = f"fitted, residual {fit.rms_px:.3g} px rms, {fit.max_px:.3g} px at most"
+        print(f"{cam}: lens {'exact' if report.exact else left}")
+    back = report.read_back
+    if back.points:
+        print(f"read back: {_said(back)}; in space {back.rms_mm:.3g} mm rms, {back.max_mm:.3g} mm at most")
+    for note in report.notes:
         print(f"note: {note}")
 
 
-def _said(residual: dict[str, Any]) -> str:
-    if not residual["points"]:
+def _said(residual: Residual) -> str:
+    if not residual.points:
         return "no points"
-    return (
-        f"{residual['points']} points, epipolar residual {residual['rms_px']:.3g} px rms, "
-        f"{residual['max_px']:.3g} px at most"
-    )
+    return f"{residual.points} points, epipolar residual {residual.rms_px:.3g} px rms, {residual.max_px:.3g} px at most"
 
 
-def _print_check(checked: dict[str, Any]) -> None:
-    print(f"baseline {checked['baseline_mm']:.6g} mm, stereo angle {checked['stereo_angle_deg']:.4g} degrees")
-    print(f"volume that both cameras see: {_said(checked['volume'])}")
-    points = checked.get("points")
+def _print_check(checked: CalibrationCheck, points: EpipolarComparison | None) -> None:
+    print(f"baseline {checked.baseline_mm:.6g} mm, stereo angle {checked.stereo_angle_deg:.4g} degrees")
+    print(f"volume that both cameras see: {_said(checked.volume)}")
     if points is not None:
         print(
-            f"measured points of {points['results']}: {_said(points['this_calibration'])}; as they were measured: "
-            f"{_said(points['measured_with'])}"
+            f"measured points of {points.results}: {_said(points.this_calibration)}; as they were measured: "
+            f"{_said(points.measured_with)}"
         )
-    for warning in checked["warnings"]:
+    for warning in checked.warnings:
         print(f"warning: {warning}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,16 @@ from pydantic import ValidationError
 
 from core.errors import InputError
 from server.formats.files import make_folder, write_bytes
-from server.formats.results.gauge_csv import gauges_csv
-from server.formats.results.gauge_mat import gauges_mat
+from server.formats.gauges.matlab import gauges_mat
+from server.formats.gauges.readings import GaugeReadings, LineReading, Number, StepReadings
+from server.formats.gauges.table import gauges_csv
 from server.formats.results.summary import to_json
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
 
 _RESULT = re.compile(r"step_\d{4,}\.nc")
-_FORMS = {".csv": gauges_csv, ".json": to_json, ".mat": gauges_mat}
+_FORMS = {".csv": gauges_csv, ".json": lambda readings: to_json(readings.document()), ".mat": gauges_mat}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,13 +94,13 @@ def run(args: argparse.Namespace) -> int:
     request = _request(args)
     files = result_files(args.folder)
     fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
-    document = read_gauges(files, request, fields)
-    print("\n".join(report(document)))
+    readings = read_gauges(files, request, fields)
+    print("\n".join(report(readings)))
     if fields is not None:
         print(f"fields written: {len(fields.written)} files in {args.field_out}")
     if args.out is not None:
         make_folder(args.out.absolute().parent)
-        write_bytes(args.out, _FORMS[args.out.suffix.lower()](document))
+        write_bytes(args.out, _FORMS[args.out.suffix.lower()](readings))
         print(f"written: {args.out}")
     return 0
 
@@ -215,79 +217,69 @@ def _numbers(option: str, text: str, counts: tuple[int, ...] | None) -> list[flo
     return numbers
 
 
-def report(document: dict[str, Any]) -> list[str]:
+def report(readings: GaugeReadings) -> list[str]:
     """Return the readings as tables over the steps, one gauge after the other."""
-    lines = [f"STALE: {reason} since this was measured; measure again" for reason in document["stale_reasons"]]
-    lines.append(f"frame: {document['frame']}")
-    alignment = document["alignment"]
-    if alignment:
-        turns = ", ".join(f"{1e6 * s:.1f}" for s in alignment["sigma_rad"])
+    lines = [f"STALE: {reason} since this was measured; measure again" for reason in readings.stale_reasons]
+    lines.append(f"frame: {readings.frame}")
+    frame = readings.alignment
+    if frame is not None:
+        turns = ", ".join(f"{1e6 * s:.1f}" for s in frame.sigma_rad)
         lines.append(
-            f"  from {alignment['points']} points, residual {1e3 * alignment['residual_rms_mm']:.2f} um rms; "
+            f"  from {frame.points} points, residual {1e3 * frame.residual_rms_mm:.2f} um rms; "
             f"sd of its turns about X, Y, Z {turns} urad"
         )
-    steps = document["steps"]
-    lines += [f"step {s['n']}: {s['problem']['code']}: {s['problem']['cause']}" for s in steps if "problem" in s]
-    steps = [s for s in steps if "problem" not in s]
-    moved = [s for s in steps if "rigid_motion" in s]
+    lines += [f"step {s.n}: {s.problem.code}: {s.problem.cause}" for s in readings.steps if s.problem is not None]
+    steps = readings.read
+    moved = [(s, s.rigid_motion.values, "") for s in steps if s.rigid_motion is not None]
     if moved:
-        lines += ["rigid motion taken out"]
-        lines += _table([(s, s["rigid_motion"]["values"], "") for s in moved])
-    for kind, title in (("points", "point"), ("extensometers", "extensometer"), ("areas", "area"), ("lines", "line")):
-        for k in range(len(steps[0][kind]) if steps else 0):
-            gauges = [(s, s[kind][k]) for s in steps]
-            lines.append(f"{title} {gauges[0][1]['name']}{_where(kind, gauges[0][1])}")
-            if kind == "areas":
-                lines += _table([(s, {n: _mean(v) for n, v in g["values"].items()}, g["missing"]) for s, g in gauges])
-            elif kind == "lines":
-                lines += [_line_summary(s, g) for s, g in gauges]
-            else:
-                lines += _table([(s, g["values"], g["missing"]) for s, g in gauges])
+        lines += ["rigid motion taken out", *_table(moved)]
+    if not steps:
+        return lines
+    for k, point in enumerate(steps[0].points):
+        lines.append("point {} at ({:g}, {:g}) px".format(point.name, *point.xy_px))
+        lines += _table([(s, s.points[k].values, s.points[k].missing) for s in steps])
+    for k, gauge in enumerate(steps[0].extensometers):
+        where = "from ({:g}, {:g}) to ({:g}, {:g}) px".format(*gauge.a_px, *gauge.b_px)
+        lines.append(f"extensometer {gauge.name} {where}")
+        lines += _table([(s, s.extensometers[k].values, s.extensometers[k].missing) for s in steps])
+    for k, area in enumerate(steps[0].areas):
+        lines.append(f"area {area.name}, mean of {area.valid} of {area.points} points in the first step read")
+        areas = [(s, s.areas[k]) for s in steps]
+        lines += _table([(s, {n: v.mean_number for n, v in a.values.items()}, a.missing) for s, a in areas])
+    for k, line in enumerate(steps[0].lines):
+        lines.append(f"line {line.name}, {len(line.x_px)} places")
+        lines += [_line_summary(s.n, s.lines[k]) for s in steps]
     return lines
 
 
-def _where(kind: str, gauge: dict[str, Any]) -> str:
-    if kind == "points":
-        return " at ({:g}, {:g}) px".format(*gauge["xy_px"])
-    if kind == "extensometers":
-        return " from ({:g}, {:g}) to ({:g}, {:g}) px".format(*gauge["a_px"], *gauge["b_px"])
-    if kind == "areas":
-        return f", mean of {gauge['valid']} of {gauge['points']} points in the first step read"
-    return f", {len(gauge['x_px'])} places"
-
-
-def _mean(v: dict[str, Any]) -> dict[str, Any]:
-    return {"value": v["mean"], "sigma": v["mean_sigma"], "units": v["units"]}
-
-
-def _line_summary(step: dict[str, Any], line: dict[str, Any]) -> str:
-    lost = sum(bool(text) for text in line["missing"])
+def _line_summary(n: int, line: LineReading) -> str:
+    lost = sum(bool(text) for text in line.missing)
     parts = []
-    for name, v in line["values"].items():
-        values = [x for x in v["value"] if x is not None]
+    for name, v in line.values.items():
+        values = [x for x in v.value if x is not None]
         parts.append(f"{name} {min(values):.6g} to {max(values):.6g}" if values else f"{name} missing")
-    return f"  step {step['n']}: {lost} missing; {', '.join(parts)}"
+    return f"  step {n}: {lost} missing; {', '.join(parts)}"
 
 
-def _table(rows: list[tuple[dict[str, Any], dict[str, Any], str]]) -> list[str]:
+def _table(rows: Sequence[tuple[StepReadings, Mapping[str, Number], str]]) -> list[str]:
     names = list(dict.fromkeys(name for _, values, _ in rows for name in values))
-    loaded = any(step["load_n"] is not None or step["label"] for step, _, _ in rows)
+    loaded = any(step.load_n is not None or step.label for step, _, _ in rows)
     head = ["step", *(["load_n", "label"] if loaded else []), *names]
     table = [head]
     for step, values, missing in rows:
-        load = "" if step["load_n"] is None else f"{step['load_n']:g}"
-        row = [str(step["n"]), *([load, step["label"][:24]] if loaded else [])]
+        load = "" if step.load_n is None else f"{step.load_n:g}"
+        row = [str(step.n), *([load, step.label[:24]] if loaded else [])]
         row += [f"missing ({missing})"] if missing else [_shown(values.get(name)) for name in names]
         table.append(row)
     width = [max(len(row[k]) for row in table if k < len(row) and len(row) == len(head)) for k in range(len(head))]
     return ["  " + "  ".join(cell.rjust(w) for cell, w in zip(row, width, strict=False)) for row in table]
 
 
-def _shown(number: dict[str, Any] | None) -> str:
+def _shown(number: Number | None) -> str:
     """A number to the second digit of its uncertainty."""
-    if number is None or number["value"] is None:
+    if number is None or number.value is None:
         return "-"
-    value, sigma = number["value"], number["sigma"]
+    value, sigma = number.value, number.sigma
     if sigma is None or sigma <= 0.0:
         return f"{value:.6g}"
     digits = min(max(1 - math.floor(math.log10(sigma)), 0), 12)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
+from core.names import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -153,4 +154,4 @@ def _hashes(record: object) -> tuple[str | None, str | None]:
     hashes = record.get("sha256") if isinstance(record, dict) else None
     if not isinstance(hashes, dict):
         return None, None
-    return tuple(str(hashes[cam]) if cam in hashes else None for cam in ("cam1", "cam2"))  # type: ignore[return-value]
+    return tuple(str(hashes[cam]) if cam in hashes else None for cam in CAMERAS)  # type: ignore[return-value]

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from core.errors import InputError
+from core.names import CAMERAS
 from core.noise import NoiseModel, measure_noise
 from server.cli.measurement.image_lists import expand
 from server.formats.files import make_folder, sha256_of
 from server.formats.noise_frames import read_frames
-from server.formats.noise_json import CAMERAS, noise_content, write_noise
+from server.formats.noise_json import noise_content, write_noise
 
 SHOWN_LEVELS = 5
 

@@ -51,6 +51,6 @@ def run(args: argparse.Namespace) -> int:
     for doubt in (*(f"{reason} since this was measured" for reason in source.stale), *source.doubts):
         print(f"note: {doubt}")
     print(f"written: {args.out}, {len(made.page) / 2**20:.1f} MiB; {len(made.missing)} items are not stated")
-    for name, remedy in made.missing:
-        print(f"  {name}: {remedy}")
+    for item in made.missing:
+        print(f"  {item.name}: {item.remedy}")
     return 0

@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from server.demo.compare import MotionComparison
 from server.exports.mesh import triangles_of
@@ -19,8 +20,6 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.patches import Rectangle
 from matplotlib.tri import Triangulation
-
-Float = NDArray[np.float64]
 
 STYLE: Any = {  # rc_context wants every key spelled out in its type
     "font.size": 9,

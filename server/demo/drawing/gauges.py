@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib import pyplot as plt
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.strain import StrainField
 from server.demo.drawing.fields import DIFFERENCE, HEIGHT, STYLE, colour_limit, draw_map, save
@@ -17,8 +17,6 @@ from server.demo.experiments.panel_gauges import ENDS_PX, Opening, Slice
 from server.demo.experiments.panel_strain import PanelStrain
 from server.demo.experiments.steel_motion import Moved
 from server.demo.strain import MICRO
-
-Float = NDArray[np.float64]
 
 
 def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm: float) -> dict[str, str]:

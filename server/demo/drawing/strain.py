@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from core.field.points.result import Field
 from core.strain import StrainField
@@ -19,7 +18,6 @@ from server.demo.experiments.plate_strain import PlateStrain
 from server.demo.strain import MICRO
 from sim.plate import CircularPlate
 
-Float = NDArray[np.float64]
 _SHOWN = 5  # pressures in the profiles
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from server.demo.client import AnalysisHandle
 from server.demo.session import Check, Outcome, Session, table
@@ -17,8 +17,6 @@ from sim.catalog import make_scene
 from sim.panel import CrackedPanel
 from sim.rig import SimRig
 from sim.truth import Truth, truth_at
-
-Float = NDArray[np.float64]
 
 ACROSS = tuple(round(0.15 * k, 2) for k in range(-6, 7))  # of the half crack: places of the extensometers
 BEYOND = (-1.35, 1.35)  # the same, ahead of the tips: nothing opens there

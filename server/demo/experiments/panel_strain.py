@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.strain import StrainField
 from server.demo.compare import MotionComparison
@@ -15,7 +16,6 @@ from server.demo.session import Check, Outcome, table
 from server.demo.strain import MICRO, Difference, along, as_read, chi_limit, difference
 from sim.panel import CrackedPanel
 
-Float = NDArray[np.float64]
 LOAD_SYS = (1.0, 1.0)  # the panel hangs upright, the grid's lines at 45 degrees
 _BESIDE = 0.6  # of the half crack: beyond, the tips' strain varies within a gauge
 SHARE_OVER = 0.1  # of what a gauge over the crack would read

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from core.arrays import Float
 from core.field.points.result import Field
 from server.demo.client import AnalysisHandle
 from server.demo.compare import MotionComparison, compare_motion, compare_shape
@@ -17,8 +17,6 @@ from server.demo.experiments import plate_strain
 from server.demo.session import Check, Outcome, Session, table
 from server.demo.strain import fetched_strain
 from sim.plate import PAPER_PRESSURES_KPA, CircularPlate
-
-Float = NDArray[np.float64]
 
 ROI_PX = (86.0, 70.0, 426.0, 410.0)  # 341 x 341 px, as in the paper
 SUBSET_PX, STEP_PX = 21, 10

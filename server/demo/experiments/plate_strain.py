@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.strain import StrainField
 from server.demo.compare import MotionComparison
 from server.demo.session import Check, Outcome, table
 from server.demo.strain import MICRO, Difference, along, as_read, chi_limit, difference, whole_gauges
 from sim.plate import CircularPlate
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

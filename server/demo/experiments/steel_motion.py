@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from core.arrays import Float
 from core.calibration.volume import CalibratedVolume
 from core.field.points.result import Field
 from core.strain import StrainField
@@ -16,8 +16,6 @@ from server.demo.session import Check, Outcome, Session, table
 from server.demo.strain import MICRO, chi_limit, fetched_strain
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.volume import volume_of
-
-Float = NDArray[np.float64]
 
 # name, translation (mm) and rotation (degrees about X_sys, Y_sys, Z_sys) of the plate, about the system's origin
 MOTIONS = (

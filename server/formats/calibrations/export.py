@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from core.cameras.conversion import LensFit, fit_opencv, fit_seidel
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
+from core.names import CAMERAS
 from server.formats.calibrations.dice_xml import dice_text
 from server.formats.calibrations.matchid_caldat import caldat_text
 from server.formats.calibrations.opencv_yaml import opencv_text
@@ -63,22 +64,62 @@ _NOTES: dict[CalibrationForm, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class ConvertedCalibration:
-    """A calibration in another form.
+class LensError:
+    """What a fitted lens is off over the image."""
+
+    rms_px: float
+    max_px: float
+
+
+@dataclass(frozen=True)
+class ReadBack(Residual):
+    """What the written file makes of points that both cameras see, and how far off it triangulates them."""
+
+    rms_mm: float | None
+    max_mm: float | None
+
+
+@dataclass(frozen=True)
+class ConversionReport:
+    """What became of a calibration on its way into another form.
 
     Attributes
     ----------
-    data
-        The file's bytes.
-    report
-        ``format``; ``source``, ``source_sha256``; ``frame``; ``exact``; ``lens`` (``rms_px``, ``max_px`` of the fit
-        over the image of each camera); ``read_back``: over a grid of points that both cameras see, by an independent
-        projection with the original, the epipolar residual of the file read back (``rms_px``, ``max_px``) and how far
-        off it triangulates them (``rms_mm``, ``max_mm``); ``notes``; ``software``.
+    format, software
+        What was written, by which version.
+    source, source_sha256
+        What was read.
+    units, frame, image_size_px
+        Of the written file.
+    exact
+        Whether both lenses are the same but for rounding.
+    lens
+        By camera, what the fit leaves.
+    read_back
+        Over a grid of points that both cameras see, projected by independent formulas with the original.
+    notes
+        What was assumed.
     """
 
+    format: CalibrationForm
+    software: str
+    source: str
+    source_sha256: str
+    units: str
+    frame: str
+    image_size_px: list[list[int]] | None
+    exact: bool
+    lens: dict[str, LensError]
+    read_back: ReadBack
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class ConvertedCalibration:
+    """A calibration in another form: the file's bytes, and what became of it."""
+
     data: bytes
-    report: dict[str, Any]
+    report: ConversionReport
 
 
 def convert_calibration(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) -> ConvertedCalibration:
@@ -128,43 +169,46 @@ def _convert(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) 
         data = _other(loaded, form, fits, sizes if known else None).encode()
     exact = all(fit.max_px < _ROUNDING_PX for fit in fits)
     own = loaded.source == "calibration_json"
-    report = {
-        "format": form,
-        "software": f"stereorig {software_version()}",
-        "source": loaded.source,
-        "source_sha256": loaded.sha256,
-        "units": "mm, px, pixel centres at integers",
-        "frame": "target" if own and form in ("json", "paper") else "camera 1",
-        "image_size_px": [list(s) for s in sizes] if known else None,
-        "exact": exact,
-        "lens": {f"cam{k + 1}": {"rms_px": f.rms_px, "max_px": f.max_px} for k, f in enumerate(fits)},
-        "read_back": read_back(loaded.pair, parse_calibration(data, name="The written file").pair, size1, size2),
-        "notes": list(_NOTES[form]) + ([] if known else ["image size not known: twice the principal point was taken"]),
-    }
+    report = ConversionReport(
+        format=form,
+        software=f"stereorig {software_version()}",
+        source=loaded.source,
+        source_sha256=loaded.sha256,
+        units="mm, px, pixel centres at integers",
+        frame="target" if own and form in ("json", "paper") else "camera 1",
+        image_size_px=[list(s) for s in sizes] if known else None,
+        exact=exact,
+        lens={f"cam{k + 1}": LensError(f.rms_px, f.max_px) for k, f in enumerate(fits)},
+        read_back=read_back(loaded.pair, parse_calibration(data, name="The written file").pair, size1, size2),
+        notes=list(_NOTES[form]) + ([] if known else ["image size not known: twice the principal point was taken"]),
+    )
     return ConvertedCalibration(data, report)
 
 
-def read_back(pair: StereoPair, again: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> dict[str, Any]:
+def read_back(pair: StereoPair, again: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> ReadBack:
     """Return what a pair makes of places that another projects points of the shared volume to."""
     points = shared_points(pair, size1, size2)
     if not len(points):
-        return {"points": 0, "rms_px": None, "max_px": None, "rms_mm": None, "max_mm": None}
+        return ReadBack(0, None, None, None, None)
     xy1, xy2 = (independent_projection(camera, points) for camera in (pair.cam1, pair.cam2))
     found = again.triangulate(xy1, xy2)
     # each pair has its own system frame: both are compared in camera 1's
     off = np.linalg.norm(again.cam1.cam_from_sys.apply(found.xyz_mm) - pair.cam1.cam_from_sys.apply(points), axis=1)
     off = off[found.valid]
-    return {
-        **Residual.of(again.epipolar_residual_px(xy1, xy2)).document(),
-        "rms_mm": float(np.sqrt(np.mean(off**2))) if off.size else None,
-        "max_mm": float(off.max()) if off.size else None,
-    }
+    residual = Residual.of(again.epipolar_residual_px(xy1, xy2))
+    return ReadBack(
+        points=residual.points,
+        rms_px=residual.rms_px,
+        max_px=residual.max_px,
+        rms_mm=float(np.sqrt(np.mean(off**2))) if off.size else None,
+        max_mm=float(off.max()) if off.size else None,
+    )
 
 
 def _paper(
     loaded: LoadedCalibration, fits: list[LensFit], sizes: tuple[tuple[int, int], tuple[int, int]] | None
 ) -> bytes:
-    content: dict[str, Any] = {"format": "stereorig calibration", "format_version": 1}
+    content: dict[str, object] = {"format": "stereorig calibration", "format_version": 1}
     pair, size = loaded.pair, sizes or image_sizes(loaded)[:2]
     to_sys = RigidTransform.identity()
     if min(camera.cam_from_sys.translation_mm[2] for camera in (pair.cam1, pair.cam2)) <= 0.0:
@@ -177,7 +221,7 @@ def _paper(
                 remedy="Check the calibration and the image sizes.",
             )
         to_sys = pair.cam1.sys_from_cam @ RigidTransform(np.eye(3), np.array([0.0, 0.0, depth]))
-    for name, camera, fit in zip(("cam1", "cam2"), (pair.cam1, pair.cam2), fits, strict=True):
+    for name, camera, fit in zip(CAMERAS, (pair.cam1, pair.cam2), fits, strict=True):
         content[name] = Camera(fit.lens, camera.cam_from_sys @ to_sys).paper_parameters()
     if sizes is not None:
         content["image_size_px"] = {f"cam{k + 1}": list(size) for k, size in enumerate(sizes)}

@@ -7,15 +7,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.conversion import image_places
 from core.cameras.lens import OpenCVLens, SeidelLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from server.formats.calibrations.recognise import LoadedCalibration
 
-Float = NDArray[np.float64]
 MOST_RESIDUAL_PX = 1e-3  # of a carried-over model against an independent projection; rounding is 1e-9
 _ACROSS = (13, 11)
 _DEPTHS = np.geomspace(0.3, 300.0, 61)  # of the baseline
@@ -39,9 +38,29 @@ class Residual:
             return Residual(0, None, None)
         return Residual(int(finite.size), float(np.sqrt(np.mean(finite**2))), float(np.abs(finite).max()))
 
-    def document(self) -> dict[str, Any]:
-        """As plain data."""
-        return {"points": self.points, "rms_px": self.rms_px, "max_px": self.max_px}
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """What a look at a calibration found.
+
+    Attributes
+    ----------
+    volume
+        Epipolar residual over a grid of points that both cameras see.
+    pixels_with_ray
+        Share of each image where the lens can be inverted.
+    image_size_known
+        Whether the file says the images' sizes.
+    warnings
+        Sentences.
+    """
+
+    volume: Residual
+    pixels_with_ray: dict[str, float]
+    baseline_mm: float
+    stereo_angle_deg: float
+    image_size_known: bool
+    warnings: list[str]
 
 
 def image_sizes(loaded: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int], bool]:
@@ -120,15 +139,8 @@ def independent_projection(camera: Any, points_mm: Float) -> Float:
     return np.stack([x / shrink + lens.cx_px, lens.aspect * y / shrink + lens.cy_px], axis=1)
 
 
-def check_calibration(loaded: LoadedCalibration) -> dict[str, Any]:
+def check_calibration(loaded: LoadedCalibration) -> CalibrationCheck:
     """Look a calibration over: what both cameras see of one volume, by an independent projection, must agree.
-
-    Returns
-    -------
-    dict
-        ``volume`` (epipolar residual over a grid of points that both cameras see), ``pixels_with_ray`` (share of each
-        image where the lens can be inverted), ``baseline_mm``, ``stereo_angle_deg``, ``image_size_known``, and
-        ``warnings``: sentences.
 
     Raises
     ------
@@ -146,7 +158,7 @@ def check_calibration(loaded: LoadedCalibration) -> dict[str, Any]:
         ) from error
 
 
-def _checked(loaded: LoadedCalibration) -> dict[str, Any]:
+def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
     size1, size2, known = image_sizes(loaded)
     points = shared_points(loaded.pair, size1, size2)
     warnings = []
@@ -171,11 +183,11 @@ def _checked(loaded: LoadedCalibration) -> dict[str, Any]:
             warnings.append(f"{name}: {1 - shares[name]:.1%} of the image has no ray, its lens folds back there")
     if not known:
         warnings.append("the file does not say the image size: twice the principal point was taken")
-    return {
-        "volume": residual.document(),
-        "pixels_with_ray": shares,
-        "baseline_mm": loaded.pair.baseline_mm,
-        "stereo_angle_deg": float(np.degrees(loaded.pair.stereo_angle_rad)),
-        "image_size_known": known,
-        "warnings": warnings,
-    }
+    return CalibrationCheck(
+        volume=residual,
+        pixels_with_ray=shares,
+        baseline_mm=loaded.pair.baseline_mm,
+        stereo_angle_deg=float(np.degrees(loaded.pair.stereo_angle_rad)),
+        image_size_known=known,
+        warnings=warnings,
+    )

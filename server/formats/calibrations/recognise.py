@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ import numpy as np
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
+from core.names import CAMERAS
 from server.formats.calibrations.dice_xml import looks_like_dice, parse_dice_xml
 from server.formats.calibrations.imported_pair import invalid, unreadable
 from server.formats.calibrations.matchid_caldat import looks_like_caldat, parse_caldat
 from server.formats.calibrations.opencv_yaml import looks_like_opencv, parse_opencv
+from server.formats.calibrations.record import CalibrationRecord
 from server.formats.calibrations.vic3d_xml import looks_like_vic3d, parse_vic3d
 
 _MAX_BYTES = 64 << 20
@@ -47,6 +50,11 @@ class LoadedCalibration:
     source: str
     sha256: str
     details: dict[str, Any]
+
+    @cached_property
+    def record(self) -> CalibrationRecord:
+        """How the cameras were calibrated; empty where the file does not say."""
+        return CalibrationRecord.model_validate(self.details)
 
 
 IMPORTED = "imported"
@@ -162,11 +170,11 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
         raise unreadable(name, "it is none of the known kinds") from error
     if not isinstance(content, dict) or not {"cam1", "cam2"} & content.keys():
         raise unreadable(name, "it is JSON, but has no cam1 and cam2")
-    cam1, cam2 = (_camera(name, which, content.get(which)) for which in ("cam1", "cam2"))
+    cam1, cam2 = (_camera(name, which, content.get(which)) for which in CAMERAS)
     pair = StereoPair(cam1, cam2)
     if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
         raise invalid(name, "both cameras stand at the same place")
-    sizes = [_size(content, which) for which in ("cam1", "cam2")]
+    sizes = [_size(content, which) for which in CAMERAS]
     return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from core.calibration import NominalCamera
 from core.errors import FileFormatError, InputError
+from core.names import CAMERAS
 from core.target import GridTarget
 
 _MAX_BYTES = 1 << 20
@@ -107,7 +108,7 @@ def read_rig(path: Path) -> NominalRig:
     """
     content = load_toml(path, what="rig description")
     cameras = []
-    for name in ("cam1", "cam2"):
+    for name in CAMERAS:
         table = content.get(name)
         if not isinstance(table, Mapping):
             raise _field(str(path), f"[{name}]", "is missing" if table is None else "is not a table")

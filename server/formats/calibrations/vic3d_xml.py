@@ -16,8 +16,9 @@ import defusedxml.ElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
 
+from core.arrays import Float
 from core.cameras.camera import RigidTransform
-from core.cameras.lens import Float, OpenCVLens
+from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from server.formats.calibrations.imported_pair import (
     euler_zyx,

@@ -7,11 +7,10 @@ from typing import Any
 
 from core.calibration.volume import CalibratedVolume, calibrated_volume
 from core.errors import TargetError
+from core.names import CAMERAS
 from core.target import GridTarget
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
-
-_CAMERAS = ("cam1", "cam2")
 
 
 def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
@@ -27,7 +26,7 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
     target, views = content.get("target"), content.get("views")
     if sizes[0] is None or sizes[1] is None or not isinstance(target, dict) or not isinstance(views, list):
         return None
-    positions = [_positions(views, camera) for camera in _CAMERAS]
+    positions = [_positions(views, camera) for camera in CAMERAS]
     try:
         grid = GridTarget(
             pitch_mm=target["pitch_mm"], lines=tuple(target["lines"]), line_width_mm=target["line_width_mm"]

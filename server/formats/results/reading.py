@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,25 +18,20 @@ from core.field.points.result import Field, References
 from core.field.points.smoothing_record import Smoothing
 from core.field.region.cuts import Cuts, from_arrays
 from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, HANDED_ON, MOTION, SHAPE
+from server.formats.results.netcdf import opened
 
 
-def _open(path: Path) -> Any:
-    if not path.exists():
-        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
-    try:
-        dataset = netCDF4.Dataset(str(path), "r")
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read as a result file: {error.strerror or error}.") from error
-    version = int(getattr(dataset, "format_version", 0))
-    if not 1 <= version <= FORMAT_VERSION:
-        dataset.close()
-        raise FileFormatError(
-            f"{path} has the result format {version or 'none'}; this program reads up to {FORMAT_VERSION}.",
-            code="format_too_new" if version else "file_unreadable",
-            remedy="Read it with the program's version that wrote it.",
-        )
-    dataset.set_auto_mask(False)
-    return dataset
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    with opened(path) as dataset:
+        version = int(getattr(dataset, "format_version", 0))
+        if not 1 <= version <= FORMAT_VERSION:
+            raise FileFormatError(
+                f"{path} has the result format {version or 'none'}; this program reads up to {FORMAT_VERSION}.",
+                code="format_too_new" if version else "file_unreadable",
+                remedy="Read it with the program's version that wrote it.",
+            )
+        yield dataset
 
 
 def read_field(path: str | Path) -> Field:
@@ -47,7 +43,7 @@ def read_field(path: str | Path) -> Field:
         ``file_missing``, ``file_unreadable`` (not such a file, a variable missing) or ``format_too_new``.
     """
     path = Path(path)
-    with _open(path) as dataset:
+    with _opened(path) as dataset:
         variables = dataset.variables
         shape = (dataset.dimensions["row"].size, dataset.dimensions["col"].size)
         curved = CURVATURE if CURVATURE[0].name in variables else ()
@@ -89,7 +85,7 @@ def read_measured(path: str | Path) -> Field:
     field = read_field(path)
     if field.smoothing is None:
         return field
-    with _open(Path(path)) as dataset:
+    with _opened(Path(path)) as dataset:
         if "measured_covariance" not in dataset.variables:
             raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
         read = {
@@ -109,7 +105,7 @@ def read_attributes(path: str | Path) -> dict[str, Any]:
     FileFormatError
         As :func:`read_field`.
     """
-    with _open(Path(path)) as dataset:
+    with _opened(Path(path)) as dataset:
         attributes = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
     for name in ("settings", "inputs_sha256", "patch_choice", "smoothing"):
         if name in attributes:

@@ -7,11 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 
 from core.errors import FileFormatError
 from core.strain import STRAIN_STATUS_MEANINGS, StrainField, StrainOptions, StrainStatus
+from server.formats.results.netcdf import opened
 
 _TENSOR = {
     "green_lagrange": "Green-Lagrange strain",
@@ -112,14 +112,9 @@ def read_strain(path: str | Path) -> StrainField | None:
         ``file_missing``, ``file_unreadable``.
     """
     path = Path(path)
-    if not path.exists():
-        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
     try:
-        with netCDF4.Dataset(str(path), "r") as dataset:
-            dataset.set_auto_mask(False)
+        with opened(path) as dataset:
             return _strain_of(dataset)
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read as a result file: {error.strerror or error}.") from error
     except (KeyError, TypeError, ValueError) as error:
         raise FileFormatError(f"{path} does not hold strain as this program writes it: {error}.") from error
 

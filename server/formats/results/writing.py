@@ -6,17 +6,13 @@ that a half-written one cannot be met. :mod:`server.formats.results.reading` rea
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +20,6 @@ from core.field.points.result import Field, References
 from core.field.region.cuts import Cuts, as_arrays
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
-from server.formats.files import written_aside
 from server.formats.results.layout import (
     COMPARISONS,
     COVARIANCE_NAMES,
@@ -35,9 +30,9 @@ from server.formats.results.layout import (
     MOTION,
     SHAPE,
 )
+from server.formats.results.netcdf import written_dataset
 from server.formats.results.strain import put_strain
 
-_NEARLY_FULL_BYTES = 1 << 20
 # measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
 # the file. What repeats is always deflated; everything is where at least this share of the points has no numbers
 _MANY_EMPTY = 0.2
@@ -316,21 +311,3 @@ def write_field(
         _fill(dataset, result, provenance, strain)
         if result.smoothing is not None and measured is not None:
             _put_measured(dataset, measured)
-
-
-@contextlib.contextmanager
-def written_dataset(path: Path, *, checksum: bool = False) -> Iterator[Any]:
-    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_aside`.
-
-    Raises
-    ------
-    StorageError
-        ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
-    """
-    with written_aside(path, checksum=checksum) as aside:
-        try:
-            with netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
-                yield dataset
-        except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
-            full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
-            raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error

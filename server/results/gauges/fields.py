@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ from core.errors import InputError
 from core.field.points.result import Field
 from core.strain import surface_strain
 from server.formats.files import make_folder
+from server.formats.gauges.readings import FrameReading, RigidMotionReading
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
 from server.results.gauges.request import GaugeRequest
-from server.results.reader import library
 
 _CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
 
@@ -59,12 +60,11 @@ class FieldWriter:
         sha256: str,
         attributes: Mapping[str, Any],
         field: Field,
-        alignment: dict[str, Any] | None,
-        motion: dict[str, Any] | None,
+        frame: FrameReading | None,
+        motion: RigidMotionReading | None,
     ) -> None:
         """Write one step; strain, where the result has it, is made anew along the new axes."""
-        with library:
-            strain = read_strain(path)
+        strain = read_strain(path)
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)
         extra = {name: str(attributes[name]) for name in _CARRIED if name in attributes}
@@ -72,26 +72,25 @@ class FieldWriter:
         extra["transformation"] = json.dumps(
             {
                 "align": None if self._request.align is None else self._request.align.model_dump(mode="json"),
-                "alignment": alignment,
+                "alignment": None if frame is None else asdict(frame),
                 "remove_rigid": None
                 if self._request.remove_rigid is None
                 else self._request.remove_rigid.model_dump(mode="json"),
-                "rigid_motion": motion,
+                "rigid_motion": None if motion is None else asdict(motion),
             },
             sort_keys=True,
         )
-        frame = str(attributes["frame"])
+        told = str(attributes["frame"])
         if self._request.align is not None:
-            frame = f"aligned by {self._request.align.kind}; before: {frame}"
+            told = f"aligned by {self._request.align.kind}; before: {told}"
         provenance = Provenance(
             settings=attributes["settings"],
             inputs=attributes["inputs_sha256"],
             software_version=software_version(),
-            frame=frame,
+            frame=told,
             step=int(attributes["step"]),
             extra=extra,
         )
         to = self._folder / path.name
-        with library:
-            write_field(to, field, provenance, strain)
+        write_field(to, field, provenance, strain)
         self.written.append(to)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import InputError, MeasurementError, StateError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -22,16 +22,29 @@ from core.gauge.reading import Reading
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
 from server.formats.files import sha256_of
+from server.formats.gauges.readings import (
+    AreaReading,
+    AreaStatistics,
+    ExtensometerReading,
+    FrameReading,
+    GaugeReadings,
+    LineReading,
+    Number,
+    Numbers,
+    PointReading,
+    Problem,
+    RigidMotionReading,
+    StepReadings,
+)
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import read_attributes, read_field
 from server.formats.version import software_version
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
-from server.results.reader import library, read_variable
+from server.results.reader import read_variable
 from server.results.staleness import stale_results
 
-Float = NDArray[np.float64]
 _Placed = dict[str | None, list[tuple[float, float]]]
 MOST_NUMBERS = 3_000_000
 _CALIBRATION = ("calibration", "calibration.json")
@@ -48,18 +61,18 @@ class _Step:
     field: Field
     shared: SharedPixels
 
-    @property
-    def head(self) -> dict[str, Any]:
+    def reading(self, **found: Any) -> StepReadings:
         load = self.attributes.get("load_n")
-        return {
-            "n": int(self.attributes["step"]),
-            "kind": str(self.attributes["kind"]),
-            "label": str(self.attributes.get("label", "")),
-            "load_n": None if load is None else float(load),
-        }
+        return StepReadings(
+            n=int(self.attributes["step"]),
+            kind=str(self.attributes["kind"]),
+            label=str(self.attributes.get("label", "")),
+            load_n=None if load is None else float(load),
+            **found,
+        )
 
 
-def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> dict[str, Any]:
+def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> GaugeReadings:
     """Read a set of gauges in every step.
 
     Parameters
@@ -70,16 +83,6 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         The gauges.
     fields
         Takes each step's field in the frame and without the motion that was asked for.
-
-    Returns
-    -------
-    dict
-        ``software_version``, ``settings`` (the request), ``inputs_sha256``, ``stale`` (True where inputs or results
-        are gone or were replaced since, told in ``stale_reasons``), ``frame``, ``subset_px``,
-        ``smoothing_window`` (of the displacements; None: as measured), ``alignment`` and
-        ``steps``: for each step ``n, kind, label, load_n``, ``rigid_motion``, and for ``points``, ``extensometers``,
-        ``lines``, ``areas`` a list of readings. Numbers come with ``sigma`` and ``units``; what is missing is None,
-        with the reason under ``missing``. A step whose rigid motion cannot be told has a ``problem`` and no readings.
 
     Raises
     ------
@@ -121,25 +124,25 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         heads.append(step.attributes)
         steps.append(_read_step(step, alignment, request, placed, found, fields))
     for name in request.variables or ():
-        if name not in found and any("problem" not in s for s in steps):
+        if name not in found and any(s.problem is None for s in steps):
             read_variable(chosen[-1], name)  # says which there are
     assert first is not None
     stale = stale_results(chosen, heads)
     frame = str(first["frame"])
     if request.align is not None:
         frame = f"aligned by {request.align.kind}; before: {frame}"
-    return {
-        "software_version": software_version(),
-        "settings": request.model_dump(mode="json"),
-        "inputs_sha256": hashes,
-        "stale": bool(stale),
-        "stale_reasons": stale,
-        "frame": frame,
-        "subset_px": first["settings"]["subset_px"],
-        "smoothing_window": first["settings"].get("smoothing_window"),
-        "alignment": None if alignment is None else _alignment_document(alignment),
-        "steps": steps,
-    }
+    return GaugeReadings(
+        software_version=software_version(),
+        settings=request.model_dump(mode="json"),
+        inputs_sha256=hashes,
+        stale=bool(stale),
+        stale_reasons=stale,
+        frame=frame,
+        subset_px=first["settings"]["subset_px"],
+        smoothing_window=first["settings"].get("smoothing_window"),
+        alignment=None if alignment is None else _frame_reading(alignment),
+        steps=steps,
+    )
 
 
 def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
@@ -170,8 +173,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _read(path: Path) -> _Step:
-    with library:
-        attributes, field = read_attributes(path), read_field(path)
+    attributes, field = read_attributes(path), read_field(path)
     subset = attributes.get("settings", {}).get("subset_px")
     if not isinstance(subset, int | float):
         raise InputError(
@@ -239,35 +241,34 @@ def _read_step(
     placed: _Placed,
     found: set[str],
     fields: FieldWriter | None,
-) -> dict[str, Any]:
+) -> StepReadings:
     field = step.field if alignment is None else aligned(step.field, alignment)
-    document = step.head
+    taken_out: RigidMotionReading | None = None
     if request.remove_rigid is not None and field.has_motion:
         removal = request.remove_rigid
         inside = points_within(field, removal.corners())
         try:
             motion = rigid_motion(field, shared=step.shared, chosen=inside, robust=removal.robust)
         except MeasurementError as error:
-            document["problem"] = {"code": error.code, "cause": error.cause, "remedy": error.remedy}
-            return document
+            return step.reading(problem=Problem(error.code, error.cause, error.remedy))
         field = without_rigid_motion(field, motion, shared=step.shared)
-        document["rigid_motion"] = _motion_document(motion)
+        taken_out = _motion_reading(motion)
     if fields is not None:
-        frame = None if alignment is None else _alignment_document(alignment)
-        fields(step.path, step.sha256, step.attributes, field, frame, document.get("rigid_motion"))
+        frame = None if alignment is None else _frame_reading(alignment)
+        fields(step.path, step.sha256, step.attributes, field, frame, taken_out)
     variables = Variables(step.path, field, step.shared, measured=step.field)
     names = variables.known(request.variables or COVARIANCE_NAMES)
     found.update(names)
-    return {
-        **document,
-        "points": [_point(variables, names, p.name, *placed[p.name]) for p in request.points],
-        "extensometers": [_extensometer(variables, e.name, *placed[e.name]) for e in request.extensometers],
-        "lines": [_line(variables, names, line) for line in request.lines],
-        "areas": [_area(variables, names, a.name, a.corners()) for a in request.areas],
-    }
+    return step.reading(
+        rigid_motion=taken_out,
+        points=[_point(variables, names, p.name, *placed[p.name]) for p in request.points],
+        extensometers=[_extensometer(variables, e.name, *placed[e.name]) for e in request.extensometers],
+        lines=[_line(variables, names, line) for line in request.lines],
+        areas=[_area(variables, names, a.name, a.corners()) for a in request.areas],
+    )
 
 
-def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> dict[str, Any]:
+def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> dict[str, Numbers]:
     own = np.arange(len(places.xy_px))
     variance = np.diagonal(places.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
     out = {}
@@ -280,42 +281,42 @@ def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> d
             s = places.of(sigma)  # as if the errors of the points about it were one
         else:
             s = np.full(len(own), np.nan)
-        out[name] = (places.of(variable.values), s, variable.units)
+        out[name] = Numbers(_list(places.of(variable.values)), _list(s), variable.units)
     return out
 
 
-def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> dict[str, Any]:
+def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> PointReading:
     places = sample(variables.field, [xy])
-    found = {n: _number(v[0], s[0], units) for n, (v, s, units) in _at_places(variables, names, places).items()}
-    return {"name": name, "xy_px": list(xy), "missing": places.missing[0], "values": found}
+    found = _at_places(variables, names, places)
+    values = {n: Number(told.value[0], told.sigma[0], told.units) for n, told in found.items()}
+    return PointReading(name, xy, places.missing[0], values)
 
 
-def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> dict[str, Any]:
+def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> LineReading:
     xy, distance = places_along(variables.field, line.vertices_px, line.count)
     places = sample(variables.field, xy)
-    found = _at_places(variables, names, places)
-    return {
-        "name": line.name,
-        "x_px": xy[:, 0].tolist(),
-        "y_px": xy[:, 1].tolist(),
-        "distance_px": distance.tolist(),
-        "missing": list(places.missing),
-        "values": {n: {"value": _list(v), "sigma": _list(s), "units": units} for n, (v, s, units) in found.items()},
-    }
+    return LineReading(
+        name=line.name,
+        x_px=xy[:, 0].tolist(),
+        y_px=xy[:, 1].tolist(),
+        distance_px=distance.tolist(),
+        missing=list(places.missing),
+        values=_at_places(variables, names, places),
+    )
 
 
 def _extensometer(
     variables: Variables, name: str | None, a: tuple[float, float], b: tuple[float, float]
-) -> dict[str, Any]:
+) -> ExtensometerReading:
     got = extensometer(variables.field, a, b, shared=variables.shared)
     readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
     values = {n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n]) for n, r in readings.items()}
-    return {"name": name, "a_px": list(a), "b_px": list(b), "missing": got.missing, "values": values}
+    return ExtensometerReading(name, a, b, got.missing, values)
 
 
 def _area(
     variables: Variables, names: Sequence[str], name: str | None, corners: list[tuple[float, float]] | None
-) -> dict[str, Any]:
+) -> AreaReading:
     field = variables.field
     inside = points_within(field, corners)
     values = {}
@@ -328,50 +329,45 @@ def _area(
         got = area_statistics(field, variable.values, known, inside, shared=shared)
         if n in STRAIN_NAMES and got.count:
             got = replace(got, mean_sigma=variables.mean_strain_sigma(inside)[STRAIN_NAMES.index(n)])
-        values[n] = {
-            "units": variable.units,
-            "count": got.count,
-            **{k: _finite(getattr(got, k)) for k in ("mean", "mean_sigma", "sd", "rms")},
-            "min": _finite(got.minimum),
-            "max": _finite(got.maximum),
-        }
+        values[n] = AreaStatistics(
+            units=variable.units,
+            count=got.count,
+            mean=_finite(got.mean),
+            mean_sigma=_finite(got.mean_sigma),
+            sd=_finite(got.sd),
+            rms=_finite(got.rms),
+            min=_finite(got.minimum),
+            max=_finite(got.maximum),
+        )
     valid = int((inside & field.valid).sum())
-    return {
-        "name": name,
-        "points": int(inside.sum()),
-        "valid": valid,
-        "missing": "" if valid else "no valid point in the area",
-        "values": values,
-    }
+    missing = "" if valid else "no valid point in the area"
+    return AreaReading(name, int(inside.sum()), valid, missing, values)
 
 
-def _alignment_document(alignment: Alignment) -> dict[str, Any]:
+def _frame_reading(alignment: Alignment) -> FrameReading:
     sigma = np.sqrt(np.diag(alignment.covariance))
-    return {
-        "rotation": alignment.rotation.tolist(),
-        "origin_mm": alignment.origin_mm.tolist(),
-        "sigma_rad": sigma[:3].tolist(),
-        "sigma_origin_mm": sigma[3:].tolist(),
-        "residual_rms_mm": alignment.residual_rms_mm,
-        "points": alignment.points,
-    }
+    return FrameReading(
+        rotation=alignment.rotation.tolist(),
+        origin_mm=alignment.origin_mm.tolist(),
+        sigma_rad=sigma[:3].tolist(),
+        sigma_origin_mm=sigma[3:].tolist(),
+        residual_rms_mm=alignment.residual_rms_mm,
+        points=alignment.points,
+    )
 
 
-def _motion_document(motion: RigidMotion) -> dict[str, Any]:
+def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
     sigma = np.sqrt(np.diag(motion.covariance))
-    values = {}
-    for k, axis in enumerate("xyz"):
-        values[f"rotation_{axis}_rad"] = _number(motion.rotation_vector_rad[k], sigma[k], "rad")
-    for k, axis in enumerate("xyz"):
-        values[f"translation_{axis}_mm"] = _number(motion.translation_mm[k], sigma[3 + k], "mm")
-    return {
-        "values": values,
-        "centre_mm": motion.centre_mm.tolist(),
-        "covariance": motion.covariance.tolist(),
-        "points": motion.points,
-        "residual_rms_mm": motion.residual_rms_mm,
-        "noise_ratio": motion.noise_ratio,
-    }
+    turns = {f"rotation_{axis}_rad": (motion.rotation_vector_rad[k], sigma[k], "rad") for k, axis in enumerate("xyz")}
+    shifts = {f"translation_{axis}_mm": (motion.translation_mm[k], sigma[3 + k], "mm") for k, axis in enumerate("xyz")}
+    return RigidMotionReading(
+        values={name: _number(*told) for name, told in (turns | shifts).items()},
+        centre_mm=motion.centre_mm.tolist(),
+        covariance=motion.covariance.tolist(),
+        points=motion.points,
+        residual_rms_mm=motion.residual_rms_mm,
+        noise_ratio=motion.noise_ratio,
+    )
 
 
 def _finite(value: float) -> float | None:
@@ -382,5 +378,5 @@ def _list(values: Float) -> list[float | None]:
     return [_finite(v) for v in values]
 
 
-def _number(value: float, sigma: float, units: str) -> dict[str, Any]:
-    return {"value": _finite(value), "sigma": _finite(sigma), "units": units}
+def _number(value: float, sigma: float, units: str) -> Number:
+    return Number(_finite(value), _finite(sigma), units)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -16,9 +17,8 @@ from core.strain.mean import mean_strain_sigma
 from server.base.errors import NotFoundError
 from server.formats.results.layout import COVARIANCE_NAMES, field_variable
 from server.formats.results.strain import read_strain
-from server.results.reader import Variable, library, read_variable
+from server.results.reader import Variable, read_variable
 
-Float = NDArray[np.float64]
 STRAIN_NAMES = ("exx", "eyy", "exy")
 
 
@@ -37,8 +37,7 @@ class Variables:
 
     def mean_strain_sigma(self, inside: NDArray[np.bool_]) -> Float:
         """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN without strain."""
-        with library:
-            strain = read_strain(self.path)
+        strain = read_strain(self.path)
         if strain is None:
             return np.full(3, np.nan)
         # the file's strain is that of the field as it was measured, along the file's axes

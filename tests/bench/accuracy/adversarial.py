@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from core.arrays import Float
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.errors import StereorigError
@@ -27,7 +28,6 @@ from tests.bench.accuracy.paper_rig import Rig, plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import rig_of_size
 
-Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 SIGMAS = 6.0
 KEPT_PERCENT = 99.0

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
+
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
 from core.calibration.aspect import measure_aspect
 from core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
@@ -25,7 +24,6 @@ from sim.world import SimWorld
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 POSITIONS = (0.0, 5.0, 2.0, 4.0)
 HELD_OUT = (2.0, 4.0)
 NODE_SEEDS = (11, 12, 13)

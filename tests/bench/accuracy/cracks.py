@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
@@ -24,7 +25,6 @@ from sim.truth import truth_at
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 SIZE_PX, CORNER_PX = (288, 160), (112.0, 160.0)  # the whole crack and what lies above and below it
 LOAD_KN = 35.6
 SUBSET_PX, STEP_PX = 21, 4

@@ -8,8 +8,8 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import RigidTransform
 from core.field.points.patch import PatchSetting
 from core.field.points.result import Field
@@ -22,7 +22,6 @@ from sim.surface import Surface, flat, sphere
 from tests.bench.accuracy.paper_rig import ROOT, Rig, load_rig, plane_scene, true_points
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 REGION = (90, 90, 420, 390)
 RADIUS_MM = 30.0
 PATCHES: tuple[PatchSetting, ...] = ("stretch", "curved", "auto")

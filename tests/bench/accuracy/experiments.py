@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray
 
+from core.robust import MAD_TO_SIGMA
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 
@@ -107,7 +108,7 @@ def specimen(figures: Path) -> Section:
     for k, field in enumerate(fields):
         ok = field["status"].values == 0
         e = field["epipolar_px"].values[ok]
-        robust = 1.4826 * np.median(np.abs(e - np.median(e)))
+        robust = MAD_TO_SIGMA * np.median(np.abs(e - np.median(e)))
         rows += [
             Row(f"step {k}: points valid", 100 * float(ok.mean()), "%", 97.0, at_least=True),
             Row(f"step {k}: epipolar offset in camera 2, mean", float(e.mean()), "px"),

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import RigidTransform
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
@@ -22,7 +22,6 @@ from core.measure import MeasureOptions, ReferencePair
 from tests.bench.accuracy.paper_rig import load_rig, plane_scene, turn
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 SUBSET, STEP, NOISE = 33, 8, 2.0
 GRID = PointGrid.rectangle(220, 200, 220 + 8 * STEP, 200 + 6 * STEP, step_px=STEP)
 COPIES = 200

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import RigidTransform
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair
@@ -15,7 +16,6 @@ from tests.bench.accuracy.paper_rig import plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import rig_of_size
 
-Float = NDArray[np.float64]
 SIZE_PX = (1200, 1100)
 REGION = (400, 380, 800, 720)
 STEP_PX = 10

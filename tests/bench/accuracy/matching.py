@@ -7,8 +7,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
@@ -19,7 +19,6 @@ from sim.scene import Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 REGION = (90, 90, 420, 390)
 TEXTURES = (1, 2, 3)
 

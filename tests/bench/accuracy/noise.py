@@ -7,8 +7,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.matching import MatchOptions, fit_motion, fit_shape, prepare
 from core.matching.image import ImageData
 from core.noise import NoiseModel, measure_noise
@@ -17,7 +17,6 @@ from tests.bench.accuracy.noise_bound import bound, displacement_bound, height_b
 from tests.bench.accuracy.noise_scenes import LOOKS, Window, digitise
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 NOISES = (1.0, 2.0, 4.0, 6.0)
 STATED = (2.0, 6.0)  # in the table, with more repeats
 SUBSETS = (21, 33)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
@@ -14,7 +15,6 @@ from sim.render import RenderOptions, render
 from sim.texture import speckle
 from tests.bench.accuracy.paper_rig import BRIGHT, DARK, load_rig, plane_scene
 
-Float = NDArray[np.float64]
 RIGS = {"paper": "sim_paper", "modern": "sim_modern"}
 GAINS = (1.0, 0.88)
 

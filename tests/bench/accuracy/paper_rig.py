@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 from sim.render import RenderOptions, material_points, render
@@ -18,8 +19,6 @@ from sim.texture import Texture, speckle
 
 ROOT = Path(__file__).resolve().parents[3]
 DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.matching import prepare
 from core.matching.blur import Blur
 from core.matching.image import ImageData
@@ -16,7 +16,6 @@ from tests.bench.accuracy.noise import SHIFT_PX, Sample, measure, phase_error_px
 from tests.bench.accuracy.noise_scenes import LOOKS, Window, digitise
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 WIDTHS_PX = (0.0, 0.5, 1.0, 2.0)
 NOISES = (2.0, 6.0)
 SUBSETS = (21, 33)

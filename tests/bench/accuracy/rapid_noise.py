@@ -10,12 +10,11 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
+from core.arrays import Float
 from core.field.points.shared_pixels import SharedPixels
 
-Float = NDArray[np.float64]
 ORDER = 4
 
 

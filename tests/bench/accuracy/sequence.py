@@ -8,8 +8,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.errors import MeasurementError
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
@@ -21,7 +21,6 @@ from tests.bench.accuracy.paper_rig import BRIGHT, DARK, Rig, plane_scene, true_
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import rig_of_size
 
-Float = NDArray[np.float64]
 SIZE_PX = (620, 580)
 GRID = PointGrid.rectangle(206, 186, 414, 394, step_px=26)
 OPTIONS = MeasureOptions(subset_px=33, patch="stretch")

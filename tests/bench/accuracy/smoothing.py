@@ -7,8 +7,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.field.smoothed import smoothed_displacement
 from core.strain import StrainOptions, surface_strain
@@ -16,7 +16,6 @@ from tests.bench.accuracy.paper_rig import load_rig
 from tests.bench.accuracy.strain import SUBSET, moved_fields
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 WINDOWS = (0, 3, 5, 9, 15)
 STATED = (5, 9)
 REPEATS = 16

@@ -12,8 +12,8 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.strain import StrainField, StrainOptions, surface_strain
@@ -24,7 +24,6 @@ from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.rapid_noise import seen_over_told, window_slope
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 REGION = (340, 430, 1560, 690)
 SUBSET, STEP = 33, 10
 WINDOWS = (3, 5, 9, 15)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import RigidTransform
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
@@ -18,7 +18,6 @@ from sim.scene import UPRIGHT, Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, turn
 from tests.bench.accuracy.table import Row, Section
 
-Float = NDArray[np.float64]
 REGION = (90, 90, 420, 390)
 SUBSET = 33
 NAMES = ("exx", "eyy", "exy")

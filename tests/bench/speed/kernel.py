@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from core.arrays import Float
 from core.cameras.camera import RigidTransform
 from core.cameras.stereo import StereoPair
 from core.field.region.region import PointGrid
@@ -23,8 +24,6 @@ from core.matching.image import ImageData, prepare
 from core.matching.options import Interpolation, MatchOptions
 from core.threads import set_threads
 from tests.bench.accuracy.paper_rig import load_rig, plane_scene
-
-Float = NDArray[np.float64]
 
 KINDS: tuple[Interpolation, ...] = ("cubic", "quintic")
 NEAR, FAR = 5e-6, 6e-5  # relative change of the start values: some 0.05 px, and some 0.7 px

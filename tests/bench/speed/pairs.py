@@ -12,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.lens import OpenCVLens, SeidelLens
 from core.cameras.stereo import StereoPair
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, true_points, turn
-
-Float = NDArray[np.float64]
 
 NOISE = 2.0  # of 255
 STEP_MM = np.array([0.0137, -0.0093, 0.0171])

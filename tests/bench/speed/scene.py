@@ -18,12 +18,12 @@ from PIL import Image
 from core.cameras.camera import Camera
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
+from core.names import CAMERAS
 from server.formats.images import encode_tiff
 from sim.scene import Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, turn
 
 SEQUENCE_SIZE = (1200, 1100)
-CAMERAS = ("cam1", "cam2")
 NOISE = 2.0
 
 

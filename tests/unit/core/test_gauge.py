@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from core.arrays import Float
 from core.errors import InputError, MeasurementError, RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -21,7 +22,7 @@ from core.gauge.locate import places_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import rigid_motion, without_rigid_motion
 from core.gauge.sampling import sample
-from tests.support.gauge_field import STEP, SUBSET, Float, make_field, pixel_noise, surface
+from tests.support.gauge_field import STEP, SUBSET, make_field, pixel_noise, surface
 
 SHARED = SharedPixels(SUBSET)
 TURN = Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix()

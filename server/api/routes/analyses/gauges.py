@@ -13,8 +13,8 @@ from core.errors import MeasurementError
 from server.api.models import GaugesReply
 from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
 from server.api.protocol.problems import errors
-from server.formats.results.gauge_csv import gauges_csv
-from server.formats.results.gauge_mat import gauges_mat
+from server.formats.gauges.matlab import gauges_mat
+from server.formats.gauges.table import gauges_csv
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
@@ -46,11 +46,10 @@ def field(
     files = [service.tests.result_file(test_id, analysis_id, n) for n in sorted(steps)]
     with tempfile.TemporaryDirectory() as folder:
         writer = FieldWriter(Path(folder), source.parent, body)
-        document = read_gauges(files, body.model_copy(update={"steps": None}), writer)
-        asked = next(s for s in document["steps"] if s["n"] == step)
-        if "problem" in asked:
-            problem = asked["problem"]
-            raise MeasurementError(problem["cause"], code=problem["code"], remedy=problem["remedy"])
+        readings = read_gauges(files, body.model_copy(update={"steps": None}), writer)
+        problem = next(s.problem for s in readings.steps if s.n == step)
+        if problem is not None:
+            raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
         content = (Path(folder) / source.name).read_bytes()
     headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_{source.name}"'}
     return Response(content, media_type="application/x-netcdf", headers=headers)
@@ -74,10 +73,10 @@ def read(
 ) -> dict[str, Any] | Response:
     """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored."""
     steps = service.tests.finished_steps(test_id, analysis_id)
-    document = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
+    readings = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
     if format == "json":
-        return document
+        return readings.document()
     headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_gauges.{format}"'}
     if format == "csv":
-        return Response(gauges_csv(document), media_type="text/csv; charset=utf-8", headers=headers)
-    return Response(gauges_mat(document), media_type=_MATLAB, headers=headers)
+        return Response(gauges_csv(readings), media_type="text/csv; charset=utf-8", headers=headers)
+    return Response(gauges_mat(readings), media_type=_MATLAB, headers=headers)

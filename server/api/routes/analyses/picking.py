@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter
@@ -110,7 +111,7 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
     if noise is None and body.noise_id is not None:
         model = load_noise(service.noise.file(body.noise_id)).models[0]
         noise = None if model is None else math.sqrt(float(model.variance(float(pixels.mean()))))
-    return texture_verdict(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise)
+    return asdict(texture_verdict(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise))
 
 
 @router.post(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -96,13 +97,13 @@ def _json(document: dict[str, Any], headers: dict[str, str] | None = None) -> Re
     "/steps/{n}/fields",
     summary="The variables of one step",
     response_model=FieldList,
-    response_model_exclude_unset=True,
+    response_model_exclude_none=True,
     responses=errors(404, 422),
 )
 def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> dict[str, Any]:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
     path = service.tests.result_file(test_id, analysis_id, n)
-    return {"fields": list_variables(path), "cuts_px": read_cut_pieces(path)}
+    return {"fields": [asdict(v) for v in list_variables(path)], "cuts_px": read_cut_pieces(path)}
 
 
 @router.get(
@@ -149,4 +150,4 @@ def get_probe(
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")] = 0,
 ) -> dict[str, Any]:
     """Return every number of the nearest point."""
-    return {"step": step, **probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px)}
+    return {"step": step, **asdict(probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px))}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
@@ -144,7 +145,7 @@ def import_calibration(
 
     def make() -> dict[str, Any]:
         content = imported_content(data, name="The file")
-        checked = without_nan(check_calibration(parse_calibration(data, name="The file")))
+        checked = without_nan(asdict(check_calibration(parse_calibration(data, name="The file"))))
         plan = {"source": "import", "label": label, "check": checked, **request.document()}
         calibration_id = service.calibrations.add_imported(plan, content)
         entry = calibration_entry(service.calibrations, calibration_id)
@@ -205,7 +206,7 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[st
     path /= "residuals.nc"
     if not path.is_file():
         raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
-    return read_residuals(path)
+    return {"views": [asdict(view) for view in read_residuals(path)]}
 
 
 @router.get(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
@@ -51,8 +52,8 @@ def export_calibration(service: ServiceDep, calibration_id: CalibrationId, forma
     """
     made = _converted(service, calibration_id, format)
     name = f"{calibration_id}_{FILE_NAMES[format]}"
-    lens = max(fit["max_px"] for fit in made.report["lens"].values())
-    epipolar = made.report["read_back"]["max_px"]
+    lens = max(fit.max_px for fit in made.report.lens.values())
+    epipolar = made.report.read_back.max_px
     headers = {
         "Content-Disposition": f'attachment; filename="{name}"',
         "X-Lens-Residual-Px": f"{lens:.3g}",
@@ -69,4 +70,4 @@ def export_calibration(service: ServiceDep, calibration_id: CalibrationId, forma
 )
 def report_conversion(service: ServiceDep, calibration_id: CalibrationId, format: Form) -> dict[str, Any]:  # noqa: A002
     """Return the residual of each lens' fit, and what the written file makes of points that both cameras see."""
-    return _converted(service, calibration_id, format).report
+    return asdict(_converted(service, calibration_id, format).report)

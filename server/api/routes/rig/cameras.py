@@ -14,6 +14,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
 from core.errors import StereorigError
+from core.names import CAMERAS
 from drivers.cameras.protocol import CameraSettings, Frame
 from server.api.models import (
     Accepted,
@@ -92,7 +93,7 @@ def put_scene(service: ServiceDep, body: SceneRequest) -> dict[str, Any]:
 @router.get("/cameras", summary="Both cameras", response_model=CamerasReply, response_model_exclude_unset=True)
 def get_cameras(service: ServiceDep) -> dict[str, Any]:
     """Return nominal data, the devices' own descriptions and their settings."""
-    return {"cameras": [service.rig.describe_camera(cam) for cam in ("cam1", "cam2")]}
+    return {"cameras": [service.rig.describe_camera(cam) for cam in CAMERAS]}
 
 
 @router.get(

@@ -1,0 +1,30 @@
+"""Robust statistics: scatter told by the median, Tukey's biweight, samples spread over all."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Float
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of normal errors over the median of their absolute values."""
+BIWEIGHT_REACH = 4.685
+"""Standard deviations beyond which the biweight is zero: 95 % efficiency on normal errors."""
+_GOLDEN_SECTION = 0.6180339887498949
+
+
+def biweight(squared: Float) -> Float:
+    """Return Tukey's weights, from one down to zero.
+
+    Parameters
+    ----------
+    squared
+        (n,) squares of the residuals over ``BIWEIGHT_REACH`` times their standard deviation.
+    """
+    return np.where(squared < 1.0, (1.0 - squared) ** 2, 0.0)
+
+
+def spread_indices(n: int, count: int) -> NDArray[np.int64]:
+    """Return ``count`` indices below n, spread over all by multiples of the golden section; some may be equal."""
+    return (n * (_GOLDEN_SECTION * np.arange(count) % 1.0)).astype(int)

@@ -1,0 +1,107 @@
+"""The entries of a calibration.json: the cameras' parameters, how they were calibrated, and how well."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from server.formats.records import Record
+
+
+class Measures(Record):
+    """Reprojection measures; ``nsce`` is a pure number."""
+
+    rbe_px: float | None = None
+    raz_mm: float | None = None
+    nsce: float | None = None
+
+
+class CheckRecord(Measures):
+    """The measures of some positions of the cameras, together and by camera."""
+
+    per_camera: dict[str, Measures] = Field(default={})
+
+
+class MadeCheck(Record):
+    """A check that a calibration went through."""
+
+    name: str = ""
+    text: str | None = None
+
+
+class ChecksRecord(Record):
+    """The measures at the positions that were fitted and at those that were held out, and the checks made."""
+
+    fitted: CheckRecord | None = None
+    held_out: CheckRecord | None = None
+    made: list[MadeCheck] = Field(default=[])
+
+
+class VerdictRecord(Record):
+    """What the calibration was judged to be worth."""
+
+    level: str | None = None
+    reasons: list[str] = Field(default=[])
+
+
+class UncertaintyRecord(Record):
+    """What the calibration's covariance leaves in a shape; ``scale`` is a pure number."""
+
+    shape_rms_mm: float | None = None
+    predicted_shape_rms_mm: float | None = None
+    scale: float | None = None
+
+
+class ViewRecord(Measures):
+    """One image of the target."""
+
+    camera: str
+    dz_mm: float
+    held_out: bool = False
+
+
+class TargetRecord(Record):
+    """The grid that was looked at."""
+
+    lines: list[int]
+    pitch_mm: float
+    line_width_mm: float
+    node_tolerance_mm: float = 0.0
+    dark_lines: bool = True
+
+
+class CameraIdentity(Record):
+    """What a camera says of itself."""
+
+    model: str | None = None
+    serial: str | None = None
+
+
+class OriginRecord(Record):
+    """Where a calibration comes from."""
+
+    localiser: str | None = None
+    frames: int | None = None
+    rig: str | None = None
+    software_version: str | None = None
+    cameras: dict[str, CameraIdentity] = Field(default={})
+
+
+class SettingsRecord(Record):
+    """Settings of the fit."""
+
+    axis_tilt_sigma_rad: float | None = None
+
+
+class CalibrationRecord(Record):
+    """What a calibration.json says; a file of another program has none of it, one of parameters alone only these."""
+
+    cam1: dict[str, float] = Field(default={})
+    cam2: dict[str, float] = Field(default={})
+    checks: ChecksRecord | None = None
+    verdict: VerdictRecord = VerdictRecord()
+    uncertainty: UncertaintyRecord = UncertaintyRecord()
+    sigma: dict[str, float] = Field(default={})
+    views: list[ViewRecord] = Field(default=[])
+    target: TargetRecord | None = None
+    provenance: OriginRecord = OriginRecord()
+    settings: SettingsRecord = SettingsRecord()

@@ -1,0 +1,41 @@
+"""Readings of gauges as a MATLAB file: the table's columns as one struct, one number a row."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.formats.gauges.readings import GaugeReadings
+from server.formats.gauges.table import COLUMNS, table_rows
+
+_TEXTS = frozenset({"label", "gauge", "kind", "quantity", "units", "missing"})
+
+
+def gauges_mat(readings: GaugeReadings) -> bytes:
+    """Return the readings as a MATLAB file of version 5.
+
+    ``gauges`` is a struct of the columns of :func:`server.formats.gauges.table.gauges_csv`: numbers as column vectors,
+    NaN where there is none, texts as cells; ``struct2table(gauges)`` makes a table of it. ``about`` holds settings,
+    inputs and version as text.
+    """
+    from scipy.io import savemat  # loaded where it is used
+
+    rows = list(table_rows(readings))
+    held = {name: _column(name, [getattr(row, name) for row in rows]) for name in COLUMNS}
+    about = {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in readings.about().items()}
+    out = io.BytesIO()
+    save: Any = savemat
+    save(out, {"gauges": held, "about": about}, long_field_names=True, do_compression=True)
+    return out.getvalue()
+
+
+def _column(name: str, values: list[str | float | None]) -> NDArray[np.object_] | NDArray[np.float64]:
+    if name in _TEXTS:
+        cells = np.empty((len(values), 1), dtype=object)
+        cells[:, 0] = ["" if v is None else str(v) for v in values]
+        return cells
+    return np.array([np.nan if v is None else float(v) for v in values]).reshape(-1, 1)

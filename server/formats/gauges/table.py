@@ -1,0 +1,93 @@
+"""Readings of gauges as a table: one number a row, so that any program can filter and plot it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+
+from server.formats.gauges.readings import GaugeReadings, Number, StepReadings
+
+_OF_AREA = ("mean", "sd", "min", "max", "rms", "count")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of a gauge; its fields are the table's columns."""
+
+    step: int
+    label: str
+    load_n: float | None
+    gauge: str | None = None
+    kind: str = ""
+    x_px: float | None = None
+    y_px: float | None = None
+    distance_px: float | None = None
+    quantity: str = ""
+    value: float | None = None
+    sigma: float | None = None
+    units: str = ""
+    missing: str = ""
+
+
+COLUMNS = tuple(f.name for f in fields(Row))
+
+
+def gauges_csv(readings: GaugeReadings) -> bytes:
+    """Return the readings as CSV, settings and inputs in comment lines (#) above the header.
+
+    Missing numbers are empty, with the reason in the last column.
+    """
+    text = io.StringIO(newline="")
+    for name, said in readings.about().items():
+        text.write(f"# {name}: {json.dumps(said, ensure_ascii=False, sort_keys=True)}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in table_rows(readings):
+        writer.writerow(_cell(getattr(row, name)) for name in COLUMNS)
+    return text.getvalue().encode()
+
+
+def table_rows(readings: GaugeReadings) -> Iterator[Row]:
+    """Yield every number of every step."""
+    for step in readings.steps:
+        yield from _of_step(step)
+
+
+def _of_step(step: StepReadings) -> Iterator[Row]:
+    head = Row(step.n, step.label, step.load_n)
+    if step.problem is not None:
+        yield replace(head, kind="step", missing=step.problem.cause)
+    if step.rigid_motion is not None:
+        motion = replace(head, gauge="rigid motion", kind="rigid_motion")
+        yield from _rows(motion, step.rigid_motion.values, "")
+    for point in step.points:
+        x, y = point.xy_px
+        yield from _rows(replace(head, gauge=point.name, kind="point", x_px=x, y_px=y), point.values, point.missing)
+    for gauge in step.extensometers:
+        yield from _rows(replace(head, gauge=gauge.name, kind="extensometer"), gauge.values, gauge.missing)
+    for area in step.areas:
+        for quantity, v in area.values.items():
+            parts = {f"{quantity}:{part}": Number(getattr(v, part), None, v.units) for part in _OF_AREA}
+            parts[f"{quantity}:mean"] = v.mean_number
+            parts[f"{quantity}:count"] = Number(v.count, None, "1")
+            yield from _rows(replace(head, gauge=area.name, kind="area"), parts, area.missing)
+    for line in step.lines:
+        for quantity, told in line.values.items():
+            for k, (x, y, at) in enumerate(zip(line.x_px, line.y_px, line.distance_px, strict=True)):
+                place = replace(head, gauge=line.name, kind="line", x_px=x, y_px=y, distance_px=at)
+                number = Number(told.value[k], told.sigma[k], told.units)
+                yield from _rows(place, {quantity: number}, line.missing[k])
+
+
+def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row]:
+    for quantity, number in values.items():
+        # the place may be there, but this variable has nothing there
+        why = missing or ("no value" if number.value is None else "")
+        yield replace(head, quantity=quantity, value=number.value, sigma=number.sigma, units=number.units, missing=why)
+
+
+def _cell(value: object) -> object:
+    return "" if value is None else repr(value) if isinstance(value, float) else value

@@ -1,0 +1,60 @@
+"""NetCDF files, opened for reading and for writing: the one place, with the one lock."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+
+from core.errors import FileFormatError
+from server.formats.files import written_aside
+
+#: the netCDF and HDF5 libraries are not built for several threads at once
+library = threading.RLock()
+_NEARLY_FULL_BYTES = 1 << 20
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Give a file's data set to read; values come as they are stored, without masks.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``, ``file_unreadable``.
+    """
+    if not path.exists():
+        raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
+    with library:
+        try:
+            dataset = netCDF4.Dataset(path, "r")
+        except OSError as error:
+            text = f"{path} cannot be read as a result file: {error.strerror or error}."
+            raise FileFormatError(text, file=path.name) from error
+        with dataset:
+            dataset.set_auto_mask(False)
+            yield dataset
+
+
+@contextlib.contextmanager
+def written_dataset(path: Path, *, checksum: bool = False) -> Iterator[Any]:
+    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_aside`.
+
+    Raises
+    ------
+    StorageError
+        ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
+    """
+    with written_aside(path, checksum=checksum) as aside:
+        try:
+            with library, netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
+                yield dataset
+        except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
+            full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
+            raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error

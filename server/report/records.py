@@ -1,0 +1,96 @@
+"""What a report reads of the records beside the results: of the test, its steps, the rig, the analysis."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from server.config.camera_facts import LensFacts
+from server.formats.calibrations.record import CameraIdentity
+from server.formats.records import Record
+
+
+class CameraRecord(Record):
+    """A camera as the rig file describes it and as it was set; see :class:`server.config.camera_facts.CameraFacts`."""
+
+    maker: str | None = None
+    model: str | None = None
+    sensor: str | None = None
+    pixel_um: float | None = None
+    lens: LensFacts | None = None
+    exposure_ms: float | None = None
+    gain_db: float | None = None
+
+
+class RigRecord(Record):
+    """The rig that a step was captured with."""
+
+    simulated: bool = False
+    trigger: str | None = None
+    frame_rate_hz: float | None = None
+    max_skew_ms: float | None = None
+    lighting: str | None = None
+    cameras: dict[str, CameraRecord] = Field(default={})
+
+
+class ImageFigures(Record):
+    """Figures of one camera's image, see :class:`server.results.quality.ImageQuality`."""
+
+    mean_grey: float | None = None
+    contrast_grey: float | None = None
+    saturated_share: float | None = None
+    focus: float | None = None
+
+
+class QualityRecord(Record):
+    """Quality of a pair of images."""
+
+    code: str = ""
+    cam1: ImageFigures = ImageFigures()
+    cam2: ImageFigures = ImageFigures()
+
+
+class StepRecord(Record):
+    """``step.json``."""
+
+    label: str = ""
+    load_n: float | None = None
+    channels: dict[str, float] = Field(default={})
+    source: str | None = None
+    captured_utc: str | None = None
+    host_monotonic_ns: int | None = None
+    skew_ms: float | None = None
+    frames: int | None = None
+    bit_depth: dict[str, int] = Field(default={})
+    image_size_px: dict[str, tuple[int, int]] = Field(default={})
+    quality: QualityRecord | None = None
+    cameras: dict[str, CameraIdentity] = Field(default={})
+    rig: RigRecord = RigRecord()
+
+
+class TestRecord(Record):
+    """``test.json``."""
+
+    __test__ = False
+
+    id: str = ""
+    name: str = ""
+    specimen: str = ""
+    notes: str = ""
+    facts: dict[str, Any] = Field(default={})
+
+
+class CalibrationFile(Record):
+    """The calibration that ``stereorig measure`` was given."""
+
+    file: Path
+
+
+class AnalysisRecord(Record):
+    """``analysis.json`` of the service, or ``summary.json`` of ``stereorig measure``."""
+
+    id: str = ""
+    label: str = ""
+    calibration: CalibrationFile | None = None
