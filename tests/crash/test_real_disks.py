@@ -40,7 +40,7 @@ def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
         text=True,
         timeout=560,
         check=False,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-6000:]
     return dict(json.loads(done.stdout.splitlines()[-1]))
@@ -58,7 +58,7 @@ subprocess.run(["mount", "-t", "tmpfs", "-o", "size=5m", "tmpfs", str(data)], ch
 from server.config.rig_file import load_config
 from server.workflows.service import Service
 from server.store.verify import verify
-from service_rig import new_test, served, wait_for_job, wait_for_rig
+from tests.support.service_rig import new_test, served, wait_for_job, wait_for_rig
 from tests.support.copied_tests import write_test_folder
 
 write_test_folder(data / "tests" / "t000007-abcdef", 12)
