@@ -35,13 +35,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark every test with its tier, which is the folder that it lies in."""
+    """Mark every test with its tier, which is the folder that it lies in, and what is left to the deep tier."""
     for item in items:
         folders = item.path.relative_to(TESTS).parts
         item.add_marker(folders[0])
         if "devices" in folders or "aravis" in item.name:
             item.add_marker("devices")
+        normal = item.get_closest_marker("normal_depth")
+        if normal is not None and item.callspec.id not in normal.args:  # type: ignore[attr-defined]
+            item.add_marker("deep")
 
 
 @pytest.fixture(scope="session")

@@ -106,6 +106,7 @@ def through_lines(error: Array, degree: int) -> Array:
     return out
 
 
+@pytest.mark.normal_depth("0.0-2")
 @pytest.mark.parametrize(("tolerance", "degree"), [(0.0, None), (0.004, None), (0.0, 1), (0.0, 2)])
 def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float, degree: int | None) -> None:
     runs = 30

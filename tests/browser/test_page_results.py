@@ -15,8 +15,11 @@ from playwright.sync_api import Browser, Page, expect
 
 from core.cameras.camera import Camera
 from server.formats.calibrations.recognise import load_calibration
+from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
 from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown
+
+bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(600)
 expect.set_options(timeout=30_000)  # the machine may be busy

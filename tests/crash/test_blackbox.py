@@ -54,6 +54,7 @@ def calibration_file(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.normal_depth("profile")
 @pytest.mark.parametrize("localiser", ["profile", "paper"])
 def test_calibrate_finds_the_rig_from_pictures(tmp_path: Path, localiser: str) -> None:
     views = tmp_path / "views"

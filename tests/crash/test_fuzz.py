@@ -1,7 +1,7 @@
 """Schema fuzzing of the whole API over a running simulated rig: nothing undocumented, nothing that breaks it.
 
-Two files share the cases, so that they run side by side; see test_fuzz_more.py. In CI they are 20,000 together,
-elsewhere fewer; ``make fuzz`` runs on for longer.
+Two files share the cases, so that they run side by side; see test_fuzz_more.py. In depth they are 20,000 together;
+``make fuzz`` runs on for longer.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import pytest
 from tests.support.fuzz_verdict import judge
 
 
+@pytest.mark.deep
 @pytest.mark.timeout(2400)
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.fault(52)

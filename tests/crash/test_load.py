@@ -17,6 +17,7 @@ from tests.support.requirements import ROOT
 SECONDS = 24.0
 
 
+@pytest.mark.deep
 @pytest.mark.fault(50)
 def test_captures_readers_slow_streams_an_analysis_and_stops_at_once(
     tmp_path: Path, record_property: pytest.RecordProperty

@@ -27,6 +27,7 @@ STOPS = 200
 ROUNDS = 3
 
 
+@pytest.mark.deep
 @pytest.mark.fault(26)
 def test_a_stop_under_full_load_is_on_the_wire_within_50_ms_at_p99(
     tmp_path: Path, record_property: pytest.RecordProperty

@@ -185,6 +185,7 @@ def small_test(folder: DataFolder, steps: int = 2) -> str:
     return test_id
 
 
+@pytest.mark.normal_depth("full", "write_error")
 @pytest.mark.fault(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_disk_that_fails_while_something_is_deleted_keeps_all_of_it_somewhere(

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from tests.support.requirements import missing
-
-IN_CI = os.environ.get("CI") == "true"
 
 
 def judge(folder: Path, *, phases: tuple[str, ...], each: int, seed: int, least: int) -> None:

@@ -35,7 +35,7 @@ setpriv --pdeathsig KILL arv-fake-gv-camera-0.8 -i 127.0.0.1 -s BENCH1 &
 CAM1=$!
 setpriv --pdeathsig KILL arv-fake-gv-camera-0.8 -i 127.0.0.2 -s BENCH2 &
 setpriv --pdeathsig KILL "$PYTHON" -c 'from server.cli import main; main(["simstage", "--port", "5301"])' &
-"$PYTHON" tests/contract/test_fake_gige_bench.py $CAM1
+"$PYTHON" -m tests.contract.devices.test_fake_gige_bench $CAM1
 """
 
 

@@ -193,7 +193,7 @@ def test_simulated_pictures_behind_the_same_drivers_end_in_a_calibration(network
     sim_file.write_text(SMALL)
     truth = SimRig.from_dict(parse_config(SMALL).model_dump(exclude_none=True))
     world = subprocess.Popen(
-        network.command(sys.executable, str(ROOT / "tests" / "gige_sim.py"), str(sim_file), *ADDRESSES),
+        network.command(sys.executable, "-m", "tests.support.gige_sim", str(sim_file), *ADDRESSES),
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdin=subprocess.PIPE,

@@ -25,6 +25,7 @@ from sim.render import RenderOptions, render
 from sim.rig import SimRig
 from sim.truth import truth_at
 from tests.support.measure_command import SIZE, command
+from tests.support.measure_command import rig as rig
 
 LOADS = (0.0, 0.5, 1.0)
 

@@ -254,6 +254,7 @@ def test_no_triangle_of_a_picture_reaches_over_a_crack() -> None:
     assert gone == {2 * cols + c for c in range(5)} | {3 * cols + c for c in range(4)}
 
 
+@pytest.mark.normal_depth("plate")
 @pytest.mark.parametrize("experiment", ["plate", "steel", "panel"])
 def test_every_experiment_keeps_its_limits(tmp_path: Path, experiment: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--experiment", experiment, "--out", str(tmp_path)]) == 0
