@@ -87,8 +87,8 @@ def calibration_content(
 
 def write_calibration(
     path: str | Path, result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, object] | None = None
-) -> dict[str, Any]:
-    """Write calibration.json aside, sync it and rename it; return its content.
+) -> None:
+    """Write calibration.json aside, sync it and rename it.
 
     Raises
     ------
@@ -98,7 +98,6 @@ def write_calibration(
     content = calibration_content(result, target, provenance=provenance)
     # a number that is not finite has no place in JSON, and none in a calibration
     write_bytes(Path(path), (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
-    return content
 
 
 def covariance_in(content: Mapping[str, object], *, name: str) -> NDArray[np.float64] | None:
