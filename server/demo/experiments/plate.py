@@ -114,10 +114,11 @@ def _strain_in_the_centre(session: Session, analysis: AnalysisHandle, fit: Plate
     found = []
     for step in steps:
         exx, eyy = (step.points[0].values[name] for name in ("exx", "eyy"))
+        sigmas = [np.nan if v.sigma is None else v.sigma for v in (exx, eyy)]
         assert exx.value is not None
         assert eyy.value is not None
         # their errors hardly go together: a whole window's slopes over column and row do not
-        found.append((0.5 * (exx.value + eyy.value), 0.5 * float(np.hypot(exx.sigma or np.nan, eyy.sigma or np.nan))))
+        found.append((0.5 * (exx.value + eyy.value), 0.5 * float(np.linalg.norm(sigmas))))
     return found
 
 

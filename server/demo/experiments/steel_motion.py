@@ -207,7 +207,7 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
             ]
         )
         elongations = " ".join(f"{1e3 * e:+.2f}" for e in one.elongation_mm)
-        u, v, w = (1e3 * (one.left[f"{c}_mm"].sd or 0.0) for c in "uvw")
+        u, v, w = (np.nan if (sd := one.left[f"{c}_mm"].sd) is None else 1e3 * sd for c in "uvw")
         false_rows.append(
             [
                 one.name,
