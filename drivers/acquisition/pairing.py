@@ -41,6 +41,9 @@ class Pair:
     skew_ms: float
     max_skew_ms: float
 
+    def __getitem__(self, cam: CameraName) -> Frame:
+        return self.cam1 if cam == "cam1" else self.cam2
+
     @property
     def accepted(self) -> bool:
         """Whether it may be measured with."""

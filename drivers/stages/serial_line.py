@@ -121,7 +121,7 @@ class SerialLine:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._record_path is not None:
                 try:
-                    self._record = Transcript(self._record_path, f"{self.url} at {self._baudrate} baud")
+                    self._record = Transcript(self._record_path, f"{self.url} at {self._baudrate} baud").open()
                 except StageError:
                     port.close()
                     raise

@@ -16,6 +16,7 @@ import threading
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Self
 
 from core.errors import StageError
 
@@ -34,11 +35,6 @@ class Transcript:
         Said at the head of each file.
     limit_bytes
         Size at which a new file is begun.
-
-    Raises
-    ------
-    StageError
-        ``record_unusable`` when the file cannot be written.
     """
 
     def __init__(self, path: Path, title: str, *, limit_bytes: int = LIMIT_BYTES) -> None:
@@ -48,15 +44,26 @@ class Transcript:
         self._start = time.monotonic()
         self._turning = threading.Lock()
         self._broken = False
+        self._fd, self._size = -1, 0
+
+    def open(self) -> Self:
+        """Begin to write.
+
+        Raises
+        ------
+        StageError
+            ``record_unusable`` when the file cannot be written.
+        """
         try:
-            self._fd = self._open()
+            self._fd = self._new_file()
             self._size = os.fstat(self._fd).st_size
         except OSError as error:
             raise StageError(
-                f"The transcript {path} cannot be written ({error.strerror}).",
+                f"The transcript {self._path} cannot be written ({error.strerror}).",
                 code="record_unusable",
                 remedy="Name a file in a folder that can be written with --record.",
             ) from error
+        return self
 
     def note(self, mark: str, data: bytes) -> None:
         """Add what was written or read; never raises."""
@@ -78,7 +85,7 @@ class Transcript:
         now = datetime.now(UTC).isoformat(timespec="microseconds").removesuffix("+00:00")
         return f"{now}Z {time.monotonic() - self._start:13.6f} {text}\n".encode("ascii", "backslashreplace")
 
-    def _open(self) -> int:
+    def _new_file(self) -> int:
         fd = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
         with contextlib.suppress(OSError):
             os.write(fd, self._line(f"# {self._title}"))
@@ -106,7 +113,7 @@ class Transcript:
                 return
             try:
                 self._path.replace(self._path.with_name(self._path.name + ".1"))
-                fresh = self._open()
+                fresh = self._new_file()
             except OSError:
                 self._broken = True
                 return

@@ -1,7 +1,7 @@
 """Who gets the processor first when everybody wants it: a stop before a picture, a picture before an analysis.
 
-All of it is asked for and not insisted on: a user without the right to raise a priority runs the service at the usual
-one. Linux may share the processors out by session first (autogroups), and by niceness only within a session.
+The systemd unit says so too. Started by hand, a user without the right to raise a priority runs the service at the
+usual one. Linux may share the processors out by session first (autogroups), and by niceness only within a session.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import signal
 import sys
 from pathlib import Path
 
+import psutil
+
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
 _SWITCH_S = 0.001
@@ -25,11 +27,23 @@ def raise_service() -> None:
     """Let this process come first where the system allows it (root, or a limit that permits it)."""
     # a thread that asks for the interpreter, such as a stop's, gets it after this long (Python's own value is 5 ms)
     sys.setswitchinterval(_SWITCH_S)
+    _set_nice(_SERVICE_NICE)
+
+
+def lower_worker() -> None:
+    """Let this process come last, in a session of its own: it would use up the share of the service's."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(_SERVICE_NICE - os.getpriority(os.PRIO_PROCESS, 0))
+        os.setsid()
+    _set_nice(_WORKER_NICE)
+
+
+def _set_nice(nice: int) -> None:
+    with contextlib.suppress(psutil.Error):
+        psutil.Process().nice(nice)
     # the session's share is ours to change only where we lead it; else it is a terminal's
-    if hasattr(os, "getsid") and os.getsid(0) == os.getpid():
-        _set_session(_SERVICE_NICE)
+    with contextlib.suppress(OSError, AttributeError):
+        if os.getsid(0) == os.getpid():
+            _AUTOGROUP.write_text(str(nice), encoding="ascii")
 
 
 def raise_file_limit() -> None:
@@ -44,24 +58,11 @@ def raise_file_limit() -> None:
 def end_with_parent() -> None:
     """End this process at once when the one that started it is gone, killed or not.
 
-    A worker whose service was killed must not write where the next one's does.
+    A worker whose service was killed must not write where the next one's does. A thread that watches a pipe of the
+    parent's would be plainer, and late: it waits for the interpreter, and a result is written meanwhile.
     """
     parent = multiprocessing.parent_process()
     with contextlib.suppress(OSError, AttributeError):  # not on every system; elsewhere it ends with its task
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if parent is not None and os.getppid() != parent.pid:
         os._exit(1)  # gone already
-
-
-def lower_worker() -> None:
-    """Let this process come last, in a session of its own: it would use up the share of the service's."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.setsid()
-    with contextlib.suppress(OSError, AttributeError):
-        os.nice(_WORKER_NICE - os.getpriority(os.PRIO_PROCESS, 0))
-    _set_session(_WORKER_NICE)
-
-
-def _set_session(nice: int) -> None:
-    with contextlib.suppress(OSError):
-        _AUTOGROUP.write_text(str(nice), encoding="ascii")

@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 
 from core.errors import CameraError
 from core.names import CAMERAS, CameraName
+from drivers.acquisition.sources import common_clock
+from drivers.acquisition.unit import CameraUnit
 from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile
 from server.results.quality import image_quality
-from server.rig.cameras import CameraPair, CameraUnit, PairShot
-from server.rig.pairs import common_clock
+from server.rig.cameras import CameraPair, PairShot
 
 #: relative difference of a setting that is the device's rounding; beyond it the device has another value
 _ROUNDING = 0.01

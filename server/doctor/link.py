@@ -6,9 +6,9 @@ import ipaddress
 from pathlib import Path
 
 from core.names import CAMERAS, CameraName
+from drivers.acquisition.unit import CameraUnit
 from server.doctor.cameras import Watch
 from server.doctor.report import Notebook
-from server.rig.unit import CameraUnit
 
 #: counts of the drivers that grow only when something goes wrong on the way
 _TROUBLES = (

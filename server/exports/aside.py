@@ -16,7 +16,8 @@ from typing import Any
 
 from server.base.errors import QueueFullError
 from server.exports.request import ExportRequest
-from server.worker.executor import ComputeWorker, TaskFuture
+from server.worker.embedded import ComputeWorker
+from server.worker.executor import TaskFuture
 
 FOLDER = ".exports"
 _MOST_WAITING = 4

@@ -11,12 +11,13 @@ from typing import Any, Literal
 
 from core.errors import CameraError, StageError
 from core.names import CAMERAS, CameraName
+from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
+from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber
 from drivers.registry import make_camera, open_stage
 from drivers.stages.protocol import AxisOptions, Stage
 from server.config.rig_file import RigConfig
-from server.rig.cameras import CameraPair, CameraUnit
-from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
+from server.rig.cameras import CameraPair
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
@@ -113,6 +114,7 @@ def open_devices(
             skew_is_set=config.rig.max_skew_ms is not None,
         )
         stack.callback(pair.close)
+        pair.start()
         stage = open_configured_stage(config, url, record=record, dynamics=dynamics)
         stack.callback(stage.close)
         reader.stage = stage

@@ -1,7 +1,7 @@
 """Both cameras together: synchronised captures, averages, live frames, and their return after a loss.
 
-A capture takes the next pairs of the rig's `server.rig.pairs.PairSource`. Live views use the same way when nobody
-captures, and otherwise show what the captures brought: recording comes first.
+A capture takes the next pairs of the rig's `drivers.acquisition.sources.PairSource`. Live views use the same way when
+nobody captures, and otherwise show what the captures brought: recording comes first.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from core.errors import CameraError, StateError
 from core.names import CAMERAS, CameraName
 from drivers.acquisition.pairing import Pair, PairingAccount
+from drivers.acquisition.sources import PairSource
+from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import CameraSettings, Frame, Pixels
 from server.config.rig_file import SKEW_PX
 from server.rig.image_speed import ImageMotion, image_motion
-from server.rig.pairs import PairSource
-from server.rig.unit import CameraUnit
-
-__all__ = ["CameraPair", "CameraUnit", "PairShot"]
 
 #: where there is nothing older to show, a look waits this long behind another one or a capture
 _FIRST_FRAME_S = 5.0
@@ -45,6 +43,12 @@ class PairShot:
     image_speed_px_s
         How fast camera 1's image moved from the first to the last frame; None for a single frame, or where it cannot
         be told.
+    settings
+        Exposure (ms) and gain (dB) of each camera, as read back.
+    frame_counts
+        What became of each camera's frames while it was taken.
+    pair_counts
+        What became of the triggers meanwhile.
     """
 
     pixels: dict[str, Pixels]
@@ -55,6 +59,40 @@ class PairShot:
     skew_ms: float
     host_ns: int
     image_speed_px_s: float | None = None
+    settings: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    frame_counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    pair_counts: dict[str, int] = field(default_factory=dict)
+
+
+class _Average:
+    """Mean of each camera's frames, pair by pair."""
+
+    def __init__(self, first: Pair) -> None:
+        self.first = self.last = first
+        self.frames = 1
+        self.skew_ms = abs(first.skew_ms)
+        self._sums: dict[CameraName, NDArray[np.uint32]] = {}
+
+    def add(self, pair: Pair) -> None:
+        """Take one more pair."""
+        if not self._sums:
+            self._sums = {cam: self.last[cam].pixels.astype(np.uint32) for cam in CAMERAS}
+        self.last = pair
+        self.frames += 1
+        self.skew_ms = max(self.skew_ms, abs(pair.skew_ms))
+        for cam in CAMERAS:
+            self._sums[cam] += pair[cam].pixels
+
+    @property
+    def scale(self) -> int:
+        """What one grey level becomes: a mean of 8 bit frames knows more than 8 bits."""
+        return 1 if self.frames == 1 else 2 ** (16 - max(self.last[cam].bit_depth for cam in CAMERAS))
+
+    def pixels(self, cam: CameraName) -> Pixels:
+        """Mean of one camera's frames; a single one as it came."""
+        if self.frames == 1:
+            return self.last[cam].pixels
+        return np.clip(np.round(self._sums[cam] * (self.scale / self.frames)), 0, 65535).astype(np.uint16)
 
 
 class CameraPair:
@@ -82,6 +120,10 @@ class CameraPair:
         self._lock = threading.Lock()
         self._capturing = threading.Event()
 
+    def start(self) -> None:
+        """Begin to take frames."""
+        self._source.start()
+
     def account(self) -> dict[str, int]:
         """What became of every trigger."""
         now = self._source.account()
@@ -91,8 +133,9 @@ class CameraPair:
         source = self._source
         source.stop()
         self._earlier, self._source = PairingAccount(**self.account()), self._make_source()
+        self._source.start()
 
-    def shoot(self, frames: int, check: Callable[[], None] | None = None) -> PairShot:
+    def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
         """Capture ``frames`` pairs and average each camera's; ``check`` may raise between them.
 
         Raises
@@ -103,48 +146,34 @@ class CameraPair:
         self._capturing.set()
         try:
             with self._lock:
-                return self._shoot(frames, check)
+                counts, account = {cam: unit.counters() for cam, unit in self.units.items()}, self.account()
+                mean = _Average(self._next_pair(check))
+                while mean.frames < frames:
+                    mean.add(self._next_pair(check))
+                motion = image_motion(mean.first.cam1, mean.last.cam1) if frames > 1 else None
+                if not self._skew_is_set and motion is not None:
+                    _check_skew(mean.skew_ms, motion)
+                last = mean.last
+                return PairShot(
+                    pixels={cam: mean.pixels(cam) for cam in CAMERAS},
+                    bit_depth={cam: last[cam].bit_depth for cam in CAMERAS},
+                    sequence={cam: last[cam].sequence for cam in CAMERAS},
+                    frames=frames,
+                    scale=mean.scale,
+                    skew_ms=mean.skew_ms,
+                    host_ns=last.cam1.host_ns,
+                    image_speed_px_s=None if motion is None else motion.speed_px_s,
+                    settings={cam: _exposure(unit.settings) for cam, unit in self.units.items()},
+                    frame_counts={cam: _grown(unit.counters(), counts[cam]) for cam, unit in self.units.items()},
+                    pair_counts=_grown(self.account(), account),
+                )
         finally:
             self._capturing.clear()
 
-    def _shoot(self, frames: int, check: Callable[[], None] | None) -> PairShot:
-        sums: dict[str, NDArray[np.uint32]] = {}
-        worst = 0.0
-        begin: Pair | None = None
-        for index in range(frames):
-            if check is not None:
-                check()
-            pair = self._source.next_pair(check).require()
-            begin = begin or pair
-            one, two = pair.cam1, pair.cam2
-            worst = max(worst, abs(pair.skew_ms))
-            if frames > 1:
-                for cam, frame in (("cam1", one), ("cam2", two)):
-                    if index == 0:
-                        sums[cam] = np.zeros(frame.pixels.shape, dtype=np.uint32)
-                    sums[cam] += frame.pixels
-        assert begin is not None
-        motion = image_motion(begin.cam1, one) if frames > 1 else None
-        if not self._skew_is_set and motion is not None:
-            _check_skew(worst, motion)
-        pixels: dict[str, Pixels] = {"cam1": one.pixels, "cam2": two.pixels}
-        scale = 1
-        if frames > 1:
-            # keep the average's fraction: a mean of 8 bit frames knows more than 8 bits
-            scale = 2 ** (16 - max(one.bit_depth, two.bit_depth))
-            pixels = {
-                cam: np.clip(np.round(s * (scale / frames)), 0, 65535).astype(np.uint16) for cam, s in sums.items()
-            }
-        return PairShot(
-            pixels,
-            {"cam1": one.bit_depth, "cam2": two.bit_depth},
-            {"cam1": one.sequence, "cam2": two.sequence},
-            frames,
-            scale,
-            worst,
-            one.host_ns,
-            None if motion is None else motion.speed_px_s,
-        )
+    def _next_pair(self, check: Callable[[], None] | None) -> Pair:
+        if check is not None:
+            check()
+        return self._source.next_pair(check).require()
 
     def live(self, cam: CameraName, max_age_s: float, after: int | None = None) -> Frame:
         """Return a frame for looking at, at most ``max_age_s`` old where recording allows it.
@@ -205,6 +234,14 @@ class CameraPair:
         for unit in self.units.values():
             unit.release()
         self._source.stop()
+
+
+def _exposure(settings: CameraSettings) -> dict[str, float | None]:
+    return {"exposure_ms": settings.exposure_ms, "gain_db": settings.gain_db}
+
+
+def _grown(after: dict[str, int], before: dict[str, int]) -> dict[str, int]:
+    return {name: count - before.get(name, 0) for name, count in after.items()}
 
 
 def _check_skew(skew_ms: float, motion: ImageMotion) -> None:

@@ -113,7 +113,9 @@ class _Search:
         self._found: list[FoundDevice] = []
         self._error: Exception | None = None
         self.done = threading.Event()
-        threading.Thread(target=self._run, name=f"search for {name}", daemon=True).start()
+
+    def start(self) -> None:
+        threading.Thread(target=self._run, name=f"search for {self.name}", daemon=True).start()
 
     def _run(self) -> None:
         try:
@@ -191,6 +193,7 @@ class DeviceFinder:
         if running is None or running.done.is_set():
             look = self._ports if name == SERIAL else lambda: self._discover(name)
             running = self._searches[name] = _Search(name, look)
+            running.start()
         return running
 
 

@@ -31,6 +31,9 @@ class ReconnectWatch:
         self._came_back = came_back
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="reconnect", daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
         self._thread.start()
 
     def stop(self) -> None:

@@ -20,7 +20,7 @@ from server.base.problem import problem_of
 from server.config.rig_file import RigConfig
 from server.jobs.hardware import HardwareGate
 from server.rig.build import Devices, first_settings, open_devices
-from server.rig.cameras import CameraPair, PairShot
+from server.rig.cameras import CameraPair
 from server.rig.reconnect import ReconnectWatch
 from server.rig.shared import SharedReading
 from server.rig.stage_controls import StageControls
@@ -80,6 +80,7 @@ class Rig:
             self.controls.collect(self._devices.stage)
             if self.config.rig.auto_reconnect:
                 self._watch = ReconnectWatch(self._devices.pair, self._came_back)
+                self._watch.start()
             if self._devices.world is not None and self.scene is None:
                 self.scene = {"scene": "grid", "load": 0.0}
             if self.config.home_at_start:
@@ -271,10 +272,6 @@ class Rig:
         taken = self.gate.call(lambda: pair.configure(cam, settings))
         self._settings[cam] = pair.units[cam].wanted
         return taken
-
-    def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
-        """Capture ``frames`` pairs; call on the owner thread, with the hold."""
-        return self.pair.shoot(frames, check)
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> dict[str, Any]:
         """Put something else before a simulated rig's cameras."""

@@ -12,14 +12,14 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor, InvalidStateError
+from concurrent.futures import InvalidStateError
 from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import Cancelled, InputError, MeasurementError
 from server.formats.files import written_aside
 from server.worker import dask_task
-from server.worker.executor import TaskFuture, WorkerDiedError
+from server.worker.executor import TaskExecutor, TaskFuture, WorkerDiedError
 from server.worker.tasks import StepTask
 
 _log = logging.getLogger("stereorig.cluster")
@@ -53,7 +53,7 @@ class ClusterFuture(TaskFuture):
             self._stop(self)
 
 
-class ClusterExecutor(Executor):
+class ClusterExecutor(TaskExecutor):
     """Runs tasks on a Dask cluster.
 
     Parameters

@@ -6,6 +6,8 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 _PROC = Path("/proc")
 _CGROUPS = Path("/sys/fs/cgroup")
 _MEANINGS = {
@@ -63,14 +65,11 @@ def _oom_kills(path: Path) -> int | None:
 
 
 def resident_mib(pid: int) -> float | None:
-    """Memory that a process holds; None where it cannot be told."""
+    """Memory that a process holds; None where it cannot be told, as when it has ended."""
     try:
-        for line in (_PROC / str(pid) / "status").read_text().splitlines():
-            if line.startswith("VmRSS:"):
-                return int(line.split()[1]) / 1024.0
-    except (OSError, ValueError, IndexError):
-        pass
-    return None
+        return float(psutil.Process(pid).memory_info().rss) / 2**20 or None
+    except psutil.Error:
+        return None
 
 
 def cause_of_death(exit_code: int | None, *, out_of_memory: bool, memory_mib: float | None) -> str:

@@ -1,36 +1,19 @@
-"""The compute worker as a ``concurrent.futures.Executor``: one process, restarted when it dies.
+"""Executors of tasks outside the service's process: what the embedded worker and a cluster have in common.
 
-Kernels never run in the service's own process: in a thread there they would delay the event loop by tens of
-milliseconds. A task function finds its channel for progress and cancellation with
-:func:`server.worker.process.current_task`, so the same function runs under any other executor.
+A task function finds its channel for progress and cancellation with :func:`server.worker.process.current_task`, so the
+same function runs under either.
 """
 
 from __future__ import annotations
 
-import contextlib
-import logging
-import multiprocessing
-import os
-import queue
 import threading
-import time
+from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from typing import Any, Self
 
-from core.compiling import COMPILING
-from core.errors import Cancelled, MeasurementError
-from server.base.logs import about, ids_now
-from server.worker.death import MemoryWatch, cause_of_death, resident_mib
-from server.worker.process import serve
+from core.errors import MeasurementError
 
-_log = logging.getLogger("stereorig.worker")
-
-_RESTART_PAUSE_S = 5.0
-_LOOK_S = 0.05
-_MEMORY_S = 0.5
 Progress = Callable[[str, int, int], None]
 
 
@@ -42,17 +25,6 @@ class WorkerDiedError(MeasurementError):
         "The worker has been started again, finished steps are kept: continue the analysis. If it dies again, look for "
         "memory limits, and report a signal other than SIGKILL with the service's log."
     )
-
-
-@dataclass(eq=False)
-class _Task:
-    id: int
-    future: TaskFuture
-    function: Callable[..., Any]
-    args: tuple[Any, ...]
-    kwargs: dict[str, Any]
-    #: what its log lines name
-    ids: dict[str, str] = field(default_factory=ids_now)
 
 
 class TaskFuture(Future[Any]):
@@ -69,254 +41,21 @@ class TaskFuture(Future[Any]):
         self.cancel()  # at once, if it has not begun
 
 
-class ComputeWorker(Executor):
-    """One process that runs one task at a time; spawned by :meth:`start` or with the first task.
-
-    Parameters
-    ----------
-    threads
-        Kernel threads inside the process; by default one per core.
-    warm_up
-        ``"module:function"`` that the process calls with ``threads`` before its first task.
-    patience_s
-        How long a cancelled task may take to stop before its process is ended.
-    """
-
-    def __init__(self, *, threads: int | None = None, warm_up: str | None = None, patience_s: float = 0.5) -> None:
-        self._threads = threads or len(os.sched_getaffinity(0))
-        self._warm_up = warm_up
-        self._patience_s = patience_s
-        self._context = multiprocessing.get_context("spawn")
-        self._tasks: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
-        self._next_id = 0
-        self._closing = threading.Event()
-        self._state_lock = threading.Lock()
-        self._process: multiprocessing.process.BaseProcess | None = None
-        self._connection: Connection | None = None
-        self._restart_at = 0.0
-        self._kills, self._held_mib = MemoryWatch({}), None  # type: tuple[MemoryWatch, float | None]
-        self.starts = 0
-        self.ready = threading.Event()
-        self.compiling = threading.Event()  # since the process began; until it is ready
-        self._thread = threading.Thread(target=self._run, name="compute-worker", daemon=True)
-        self._started = False
+class TaskExecutor(Executor):
+    """Runs tasks; everything that goes to one and comes back must pickle."""
 
     def start(self) -> None:
-        """Spawn the process and warm it up, without waiting for it; nothing where that was done before."""
-        with self._state_lock:
-            self._start_once()
+        """Get ready before the first task, without waiting; nothing where that was done before."""
 
     def __enter__(self) -> Self:
         self.start()
         return self
 
-    def _start_once(self) -> None:
-        if not self._started and not self._closing.is_set():
-            self._started = True
-            self._thread.start()
-
     @property
+    @abstractmethod
     def width(self) -> int:
         """How many tasks run at once."""
-        return 1
 
-    @property
-    def pid(self) -> int | None:
-        """Process id of the worker, if it runs."""
-        process = self._process
-        return process.pid if process is not None else None
-
+    @abstractmethod
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> TaskFuture:
-        """Queue ``fn(*args, **kwargs)``; everything must pickle."""
-        future = TaskFuture()
-        with self._state_lock:
-            if self._closing.is_set():
-                raise RuntimeError("the compute worker is shut down")
-            self._start_once()
-            self._next_id += 1
-            self._tasks.put(_Task(self._next_id, future, fn, args, kwargs))
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
-        """End the process; running and waiting tasks are cancelled, whatever ``cancel_futures`` says."""
-        with self._state_lock:
-            self._closing.set()
-            self._tasks.put(None)
-        if wait and self._started:
-            self._thread.join(timeout=10.0)
-
-    # the thread that owns the process --------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        self._spawn()
-        while True:
-            task = self._next_task()
-            if task is None or self._closing.is_set():
-                if task is not None:
-                    task.future.set_exception(Cancelled("The service is shutting down."))
-                break
-            if task.future.set_running_or_notify_cancel():
-                with about(**task.ids):
-                    self._work_on(task)
-        self._end_process()
-        with contextlib.suppress(queue.Empty):
-            while True:
-                left = self._tasks.get_nowait()
-                if left is not None and left.future.set_running_or_notify_cancel():
-                    left.future.set_exception(Cancelled("The service is shutting down."))
-
-    def _next_task(self) -> _Task | None:
-        # while idle, watch the process too: its death is noticed (and mended) before the next task needs it
-        while True:
-            with contextlib.suppress(queue.Empty):
-                return self._tasks.get(timeout=0.2)
-            self._drain_idle()
-            now = time.monotonic()
-            if self._process is not None and not self._process.is_alive() and now > self._restart_at:
-                # one that cannot even start must not be started five times a second
-                self._restart_at = now + _RESTART_PAUSE_S
-                _log.warning("the idle compute worker ended (exit code %s); starting it again", self._process.exitcode)
-                self._spawn()
-
-    def _drain_idle(self) -> None:
-        connection = self._connection
-        with contextlib.suppress(EOFError, OSError):
-            while connection is not None and connection.poll():
-                self._note(connection.recv())
-
-    def _note(self, message: tuple[Any, ...]) -> None:
-        if message[0] == "ready":
-            self.ready.set()
-        elif message[0] == "compiling":
-            self.compiling.set()
-            _log.warning("%s", COMPILING)  # a warning reaches the service's terminal
-        elif message[0] == "log":
-            logging.getLogger(message[1].name).handle(message[1])
-
-    def _spawn(self) -> None:
-        self._end_process()
-        self._held_mib = None
-        self.ready.clear()
-        self.compiling.clear()
-        ours, theirs = self._context.Pipe()
-        self._cancel = self._context.Event()
-        process = self._context.Process(
-            target=serve,
-            args=(theirs, self._cancel, self._threads, self._warm_up, logging.getLogger().getEffectiveLevel()),
-            name="stereorig-worker",
-            daemon=True,
-        )
-        process.start()
-        theirs.close()
-        self._process, self._connection = process, ours
-        self.starts += 1
-
-    def _end_process(self, *, at_once: bool = False) -> None:
-        process, self._process = self._process, None
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
-        if process is not None:
-            process.kill() if at_once else process.terminate()
-            process.join(timeout=2.0)
-            if process.is_alive():
-                process.kill()
-                process.join()
-            process.close()
-
-    def _work_on(self, task: _Task) -> None:
-        try:
-            result = self._exchange(task)
-        except Exception as error:  # noqa: BLE001 - it belongs to the future
-            task.future.set_exception(error)
-        else:
-            task.future.set_result(result)
-        if self._process is None and not self._closing.is_set():
-            self._spawn()  # only now: whoever waits for the task does not wait for that
-
-    def _exchange(self, task: _Task) -> Any:
-        if self._process is None or not self._process.is_alive():
-            self._spawn()
-        connection, process = self._connection, self._process
-        assert connection is not None
-        assert process is not None
-        if not self._wait_ready(task, connection, process):
-            return self._died(process)
-        self._cancel.clear()
-        self._kills, look_at = MemoryWatch.now(), 0.0
-        try:
-            connection.send((task.id, task.function, task.args, task.kwargs))
-        except (BrokenPipeError, ConnectionResetError):
-            return self._died(process)
-        stop_at: float | None = None
-        while True:
-            if stop_at is None and (task.future.stop_requested.is_set() or self._closing.is_set()):
-                self._cancel.set()
-                stop_at = time.monotonic() + self._patience_s
-            if stop_at is not None and time.monotonic() > stop_at:
-                self._end_process(at_once=True)
-                raise Cancelled("The computation was cancelled.")
-            if time.monotonic() > look_at and process.pid is not None:
-                look_at = time.monotonic() + _MEMORY_S
-                self._held_mib = resident_mib(process.pid) or self._held_mib
-            try:
-                if not connection.poll(_LOOK_S):
-                    if not process.is_alive() and not connection.poll():
-                        return self._died(process)
-                    continue
-                message = connection.recv()
-            except (EOFError, OSError):
-                return self._died(process)
-            self._note(message)
-            if message[0] == "progress" and message[1] == task.id and task.future.on_progress is not None:
-                task.future.on_progress(*message[2:])
-            elif message[0] == "result" and message[1] == task.id:
-                return message[2]
-            elif message[0] == "error" and message[1] == task.id:
-                _log.info("task %d failed:\n%s", task.id, message[3])
-                raise message[2]
-
-    def _wait_ready(self, task: _Task, connection: Connection, process: multiprocessing.process.BaseProcess) -> bool:
-        # a task that is cancelled while the kernels warm up must not cost a restart
-        told = False
-        while not self.ready.is_set():
-            if self.compiling.is_set() and not told and task.future.on_progress is not None:
-                told = True
-                task.future.on_progress(COMPILING, 0, 1)
-            if task.future.stop_requested.is_set() or self._closing.is_set():
-                raise Cancelled("The computation was cancelled.")
-            try:
-                if connection.poll(_LOOK_S):
-                    self._note(connection.recv())
-                elif not process.is_alive():
-                    return False
-            except (EOFError, OSError):
-                return False
-        return True
-
-    def _died(self, process: multiprocessing.process.BaseProcess) -> Any:
-        process.join(timeout=2.0)
-        code, held_mib = process.exitcode, self._held_mib
-        out_of_memory = self._kills.killed_since()
-        how = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=held_mib)
-        _log.error("the compute worker ended during a task, %s; starting it again", how.rstrip("."))
-        self._spawn()
-        raise WorkerDiedError(
-            f"The compute process ended while it worked, {how}",
-            exit_code=code,
-            signal=None if code is None or code >= 0 else -code,
-            out_of_memory=out_of_memory,
-            memory_mib=held_mib,
-        )
-
-
-def make_worker(threads: int | None) -> ComputeWorker:
-    """Make the worker of a service, not yet started."""
-    return ComputeWorker(threads=threads, warm_up="server.worker.tasks:warm_up")
-
-
-def start_worker(threads: int | None) -> ComputeWorker:
-    """Start the worker of a service; its process loads and warms the kernels while the service goes on starting."""
-    worker = make_worker(threads)
-    worker.start()
-    return worker
+        """Run ``fn(*args, **kwargs)`` when its turn comes."""

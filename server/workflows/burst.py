@@ -10,7 +10,7 @@ from server.base.metrics import timed_capture
 from server.base.problem import problem_of
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
-from server.workflows.capture import commit_pair, take_pair
+from server.workflows.capture import commit_pair
 from server.workflows.service import Service
 
 _LOOK_S = 0.02
@@ -100,10 +100,10 @@ def _take(
     first_ns: int | None,
 ) -> dict[str, Any]:
     service.require_room()
-    taken = take_pair(service.rig, frames, job.check)
-    since_ns = 0 if first_ns is None else taken.shot.host_ns - first_ns
+    shot, positions_mm = service.rig.pair.shoot(frames, job.check), service.rig.positions_mm()
+    since_ns = 0 if first_ns is None else shot.host_ns - first_ns
     burst = {**place, "since_first_ms": round(since_ns / 1e6, 3)}
-    return commit_pair(service, test_id, {**facts, "burst": burst}, taken)
+    return commit_pair(service, test_id, {**facts, "burst": burst}, shot, positions_mm)
 
 
 def _wait_until(job: Job, moment: float) -> None:

@@ -93,7 +93,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
         job.progress("views", index, len(stops))
         moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)))
         job.check()
-        shot = rig.shoot(plan.frames, job.check)
+        shot = rig.pair.shoot(plan.frames, job.check)
         role = _role(plan, dz, last=index == len(stops) - 1)
         for cam in CAMERAS:
             axis = rig.config.camera(cam).stage_axis

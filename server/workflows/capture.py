@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,6 @@ from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode_image, encode_tiff
 from server.results.quality import image_quality, pair_quality
-from server.rig import Rig
 from server.rig.cameras import PairShot
 from server.store.folder import now_utc
 from server.store.index import step_entry
@@ -30,58 +27,19 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
     """Capture a pair and commit it as the test's next step; returns ``step.json``."""
     service.require_room()
     with service.gate.hold("the capture of a step", test_id=test_id):
-        taken = service.gate.call(lambda: take_pair(service.rig, frames))
-        return commit_pair(service, test_id, facts, taken)
+        shot, positions_mm = service.gate.call(lambda: (service.rig.pair.shoot(frames), service.rig.positions_mm()))
+        return commit_pair(service, test_id, facts, shot, positions_mm)
 
 
-@dataclass(frozen=True, eq=False)
-class TakenPair:
-    """A captured pair, and what the rig was like as it was taken.
+def commit_pair(
+    service: Service, test_id: str, facts: dict[str, Any], shot: PairShot, positions_mm: dict[int, float]
+) -> dict[str, Any]:
+    """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
 
     Parameters
     ----------
-    shot
-        The images.
     positions_mm
-        Of the stage, read back, by axis.
-    settings
-        Exposure (ms) and gain (dB) of each camera, as read back.
-    frame_counts
-        What became of each camera's frames while it was taken.
-    pair_counts
-        What became of the triggers meanwhile.
-    """
-
-    shot: PairShot
-    positions_mm: dict[int, float]
-    settings: dict[str, dict[str, float | None]]
-    frame_counts: dict[str, dict[str, int]]
-    pair_counts: dict[str, int]
-
-
-def take_pair(rig: Rig, frames: int, check: Callable[[], None] | None = None) -> TakenPair:
-    """Capture; call on the owner thread, with the hold. ``check`` may raise between the frames."""
-    pair = rig.pair
-    units = pair.units.items()
-    before, pairs_before = {cam: unit.counters() for cam, unit in units}, pair.account()
-    shot = rig.shoot(frames, check)
-    return TakenPair(
-        shot=shot,
-        positions_mm=rig.positions_mm(),
-        settings={
-            cam: {"exposure_ms": unit.settings.exposure_ms, "gain_db": unit.settings.gain_db} for cam, unit in units
-        },
-        frame_counts={cam: _difference(unit.counters(), before[cam]) for cam, unit in units},
-        pair_counts=_difference(pair.account(), pairs_before),
-    )
-
-
-def _difference(after: dict[str, int], before: dict[str, int]) -> dict[str, int]:
-    return {name: count - before.get(name, 0) for name, count in after.items()}
-
-
-def commit_pair(service: Service, test_id: str, facts: dict[str, Any], taken: TakenPair) -> dict[str, Any]:
-    """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
+        Of the stage, read back as the pair was taken, by axis.
 
     Raises
     ------
@@ -92,19 +50,19 @@ def commit_pair(service: Service, test_id: str, facts: dict[str, Any], taken: Ta
     StorageError
         It is not on disk.
     """
-    rig, shot = service.rig, taken.shot
+    rig = service.rig
     sizes: dict[str, list[int]] = {cam: [*reversed(shot.pixels[cam].shape)] for cam in CAMERAS}
     _check_sizes(service, test_id, sizes)
     if service.tests.is_calibrated(test_id):
         check_same_cameras(service.tests.calibration_file(test_id), rig.identities(), "The step")
     depth = {cam: 16 if shot.scale > 1 else shot.bit_depth[cam] for cam in CAMERAS}
     quality = pair_quality(*(image_quality(shot.pixels[cam], depth[cam]) for cam in CAMERAS))
-    dz = {cam: rig.dz_of(cam, taken.positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
+    dz = {cam: rig.dz_of(cam, positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
     if quality["code"] == "ok" and max(abs(v) for v in dz.values()) > OFF_ZERO_MM:
         quality["code"] = "cameras_off_zero"
-    quality |= {"skew_ms": shot.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": taken.pair_counts}
+    quality |= {"skew_ms": shot.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": shot.pair_counts}
     for cam in CAMERAS:
-        quality[cam] |= taken.settings[cam] | {"frames": taken.frame_counts[cam]}
+        quality[cam] |= shot.settings[cam] | {"frames": shot.frame_counts[cam]}
     document = {
         **facts,
         "source": "capture",

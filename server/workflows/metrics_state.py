@@ -14,6 +14,7 @@ from prometheus_client.registry import Collector
 from core.errors import DeviceError, StereorigError
 from drivers.stages.protocol import AxisState
 from server.formats.version import software_version
+from server.worker.death import resident_mib
 from server.workflows.service import Service
 
 _log = logging.getLogger("stereorig.metrics")
@@ -73,9 +74,9 @@ class StateCollector(Collector):
         worker = self._service.worker
         yield CounterMetricFamily("stereorig_worker_starts", "How often the compute worker was started.", worker.starts)
         yield _gauge("worker_ready", "Whether the worker takes tasks.", worker.ready.is_set())
-        memory = _resident_bytes(worker.pid)
-        if memory is not None:
-            yield _gauge("worker_resident_bytes", "Memory of the worker.", memory)
+        memory_mib = None if worker.pid is None else resident_mib(worker.pid)
+        if memory_mib is not None:
+            yield _gauge("worker_resident_bytes", "Memory of the worker.", memory_mib * _MIB)
 
     def _readers(self) -> Iterator[Metric]:
         readers = GaugeMetricFamily("stereorig_streams", "Streams that are open, by kind.", labels=["kind"])
@@ -119,14 +120,3 @@ class StateCollector(Collector):
         except DeviceError:
             answers.add_metric([], 0)
         yield from (answers, places, states)
-
-
-def _resident_bytes(pid: int | None) -> int | None:
-    """Return a process' resident memory; None where there is no such process, or no /proc."""
-    if pid is None:
-        return None
-    try:
-        with open(f"/proc/{pid}/statm", encoding="ascii") as file:  # noqa: PTH123 - a pseudo file, read at each scrape
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return None

@@ -20,7 +20,7 @@ def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[
         job.check()
         service.require_room()
         job.progress("frames", index, frames)
-        shot = rig.shoot(1, job.check)
+        shot = rig.pair.shoot(1, job.check)
         taken += [service.noise.put_frame(noise_id, index, cam, shot.pixels[cam]) for cam in CAMERAS]
     facts = {
         "bit_depth": {cam: shot.bit_depth[cam] for cam in CAMERAS},

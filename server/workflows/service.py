@@ -34,7 +34,8 @@ from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
-from server.worker.executor import ComputeWorker, make_worker
+from server.worker.embedded import ComputeWorker, make_worker
+from server.worker.executor import TaskExecutor
 
 _log = logging.getLogger("stereorig.service")
 _OPEN_WAIT_S = 5.0
@@ -80,7 +81,7 @@ class Service:
             self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
         )
         self.worker = worker or make_worker(config.service.kernel_threads)
-        self.executor: ComputeWorker | ClusterExecutor = self.worker  # of analyses
+        self.executor: TaskExecutor = self.worker  # of analyses
         if config.compute.scheduler is not None:
             self.executor = ClusterExecutor(
                 config.compute.scheduler, images=config.compute.images, threads=config.compute.threads_per_worker
@@ -131,8 +132,8 @@ class Service:
             parts.callback(self.exports.close)
             self.worker.start()
             parts.callback(self.worker.shutdown)
-            if self.executor is not self.worker:
-                parts.callback(self.executor.shutdown)
+            self.executor.start()
+            parts.callback(self.executor.shutdown)
             self.jobs.start()
             parts.callback(self.jobs.close)
             self._end_thread.start()

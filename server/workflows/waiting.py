@@ -8,21 +8,16 @@ from typing import Any
 
 from core.errors import Cancelled
 from server.jobs.job import Job
-from server.worker.dask_cluster import ClusterExecutor
-from server.worker.executor import ComputeWorker, Progress, TaskFuture
+from server.worker.executor import Progress, TaskExecutor, TaskFuture
 
 _STOPPING_S = 3.0  # the worker ends a task within a second, by force if need be
 
 
 def run_task(
-    worker: ComputeWorker | ClusterExecutor,
-    job: Job,
-    function: Callable[..., Any],
-    *args: Any,
-    progress: Progress | None = None,
+    executor: TaskExecutor, job: Job, function: Callable[..., Any], *args: Any, progress: Progress | None = None
 ) -> Any:
-    """Run ``function(*args)`` in the worker; progress goes to the job, the job's cancellation to the worker."""
-    future = worker.submit(function, *args)
+    """Run ``function(*args)`` outside; progress goes to the job, the job's cancellation to the task."""
+    future = executor.submit(function, *args)
     future.on_progress = progress or job.progress
     job.stop_waiting = future.request_stop
     try:
@@ -41,7 +36,7 @@ def run_task(
 
 
 def run_side_by_side(
-    worker: ComputeWorker | ClusterExecutor,
+    executor: TaskExecutor,
     job: Job,
     function: Callable[..., Any],
     tasks: Iterator[tuple[int, Callable[[], Any]]],
@@ -73,12 +68,12 @@ def run_side_by_side(
         more = True
         while more or running:
             job.check()
-            while more and len(running) < worker.width:
+            while more and len(running) < executor.width:
                 number, make = next(tasks, (None, None))
                 if number is None or make is None:
                     more = False
                     break
-                future = worker.submit(function, make())
+                future = executor.submit(function, make())
                 future.on_progress = shown(number)
                 running[future] = number
             finished, _ = wait(list(running), timeout=0.05, return_when=FIRST_COMPLETED)

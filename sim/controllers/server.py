@@ -12,7 +12,7 @@ import socket
 import threading
 import tty
 from types import TracebackType
-from typing import Literal
+from typing import Literal, Self
 
 from sim.controllers.wire import WireController
 
@@ -36,15 +36,21 @@ class ControllerServer:
         self, controller: WireController, transport: Literal["socket", "pty"] = "socket", *, port: int = 0
     ) -> None:
         self.controller = controller
+        self.url = ""
+        self._transport = transport
+        self._port = port
         self._selector = selectors.DefaultSelector()
         self._buffers: dict[int, bytearray] = {}
         self._sockets: dict[int, socket.socket] = {}
         self._listener: socket.socket | None = None
         self._pty: tuple[int, int] | None = None
-        self._wake_read, self._wake_write = os.pipe()
-        self._selector.register(self._wake_read, selectors.EVENT_READ)
-        if transport == "socket":
-            self._listener = socket.create_server(("127.0.0.1", port))
+        self._wake_read = self._wake_write = -1
+        self._thread = threading.Thread(target=self._run, name="simulated controller", daemon=True)
+
+    def start(self) -> Self:
+        """Open the line and answer on it, at `url`; OSError where the port cannot be had."""
+        if self._transport == "socket":
+            self._listener = socket.create_server(("127.0.0.1", self._port))
             self._selector.register(self._listener, selectors.EVENT_READ)
             self.url = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
         else:
@@ -55,11 +61,13 @@ class ControllerServer:
             self._buffers[near] = bytearray()
             self._selector.register(near, selectors.EVENT_READ)
             self.url = os.ttyname(far)
-        self._thread = threading.Thread(target=self._run, name="simulated controller", daemon=True)
+        self._wake_read, self._wake_write = os.pipe()
+        self._selector.register(self._wake_read, selectors.EVENT_READ)
         self._thread.start()
-
-    def __enter__(self) -> ControllerServer:
         return self
+
+    def __enter__(self) -> Self:
+        return self if self._thread.is_alive() else self.start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -227,7 +227,8 @@ def test_the_unit_says_what_the_service_does() -> None:
     assert section["KillMode"] == "mixed"
     from server.base.priority import _SERVICE_NICE
 
-    assert int(section["LimitNICE"]) == _SERVICE_NICE
+    assert int(section["Nice"]) == int(section["LimitNICE"]) == _SERVICE_NICE
+    assert section["OOMPolicy"] == "continue"  # the worker's death is not the service's
 
 
 def test_the_units_command_is_one_that_the_command_line_takes() -> None:

@@ -131,7 +131,7 @@ def test_an_attached_burst_answers_when_it_has_ended(client: httpx.Client) -> No
 @pytest.mark.fault(16)
 def test_a_burst_goes_on_after_a_pair_that_is_refused_and_says_which(client: httpx.Client, service: Service) -> None:
     test_id = new_test(client)
-    rig, shoot, calls = service.rig, service.rig.shoot, 0
+    pair, shoot, calls = service.rig.pair, service.rig.pair.shoot, 0
 
     def shoot_or_refuse(*args: Any, **more: Any) -> Any:
         nonlocal calls
@@ -140,11 +140,11 @@ def test_a_burst_goes_on_after_a_pair_that_is_refused_and_says_which(client: htt
             raise CameraError("3 ms apart", code="skew_too_large", skew_ms=3.0)
         return shoot(*args, **more)
 
-    rig.shoot = shoot_or_refuse  # type: ignore[method-assign]
+    pair.shoot = shoot_or_refuse  # type: ignore[method-assign]
     try:
         answer = client.post(f"{API}/tests/{test_id}/steps", params={"attached": True}, json={"count": 3})
     finally:
-        del rig.shoot  # type: ignore[method-assign]
+        del pair.shoot  # type: ignore[method-assign]
     job = answer.json()["job"]
     assert job["state"] == "failed"
     assert job["problem"]["code"] == "burst_incomplete"

@@ -18,7 +18,7 @@ import pytest
 
 from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, ids_now
 from server.jobs.hardware import HardwareGate
-from server.worker.executor import ComputeWorker
+from server.worker.embedded import ComputeWorker
 from server.workflows.service import Service
 from tests.support.service_rig import TINY, new_test, wait_for_job, wait_for_rig
 

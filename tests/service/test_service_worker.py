@@ -12,7 +12,8 @@ from numba import njit
 
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import Cancelled, RegionError
-from server.worker.executor import ComputeWorker, WorkerDiedError
+from server.worker.embedded import ComputeWorker
+from server.worker.executor import WorkerDiedError
 from tests.support import worker_functions as work
 
 

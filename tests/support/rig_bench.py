@@ -13,10 +13,10 @@ import numpy as np
 
 from core.errors import CameraError
 from core.names import CAMERAS, CameraName
+from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
+from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import CameraSettings, FrameGrabber, Pixels, TriggerMode
 from server.rig.cameras import CameraPair
-from server.rig.pairs import PairSource, StreamedPairs, TriggeredPairs
-from server.rig.unit import CameraUnit
 from sim.grabber import SimFrameGrabber, TriggerLine
 
 SIZE = (64, 48)
@@ -86,6 +86,7 @@ class Bench:
         for unit in self.units.values():
             unit.open(CameraSettings(exposure_ms=5.0))
         self.pair = CameraPair(self.units["cam1"], self.units["cam2"], make_source=source, skew_is_set=skew_is_set)
+        self.pair.start()
 
     def grabber(self, cam: CameraName) -> FrameGrabber:
         return SimFrameGrabber(

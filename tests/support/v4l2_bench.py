@@ -36,7 +36,7 @@ _CALM: dict[str, FeatureValue] = {
 @contextmanager
 def controls_of(node: str) -> Iterator[Controls]:
     """The controls of a device that another one may be streaming from."""
-    device = Device(node)
+    device = Device(node).open()
     try:
         with device.use():
             yield Controls(device)

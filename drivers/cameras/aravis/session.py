@@ -128,9 +128,9 @@ class Session:
                 )
             self._triggers.arm()
             self._await_standstill()
-            self._stream = CameraStream(
-                self._device, buffers=self._options.buffers, region_px=region, pixel_format=BY_NAME[name]
-            )
+            stream = CameraStream(self._device.name, region_px=region, pixel_format=BY_NAME[name])
+            stream.start(self._device, self._options.buffers)
+            self._stream = stream
             try:
                 self._device.ask_camera("start_acquisition")
             except CameraError:

@@ -49,18 +49,14 @@ class CameraStream:
 
     Parameters
     ----------
-    device
-        The camera, connected.
-    buffers
-        Frames that may be under way.
+    name
+        The camera's, for error texts.
     region_px, pixel_format
         What the camera is set to, for frames that come without their header.
     """
 
-    def __init__(
-        self, device: Device, *, buffers: int, region_px: tuple[int, int, int, int], pixel_format: PixelFormat
-    ) -> None:
-        self._name = device.name
+    def __init__(self, name: str, *, region_px: tuple[int, int, int, int], pixel_format: PixelFormat) -> None:
+        self._name = name
         self._width, self._height = region_px[2:]
         self._format = pixel_format
         self._clock = ArrivalClock()
@@ -68,7 +64,18 @@ class CameraStream:
         self._ended = False
         self._users = 0
         self._changed = threading.Condition()
-        self._stream: Any
+        self._stream: Any = None
+
+    def start(self, device: Device, buffers: int) -> None:
+        """Let the camera's frames come.
+
+        Parameters
+        ----------
+        device
+            The camera, connected.
+        buffers
+            Frames that may be under way.
+        """
         self._stream, payload = device.start_stream()
         if device.is_gige:
             gv = aravis()

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Self
 
 from core.errors import CameraError
 from drivers.cameras.v4l2 import structures as v
@@ -24,40 +25,45 @@ _GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EIO}
 
 
 class Device:
-    """An open video device.
+    """A video device.
 
     Parameters
     ----------
     path
         ``/dev/video0`` or a link to such a node.
-
-    Raises
-    ------
-    CameraError
-        ``camera_lost`` when it is not there, ``camera_busy``, ``no_permission``, ``not_a_camera``.
     """
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self.wake = -1
+        self.fd = self.wake = -1
+        self.capability = v.Capability()
         self._lock = threading.Lock()
         self._users = 0
         self._closing = False
+
+    def open(self) -> Self:
+        """Open it and ask what it is.
+
+        Raises
+        ------
+        CameraError
+            ``camera_lost`` when it is not there, ``camera_busy``, ``no_permission``, ``not_a_camera``.
+        """
         try:
-            if not stat.S_ISCHR(Path(path).stat().st_mode):
-                raise not_a_camera(path, "it is no device node")
-            self.fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+            if not stat.S_ISCHR(Path(self.path).stat().st_mode):
+                raise not_a_camera(self.path, "it is no device node")
+            self.fd = os.open(self.path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
             raise self._unopened(error) from error
         try:
-            self.capability = v.Capability()
             self.ioctl(v.VIDIOC_QUERYCAP, self.capability)
         except OSError as error:
             os.close(self.fd)
             if error.errno in (errno.ENOTTY, errno.EINVAL):
-                raise not_a_camera(path, "it does not speak V4L2") from error
+                raise not_a_camera(self.path, "it does not speak V4L2") from error
             raise self.fault(error, "be asked what it is") from error
         self.wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        return self
 
     @property
     def capabilities(self) -> int:

@@ -71,7 +71,7 @@ def discover() -> list[FoundDevice]:
 
 def _examined(node: Path) -> FoundDevice | None:
     try:
-        device = Device(str(node))
+        device = Device(str(node)).open()
     except CameraError as error:
         if error.code == "not_a_camera":
             return None

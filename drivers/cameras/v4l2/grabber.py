@@ -56,7 +56,7 @@ class V4L2Grabber:
         """
         if self._device is not None:
             return
-        device = Device(self._options.device)
+        device = Device(self._options.device).open()
         try:
             wanted = v.CAP_VIDEO_CAPTURE | v.CAP_VIDEO_CAPTURE_MPLANE
             if not device.capabilities & wanted or not device.capabilities & v.CAP_STREAMING:

@@ -177,13 +177,12 @@ def run(args: argparse.Namespace) -> int:
     check_host(args.host, keys)
     check_tls(args.tls_cert, args.tls_key)
     logs.configure(args.log_level, args.log_format)
-    from server.base.memory import hurry, keep_memory_steady, settle
+    from server.base.memory import hurry, settle
     from server.base.priority import raise_file_limit, raise_service
     from server.config.rig_file import load_config
     from server.http.systemd import Notifier
-    from server.worker.executor import start_worker
+    from server.worker.embedded import start_worker
 
-    keep_memory_steady()
     hurry()
     config = load_config(args.config or default_config())
     if args.record is not None:

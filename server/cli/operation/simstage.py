@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--travel {args.travel} does not lie on both sides of home, 0.")
     controller = make_controller(args.driver, args.axes, travel_mm=tuple(args.travel))
     try:
-        server = ControllerServer(controller, "pty" if args.pty else "socket", port=args.port)
+        server = ControllerServer(controller, "pty" if args.pty else "socket", port=args.port).start()
     except OSError as error:
         raise InputError(
             f"Port {args.port} cannot be used: {error}.",

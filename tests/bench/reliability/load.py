@@ -342,6 +342,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write everything that was seen to this file")
     parser.add_argument("--page", action="store_true", help="write figures and plot into docs/reliability.md")
     args = parser.parse_args()
+    os.environ["MALLOC_ARENA_MAX"] = "2"  # as the systemd unit gives it to a service that runs for days
     set_priority(-15)  # the controller in here is the instrument: its clock must not wait
     with tempfile.TemporaryDirectory() as folder:
         load = measure(Path(folder), 60.0 * args.minutes)

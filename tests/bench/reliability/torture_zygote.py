@@ -41,19 +41,19 @@ def load() -> None:
 
 def fork_workers() -> None:
     """Let the services of this process fork their workers too, before they have threads and locks of their own."""
-    import server.worker.executor
+    import server.worker.embedded
 
     fork = multiprocessing.get_context("fork")
-    server.worker.executor.multiprocessing = types.SimpleNamespace(get_context=lambda _: fork)  # type: ignore[attr-defined]
-    start = server.worker.executor.start_worker
+    server.worker.embedded.multiprocessing = types.SimpleNamespace(get_context=lambda _: fork)  # type: ignore[attr-defined]
+    start = server.worker.embedded.start_worker
 
-    def started(*arguments: Any, **more: Any) -> server.worker.executor.ComputeWorker:
+    def started(*arguments: Any, **more: Any) -> server.worker.embedded.ComputeWorker:
         worker = start(*arguments, **more)
         while worker.pid is None:
             time.sleep(0.001)
         return worker
 
-    server.worker.executor.start_worker = started
+    server.worker.embedded.start_worker = started
 
 
 def serve(order: dict[str, Any]) -> None:

@@ -69,7 +69,7 @@ def test_a_lost_controller_stands_in_the_transcript_in_words(tmp_path: Path) -> 
 
 def test_old_lines_go_when_the_limit_is_reached(tmp_path: Path) -> None:
     record = tmp_path / "wire.txt"
-    transcript = Transcript(record, "a title", limit_bytes=4000)
+    transcript = Transcript(record, "a title", limit_bytes=4000).open()
 
     def write(n: int) -> None:
         for i in range(300):

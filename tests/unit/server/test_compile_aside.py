@@ -17,7 +17,7 @@ import numpy as np
 from core.compiling import told_when_compiling
 from core.matching.fit import fit_motion
 from core.matching.options import MatchOptions
-from matching_scene import paper_pair
+from tests.support.matching_scene import paper_pair
 
 told = []
 picture = np.random.default_rng(2).integers(0, 255, (80, 90)).astype(np.uint8)

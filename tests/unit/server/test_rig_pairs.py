@@ -144,6 +144,7 @@ def test_a_lost_camera_comes_back_with_its_settings(trigger: str, rate_hz: float
     back: list[str] = []
     with rig_bench(trigger, rate_hz=rate_hz, max_skew_ms=50.0) as bench:  # type: ignore[arg-type]
         watch = ReconnectWatch(bench.pair, back.append)
+        watch.start()
         try:
             bench.pair.configure("cam2", CameraSettings(exposure_ms=7.0, gain_db=3.0))
             bench.pair.shoot(1)

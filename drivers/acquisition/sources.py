@@ -1,4 +1,4 @@
-"""Where pairs come from: software triggers fired for each one, or two streams of frames matched all the time."""
+"""Sources of pairs: software triggers fired for each one, or two streams of frames matched all the time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from core.errors import CameraError
 from core.names import CAMERAS, CameraName
 from drivers.acquisition.counter_offset import AlignedPairing
 from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, TimePairing
+from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import Frame, FrameStatus
-from server.rig.unit import CameraUnit
 
 Check = Callable[[], None]
 Units = Mapping[CameraName, CameraUnit]
@@ -26,7 +26,10 @@ _KEPT_PAIRS = 8
 
 
 class PairSource(Protocol):
-    """Delivers pairs of frames that belong together."""
+    """Delivers pairs of frames that belong together, once it was started."""
+
+    def start(self) -> None:
+        """Begin to take the cameras' frames."""
 
     def next_pair(self, check: Check | None = None) -> Pair:
         """Return a pair exposed after this call; ``check`` may raise while it waits."""
@@ -55,6 +58,9 @@ class TriggeredPairs:
         self._max_skew_ms = max_skew_ms
         self._pairing: NumberPairing | None = None
         self._origin = 0
+
+    def start(self) -> None:
+        """Nothing to do: frames come when they are asked for."""
 
     def next_pair(self, check: Check | None = None) -> Pair:
         """See `PairSource`.
@@ -182,10 +188,13 @@ class StreamedPairs:
         self._pairs: deque[Pair] = deque(maxlen=_KEPT_PAIRS)
         self._changed = threading.Condition()
         self._ending = False
-        self._threads = [
-            threading.Thread(target=self._pump, args=(cam,), name=f"pairs {cam}", daemon=True) for cam in CAMERAS
-        ]
-        for thread in self._threads:
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Take both cameras' frames, each in a thread of its own."""
+        for cam in CAMERAS:
+            thread = threading.Thread(target=self._pump, args=(cam,), name=f"pairs {cam}", daemon=True)
+            self._threads.append(thread)
             thread.start()
 
     def _pump(self, cam: CameraName) -> None:
