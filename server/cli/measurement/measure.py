@@ -22,7 +22,6 @@ from core.settings import (
     STRAIN_TENSORS,
     STRAIN_WINDOW,
     SUBSET_PX,
-    NoiseRecord,
     StoredSettings,
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
@@ -228,7 +227,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "reference_update": args.reference_update,
             "strain": strain,
             "reference": steps[0].n,
-            "noise": None if noise is None else NoiseRecord(**noise.record()),
+            "noise": None if noise is None else noise.record(),
         }
     )
     return MeasureJob(

@@ -262,7 +262,7 @@ def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
     )
 
 
-def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
+def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, object]:
     return {
         "Conventions": "CF-1.11",
         "title": "displacement from the reference step" if moved else "shape of the reference step",

@@ -87,7 +87,7 @@ def test_shape_and_displacement_agree_with_the_truth(measured: Path, rig: SimRig
 def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> None:
     summary = json.loads((measured / "summary.json").read_text())
     assert [step["step"] for step in summary["steps"]] == [0, 1, 2]
-    assert summary["settings"]["roi"] == [50.0, 45.0, 180.0, 155.0]
+    assert summary["settings"]["region"]["rectangle"] == [50.0, 45.0, 180.0, 155.0]
     assert summary["calibration"]["source"] == "calibration_json"
     for step in summary["steps"]:
         assert step["points"] == 14 * 12
@@ -104,8 +104,8 @@ def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) 
     assert main([*arguments, "--crack", crack, "--hole", hole]) == 0
     with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
         settings = json.loads(data.attrs["settings"])
-        assert settings["cracks"] == [[[50.0, 100.2], [90.5, 101.7], [130.0, 96.4]]]
-        assert settings["holes"] == [[[140.0, 60.0], [165.0, 60.0], [165.0, 85.0], [140.0, 85.0]]]
+        assert settings["region"]["cracks"] == [[[50.0, 100.2], [90.5, 101.7], [130.0, 96.4]]]
+        assert settings["region"]["holes"] == [[[140.0, 60.0], [165.0, 60.0], [165.0, 85.0], [140.0, 85.0]]]
         inside = (data["x_px"] >= 140) & (data["x_px"] <= 165) & (data["y_px"] >= 60) & (data["y_px"] <= 85)
         assert (data["status"].values[inside.values] == 2).all()
         assert (data["status"].values[~inside.values] == 0).mean() > 0.97

@@ -52,7 +52,9 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
         check_same_cameras(calibration, service.tests.step(test_id, n).document.get("cameras"), f"Step {n}")
     mask = mask_of(body.region)
     noise = None if body.noise_id is None else service.noise.file(body.noise_id)
-    record = None if noise is None else NoiseRecord(noise_id=body.noise_id, **load_noise(noise).record())
+    record = (
+        None if noise is None else NoiseRecord.model_validate({"noise_id": body.noise_id, **load_noise(noise).record()})
+    )
     settings = body.stored(record)
     analysis_start.check_region(service, test_id, steps[0], settings, mask)
     if body.seeds_cam2 is not None:
