@@ -23,7 +23,7 @@ def current_settings(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a result's settings in today's form."""
     if "roi" not in document:
         return dict(document)
-    region = {"rectangle": document["roi"], **{name: document.get(name) for name in _CUTS_AND_MASK}}
+    region = {"rectangle": document["roi"], **{name: document[name] for name in _CUTS_AND_MASK if name in document}}
     settings = {name: value for name, value in document.items() if name not in ("roi", *_CUTS_AND_MASK)}
     return {**settings, "region": region}
 

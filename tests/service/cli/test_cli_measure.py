@@ -113,7 +113,7 @@ def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) 
         assert data["cut_y_px"].values[5:].tolist() == [100.2, 101.7, 96.4]
     cuts = read_field(tmp_path / "out" / "step_0000.nc").cuts
     assert cuts is not None
-    assert cuts.lines_px[1].tolist() == settings["cracks"][0]
+    assert cuts.lines_px[1].tolist() == settings["region"]["cracks"][0]
 
 
 @pytest.mark.parametrize(

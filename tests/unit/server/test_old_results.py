@@ -11,7 +11,8 @@ import pytest
 
 from server.formats.results.reading import read_attributes, read_field, read_measured
 from server.formats.results.settings import current_summary, stored_settings
-from server.results.steps import calibration_of, read_step
+from server.results.provenance import calibration_of
+from server.results.steps import read_step
 from tests.support.requirements import ROOT
 
 OLD = ROOT / "tests" / "support" / "old_results"
