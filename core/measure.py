@@ -13,8 +13,9 @@ import numpy as np
 
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
-from core.field.growth.run import Run, Seeds
-from core.field.growth.state import Image
+from core.field.growth.field import motion_field, shape_field
+from core.field.growth.seed import Seeds
+from core.field.growth.state import Image, prepare
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
@@ -133,9 +134,7 @@ def measure_shape(
     Cancelled
         If the token said so.
     """
-    run = Run(pair, image1, image2, None, None, grid, options, progress, cancel)
-    run.seed_shape(seeds)
-    return run.finish(seeds is None, None)
+    return shape_field(prepare(pair, (image1, image2), None, grid, options, progress=progress, cancel=cancel), seeds)
 
 
 def measure_motion(
@@ -192,7 +191,8 @@ def measure_motion(
         shape = measure_shape(
             pair, reference1, reference2, grid, options, seeds=seeds, progress=progress, cancel=cancel
         )
-    run = Run(pair, reference1, reference2, cur1, cur2, grid, options, progress, cancel)
+    images = (reference1, reference2), (cur1, cur2)
+    inputs = prepare(pair, *images, grid, options, progress=progress, cancel=cancel)
     for name, other in (("shape", shape), ("previous", previous)):
         if other is not None and (other.shape != grid.shape or not np.allclose(other.x_px, grid.x_px)):
             raise InputError(
@@ -200,5 +200,4 @@ def measure_motion(
                 code="grid_mismatch",
                 remedy="Measure every step on the same grid.",
             )
-    run.seed_motion(shape, previous, seeds)
-    return run.finish(seeds is None, shape)
+    return motion_field(inputs, shape, previous, seeds)

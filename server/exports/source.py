@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 from core.errors import InputError
 from server.formats.results.reading import read_attributes
 from server.results.staleness import stale_results
 from server.results.steps import Source
+from server.store.durable import known_json
 
 _RESULT = re.compile(r"step_\d{4,}\.nc")
 
@@ -56,35 +55,34 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
 def source_of(folder: Path, files: list[Path]) -> Source:
     """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
     heads = [read_attributes(path) for path in files]
-    stale = stale_results(files, heads)
-    about: dict[str, Any] = {"stale_reasons": stale} if stale else {}
+    stale, mask = stale_results(files, heads), _mask(folder, heads[0].get("settings"))
+    about: dict[str, object] = {}
     test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
-    document = _json(test / "test.json")
+    document = known_json(test / "test.json")
     reference = int(heads[-1].get("reference_step", heads[0].get("step", 0)))
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
-        about |= {
+        about = {
             "test_id": document.get("id", test.name),
             "test": document.get("name", ""),
             "calibration_id": document.get("calibration_id"),
             "specimen": document.get("specimen", ""),
         }
+        name, title = test.name, str(document.get("name") or test.name)
         if folder.parent.name == "analyses":
             about["analysis_id"] = folder.name
-        name = f"{test.name}_{folder.name}" if folder.parent.name == "analyses" else test.name
-        return Source(files, name, str(document.get("name") or test.name), image, about, _mask(folder, heads[0]))
+            name = f"{test.name}_{folder.name}"
+        return Source(files, name, title, image, about, mask, stale)
     said = str(heads[0].get("cam1_file", ""))
-    calibration = _json(folder / "summary.json").get("calibration")
+    calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
-    return Source(
-        files, folder.name or "results", folder.name, Path(said) if said else None, about, _mask(folder, heads[0])
-    )
+    return Source(files, folder.name or "results", folder.name, Path(said) if said else None, about, mask, stale)
 
 
-def _mask(folder: Path, head: dict[str, Any]) -> Path | None:
+def _mask(folder: Path, settings: object) -> Path | None:
     """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
-    named = head["settings"].get("mask") if isinstance(head.get("settings"), dict) else None
+    named = settings.get("mask") if isinstance(settings, dict) else None
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):
         if path.is_file():
             return path
@@ -114,11 +112,3 @@ def _of_test(test: Path, analysis: str | None) -> Path:
             remedy="Name one with --analysis, or give its folder.",
         )
     return there[0] if there else test
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

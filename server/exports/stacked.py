@@ -12,7 +12,8 @@ import numpy as np
 
 from server.formats.files import written_aside
 from server.formats.results.netcdf import library
-from server.results.steps import Source, StepResult, chosen, each, provenance, require_same_grid
+from server.results.provenance import provenance
+from server.results.steps import Source, StepResult, chosen, each, require_same_grid
 
 _NO_STATE = -1  # of an integer variable in a step that does not have it
 _COMMON = ("x_px", "y_px")

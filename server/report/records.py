@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field
 
@@ -79,7 +78,7 @@ class TestRecord(Record):
     name: str = ""
     specimen: str = ""
     notes: str = ""
-    facts: dict[str, Any] = Field(default={})
+    facts: dict[str, object] = Field(default={})
 
 
 class CalibrationFile(Record):

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
+from core.field.region.find_visible import with_sight
 from core.field.region.line_crossings import squared_distance
 from core.field.region.region import PointGrid
-from core.field.region.visibility import sight_of
 from core.matching.fit import fit_motion
 from core.matching.options import MatchOptions
 from core.measure import MeasureOptions, ReferencePair
@@ -165,7 +165,7 @@ def test_threads_change_no_digit() -> None:
 def test_points_away_from_the_line_are_the_same_to_the_digit() -> None:
     """From the same starts: what the kernels do for a point whose subset is whole does not know of the others."""
     grid = bench.grid(step_px=8.0, margin_px=36.0).with_cracks([LINES["straight"]])
-    sight = sight_of(grid, 21)
+    sight = with_sight(grid, 21).sight
     assert sight is not None
     xy = grid.xy_px.reshape(-1, 2)
     depth = bench.pair().cam1.cam_from_sys.apply(truth_of(xy))[:, 2]

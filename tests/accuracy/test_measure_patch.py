@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.field.growth.waves import Attempts, grow
+from core.field.growth.grow import Attempts, grow
 from core.field.points.fitter import PointFits
 from core.measure import MeasureOptions, measure_shape
 from core.status import PointStatus

@@ -1,8 +1,9 @@
-"""What one measurement of a field holds, and how its points grow and are checked, wherever they came from."""
+"""What one measurement of a field is made from, and what its stages hand on from one to the next."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,163 +11,78 @@ from numpy.typing import ArrayLike
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.checks.edges import clear_of_edges
-from core.field.checks.gates import apply_gates
-from core.field.checks.patch_choice import advise, choose_patch
-from core.field.checks.plane_error import plane_error
 from core.field.checks.residual_test import SigmaLimits
-from core.field.growth.waves import Attempts, fit_in_batches, grow
-from core.field.points.fitter import Fitter
+from core.field.growth.grow import Attempts
+from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage, different, refuse_stale, same_size
-from core.field.points.patch import UsedPatch, asked_for
+from core.field.points.patch import PatchChoice, UsedPatch, asked_for
 from core.field.points.result import Field
+from core.field.region.find_visible import with_sight
 from core.field.region.region import PointGrid, check_region
-from core.field.region.visibility import sight_of
+from core.field.region.repeats import repeats
+from core.field.region.visibility import Sight
 from core.field.settings import MeasureOptions
 from core.matching.image import ImageData
 from core.progress import CancelToken, Progress, no_progress
-from core.status import PointStatus
 
 Image = ArrayLike | ImageData | MeasureImage
 
 SAMPLE_FAR_PX = 3.0
 
 
-class Growing:
-    """Images and points of one computation; points that stand grow into others and are checked."""
+@dataclass(frozen=True, eq=False)
+class FieldInputs:
+    """Images, points and settings of one measurement; nothing of it changes while it runs.
 
-    def __init__(
-        self,
-        pair: StereoPair,
-        ref1: Image,
-        ref2: Image,
-        cur1: Image | None,
-        cur2: Image | None,
-        grid: PointGrid,
-        options: MeasureOptions | None,
-        progress: Progress | None,
-        cancel: CancelToken | None,
-    ) -> None:
-        self.options = options or MeasureOptions()
-        self.pair, self.grid, self.cancel = pair, grid, cancel
-        self.progress: Progress = progress or no_progress
-        self.ref1, self.ref2 = MeasureImage(ref1, "camera 1's image"), MeasureImage(ref2, "camera 2's image")
-        self.cur1 = None if cur1 is None else MeasureImage(cur1, "camera 1's image at t")
-        self.cur2 = None if cur2 is None else MeasureImage(cur2, "camera 2's image at t")
-        self.sight = sight_of(grid, self.options.subset_px)
-        if self.sight is not None:
-            self.grid = grid = replace(grid, allowed=grid.allowed & self.sight.enough)
-        self.fits_image = check_region(grid, image_shape=self.ref1.shape, subset_px=self.options.subset_px)
-        if self.cur1 is None or self.cur2 is None:
-            self.ref1.refuse_blank(grid.extent_px)
-            self.ref2.refuse_blank()
-            different(self.ref1, self.ref2)
-        else:
-            same_size(self.ref1, self.cur1)
-            same_size(self.ref2, self.cur2)
-            self.cur1.refuse_blank()
-            self.cur2.refuse_blank()
-            different(self.cur1, self.cur2)
-            refuse_stale(self.ref1, self.ref2, self.cur1, self.cur2)
-        self.blur = self.options.blur
-        if self.blur is not None:
-            self.fits_image = clear_of_edges(self.fits_image, grid, self.ref1.shape, self.options.subset_px, self.blur)
-        self.xy_px = grid.xy_px.reshape(-1, 2)
-        self.rays = pair.cam1.rays_cam(self.xy_px).xyz_mm
-        self.usable: Bool = self.fits_image.ravel() & np.isfinite(self.rays).all(axis=1)
-        kind, (noise1, noise2) = self.options.interpolation, self.options.noise
-        self.fitter = Fitter(
-            pair=pair,
-            ref1=self.ref1.prepared(kind, noise1, self.blur),
-            ref2=self.ref2.prepared(kind, noise2, self.blur),
-            cur1=None if self.cur1 is None else self.cur1.prepared(kind, noise1, self.blur),
-            cur2=None if self.cur2 is None else self.cur2.prepared(kind, noise2, self.blur),
-            options=self.options.match_options(),
-            least_zncc=self.options.least_zncc,
-            sight=self.sight,
-        )
-        asked = self.options.patch
-        plane: UsedPatch = "plane" if cur1 is None else self.fitter.options.patch
-        self.patch = asked_for("curved" if asked == "curved" else plane, asked)
-        self.points = self.fitter.empty(len(self.xy_px))
-        self.known_w: Float | None = None
-        self.hoped_for = self.usable  # where new seeds are worth their time
-        self.checked = False  # whether every point that stands went through the gates
-        self.attempts = Attempts.on(grid.shape, self.sight)
-        compared = None if self.blur is None else self.fitter.ref1
-        self.texture = self.ref1.subset_variance(self.xy_px, self.options.subset_px, compared)
-        if self.sight is not None:
-            pixels = self.ref1.pixels if compared is None else compared.pixels
-            self.texture = self.sight.correct_variance(self.texture, pixels)
+    Attributes
+    ----------
+    pair, options
+        Cameras and settings.
+    grid
+        The points, with what they see of their subsets.
+    ref1, ref2
+        Both cameras' images at the reference.
+    current
+        Both cameras' images at t; none of a shape.
+    matcher
+        The prepared images of all that is compared, with the patch that is tried first.
+    fits_image
+        (r, c) where a point is allowed and its subset lies in the image.
+    xy_px, rays
+        (n, 2) px, (n, 3) normalised: the points in camera 1's image.
+    texture
+        (n,) grey-level variance of the subsets.
+    usable
+        (n,) which points may be measured.
+    hoped_for
+        (n,) where new seeds are worth their time.
+    known_w
+        (n, k) the shape that was measured before, NaN where it has no point; None where none was.
+    progress, cancel
+        Reports and stop.
+    """
 
-    def _settle_patch(self) -> None:
-        """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
-        told = None
-        if self.fitter.terms == 3:
-            told = plane_error(
-                self.points,
-                shape=self.grid.shape,
-                rays=self.rays,
-                step_px=self.grid.step_px,
-                subset_px=self.options.subset_px,
-            )
-        if self.options.patch != "auto":
-            self.patch = advise(self.patch, told)
-        elif not self.patch.kept:
-            self.patch = choose_patch(self.fitter, self.points, self.xy_px, told)
-            if self.patch.patch == "curved":
-                self._refit_curved()
-                self._fill()
+    pair: StereoPair
+    grid: PointGrid
+    options: MeasureOptions
+    ref1: MeasureImage
+    ref2: MeasureImage
+    current: tuple[MeasureImage, ...]
+    matcher: Fitter
+    fits_image: Bool
+    xy_px: Float
+    rays: Float
+    texture: Float
+    usable: Bool
+    hoped_for: Bool
+    known_w: Float | None
+    progress: Progress
+    cancel: CancelToken | None
 
-    def _fill(self) -> None:
-        """Grow, check, and grow into what the checks emptied."""
-        for _ in range(3):
-            if self._grow() == 0 and self.checked:
-                break
-            self.check()
-
-    def keep_patch(self, previous: Field | None) -> None:
-        """Where a sequence went over to curved patches by itself, it stays with them."""
-        choice = None if previous is None or not previous.has_motion else previous.patch
-        if self.options.patch == "auto" and choice is not None and choice.patch == "curved":
-            self.patch = choice.for_next_step()
-
-    def _refit_curved(self) -> None:
-        """Measure the points that stand anew with curved patches; the others keep their status and are tried again."""
-        flat = self.points
-        index = np.flatnonzero(flat.ok)
-        self.fitter = self.fitter.curved()
-        self.points = self.fitter.empty(len(flat.status))
-        self.points.status[:] = flat.status
-        self._forget_attempts()
-        G = None if self.fitter.comparisons == 1 else flat.G[index]
-        fit_in_batches(
-            self.fitter, self.points, index, self.xy_px, flat.w[index], G, far_px=SAMPLE_FAR_PX, cancel=self.cancel
-        )
-        self.checked = False
-
-    def _unreached(self) -> float:
-        """Share of the usable points that nothing reached; those lost in an earlier step do not count again."""
-        untouched = self.hoped_for & (self.points.status == PointStatus.NOT_SEEDED)
-        return float(untouched.sum()) / max(int(self.usable.sum()), 1)
-
-    def _forget_attempts(self) -> None:
-        """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
-        self.attempts = Attempts.on(self.grid.shape, self.sight)
-        self.attempts.left[self.usable & ~self.hoped_for] = 1
-
-    def _grow(self) -> int:
-        added = grow(
-            self.fitter,
-            self.points,
-            attempts=self.attempts,
-            xy_px=self.xy_px,
-            rays=self.rays,
-            usable=self.usable,
-            progress=self.progress,
-            cancel=self.cancel,
-        )
-        self.checked = self.checked and added == 0
-        return added
+    @property
+    def sight(self) -> Sight | None:
+        """What the points see of their subsets; None: all of it."""
+        return self.grid.sight
 
     @property
     def sigma_limits(self) -> SigmaLimits:
@@ -174,16 +90,140 @@ class Growing:
         gates = self.options.gates
         return SigmaLimits(motion_px=gates.largest_sigma_px, depth_px=gates.largest_depth_sigma_px)
 
-    def check(self) -> None:
-        """Have every point that stands checked; those that fail are refused."""
-        apply_gates(
-            self.points,
-            pair=self.pair,
-            shape=self.grid.shape,
-            xy_px=self.xy_px,
-            rays=self.rays,
-            texture=self.texture,
-            options=self.options.gates,
-            sight=self.sight,
+    @cached_property
+    def repeating(self) -> Bool:
+        """(n,) where the texture repeats itself, so that no start may be put there."""
+        out = np.zeros(len(self.xy_px), bool)
+        out[self.usable] = repeats(self.ref1.pixels, self.xy_px[self.usable], subset_px=self.options.subset_px)
+        return out
+
+    def on_shape(self, shape: Field, previous: Field | None) -> FieldInputs:
+        """Return the inputs of a motion: the points that the shape has; those lost in the last step come second."""
+        usable = self.usable & shape.valid.ravel()
+        return replace(
+            self,
+            usable=usable,
+            hoped_for=usable if previous is None else usable & previous.valid.ravel(),
+            known_w=None if shape.starts is None else shape.starts.w.reshape(len(self.xy_px), -1),
         )
-        self.checked = True
+
+
+def prepare(
+    pair: StereoPair,
+    reference: tuple[Image, Image],
+    current: tuple[Image, Image] | None,
+    grid: PointGrid,
+    options: MeasureOptions | None,
+    *,
+    progress: Progress | None = None,
+    cancel: CancelToken | None = None,
+) -> FieldInputs:
+    """Check and prepare what a field is measured from: a shape, or with current images a motion.
+
+    Raises
+    ------
+    RegionError, ImageError
+        If region or images cannot be used.
+    """
+    options = options or MeasureOptions()
+    subset_px, kind, blur = options.subset_px, options.interpolation, options.blur
+    ref1, ref2 = (MeasureImage(reference[k], f"camera {k + 1}'s image") for k in (0, 1))
+    now = () if current is None else tuple(MeasureImage(current[k], f"camera {k + 1}'s image at t") for k in (0, 1))
+    grid = with_sight(grid, subset_px)
+    if grid.sight is not None:
+        grid = replace(grid, allowed=grid.allowed & grid.sight.enough)
+    fits_image = check_region(grid, image_shape=ref1.shape, subset_px=subset_px)
+    if now:
+        for before, after in zip((ref1, ref2), now, strict=True):
+            same_size(before, after)
+        for image in now:
+            image.refuse_blank()
+        different(*now)
+        refuse_stale(ref1, ref2, *now)
+    else:
+        ref1.refuse_blank(grid.extent_px)
+        ref2.refuse_blank()
+        different(ref1, ref2)
+    if blur is not None:
+        fits_image = clear_of_edges(fits_image, grid, ref1.shape, subset_px, blur)
+    xy_px = grid.xy_px.reshape(-1, 2)
+    rays = pair.cam1.rays_cam(xy_px).xyz_mm
+    usable: Bool = fits_image.ravel() & np.isfinite(rays).all(axis=1)
+    prepared = [
+        image.prepared(kind, noise, blur) for image, noise in zip((ref1, ref2, *now), 2 * options.noise, strict=False)
+    ]
+    matcher = Fitter(
+        pair=pair,
+        ref1=prepared[0],
+        ref2=prepared[1],
+        cur1=prepared[2] if now else None,
+        cur2=prepared[3] if now else None,
+        options=options.match_options(),
+        least_zncc=options.least_zncc,
+        sight=grid.sight,
+    )
+    compared = None if blur is None else matcher.ref1
+    texture = ref1.subset_variance(xy_px, subset_px, compared)
+    if grid.sight is not None:
+        texture = grid.sight.correct_variance(texture, ref1.pixels if compared is None else compared.pixels)
+    return FieldInputs(
+        pair=pair,
+        grid=grid,
+        options=options,
+        ref1=ref1,
+        ref2=ref2,
+        current=now,
+        matcher=matcher,
+        fits_image=fits_image,
+        xy_px=xy_px,
+        rays=rays,
+        texture=texture,
+        usable=usable,
+        hoped_for=usable,
+        known_w=None,
+        progress=progress or no_progress,
+        cancel=cancel,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class GrowthState:
+    """Where a measurement stands. A stage returns the state that it leaves; points and attempts it changes in place.
+
+    Attributes
+    ----------
+    fitter, patch
+        The matcher with the patch that the points are measured with, and why it is this one.
+    points
+        The n points as far as they are measured.
+    attempts
+        What growth has tried.
+    checked
+        Whether every point that stands went through the gates.
+    """
+
+    fitter: Fitter
+    patch: PatchChoice
+    points: PointFits
+    attempts: Attempts
+    checked: bool
+
+
+def begin(inputs: FieldInputs) -> GrowthState:
+    """Return the state in which no point stands."""
+    asked, matcher = inputs.options.patch, inputs.matcher
+    plane: UsedPatch = "plane" if matcher.comparisons == 1 else matcher.options.patch
+    return GrowthState(
+        fitter=matcher,
+        patch=asked_for("curved" if asked == "curved" else plane, asked),
+        points=matcher.empty(len(inputs.xy_px)),
+        attempts=fresh_attempts(inputs),
+        checked=False,
+    )
+
+
+def fresh_attempts(inputs: FieldInputs) -> Attempts:
+    """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
+    attempts = Attempts.on(inputs.grid.shape, inputs.sight)
+    attempts.left[inputs.usable & ~inputs.hoped_for] = 1
+    return attempts

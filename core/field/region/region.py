@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,9 @@ from numpy.typing import ArrayLike
 from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.region.cuts import Cuts
+
+if TYPE_CHECKING:
+    from core.field.region.visibility import Sight
 
 _MOST_POINTS = 20_000_000
 
@@ -33,6 +37,9 @@ class PointGrid:
         Lines over which nothing reaches, cracks and borders of holes; or None.
     white
         (rows, cols) of camera 1's image, True where the mask lets the surface be seen; None without a mask.
+    sight
+        What the points see of their subsets past cuts and mask, see :func:`core.field.region.find_visible.with_sight`;
+        None as long as it is not found, and where nothing is in the way.
     """
 
     x_px: Float
@@ -42,6 +49,7 @@ class PointGrid:
     extent_px: tuple[float, float, float, float]
     cuts: Cuts | None = None
     white: Bool | None = None
+    sight: Sight | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -149,7 +157,7 @@ class PointGrid:
 
     def _with_cuts(self, more: Cuts) -> PointGrid:
         lines = (*(self.cuts.lines_px if self.cuts else ()), *more.lines_px)
-        return replace(self, cuts=Cuts(lines) if lines else None)
+        return replace(self, cuts=Cuts(lines) if lines else None, sight=None)
 
     def within_mask(self, mask: ArrayLike) -> PointGrid:
         """Keep only the points whose centre lies on the white (non-zero) of a mask the size of camera 1's image.
@@ -164,7 +172,7 @@ class PointGrid:
         off = (col < 0) | (row < 0) | (col >= m.shape[1]) | (row >= m.shape[0])
         white = m[np.clip(row, 0, m.shape[0] - 1), np.clip(col, 0, m.shape[1] - 1)]
         both = m if self.white is None or self.white.shape != m.shape else m & self.white
-        return replace(self, allowed=self.allowed & (white | off), white=both)
+        return replace(self, allowed=self.allowed & (white | off), white=both, sight=None)
 
 
 def check_region(

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
+from core.field.region.find_visible import MARGIN_PX, patches_seen
 from core.field.region.region import PointGrid
-from core.field.region.visibility import MARGIN_PX, Sight, keep_sight, patches_seen, sight_of
+from core.field.region.visibility import Sight
 from core.matching.arguments import VisiblePixels
 
 _WIDEST = 4  # times a subset: what a leg's subset may cover of the first reference
@@ -74,21 +75,19 @@ def _keys(xy_px: Float) -> NDArray[np.int64]:
     return np.asarray(y * 1_000_003 + x)
 
 
-def carry_sight(leg_grid: PointGrid, grid: PointGrid, subset_px: int, place_px: Float, slopes_px: Float) -> None:
-    """Find what a leg's points see, and keep it with the leg's grid; nothing where nothing is in the way.
+def carry_sight(first: Sight, leg_grid: PointGrid, grid: PointGrid, place_px: Float, slopes_px: Float) -> LegSight:
+    """Return what a leg's points see.
 
     Parameters
     ----------
+    first
+        What they saw at the first reference.
     leg_grid, grid
         The leg's pixels and the first reference's points, (r, c) both.
-    subset_px
-        Width of the subset.
     place_px, slopes_px
         (n, 2) where camera 1 sees the points in the later image, (n, 2, 2) derivative of that image over the first.
     """
-    first = sight_of(grid, subset_px)
-    if first is None:
-        return
+    subset_px = first.subset_px
     has = np.flatnonzero(leg_grid.allowed)
     back = np.full(slopes_px.shape, np.nan)
     back[has] = np.linalg.inv(slopes_px[has])
@@ -116,7 +115,7 @@ def carry_sight(leg_grid: PointGrid, grid: PointGrid, subset_px: int, place_px: 
         of_point[index[cut]] = sum(map(len, kept)) + np.arange(int(cut.sum()), dtype=np.int32)
         kept.append(found[cut].reshape(-1, subset_px, subset_px).astype(np.uint8))
     patches = np.concatenate(kept) if kept else np.zeros((0, subset_px, subset_px), np.uint8)
-    sight = LegSight(
+    return LegSight(
         xy_px=pixel,
         shape=leg_grid.shape,
         step_px=leg_grid.step_px,
@@ -130,4 +129,3 @@ def carry_sight(leg_grid: PointGrid, grid: PointGrid, subset_px: int, place_px: 
         back=back[has],
         first_px=xy[has],
     )
-    keep_sight(leg_grid, subset_px, sight)

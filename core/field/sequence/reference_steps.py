@@ -10,25 +10,23 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
+from core.arrays import Bool
 from core.cameras.stereo import StereoPair
 from core.errors import MeasurementError, SeedError
-from core.field.checks.residual_test import judge
-from core.field.growth.run import Run, Seeds
-from core.field.growth.waves import Attempts, grow
-from core.field.points.assemble import assemble
-from core.field.points.fitter import Fitter, PointFits
+from core.field.growth.field import assemble_field, motion_field
+from core.field.growth.seed import Seeds
+from core.field.growth.state import FieldInputs, prepare
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field, References
 from core.field.reference_update import ReferenceUpdate
+from core.field.region.find_visible import with_sight
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals
+from core.field.sequence.lost_points import OLDER, find_again
 from core.field.sequence.propagated import HandedOn, pattern_share
-from core.field.sequence.segment import Leg, LegFitter, begin_leg, measure_leg
+from core.field.sequence.segment import Leg, begin_leg, measure_leg
 from core.field.settings import MeasureOptions
 from core.matching.fit import no_motion
 from core.matching.geometry import plane_from_angles
@@ -40,11 +38,7 @@ Pair = tuple[MeasureImage, MeasureImage]
 MAY_BE_LOST = 0.01  # of the points that a reference has: the share that checks may refuse with no fault of its own
 SIGMAS = 3.0  # a loss beyond that share is no chance
 BETTER_SIGMAS = 2.0  # and an update must be better by as much
-OLDER = 2  # references besides the current one that are tried for points it does not have
 _KEPT = OLDER + 1
-_BESIDE = 3  # points
-_CONTROLS = 64
-_FAR_PX = 1.0
 _BY_THE_MATCH = (
     PointStatus.NOT_SEEDED,
     PointStatus.NOT_CONVERGED,
@@ -92,7 +86,8 @@ class Updating:
         field_of: Callable[[int], Field],
         first: int = 0,
     ) -> None:
-        self._pair, self._reference, self._shape, self._grid, self._options = pair, reference, shape, grid, options
+        self._pair, self._reference, self._shape, self._options = pair, reference, shape, options
+        self._grid = with_sight(grid, options.subset_px)
         self._mode, self._first = mode, first
         self._images_of, self._field_of = images_of, field_of
         self._legs: OrderedDict[int, Leg] = OrderedDict()
@@ -151,9 +146,12 @@ class Updating:
         return self._by_leg(reference, step)
 
     def _total(self, step: _Step) -> Field:
-        run = Run(self._pair, *self._reference, *step.images, self._grid, self._options, step.progress, step.cancel)
-        run.seed_motion(self._shape, None if step.earlier is None else step.earlier.field, step.seeds)
-        return run.finish(step.seeds is None, self._shape)
+        inputs = self._inputs(self._reference, self._grid, step, step.progress)
+        previous = None if step.earlier is None else step.earlier.field
+        return motion_field(inputs, self._shape, previous, step.seeds)
+
+    def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
+        return prepare(self._pair, reference, step.images, grid, self._options, progress=progress, cancel=step.cancel)
 
     def _leg(self, step: int) -> Leg:
         """The leg that begins at a step; those last asked for are kept."""
@@ -206,7 +204,7 @@ class Updating:
     def _by_leg(self, reference: int, step: _Step) -> Field:
         assert step.earlier is not None
         leg = self._leg(reference)
-        run = measure_leg(
+        state = measure_leg(
             leg,
             *step.images,
             pair=self._pair,
@@ -217,84 +215,35 @@ class Updating:
             cancel=step.cancel,
         )
         n, subset = len(leg.has), self._options.subset_px
-        zncc = np.where(run.points.ok[:, None], run.points.zncc, np.nan)
+        zncc = np.where(state.points.ok[:, None], state.points.zncc, np.nan)
         share = pattern_share(zncc.reshape(*self._grid.shape, 3)).ravel()
-        points, handed = leg.total(run.points, np.arange(n), share, pair=self._pair, subset_px=subset)
+        points, handed = leg.total(state.points, np.arange(n), share, pair=self._pair, subset_px=subset)
         points.status[~leg.has] = leg.status[~leg.has]
         steps = leg.steps.copy()
-        # the first reference's own frame: all totals are told there
-        whole = Run(self._pair, *self._reference, *step.images, self._grid, self._options, None, step.cancel)
-        self._find_again(leg, points, handed, steps, whole, run, step)
-        field = assemble(
-            points, pair=self._pair, grid=whole.grid, fits_image=whole.fits_image, shape=self._shape, patch=run.patch
+        whole = self._inputs(
+            self._reference, self._grid, step
+        )  # the first reference's own frame: all totals are told there
+
+        def inputs_of(older: Leg) -> FieldInputs:
+            return whole if older.step == self._first else self._inputs((older.image1, older.image2), older.grid, step)
+
+        find_again(
+            leg,
+            points,
+            handed,
+            steps,
+            whole=whole,
+            shape=self._shape,
+            curved=state.fitter.terms == 6,
+            leg_of=self._leg,
+            inputs_of=inputs_of,
         )
+        field = assemble_field(whole, replace(state, points=points), self._shape)
         place = (*field.shape, 2, 2)
         references = References(
             reference, steps.reshape(field.shape), handed.noise.reshape(place), handed.pattern.reshape(place)
         )
         return replace(field, references=references)
-
-    def _find_again(
-        self, leg: Leg, points: PointFits, handed: HandedOn, steps: NDArray[np.int32], whole: Run, run: Run, step: _Step
-    ) -> None:
-        """Try points that the leg does not have against the newest reference that shows them, where a neighbour stands.
-
-        They were lost in an earlier step. What is found goes through the checks among all others.
-        """
-        standing = points.ok
-        missing = whole.usable & self._shape.valid.ravel() & ~leg.has & ~standing
-        values, counts = np.unique(steps[missing], return_counts=True)
-        for used in values[np.argsort(-counts)][:OLDER]:
-            older = self._leg(int(used))
-            usable = missing & (steps == used) & older.has
-            near = _beside(usable, standing & older.has, self._grid.shape)
-            if not near.any():
-                continue
-            matcher, texture = self._matcher(older, whole, run, step)
-            fitter = LegFitter(older, matcher, self._grid)
-            level = _level(fitter, points, np.flatnonzero(near), whole.xy_px)
-            if level is None:
-                continue
-            attempts = Attempts.on(self._grid.shape, whole.sight)
-            attempts.left[:] = usable
-            tried = points.take(np.arange(len(steps)))
-            grow(
-                fitter,
-                tried,
-                attempts=attempts,
-                xy_px=whole.xy_px,
-                rays=whole.rays,
-                usable=usable,
-                stage="again",
-                cancel=step.cancel,
-            )
-            # an older reference correlates less: by as much as the points beside do that stand in both
-            correlation = tried.zncc.copy()
-            found = usable & tried.ok
-            tried.zncc[found] = 1.0 - np.minimum((1.0 - tried.zncc[found]) * level, 1.0)
-            whole.points = tried
-            whole.check()
-            tried.zncc[:] = correlation
-            own = fitter.own
-            own.refuse(own.ok & ~(usable & tried.ok), PointStatus.NEIGHBOUR_MISMATCH)
-            judge(matcher, own, xy_px=older.pixel_px, texture=texture, limits=whole.sigma_limits, cancel=step.cancel)
-            tried.refuse(usable & tried.ok & ~own.ok, PointStatus.LOW_CORRELATION)
-            index = np.flatnonzero(usable)
-            points.put(index, tried.take(index))
-            good = np.flatnonzero(usable & own.ok)
-            fits = own.take(good)
-            totals, known = older.total(
-                fits, good, pattern_share(fits.zncc), pair=self._pair, subset_px=self._options.subset_px
-            )
-            points.put(good, totals)
-            handed.noise[good], handed.pattern[good] = known.noise, known.pattern
-
-    def _matcher(self, leg: Leg, whole: Run, run: Run, step: _Step) -> tuple[Fitter, Float]:
-        """The matcher of an older reference, with the patch of the current one, and the texture of its subsets."""
-        older = whole
-        if leg.step != self._first:
-            older = Run(self._pair, leg.image1, leg.image2, *step.images, leg.grid, self._options, None, step.cancel)
-        return older.fitter.curved() if run.fitter.terms == 6 else older.fitter, older.texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,31 +255,6 @@ class _Step:
     seeds: Seeds | None
     progress: Progress | None
     cancel: CancelToken | None
-
-
-def _beside(missing: Bool, standing: Bool, shape: tuple[int, int]) -> Bool:
-    """Return the standing points (n,) within a few steps of missing ones."""
-    disc = np.ones((2 * _BESIDE + 1, 2 * _BESIDE + 1), np.uint8)
-    about = cv2.dilate(missing.reshape(shape).astype(np.uint8), disc)
-    return np.asarray(standing & (np.asarray(about).ravel() > 0))
-
-
-def _level(fitter: LegFitter, points: PointFits, near: NDArray[np.intp], xy_px: Float) -> Float | None:
-    """Return (3,) how much 1 - zncc is now over what it is against an older reference, at points that stand in both.
-
-    None where fewer than half of them match the older reference: it then serves for nothing.
-    """
-    sample = near[np.linspace(0, len(near) - 1, min(len(near), _CONTROLS)).astype(int)]
-    fits = fitter.fit(xy_px[sample], points.w[sample], points.G[sample])
-    fits.refuse(
-        fits.ok & fitter.far_from_start(xy_px[sample], fits, points.w[sample], points.G[sample], _FAR_PX),
-        PointStatus.NOT_CONVERGED,
-    )
-    ok = fits.ok
-    if 2 * ok.sum() < len(sample):
-        return None
-    now, then = (np.maximum(1.0 - z, 1e-9) for z in (points.zncc[sample[ok]], fits.zncc[ok]))
-    return np.asarray(np.median(now, axis=0) / np.median(then, axis=0))
 
 
 def _lost(field: Field, before: Bool) -> Bool:

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import RegionError, SeedError
-from core.field.growth.run import Run
+from core.field.growth.field import fill_field
+from core.field.growth.patch import keep_patch
+from core.field.growth.seed import seed_motion
+from core.field.growth.state import GrowthState, begin, prepare
 from core.field.points.assemble import assemble
-from core.field.points.fitter import Fitter, PointFits
+from core.field.points.fitter import PointFits
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.points.starts import Starts, move_matrix, move_w
@@ -151,7 +154,7 @@ def begin_leg(
     image1, image2
         The step's images.
     pair, grid, options
-        The cameras, and points and settings of the first reference.
+        The cameras, and points (with what they see) and settings of the first reference.
     slope_share
         As in :func:`handed_on`.
     first
@@ -201,7 +204,8 @@ def begin_leg(
         step_px=max(grid.step_px * spread, 1.0),
         extent_px=(0.0, 0.0, cols - 1.0, rows - 1.0),
     )
-    carry_sight(leg_grid, grid, subset, place, slopes_px)
+    if grid.sight is not None:
+        leg_grid = replace(leg_grid, sight=carry_sight(grid.sight, leg_grid, grid, place, slopes_px))
     points = PointFits.empty(n, 1)
     points.w[has] = move_w(plane, -offset)[has]
     points.status[has] = PointStatus.OK
@@ -238,8 +242,8 @@ def measure_leg(
     previous_step: int,
     progress: Progress | None,
     cancel: CancelToken | None,
-) -> Run:
-    """Match a pair of images against a leg's reference; return the run, its points about the leg's pixels.
+) -> GrowthState:
+    """Match a pair of images against a leg's reference; return where that ends, with points about the leg's pixels.
 
     ``previous`` is the field of the step before, in totals; it gives the start unless it is the leg's own reference.
 
@@ -248,14 +252,15 @@ def measure_leg(
     SeedError, ImageError, Cancelled
         As :func:`core.measure.measure_motion`.
     """
+    images = (leg.image1, leg.image2), (cur1, cur2)
     try:
-        run = Run(pair, leg.image1, leg.image2, cur1, cur2, leg.grid, options, progress, cancel)
+        inputs = prepare(pair, *images, leg.grid, options, progress=progress, cancel=cancel)
     except RegionError as error:
         raise SeedError(f"no point of step {leg.step} is left to match a later step against.") from error
-    run.keep_patch(previous)
-    run.seed_motion(leg.shape, None if previous_step == leg.step else _started(leg, previous, pair), None)
-    run.fill_field(True, leg.shape)
-    return run
+    start = None if previous_step == leg.step else _started(leg, previous, pair)
+    inputs = inputs.on_shape(leg.shape, start)
+    state = seed_motion(inputs, keep_patch(inputs, begin(inputs), previous), leg.shape, start, None)
+    return fill_field(inputs, state, automatic=True, shape=leg.shape)
 
 
 def _started(leg: Leg, previous: Field, pair: StereoPair) -> Field:
@@ -274,37 +279,3 @@ def _started(leg: Leg, previous: Field, pair: StereoPair) -> Field:
         patch=previous.patch,
         starts=Starts(w.reshape(*shape, 3), G.reshape(*shape, 3, 3)),
     )
-
-
-class LegFitter:
-    """Fits points of the first reference's grid against a leg's images: totals in, totals out.
-
-    Attributes
-    ----------
-    own
-        (n,) the points as they were fitted last, about the leg's pixels.
-    """
-
-    def __init__(self, leg: Leg, fitter: Fitter, grid: PointGrid) -> None:
-        self._leg, self._fitter, self._subset_px = leg, fitter, fitter.options.subset_px
-        self.own = fitter.empty(grid.x_px.size)
-        self._corner, self._step_px, self._cols = grid.xy_px[0, 0], grid.step_px, grid.shape[1]
-        self.comparisons, self.terms = 3, 3
-
-    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
-        """Refine totals from totals; as :meth:`core.field.points.fitter.Fitter.fit`."""
-        if G is None:
-            raise ValueError("a leg measures motions")
-        leg = self._leg
-        col, row = np.rint((xy_px - self._corner) / self._step_px).astype(np.int64).T
-        index = row * self._cols + col
-        start = Totals(leg.totals.rays[index], leg.totals.w[index], leg.totals.G[index])
-        own = since(start, Totals(start.rays, w, G), leg.plane[index])
-        offset = leg.offset[index]
-        fits = self._fitter.fit(leg.pixel_px[index], move_w(leg.plane[index], -offset), move_matrix(own, -offset))
-        self.own.put(index, fits)
-        return leg.total(fits, index, np.zeros(len(index)), pair=self._fitter.pair, subset_px=self._subset_px)[0]
-
-    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
-        """As :meth:`core.field.points.fitter.Fitter.far_from_start`."""
-        return self._fitter.far_from_start(xy_px, fits, w, G, limit_px)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.field.points.result import Field
+from server.demo.calibration import ViewResiduals
 from server.demo.compare import MotionComparison
 from server.exports.mesh import triangles_of
 from sim.plate import CircularPlate
@@ -97,7 +98,7 @@ def region(out: Path, image: NDArray[Any], roi_px: Sequence[float], result: Fiel
     return {"region.png": "camera 1's reference image with the region and its points"}
 
 
-def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
+def calibration(out: Path, views: Sequence[ViewResiduals]) -> dict[str, str]:
     """Draw the residuals of every view as arrows.
 
     Parameters
@@ -105,20 +106,20 @@ def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
     out
         Folder.
     views
-        Each with ``title``, ``held_out``, ``rbe_px``, ``xy_px`` (n, 2) and ``residual_px`` (n, 2).
+        What each found.
     """
     if not views:
         return {}
     columns = min(4, len(views))
     rows = -(-len(views) // columns)
-    scale = max(colour_limit(np.concatenate([np.ravel(v["residual_px"]) for v in views])), 1e-6)
+    scale = max(colour_limit(np.concatenate([np.ravel(v.residual_px) for v in views])), 1e-6)
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(rows, columns, figsize=(3.0 * columns, 3.1 * rows), squeeze=False)
         for axis in axes.flat[len(views) :]:
             axis.set_visible(False)
         for axis, view in zip(axes.flat, views, strict=False):
-            xy, residual = np.asarray(view["xy_px"]), np.asarray(view["residual_px"])
-            colour = "#c04020" if view["held_out"] else "#2060a0"
+            xy, residual = view.xy_px, view.residual_px
+            colour = "#c04020" if view.held_out else "#2060a0"
             arrows = axis.quiver(
                 xy[:, 0],
                 xy[:, 1],
@@ -132,7 +133,7 @@ def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
             )
             axis.invert_yaxis()
             axis.set_aspect("equal")
-            axis.set_title(f"{view['title']}\nRBE {view['rbe_px']:.4f} px{', held out' if view['held_out'] else ''}")
+            axis.set_title(f"{view.title}\nRBE {view.rbe_px:.4f} px{', held out' if view.held_out else ''}")
             axis.tick_params(labelsize=7)
         figure.suptitle("Grid intersections: measured minus projected (blue fitted, red held out)", x=0.02, ha="left")
         figure.tight_layout()

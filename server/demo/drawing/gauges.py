@@ -18,6 +18,8 @@ from server.demo.experiments.panel_strain import PanelStrain
 from server.demo.experiments.steel_motion import Moved
 from server.demo.strain import MICRO
 
+_DOTS: Any = {"fmt": ".", "markersize": 5, "elinewidth": 0.8}
+
 
 def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm: float) -> dict[str, str]:
     """Draw the opening along the crack and over the load, and by how much the lips part out of the plane."""
@@ -27,12 +29,11 @@ def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm:
         x = found.place * half_crack_mm
         inner = np.linspace(-half_crack_mm, half_crack_mm, 201)
         for k, (load, colour) in enumerate(zip(loads_kn, colours, strict=True)):
-            bars: dict[str, Any] = {"fmt": ".", "color": colour, "markersize": 5, "elinewidth": 0.8}
-            axes[0].errorbar(x, 1e3 * found.found[k], 1e3 * found.sigma[k], label=f"{load:g} kN", **bars)
+            axes[0].errorbar(x, 1e3 * found.found[k], 1e3 * found.sigma[k], label=f"{load:g} kN", color=colour, **_DOTS)
             _true(axes[0], x, 1e3 * found.true[k], half_crack_mm)
             lens = np.max(found.lips[k]) * np.sqrt(1.0 - (inner / half_crack_mm) ** 2)  # one place is the middle
             axes[0].plot(inner, 1e3 * lens, "--", color="0.5", linewidth=0.7)
-            axes[2].errorbar(x, 1e3 * found.parting[k], 1e3 * found.parting_sigma[k], **bars)
+            axes[2].errorbar(x, 1e3 * found.parting[k], 1e3 * found.parting_sigma[k], color=colour, **_DOTS)
             _true(axes[2], x, 1e3 * found.parting_true[k], half_crack_mm)
         axes[0].set_ylabel("elongation over the crack, um")
         axes[0].set_title(

@@ -259,7 +259,7 @@ def _put_measured(dataset: Any, measured: Field) -> None:
     )
 
 
-def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
+def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, object]:
     return {
         "Conventions": "CF-1.11",
         "title": "displacement from the reference step" if moved else "shape of the reference step",

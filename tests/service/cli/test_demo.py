@@ -23,6 +23,7 @@ from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from server.cli import main
 from server.cli.operation import demo
+from server.demo.calibration import ViewResiduals
 from server.demo.client import ServiceClient
 from server.demo.compare import compare_motion, compare_shape, heights_mm, pixel_mm
 from server.demo.drawing import fields as pictures
@@ -134,7 +135,7 @@ def test_pictures_are_drawn_for_fields_with_holes(tmp_path: Path) -> None:
     found |= pictures.panel(tmp_path, image, (46, 30, 466, 450), [one], [comparison], [1.0])
     heights = heights_mm(one.xyz_mm, one.valid)
     found |= pictures.steel(tmp_path, image, (46, 30, 466, 450), one, heights, heights)
-    view = {"title": "cam1", "held_out": True, "rbe_px": 0.1, "xy_px": np.ones((3, 2)), "residual_px": np.ones((3, 2))}
+    view = ViewResiduals("cam1", True, np.ones((3, 2)), np.ones((3, 2)))
     found |= pictures.calibration(tmp_path, [view])
     assert len(found) == 9
     for name in found:

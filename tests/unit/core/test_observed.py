@@ -11,7 +11,9 @@ import pytest
 from core.errors import InputError
 from core.field.checks.gates import GateOptions
 from core.field.checks.residual_test import SigmaLimits, judge
-from core.field.growth.run import Run
+from core.field.growth.field import fill_field
+from core.field.growth.seed import seed_shape
+from core.field.growth.state import begin, prepare
 from core.field.points.starts import depth_per_px
 from core.matching import MatchOptions, fit_motion, fit_shape
 from core.matching.kernels.observed import blocks_across
@@ -224,36 +226,34 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
 def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(depth_said, offset_said, kept):
     """Residuals show this many times the variances that the fit tells; of noise there is too much for any point."""
     reference, _ = pictures()
-    run = Run(bench.pair(), *reference, None, None, bench.grid(step_px=6.0), OPTIONS, None, None)
-    run.seed_shape(None)
-    run.finish(True, None)
-    points, count = run.points, int(run.points.ok.sum())
+    inputs = prepare(bench.pair(), reference, None, bench.grid(step_px=6.0), OPTIONS)
+    state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)
+    points, count = state.points, int(state.points.ok.sum())
     sd = np.sqrt(np.diagonal(points.covariance[points.ok], axis1=1, axis2=2)).mean(0)
-    depth_px = max(sd[1], (sd[0] / depth_per_px(run.pair, run.rays, points.w[:, 0])).mean())
+    depth_px = max(sd[1], (sd[0] / depth_per_px(inputs.pair, inputs.rays, points.w[:, 0])).mean())
     said = np.array([depth_said, offset_said])
     points.covariance /= np.sqrt(said[:, None] * said)
     limits = SigmaLimits(motion_px=0.1, depth_px=0.75 * depth_px)
-    judged = judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits)
+    judged = judge(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
     assert judged.factor == pytest.approx(said, rel=0.25)
     assert points.ok.sum() / count == pytest.approx(kept, abs=0.05)
 
 
 def test_matches_without_any_residual_stay_as_they_are():
     reference, _ = pictures()
-    run = Run(bench.pair(), *reference, None, None, bench.grid(step_px=12.0), OPTIONS, None, None)
-    run.seed_shape(None)
-    run.finish(True, None)
-    points = run.points
+    inputs = prepare(bench.pair(), reference, None, bench.grid(step_px=12.0), OPTIONS)
+    state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)
+    points = state.points
     points.covariance[:2] = 0.0
     before = points.covariance.copy()
     limits = SigmaLimits(motion_px=0.1, depth_px=0.05)
-    judged = judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits)
+    judged = judge(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
     assert judged.refused == 0
     assert np.isfinite(judged.factor).all()
     np.testing.assert_array_equal(points.covariance[:2], before[:2])
     assert np.isfinite(points.covariance[points.ok]).all()
     points.covariance[:] = 0.0
-    assert judge(run.fitter, points, xy_px=run.xy_px, texture=run.texture, limits=limits).refused == 0
+    assert judge(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits).refused == 0
     assert not points.covariance.any()
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from core.errors import RegionError
-from core.field.growth.waves import Attempts
+from core.field.growth.grow import Attempts
 from core.field.region.cuts import Cuts, crosses
+from core.field.region.find_visible import MARGIN_PX, with_sight
 from core.field.region.region import PointGrid, check_region
-from core.field.region.visibility import LEAST_SHARE, MARGIN_PX, sight_of
+from core.field.region.visibility import LEAST_SHARE
 from core.field.seeding.local_fit import robust_local_fits
 from core.field.seeding.seeds import as_seeds, nearest_points
 
@@ -30,7 +31,7 @@ def distance(p: tuple[float, float], a: tuple[float, float], b: tuple[float, flo
 
 def test_a_point_sees_what_the_definition_says() -> None:
     grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, step_px=7.0).with_cracks([KINKED])
-    sight = sight_of(grid, SUBSET)
+    sight = with_sight(grid, SUBSET).sight
     assert sight is not None
     half = SUBSET // 2
     cut = 0
@@ -53,7 +54,7 @@ def test_a_point_sees_what_the_definition_says() -> None:
 
 def test_neighbours_that_a_crack_parts_are_none() -> None:
     grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, step_px=7.0).with_cracks([KINKED])
-    sight = sight_of(grid, SUBSET)
+    sight = with_sight(grid, SUBSET).sight
     assert sight is not None
     rows, cols = grid.shape
     xy = grid.xy_px
@@ -82,7 +83,7 @@ def test_a_mask_is_seen_along_its_white_alone() -> None:
     mask[10:110, 10:110] = True
     mask[10:90, 55:63] = False
     grid = PointGrid.rectangle(20.0, 20.0, 100.0, 104.0, step_px=6.0).within_mask(mask)
-    sight = sight_of(grid, SUBSET)
+    sight = with_sight(grid, SUBSET).sight
     assert sight is not None
     col = int(np.flatnonzero(grid.x_px[0] == 50.0)[0])
     row = int(np.flatnonzero(grid.y_px[:, 0] == 44.0)[0])
@@ -100,7 +101,7 @@ def test_a_hole_takes_its_points_and_what_lies_behind_it() -> None:
     np.testing.assert_array_equal(grid.allowed, ~inside)
     assert grid.cuts is not None
     assert grid.cuts.lines_px[0].tolist() == [*map(list, hole), list(hole[0])]
-    sight = sight_of(grid, SUBSET)
+    sight = with_sight(grid, SUBSET).sight
     assert sight is not None
     beside = sight.visible.patches[sight.visible.of_point[6 * grid.shape[1] + 3]].astype(bool)  # (35, 50)
     assert beside[:, : 40 - 2 - 25 + 1].all()
@@ -109,7 +110,7 @@ def test_a_hole_takes_its_points_and_what_lies_behind_it() -> None:
 
 def test_a_point_on_the_line_sees_nothing() -> None:
     grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0).with_cracks([[(20.0, 50.0), (80.0, 50.0)]])
-    sight = sight_of(grid, SUBSET)
+    sight = with_sight(grid, SUBSET).sight
     assert sight is not None
     np.testing.assert_array_equal(sight.enough, grid.y_px != 50.0)
     assert (sight.share[sight.enough.ravel()] > LEAST_SHARE).all()
@@ -135,7 +136,7 @@ def test_local_fits_hear_only_what_they_see() -> None:
 def test_a_click_starts_on_its_own_side() -> None:
     """The nearest point lies just over the line."""
     grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=10.0).with_cracks([[(15.0, 49.0), (85.0, 49.0)]])
-    sight = sight_of(grid, SUBSET)
+    sight = with_sight(grid, SUBSET).sight
     xy, usable = grid.xy_px.reshape(-1, 2), np.ones(49, bool)
     seeds = as_seeds([(50.0, 48.0), (50.0, 51.0)])
     found = nearest_points(seeds, xy, usable, reach_px=20.0, sight=sight)
@@ -153,4 +154,4 @@ def test_a_crack_outside_the_image_is_refused() -> None:
 
 
 def test_without_anything_in_the_way_there_is_nothing_to_see() -> None:
-    assert sight_of(PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0), SUBSET) is None
+    assert with_sight(PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0), SUBSET).sight is None

@@ -1,0 +1,68 @@
+"""Checks of the points that stand, and growth into what they emptied."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from core.field.checks.edges import refuse_near_edges
+from core.field.checks.gates import apply_gates
+from core.field.checks.residual_test import judge
+from core.field.checks.unreached import mark_outside
+from core.field.growth.grow import grow
+from core.field.growth.state import FieldInputs, GrowthState
+from core.field.points.fitter import PointFits
+
+
+def check(inputs: FieldInputs, points: PointFits) -> None:
+    """Have every point that stands checked; those that fail are refused."""
+    apply_gates(
+        points,
+        pair=inputs.pair,
+        shape=inputs.grid.shape,
+        xy_px=inputs.xy_px,
+        rays=inputs.rays,
+        texture=inputs.texture,
+        options=inputs.options.gates,
+        sight=inputs.sight,
+    )
+
+
+def grow_field(inputs: FieldInputs, state: GrowthState) -> int:
+    """Grow from the points that stand over all usable ones; returns how many were added."""
+    return grow(
+        state.fitter,
+        state.points,
+        attempts=state.attempts,
+        xy_px=inputs.xy_px,
+        rays=inputs.rays,
+        usable=inputs.usable,
+        progress=inputs.progress,
+        cancel=inputs.cancel,
+    )
+
+
+def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
+    """Grow, check, and grow into what the checks emptied."""
+    for _ in range(3):
+        if grow_field(inputs, state) == 0 and state.checked:
+            break
+        check(inputs, state.points)
+        state = replace(state, checked=True)
+    return state
+
+
+def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
+    """Correct the covariances by the residuals; refuse what scatters too far, and what the edges' blur reaches."""
+    judged = judge(
+        state.fitter,
+        state.points,
+        xy_px=inputs.xy_px,
+        texture=inputs.texture,
+        limits=inputs.sigma_limits,
+        cancel=inputs.cancel,
+    )
+    if judged.refused:
+        check(inputs, state.points)  # points that stand alone now have nothing to confirm them
+    mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
+    if inputs.options.blur is not None:
+        refuse_near_edges(state.fitter, state.points, inputs.xy_px, inputs.options.blur)

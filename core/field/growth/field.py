@@ -1,0 +1,90 @@
+"""One measurement of a field, stage by stage: seed, grow, check, choose the patch, grow again, assemble."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from core.errors import SeedError
+from core.field.checks.unreached import mark_outside
+from core.field.growth.check import check, check_residuals, fill, grow_field
+from core.field.growth.patch import choose_patch, refit_curved
+from core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
+from core.field.growth.state import FieldInputs, GrowthState, begin, fresh_attempts
+from core.field.points.assemble import assemble
+from core.field.points.result import Field
+from core.status import PointStatus
+
+_LEFT_OVER = 0.02
+
+
+def shape_field(inputs: FieldInputs, seeds: Seeds | None) -> Field:
+    """Measure a shape from given seeds, or from those that are found."""
+    state = seed_shape(inputs, begin(inputs), seeds)
+    return assemble_field(inputs, fill_field(inputs, state, automatic=seeds is None), None)
+
+
+def motion_field(inputs: FieldInputs, shape: Field, previous: Field | None, seeds: Seeds | None) -> Field:
+    """Measure a motion from the last step, from given seeds, or from those that are found."""
+    inputs = inputs.on_shape(shape, previous)
+    state = seed_motion(inputs, begin(inputs), shape, previous, seeds)
+    return assemble_field(inputs, fill_field(inputs, state, automatic=seeds is None, shape=shape), shape)
+
+
+def assemble_field(inputs: FieldInputs, state: GrowthState, shape: Field | None) -> Field:
+    """Return the field in the system frame."""
+    return assemble(
+        state.points, pair=inputs.pair, grid=inputs.grid, fits_image=inputs.fits_image, shape=shape, patch=state.patch
+    )
+
+
+def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shape: Field | None = None) -> GrowthState:
+    """Grow from the seeds, check, choose the patch, grow into the gaps, and check again.
+
+    Parameters
+    ----------
+    inputs, state
+        With seeds.
+    automatic
+        Whether seeds may be looked for where growth did not come.
+    shape
+        Of a motion: what was measured before.
+
+    Raises
+    ------
+    SeedError
+        If no point stands.
+    """
+    if not state.points.ok.any() and (shape is None or shape.valid.any()):
+        raise _no_seed(state.fitter.ref1.noise_variance)
+    if state.patch.patch == "curved" and state.fitter.terms == 3:
+        state = refit_curved(inputs, state)
+    state = choose_patch(inputs, fill(inputs, state))
+    if not state.checked:  # measured anew
+        state = fill(inputs, state)
+    mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
+    if automatic and _unreached(inputs, state) > _LEFT_OVER and match_seeds(inputs, state) > 0:
+        state = replace(state, attempts=fresh_attempts(inputs))
+        grow_field(inputs, state)
+        check(inputs, state.points)
+    check_residuals(inputs, state)
+    inputs.progress("done", int(state.points.ok.sum()), int(inputs.usable.sum()))
+    return state
+
+
+def _unreached(inputs: FieldInputs, state: GrowthState) -> float:
+    """Share of the usable points that nothing reached; those lost in an earlier step do not count again."""
+    untouched = inputs.hoped_for & (state.points.status == PointStatus.NOT_SEEDED)
+    return float(untouched.sum()) / max(int(inputs.usable.sum()), 1)
+
+
+def _no_seed(noise_variance: float | None) -> SeedError:
+    remedy = (
+        "Check that both cameras see the same textured surface and that the calibration belongs to these "
+        "images, or give a seed point. A texture that repeats itself gives no start."
+    )
+    if noise_variance is not None:
+        remedy += (
+            f" The noise model says {noise_variance**0.5:.1f} grey levels: with too much, texture passes for noise; "
+            "try without it."
+        )
+    return SeedError("no point of the region could be matched between the images from any start.", remedy=remedy)

@@ -1,0 +1,231 @@
+"""The first points of a field: from the last step, from given seeds, from feature matches, or from searches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Bool, Float
+from core.errors import SeedError
+from core.field.growth.check import check
+from core.field.growth.grow import fit_in_batches
+from core.field.growth.patch import keep_patch, refit_curved
+from core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState
+from core.field.points.features import Box
+from core.field.points.fitter import PointFits
+from core.field.points.images import features_of
+from core.field.points.result import Field
+from core.field.points.starts import Starts
+from core.field.seeding.predict import predict
+from core.field.seeding.scattered_matches import (
+    ScatteredMotion,
+    ScatteredShape,
+    scattered_motion,
+    scattered_shape,
+    stretched_motion,
+)
+from core.field.seeding.search_region import box_around, scales, seen_by_camera2
+from core.field.seeding.seeds import (
+    Seed,
+    as_seeds,
+    nearest_points,
+    refine,
+    search_motion,
+    seeds_from_matches,
+    spread,
+    sweep_shape,
+    swept_places,
+)
+from core.matching.fit import no_motion
+from core.progress import raise_if_cancelled
+from core.status import PointStatus
+
+Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
+
+_FEWEST_MATCHES = 12
+_SAMPLE_SHARE = 0.7
+_REACH_STEPS = 2.0
+_SEARCHED = 6  # places
+
+
+def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> GrowthState:
+    """Put the first points of a shape down."""
+    inputs.progress("seeds", 0, 1)
+    if seeds is not None:
+        _given_shape(inputs, state, as_seeds(seeds))
+    elif match_seeds(inputs, state) == 0:
+        _swept_shape(inputs, state)
+    inputs.progress("seeds", 1, 1)
+    return state
+
+
+def seed_motion(
+    inputs: FieldInputs, state: GrowthState, shape: Field, previous: Field | None, seeds: Seeds | None
+) -> GrowthState:
+    """Put the first points of a motion down: from the last step, where they stood, or from matches."""
+    if not inputs.usable.any():
+        return state
+    state = keep_patch(inputs, state, previous)
+    left = ~inputs.usable & inputs.fits_image.ravel()
+    state.points.status[left] = shape.status.ravel()[left]
+    if previous is not None and previous.starts is not None and previous.starts.G is not None:
+        n = len(inputs.xy_px)
+        w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
+        if _sample_holds(inputs, state, w, G):
+            return _go_on(inputs, state, w, G)
+    inputs.progress("seeds", 0, 1)
+    if seeds is not None:
+        _given_motion(inputs, state, as_seeds(seeds))
+    elif not _stayed(inputs, state):
+        state.points.status[inputs.usable] = PointStatus.NOT_SEEDED
+        if match_seeds(inputs, state) == 0:
+            _searched_motion(inputs, state)
+    inputs.progress("seeds", 1, 1)
+    return state
+
+
+def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
+    """Seeds from feature matches; how many stand. Large images are reduced, less and less until seeds are found."""
+    if not (inputs.usable & ~inputs.repeating).any():
+        return 0
+    reach = inputs.options.subset_px + inputs.grid.step_px
+    shape1, shape2 = inputs.ref1.shape, inputs.ref2.shape
+    box1 = box_around(inputs.xy_px[inputs.usable], reach, shape1)
+    box2 = seen_by_camera2(inputs.pair, box1, shape2)
+    for scale in scales((box1, box2), (shape1, shape2)):
+        found = _match_seeds_at(inputs, state, scale, box1, box2)
+        if found > 0:
+            return found
+    return 0
+
+
+def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: Box, box2: Box) -> int:
+    raise_if_cancelled(inputs.cancel)
+    known_w, pair = inputs.known_w, inputs.pair
+    wanted = [(inputs.ref1, box1)]
+    if known_w is None:
+        wanted.append((inputs.ref2, box2))
+    wanted += [(image, (0, 0, *image.shape[::-1])) for image in inputs.current]
+    features = features_of(wanted, scale)
+    raise_if_cancelled(inputs.cancel)
+    shape = ScatteredShape.empty() if known_w is not None else scattered_shape(pair, *features[:2])
+    motion = shape_now = None
+    if inputs.current:
+        motion = scattered_motion(features[0], features[-2])
+        raise_if_cancelled(inputs.cancel)
+        shape_now = scattered_shape(pair, *features[-2:])
+    elif len(shape.xy_px) < _FEWEST_MATCHES:
+        return 0
+
+    def put_seeds(motion: ScatteredMotion | None) -> int:
+        usable = inputs.usable & ~inputs.repeating
+        return seeds_from_matches(
+            state.fitter, state.points, inputs.xy_px, usable, shape, motion, shape_now, inputs.known_w
+        )
+
+    found = put_seeds(motion)
+    if found == 0 and motion is not None:
+        # a strain or tilt too large for the features' own tolerance
+        found = put_seeds(stretched_motion(inputs.ref1.pixels, box1, features[-2], scale))
+    return found
+
+
+def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> GrowthState:
+    """Start all points from the last step's values; a sample of them stands already, fitted from these very starts."""
+    if state.patch.patch == "curved":
+        state = refit_curved(inputs, state)
+    points = state.points
+    sample = np.flatnonzero(points.ok)
+    if points.G.shape == G.shape:
+        G = predict(inputs.pair, inputs.xy_px, G, sample, points.w[sample], points.G[sample])
+    known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+    index = np.flatnonzero(inputs.usable & known & ~points.ok)
+    inputs.progress("previous", 0, len(index))
+    fit_in_batches(
+        state.fitter, points, index, inputs.xy_px, w[index], G[index], far_px=SAMPLE_FAR_PX, cancel=inputs.cancel
+    )
+    check(inputs, points)
+    return replace(state, checked=True)
+
+
+def _stayed(inputs: FieldInputs, state: GrowthState) -> bool:
+    """Try whether the surface is about where it was: not on a texture that looks alike a period further on."""
+    w = inputs.known_w
+    return w is not None and _sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)
+
+
+def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False) -> bool:
+    """Fit a spread sample from given starts; True (and the sample stands as seeds) if nearly all of it matches."""
+    usable = inputs.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+    if once_only:
+        usable &= ~inputs.repeating
+    if usable.sum() < 1:
+        return False
+    index = spread(inputs.xy_px, usable, np.zeros(len(usable)))[0]
+    fits = refine(state.fitter, inputs.xy_px[index], Starts(w[index], G[index]), far_px=SAMPLE_FAR_PX)
+    if fits.ok.mean() < _SAMPLE_SHARE:
+        return False
+    good = np.flatnonzero(fits.ok)
+    state.points.put(index[good], fits.take(good))
+    return True
+
+
+def _swept_shape(inputs: FieldInputs, state: GrowthState) -> None:
+    for i in swept_places(inputs.xy_px, _rather_whole(inputs, inputs.usable & ~inputs.repeating)):
+        raise_if_cancelled(inputs.cancel)
+        _put_one(state, i, sweep_shape(state.fitter, inputs.ref1.pixels, inputs.ref2.pixels, inputs.xy_px[i]))
+
+
+def _searched_motion(inputs: FieldInputs, state: GrowthState) -> None:
+    if inputs.known_w is None:
+        return
+    known = inputs.usable & np.isfinite(inputs.known_w).all(axis=1) & ~inputs.repeating
+    for i in swept_places(inputs.xy_px, _rather_whole(inputs, known))[:_SEARCHED]:
+        raise_if_cancelled(inputs.cancel)
+        _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
+
+
+def _put_one(state: GrowthState, i: np.intp, found: PointFits) -> None:
+    if found.ok[0]:
+        state.points.put(np.array([i]), found)
+
+
+def _rather_whole(inputs: FieldInputs, usable: Bool) -> Bool:
+    """Of usable points those that see all of their subset, where there are any: searches compare whole squares."""
+    whole = usable if inputs.sight is None else usable & inputs.sight.whole
+    return whole if whole.any() else usable
+
+
+def _nearest(inputs: FieldInputs, seeds: tuple[Seed, ...], usable: Bool) -> NDArray[np.intp]:
+    reach = max(_REACH_STEPS * inputs.grid.step_px, float(inputs.options.subset_px))
+    return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, sight=inputs.sight)
+
+
+def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
+    for seed, i in zip(seeds, _nearest(inputs, seeds, inputs.usable), strict=True):
+        raise_if_cancelled(inputs.cancel)
+        found = PointFits.empty(1, 1)
+        if seed.xy2_px is not None:
+            p = inputs.pair.triangulate(np.array([seed.xy_px]), np.array([seed.xy2_px]))
+            depth = inputs.pair.cam1.cam_from_sys.apply(p.xyz_mm)[:, 2]
+            start = Starts(np.array([[1.0 / depth[0], 0.0, 0.0]]))
+            found = refine(state.fitter.shape_only(), inputs.xy_px[i : i + 1], start)
+        if not found.ok[0]:
+            found = sweep_shape(state.fitter, inputs.ref1.pixels, inputs.ref2.pixels, inputs.xy_px[i])
+        _put_one(state, i, found)
+
+
+def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
+    if inputs.known_w is None:
+        raise SeedError("a seed for a motion needs the shape that was measured before it.")
+    index = _nearest(inputs, seeds, inputs.usable & np.isfinite(inputs.known_w).all(axis=1))
+    for i in index[~inputs.repeating[index]]:
+        raise_if_cancelled(inputs.cancel)
+        _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
+    if not state.points.ok.any():
+        # turned or stretched too far for a template: matches about the seed know how
+        match_seeds(inputs, state)
