@@ -27,20 +27,16 @@ from server.workflows.service import Service
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
 
 
-@router.post(
-    "",
-    summary="Measure a test's steps",
-    response_model=AnalysisAccepted,
-    status_code=202,
-    responses=errors(404, 409, 422, 503, 507),
-)
+@router.post("", summary="Measure a test's steps", status_code=202, responses=errors(404, 409, 422, 503, 507))
 def create_analysis(
     service: ServiceDep, test_id: TestId, body: AnalysisRequest, key: KeyHeader = None
-) -> dict[str, Any]:
+) -> AnalysisAccepted:
     """Compute shape and displacement over a region; results can be read step by step as they are finished."""
     request = mark(f"tests/{test_id}/analyses", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, lambda: _begin(service, test_id, body, request))
-    return {"job": service.jobs.document(made["job_id"]), "analysis_id": made["analysis_id"]}
+    return AnalysisAccepted.model_validate(
+        {"job": service.jobs.document(made["job_id"]), "analysis_id": made["analysis_id"]}
+    )
 
 
 def _begin(service: Service, test_id: str, body: AnalysisRequest, request: RequestMark) -> dict[str, Any]:
@@ -132,24 +128,23 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> dict[str
     }
 
 
-@router.get("", summary="A test's analyses, oldest first", response_model=AnalysisList, responses=errors(404, 422))
-def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> dict[str, Any]:
+@router.get("", summary="A test's analyses, oldest first", responses=errors(404, 422))
+def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> AnalysisList:
     """Return the analyses of a test."""
     service.tests.path(test_id)
     analyses_page = page.of(service.catalog.entries("analysis", test_id), lambda a: str(a["id"]))
-    return {"analyses": analyses_page, "next_cursor": page.next_cursor}
+    return AnalysisList.model_validate({"analyses": analyses_page, "next_cursor": page.next_cursor})
 
 
-@router.get("/{analysis_id:plain_id}", summary="One analysis", response_model=AnalysisReply, responses=errors(404))
-def get_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> dict[str, Any]:
+@router.get("/{analysis_id:plain_id}", summary="One analysis", responses=errors(404))
+def get_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> AnalysisReply:
     """Return settings, state and summary."""
-    return analysis_reply(service, test_id, analysis_id)
+    return AnalysisReply.model_validate(analysis_reply(service, test_id, analysis_id))
 
 
 @router.post(
     "/{analysis_id}:continue",
     summary="Go on with an analysis that stopped",
-    response_model=AnalysisAccepted,
     status_code=202,
     responses=errors(404, 409, 422, 503, 507),
 )
@@ -159,7 +154,7 @@ def continue_analysis(
     analysis_id: AnalysisId,
     body: ContinueRequest | None = None,
     key: KeyHeader = None,
-) -> dict[str, Any]:
+) -> AnalysisAccepted:
     """Measure what an interrupted, cancelled or failed analysis has not measured yet, in a new job.
 
     Finished steps are kept, and the others are measured from them as they would have been: the results are the same as
@@ -175,19 +170,18 @@ def continue_analysis(
         return {"analysis_id": analysis_id, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return {"job": service.jobs.document(made["job_id"]), "analysis_id": analysis_id}
+    return AnalysisAccepted.model_validate({"job": service.jobs.document(made["job_id"]), "analysis_id": analysis_id})
 
 
 @router.post(
     "/{analysis_id}:finish",
     summary="Let an analysis that follows its test come to its end",
-    response_model=AnalysisAccepted,
     status_code=202,
     responses=errors(404, 409),
 )
-def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> dict[str, Any]:
+def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> AnalysisAccepted:
     """Measure the steps that have landed so far, then end the job; cancelling it instead ends it at once."""
     service.tests.analysis_path(test_id, analysis_id)
     runs = service.tests.analysis_jobs(test_id, analysis_id)
     job_id = runs[-1]["job_id"] if runs else ""
-    return {"job": service.jobs.finish(job_id), "analysis_id": analysis_id}
+    return AnalysisAccepted.model_validate({"job": service.jobs.finish(job_id), "analysis_id": analysis_id})

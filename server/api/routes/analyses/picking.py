@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter
 from pydantic import Field, StringConstraints
@@ -95,10 +95,9 @@ class SeedsReply(Reply):
 @router.post(
     "/steps/{n}/texture",
     summary="Whether a region's texture carries subsets of a size",
-    response_model=TextureReply,
     responses=errors(404, 409, 422),
 )
-def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> dict[str, Any]:
+def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
     """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""
     if body.subset_px % 2 == 0:
         raise InputError(
@@ -116,13 +115,13 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
     if noise is None and body.noise_id is not None:
         model = load_noise(service.noise.file(body.noise_id)).models[0]
         noise = None if model is None else math.sqrt(float(model.variance(float(pixels.mean()))))
-    return asdict(texture_verdict(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise))
+    return TextureReply.model_validate(
+        asdict(texture_verdict(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise))
+    )
 
 
-@router.post(
-    "/seeds:check", summary="Where camera 2 may see a seed", response_model=SeedsReply, responses=errors(404, 409, 422)
-)
-def check_seed_places(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> dict[str, Any]:
+@router.post("/seeds:check", summary="Where camera 2 may see a seed", responses=errors(404, 409, 422))
+def check_seed_places(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> SeedsReply:
     """Return each seed's epipolar line in camera 2, and how far the place named there lies from it."""
     two = [None] * len(body.seeds) if body.seeds_cam2 is None else body.seeds_cam2
     if len(two) != len(body.seeds):
@@ -135,9 +134,11 @@ def check_seed_places(service: ServiceDep, test_id: TestId, body: SeedsRequest) 
     rows, cols = read_image(service.tests.step(test_id, body.reference).cam2).shape
     seeds = [Seed(one, other) for one, other in zip(body.seeds, two, strict=True)]
     off = distances_px(pair, seeds)
-    return {
-        "seeds": [
-            {"line_px": epipolar_line(pair, s.xy_px, (cols, rows)), "distance_px": None if d != d else float(d)}
-            for s, d in zip(seeds, off, strict=True)
-        ]
-    }
+    return SeedsReply.model_validate(
+        {
+            "seeds": [
+                {"line_px": epipolar_line(pair, s.xy_px, (cols, rows)), "distance_px": None if d != d else float(d)}
+                for s, d in zip(seeds, off, strict=True)
+            ]
+        }
+    )

@@ -96,14 +96,15 @@ def _json(document: dict[str, Any], headers: dict[str, str] | None = None) -> Re
 @router.get(
     "/steps/{n}/fields",
     summary="The variables of one step",
-    response_model=FieldList,
     response_model_exclude_none=True,
     responses=errors(404, 422),
 )
-def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> dict[str, Any]:
+def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
     path = service.tests.result_file(test_id, analysis_id, n)
-    return {"fields": [asdict(v) for v in list_variables(path)], "cuts_px": read_cut_pieces(path)}
+    return FieldList.model_validate(
+        {"fields": [asdict(v) for v in list_variables(path)], "cuts_px": read_cut_pieces(path)}
+    )
 
 
 @router.get(
@@ -138,9 +139,7 @@ def get_places(
     )
 
 
-@router.get(
-    "/probe", summary="The measurement point nearest to a pixel", response_model=ProbeReply, responses=errors(404, 422)
-)
+@router.get("/probe", summary="The measurement point nearest to a pixel", responses=errors(404, 422))
 def get_probe(
     service: ServiceDep,
     test_id: TestId,
@@ -148,6 +147,8 @@ def get_probe(
     x_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Column in camera 1's image.")],
     y_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Row in camera 1's image.")],
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")] = 0,
-) -> dict[str, Any]:
+) -> ProbeReply:
     """Return every number of the nearest point."""
-    return {"step": step, **asdict(probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px))}
+    return ProbeReply.model_validate(
+        {"step": step, **asdict(probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px))}
+    )

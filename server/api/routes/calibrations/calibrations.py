@@ -47,16 +47,10 @@ from server.workflows.calibration_sequence import (
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 
-@router.post(
-    "",
-    summary="Calibrate the pair",
-    response_model=CalibrationAccepted,
-    status_code=202,
-    responses=errors(409, 422, 503, 507),
-)
+@router.post("", summary="Calibrate the pair", status_code=202, responses=errors(409, 422, 503, 507))
 def create_calibration(
     service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None
-) -> dict[str, Any]:
+) -> CalibrationAccepted:
     """Move both cameras through the plan before the grid, then fit; the rig file gives what the body leaves out."""
     body = body or CalibrationRequest.model_validate({})
     usual = service.config.calibration
@@ -101,31 +95,29 @@ def create_calibration(
         return {**made, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return {"job": service.jobs.document(made["job_id"]), "calibration_id": made["calibration_id"]}
+    return CalibrationAccepted.model_validate(
+        {"job": service.jobs.document(made["job_id"]), "calibration_id": made["calibration_id"]}
+    )
 
 
-@router.get("", summary="Calibrations, oldest first", response_model=CalibrationList, responses=errors(422))
-def list_calibrations(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+@router.get("", summary="Calibrations, oldest first", responses=errors(422))
+def list_calibrations(service: ServiceDep, page: PageDep) -> CalibrationList:
     """Return every calibration that was begun, with its state and verdict."""
     calibrations = page.of(service.catalog.entries("calibration"), lambda c: str(c["id"]))
-    return {"calibrations": calibrations, "next_cursor": page.next_cursor}
+    return CalibrationList.model_validate({"calibrations": calibrations, "next_cursor": page.next_cursor})
 
 
-@router.get("/{calibration_id}", summary="One calibration", response_model=CalibrationReply, responses=errors(404, 409))
-def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> dict[str, Any]:
+@router.get("/{calibration_id}", summary="One calibration", responses=errors(404, 409))
+def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> CalibrationReply:
     """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it.
 
     One that failed its verdict has what was refused in the same places, to be looked at; `state` stays `failed`.
     """
-    return tagged(response, service.calibrations.read(calibration_id))
+    return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id)))
 
 
 @router.post(
-    ":import",
-    summary="Import a calibration made elsewhere",
-    response_model=CalibrationReply,
-    status_code=201,
-    responses=errors(409, 413, 422, 507),
+    ":import", summary="Import a calibration made elsewhere", status_code=201, responses=errors(409, 413, 422, 507)
 )
 def import_calibration(
     service: ServiceDep,
@@ -135,7 +127,7 @@ def import_calibration(
     ],
     label: Annotated[Label, Form(description="Free text.")] = "",
     key: KeyHeader = None,
-) -> dict[str, Any]:
+) -> CalibrationReply:
     """Store another program's stereo calibration, or one of another data folder, to measure imported steps with.
 
     `plan.check` says what both cameras make of points that both see (epipolar residual), and what to doubt.
@@ -154,7 +146,7 @@ def import_calibration(
         return {"calibration_id": calibration_id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return service.calibrations.read(made["calibration_id"])
+    return CalibrationReply.model_validate(service.calibrations.read(made["calibration_id"]))
 
 
 def complete(service: ServiceDep, calibration_id: str) -> FilePath:
@@ -180,22 +172,16 @@ def complete(service: ServiceDep, calibration_id: str) -> FilePath:
 @router.get(
     "/{calibration_id}/views",
     summary="Views that were taken",
-    response_model=ViewList,
     response_model_exclude_unset=True,
     responses=errors(404, 409),
 )
-def list_views(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+def list_views(service: ServiceDep, calibration_id: CalibrationId) -> ViewList:
     """Return camera, role, read-back dZ and checksum of every view; empty until all are taken."""
-    return {"views": service.calibrations.read(calibration_id)["taken"] or []}
+    return ViewList.model_validate({"views": service.calibrations.read(calibration_id)["taken"] or []})
 
 
-@router.get(
-    "/{calibration_id}/residuals",
-    summary="Residuals of every view",
-    response_model=ResidualsReply,
-    responses=errors(404, 409),
-)
-def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[str, Any]:
+@router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))
+def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> ResidualsReply:
     """Return, for each view, where every intersection was found and by how much the model misses it.
 
     A calibration that failed its verdict has them too: they tell what was wrong.
@@ -206,7 +192,7 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> dict[st
     path /= "residuals.nc"
     if not path.is_file():
         raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
-    return {"views": [asdict(view) for view in read_residuals(path)]}
+    return ResidualsReply.model_validate({"views": [asdict(view) for view in read_residuals(path)]})
 
 
 @router.get(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
@@ -63,11 +63,8 @@ def export_calibration(service: ServiceDep, calibration_id: CalibrationId, forma
 
 
 @router.get(
-    "/export/report",
-    summary="What a calibration loses in another program's form",
-    response_model=ConversionReply,
-    responses=errors(404, 409, 422),
+    "/export/report", summary="What a calibration loses in another program's form", responses=errors(404, 409, 422)
 )
-def report_conversion(service: ServiceDep, calibration_id: CalibrationId, format: Form) -> dict[str, Any]:  # noqa: A002
+def report_conversion(service: ServiceDep, calibration_id: CalibrationId, format: Form) -> ConversionReply:  # noqa: A002
     """Return the residual of each lens' fit, and what the written file makes of points that both cameras see."""
-    return asdict(_converted(service, calibration_id, format).report)
+    return ConversionReply.model_validate(asdict(_converted(service, calibration_id, format).report))

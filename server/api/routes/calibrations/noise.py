@@ -21,14 +21,8 @@ router = APIRouter(prefix="/noise", tags=["noise"])
 NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurement.")]
 
 
-@router.post(
-    "",
-    summary="Measure both cameras' noise",
-    response_model=NoiseAccepted,
-    status_code=202,
-    responses=errors(409, 422, 503, 507),
-)
-def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: KeyHeader = None) -> dict[str, Any]:
+@router.post("", summary="Measure both cameras' noise", status_code=202, responses=errors(409, 422, 503, 507))
+def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: KeyHeader = None) -> NoiseAccepted:
     """Take frames of what stands still before the cameras, as they are set now; fit variance against grey level."""
     body = body or NoiseRequest.model_validate({})
     request = mark("noise", key, body)
@@ -61,23 +55,23 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
         return {**made, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return {"job": service.jobs.document(made["job_id"]), "noise_id": made["noise_id"]}
+    return NoiseAccepted.model_validate({"job": service.jobs.document(made["job_id"]), "noise_id": made["noise_id"]})
 
 
-@router.get("", summary="Noise measurements, oldest first", response_model=NoiseList, responses=errors(422))
-def list_noise(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+@router.get("", summary="Noise measurements, oldest first", responses=errors(422))
+def list_noise(service: ServiceDep, page: PageDep) -> NoiseList:
     """Return every noise measurement that was begun, with its state."""
     found = []
     for noise_id in page.of(service.noise.ids(), str):
         with contextlib.suppress(FileFormatError):  # what is damaged says so when it is asked for
             found.append(_shown(service.noise.read(noise_id)))
-    return {"noise": found, "next_cursor": page.next_cursor}
+    return NoiseList.model_validate({"noise": found, "next_cursor": page.next_cursor})
 
 
-@router.get("/{noise_id}", summary="One noise measurement", response_model=NoiseReply, responses=errors(404, 409))
-def get_noise(service: ServiceDep, noise_id: NoiseId) -> dict[str, Any]:
+@router.get("/{noise_id}", summary="One noise measurement", responses=errors(404, 409))
+def get_noise(service: ServiceDep, noise_id: NoiseId) -> NoiseReply:
     """Return plan, state and, once complete, both cameras' models."""
-    return _shown(service.noise.read(noise_id))
+    return NoiseReply.model_validate(_shown(service.noise.read(noise_id)))
 
 
 @router.get(

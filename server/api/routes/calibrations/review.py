@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter, Request, Response
 
 from server.api.models import CalibrationReply
@@ -17,13 +15,8 @@ from server.workflows.calibration_sequence import CalibrationPlan
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 
-@router.post(
-    ":expect",
-    summary="What a plan may be expected to leave uncertain",
-    response_model=ExpectReply,
-    responses=errors(409, 422, 503),
-)
-def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> dict[str, Any]:
+@router.post(":expect", summary="What a plan may be expected to leave uncertain", responses=errors(409, 422, 503))
+def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> ExpectReply:
     """Predict each parameter's standard deviation, and what they do to points; nothing moves, nothing is kept.
 
     The rig file's nominal cameras look at the target; the adjustment's own derivatives there give the covariance.
@@ -36,14 +29,11 @@ def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -
         frames=usual.frames,
         localiser=body.localiser or usual.localiser,
     )
-    return calibration_review.expectation(service, plan, body.noise_px, body.roll_deg)
+    return ExpectReply.model_validate(calibration_review.expectation(service, plan, body.noise_px, body.roll_deg))
 
 
 @router.put(
-    "/{calibration_id}/judgement",
-    summary="Accept or discard a calibration",
-    response_model=CalibrationReply,
-    responses=errors(404, 409, 412, 422, 507),
+    "/{calibration_id}/judgement", summary="Accept or discard a calibration", responses=errors(404, 409, 412, 422, 507)
 )
 def put_judgement(
     service: ServiceDep,
@@ -52,7 +42,7 @@ def put_judgement(
     body: JudgementRequest,
     response: Response,
     if_match: IfMatch = None,
-) -> dict[str, Any]:
+) -> CalibrationReply:
     """Keep a decision: tests that name `accepted` take the newest accepted; none can be made with a discarded one.
 
     If-Match, with the ETag of the calibration, refuses if somebody else decided meanwhile.
@@ -63,4 +53,4 @@ def put_judgement(
             now = etag_of(service.calibrations.read(calibration_id))
             require_match(if_match, now, f"calibration {calibration_id}")
         calibration_review.decide(service, calibration_id, body.decision, body.note, person_name(request))
-    return tagged(response, service.calibrations.read(calibration_id))
+    return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id)))

@@ -38,25 +38,14 @@ router = APIRouter(tags=["rig"])
 _BOUNDARY = "frame"
 
 
-@router.get(
-    "/rig",
-    summary="The rig: cameras, stage, target, who holds it",
-    response_model=RigReply,
-    response_model_exclude_unset=True,
-)
-def get_rig(service: ServiceDep) -> dict[str, Any]:
+@router.get("/rig", summary="The rig: cameras, stage, target, who holds it", response_model_exclude_unset=True)
+def get_rig(service: ServiceDep) -> RigReply:
     """Return everything a client wants to know before it does anything."""
-    return service.rig.describe()
+    return RigReply.model_validate(service.rig.describe())
 
 
-@router.post(
-    "/rig/reconnect",
-    summary="Open cameras and stage again",
-    response_model=Accepted,
-    status_code=202,
-    responses=errors(409, 503, 507),
-)
-def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
+@router.post("/rig/reconnect", summary="Open cameras and stage again", status_code=202, responses=errors(409, 503, 507))
+def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
     """Close and open every device; settings are pushed and read back."""
 
     def run(job: Job) -> dict[str, Any]:
@@ -72,57 +61,45 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> dict[str, Any]:
 
     request = mark("reconnect", key, None)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return {"job": service.jobs.document(made["job_id"])}
+    return Accepted.model_validate({"job": service.jobs.document(made["job_id"])})
 
 
 @router.put(
     "/sim/scene",
     summary="Choose what a simulated rig sees",
-    response_model=SceneReply,
     response_model_exclude_unset=True,
     responses=errors(409, 422, 503),
 )
-def put_scene(service: ServiceDep, body: SceneRequest) -> dict[str, Any]:
+def put_scene(service: ServiceDep, body: SceneRequest) -> SceneReply:
     """Put the grid, a plate, a panel ... before the cameras; only on simulated rigs."""
     with service.gate.hold("a change of the scene"):
         scene = service.rig.set_scene(body.scene, load=body.load, **body.params)
     service.hub.publish("scene", scene)
-    return scene
+    return SceneReply.model_validate(scene)
 
 
-@router.get("/cameras", summary="Both cameras", response_model=CamerasReply, response_model_exclude_unset=True)
-def get_cameras(service: ServiceDep) -> dict[str, Any]:
+@router.get("/cameras", summary="Both cameras", response_model_exclude_unset=True)
+def get_cameras(service: ServiceDep) -> CamerasReply:
     """Return nominal data, the devices' own descriptions and their settings."""
-    return {"cameras": [service.rig.describe_camera(cam) for cam in CAMERAS]}
+    return CamerasReply.model_validate({"cameras": [service.rig.describe_camera(cam) for cam in CAMERAS]})
 
 
-@router.get(
-    "/cameras/{cam}",
-    summary="One camera",
-    response_model=CameraReply,
-    response_model_exclude_unset=True,
-    responses=errors(422),
-)
-def get_camera(service: ServiceDep, cam: Camera, response: Response) -> dict[str, Any]:
+@router.get("/cameras/{cam}", summary="One camera", response_model_exclude_unset=True, responses=errors(422))
+def get_camera(service: ServiceDep, cam: Camera, response: Response) -> CameraReply:
     """Return nominal data, the device's own description and its settings."""
-    return tagged(response, service.rig.describe_camera(cam))
+    return CameraReply.model_validate(tagged(response, service.rig.describe_camera(cam)))
 
 
-@router.patch(
-    "/cameras/{cam}",
-    summary="Change a camera's settings",
-    response_model=CameraSet,
-    responses=errors(409, 412, 422, 503),
-)
+@router.patch("/cameras/{cam}", summary="Change a camera's settings", responses=errors(409, 412, 422, 503))
 def patch_camera(
     service: ServiceDep, cam: Camera, body: SettingsPatch, response: Response, if_match: IfMatch = None
-) -> dict[str, Any]:
+) -> CameraSet:
     """Set what is given; the answer holds every setting as read back. If-Match refuses if others changed them."""
     with service.gate.hold(f"new settings of {cam}"):
         require_match(if_match, etag_of(service.rig.describe_camera(cam)), f"the settings of {cam}", required=False)
         taken = service.rig.configure(cam, CameraSettings(**body.model_dump()))
         response.headers["ETag"] = etag_of(service.rig.describe_camera(cam))
-    return {"name": cam, "settings": asdict(taken)}
+    return CameraSet.model_validate({"name": cam, "settings": asdict(taken)})
 
 
 @router.get(
@@ -152,23 +129,24 @@ def get_frame(
 @router.get(
     "/cameras/{cam}/stats",
     summary="What became of a camera's frames, and the newest one's quality",
-    response_model=CameraStats,
     responses=errors(409, 422, 503),
 )
-def get_stats(service: ServiceDep, cam: Camera) -> dict[str, Any]:
+def get_stats(service: ServiceDep, cam: Camera) -> CameraStats:
     """Return counters, mean grey level, saturation, texture, focus and histogram."""
     frame = service.rig.pair.live(cam, max_age_s=0.2)
     shift = max(frame.bit_depth - 8, 0)
     histogram = np.bincount((frame.pixels >> shift).ravel().astype(np.uint8), minlength=256)
-    return {
-        "name": cam,
-        "frames": service.rig.pair.units[cam].counters(),
-        "driver": service.rig.pair.units[cam].statistics(),
-        "pairs": service.rig.pair.account(),
-        "sequence": frame.sequence,
-        "quality": image_quality(frame.pixels, frame.bit_depth).as_dict(),
-        "histogram": histogram.tolist(),
-    }
+    return CameraStats.model_validate(
+        {
+            "name": cam,
+            "frames": service.rig.pair.units[cam].counters(),
+            "driver": service.rig.pair.units[cam].statistics(),
+            "pairs": service.rig.pair.account(),
+            "sequence": frame.sequence,
+            "quality": image_quality(frame.pixels, frame.bit_depth).as_dict(),
+            "histogram": histogram.tolist(),
+        }
+    )
 
 
 def _jpeg(frame: Frame) -> bytes:

@@ -37,27 +37,19 @@ AxisNumber = Annotated[int, Path(ge=1, le=31, description="Number of an axis.")]
 
 
 @router.get(
-    "",
-    summary="Identity, limits and state of every axis",
-    response_model=StageReply,
-    response_model_exclude_unset=True,
-    responses=errors(503),
+    "", summary="Identity, limits and state of every axis", response_model_exclude_unset=True, responses=errors(503)
 )
-def get_stage(service: ServiceDep) -> dict[str, Any]:
+def get_stage(service: ServiceDep) -> StageReply:
     """Read the controller; works while a move runs."""
-    return service.rig.describe_stage()
+    return StageReply.model_validate(service.rig.describe_stage())
 
 
-@router.post(
-    "/moves", summary="Move axes", response_model=Accepted, status_code=202, responses=errors(409, 422, 503, 507)
-)
-async def move(
-    request: Request, body: MoveRequest, attached: Attached = False, key: KeyHeader = None
-) -> dict[str, Any]:
+@router.post("/moves", summary="Move axes", status_code=202, responses=errors(409, 422, 503, 507))
+async def move(request: Request, body: MoveRequest, attached: Attached = False, key: KeyHeader = None) -> Accepted:
     """Start a move; its job's result holds positions read back. Targets are checked before any byte goes out."""
     service = get_service(request)
     job_id = await run_in_threadpool(_start_move, service, body, key)
-    return await job_reply(request, service, job_id, attached)
+    return Accepted.model_validate(await job_reply(request, service, job_id, attached))
 
 
 def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
@@ -94,16 +86,14 @@ def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
     return str(made["job_id"])
 
 
-@router.post(
-    "/home", summary="Home axes", response_model=Accepted, status_code=202, responses=errors(409, 422, 503, 507)
-)
+@router.post("/home", summary="Home axes", status_code=202, responses=errors(409, 422, 503, 507))
 async def home(
     request: Request, body: HomeRequest | None = None, attached: Attached = False, key: KeyHeader = None
-) -> dict[str, Any]:
+) -> Accepted:
     """Switch motors on and search home."""
     service = get_service(request)
     job_id = await run_in_threadpool(_start_home, service, body, key)
-    return await job_reply(request, service, job_id, attached)
+    return Accepted.model_validate(await job_reply(request, service, job_id, attached))
 
 
 def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> str:
@@ -134,26 +124,21 @@ def _motion(service: Service, sent: RequestMark, kind: str, what: str, subject: 
     return job.id
 
 
-@router.post("/stop", summary="Stop every axis, always", response_model=StopReply, responses=errors(503))
-async def stop(request: Request) -> dict[str, Any]:
+@router.post("/stop", summary="Stop every axis, always", responses=errors(503))
+async def stop(request: Request) -> StopReply:
     """Stop at once: waits for no job and no lock, and cancels the hardware job if one runs."""
     service = get_service(request)
     answer = await _halt(service, service.stop_thread, service.rig.stop)
     service.metrics.stop_s.observe(answer["elapsed_ms"] / 1e3)
-    return answer
+    return StopReply.model_validate(answer)
 
 
-@router.post(
-    "/abort",
-    summary="Stop every axis and switch the motors off, always",
-    response_model=StopReply,
-    responses=errors(503),
-)
-async def abort(request: Request) -> dict[str, Any]:
+@router.post("/abort", summary="Stop every axis and switch the motors off, always", responses=errors(503))
+async def abort(request: Request) -> StopReply:
     """Stop as in an emergency: as `/stage/stop`, with the controller's emergency stop, and without power afterwards."""
     service = get_service(request)
     # it waits until the motors are off, behind which no stop must wait
-    return await _halt(service, service.abort_thread, service.rig.controls.abort)
+    return StopReply.model_validate(await _halt(service, service.abort_thread, service.rig.controls.abort))
 
 
 async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[], None]) -> dict[str, Any]:
@@ -167,28 +152,18 @@ async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[],
     return {"stopped": True, "elapsed_ms": round(elapsed_ms, 3), "cancelled_job": cancelled}
 
 
-@router.post(
-    "/enable",
-    summary="Switch motors on",
-    response_model=StageReply,
-    response_model_exclude_unset=True,
-    responses=errors(409, 422, 503),
-)
-def enable(service: ServiceDep, body: AxesRequest | None = None) -> dict[str, Any]:
+@router.post("/enable", summary="Switch motors on", response_model_exclude_unset=True, responses=errors(409, 422, 503))
+def enable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
     """Switch motors on, and return the stage as it is then. An SMC100's are switched on by homing the first time."""
-    return _switch(service, body, on=True)
+    return StageReply.model_validate(_switch(service, body, on=True))
 
 
 @router.post(
-    "/disable",
-    summary="Switch motors off",
-    response_model=StageReply,
-    response_model_exclude_unset=True,
-    responses=errors(409, 422, 503),
+    "/disable", summary="Switch motors off", response_model_exclude_unset=True, responses=errors(409, 422, 503)
 )
-def disable(service: ServiceDep, body: AxesRequest | None = None) -> dict[str, Any]:
+def disable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
     """Switch motors off, and return the stage as it is then; refused while a job uses it."""
-    return _switch(service, body, on=False)
+    return StageReply.model_validate(_switch(service, body, on=False))
 
 
 def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> dict[str, Any]:
@@ -199,27 +174,17 @@ def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> dict[str
     return service.rig.describe_stage()
 
 
-@router.get(
-    "/axes/{axis}",
-    summary="An axis' velocity and acceleration",
-    response_model=DynamicsReply,
-    responses=errors(422, 503),
-)
-def get_axis(service: ServiceDep, axis: AxisNumber, response: Response) -> dict[str, Any]:
+@router.get("/axes/{axis}", summary="An axis' velocity and acceleration", responses=errors(422, 503))
+def get_axis(service: ServiceDep, axis: AxisNumber, response: Response) -> DynamicsReply:
     """Read both back from the controller; the header ETag names this state of them."""
     service.rig.check_axes((axis,))
-    return tagged(response, service.rig.controls.read_dynamics(axis))
+    return DynamicsReply.model_validate(tagged(response, service.rig.controls.read_dynamics(axis)))
 
 
-@router.patch(
-    "/axes/{axis}",
-    summary="Set an axis' velocity and acceleration",
-    response_model=DynamicsReply,
-    responses=errors(409, 412, 422, 503),
-)
+@router.patch("/axes/{axis}", summary="Set an axis' velocity and acceleration", responses=errors(409, 412, 422, 503))
 def patch_axis(
     service: ServiceDep, axis: AxisNumber, body: DynamicsPatch, response: Response, if_match: IfMatch = None
-) -> dict[str, Any]:
+) -> DynamicsReply:
     """Set what is given; the answer is what the controller took. It lasts until the service ends.
 
     If-Match, with the ETag of GET, refuses if others changed them.
@@ -231,19 +196,16 @@ def patch_axis(
             now = etag_of(service.gate.call(lambda: controls.read_dynamics(axis)))
             require_match(if_match, now, f"axis {axis}")
         taken = service.gate.call(lambda: controls.set_dynamics(axis, body.velocity_mm_s, body.acceleration_mm_s2))
-        return tagged(response, taken)
+        return DynamicsReply.model_validate(tagged(response, taken))
 
 
 @router.post(
     "/axes/{axis}/leave-configuration",
     summary="Leave an SMC100's configuration state",
-    response_model=Accepted,
     status_code=202,
     responses=errors(409, 422, 503, 507),
 )
-def leave_configuration(
-    service: ServiceDep, axis: AxisNumber, body: FlashConsent, key: KeyHeader = None
-) -> dict[str, Any]:
+def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsent, key: KeyHeader = None) -> Accepted:
     """Leave the state in which it refuses every motion. This writes its flash memory, and `write_flash` consents."""
 
     def run(job: Job) -> dict[str, Any]:
@@ -258,10 +220,10 @@ def leave_configuration(
 
     request = mark(f"leave-configuration/{axis}", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return {"job": service.jobs.document(made["job_id"])}
+    return Accepted.model_validate({"job": service.jobs.document(made["job_id"])})
 
 
-@router.get("/messages", summary="What the controller had to say", response_model=StageMessages)
-def get_messages(service: ServiceDep) -> dict[str, Any]:
+@router.get("/messages", summary="What the controller had to say")
+def get_messages(service: ServiceDep) -> StageMessages:
     """Empty the controller's error queue and return the last 200 messages with their texts; reading loses none."""
-    return {"messages": service.rig.controls.messages()}
+    return StageMessages.model_validate({"messages": service.rig.controls.messages()})

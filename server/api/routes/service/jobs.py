@@ -24,25 +24,23 @@ def known_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
     return service.jobs.document(job_id)
 
 
-@router.get("", summary="Jobs, newest first", response_model=JobList, responses=errors(422))
-def list_jobs(service: ServiceDep, page: ShortPageDep) -> dict[str, Any]:
+@router.get("", summary="Jobs, newest first", responses=errors(422))
+def list_jobs(service: ServiceDep, page: ShortPageDep) -> JobList:
     """Return a page of the jobs of this and earlier runs of the service."""
     jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after), lambda j: str(j["id"]))
-    return {"jobs": jobs, "next_cursor": page.next_cursor}
+    return JobList.model_validate({"jobs": jobs, "next_cursor": page.next_cursor})
 
 
-@router.get("/{job_id}", summary="One job", response_model=JobReply, responses=errors(404))
-def get_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
+@router.get("/{job_id}", summary="One job", responses=errors(404))
+def get_job(service: ServiceDep, job_id: JobId) -> JobReply:
     """Return state, progress, and result or problem."""
-    return service.jobs.document(job_id)
+    return JobReply.model_validate(service.jobs.document(job_id))
 
 
-@router.post(
-    "/{job_id}/cancel", summary="Cancel a job", response_model=JobReply, status_code=202, responses=errors(404, 409)
-)
-def cancel_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
+@router.post("/{job_id}/cancel", summary="Cancel a job", status_code=202, responses=errors(404, 409))
+def cancel_job(service: ServiceDep, job_id: JobId) -> JobReply:
     """Ask the job to stop; it does within a second, and keeps what was finished."""
-    return service.jobs.cancel(job_id)
+    return JobReply.model_validate(service.jobs.cancel(job_id))
 
 
 @router.get(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Header
 from fastapi.responses import PlainTextResponse, Response
@@ -40,16 +40,18 @@ class HealthReply(BaseModel):
     worker: Literal["ready", "starting"] = Field(description="Whether it can compute yet.")
 
 
-@router.get("/healthz", summary="Whether the service is up", response_model=HealthReply)
-def healthz(service: ServiceDep) -> dict[str, Any]:
+@router.get("/healthz", summary="Whether the service is up")
+def healthz(service: ServiceDep) -> HealthReply:
     """Answer quickly, whatever else is going on; says what is not well."""
-    return {
-        "status": "ok",
-        "version": software_version(),
-        "uptime_s": round(time.monotonic() - service.started_monotonic, 1),
-        "rig": "fault" if service.rig.fault else "ok",
-        "worker": "ready" if service.worker.ready.is_set() else "starting",
-    }
+    return HealthReply.model_validate(
+        {
+            "status": "ok",
+            "version": software_version(),
+            "uptime_s": round(time.monotonic() - service.started_monotonic, 1),
+            "rig": "fault" if service.rig.fault else "ok",
+            "worker": "ready" if service.worker.ready.is_set() else "starting",
+        }
+    )
 
 
 @router.get(

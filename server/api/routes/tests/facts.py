@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
 
@@ -15,22 +15,15 @@ from server.results.metadata import TestFacts
 router = APIRouter(prefix="/tests/{test_id}/facts", tags=["tests"])
 
 
-@router.get(
-    "",
-    summary="What was told about a test",
-    response_model=TestFacts,
-    response_model_exclude_none=True,
-    responses=errors(404),
-)
-def get_facts(service: ServiceDep, test_id: TestId, response: Response) -> dict[str, Any]:
+@router.get("", summary="What was told about a test", response_model_exclude_none=True, responses=errors(404))
+def get_facts(service: ServiceDep, test_id: TestId, response: Response) -> TestFacts:
     """Return the facts, empty where nothing was told; the header ETag names this state of them."""
-    return tagged(response, service.tests.facts(test_id))
+    return TestFacts.model_validate(tagged(response, service.tests.facts(test_id)))
 
 
 @router.put(
     "",
     summary="Tell what no device can say about a test",
-    response_model=TestFacts,
     response_model_exclude_none=True,
     responses=errors(404, 412, 422, 507),
 )
@@ -42,7 +35,7 @@ def put_facts(
     if_match: Annotated[
         str | None, Header(max_length=200, description="ETag of the state that is replaced; another one is refused.")
     ] = None,
-) -> dict[str, Any]:
+) -> TestFacts:
     """Replace all facts of the test: lens, light, pattern, specimen, static steps and the like; a report shows them."""
     expected = None
     if if_match is not None and if_match.strip() != "*":
@@ -56,4 +49,4 @@ def put_facts(
             )
     document = body.document()
     service.tests.put_facts(test_id, document, expected)
-    return tagged(response, document)
+    return TestFacts.model_validate(tagged(response, document))

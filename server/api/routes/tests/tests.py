@@ -54,8 +54,8 @@ def _reply(service: Service, test_id: str) -> dict[str, Any]:
     }
 
 
-@router.post("", summary="Make a test", response_model=TestReply, status_code=201, responses=errors(404, 409, 422, 507))
-def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -> dict[str, Any]:
+@router.post("", summary="Make a test", status_code=201, responses=errors(404, 409, 422, 507))
+def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -> TestReply:
     """Make a test; it gets its own copy of the calibration."""
     request = mark("tests", key, body)
 
@@ -81,30 +81,29 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
         return {"test_id": document["id"]}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return _reply(service, made["test_id"])
+    return TestReply.model_validate(_reply(service, made["test_id"]))
 
 
-@router.get("", summary="Tests, oldest first", response_model=TestList, responses=errors(422))
-def list_tests(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+@router.get("", summary="Tests, oldest first", responses=errors(422))
+def list_tests(service: ServiceDep, page: PageDep) -> TestList:
     """Return a page of the tests."""
-    return {"tests": page.of(service.catalog.entries("test"), lambda t: str(t["id"])), "next_cursor": page.next_cursor}
+    return TestList.model_validate(
+        {"tests": page.of(service.catalog.entries("test"), lambda t: str(t["id"])), "next_cursor": page.next_cursor}
+    )
 
 
-@router.get("/{test_id}", summary="One test", response_model=TestReply, responses=errors(404))
-def get_test(service: ServiceDep, test_id: TestId, response: Response) -> dict[str, Any]:
+@router.get("/{test_id}", summary="One test", responses=errors(404))
+def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestReply:
     """Return a test with its steps and analyses; the header ETag names this state of it."""
-    return tagged(response, _reply(service, test_id))
+    return TestReply.model_validate(tagged(response, _reply(service, test_id)))
 
 
 @router.patch(
-    "/{test_id}",
-    summary="Change a test's name, specimen or notes",
-    response_model=TestReply,
-    responses=errors(404, 412, 422, 428, 507),
+    "/{test_id}", summary="Change a test's name, specimen or notes", responses=errors(404, 412, 422, 428, 507)
 )
 def patch_test(
     service: ServiceDep, test_id: TestId, body: TestPatch, response: Response, if_match: IfMatch = None
-) -> dict[str, Any]:
+) -> TestReply:
     """Change what is given; If-Match says which state of the test was meant."""
     service.tests.path(test_id)
     changes = {k: v for k, v in body.model_dump(exclude_unset=True).items() if v is not None}
@@ -112,7 +111,7 @@ def patch_test(
         require_match(if_match, etag_of(_reply(service, test_id)), f"test {test_id}")
         document = service.tests.update(test_id, changes)
         service.catalog.put_entry("test", "", test_id, test_entry(document))
-        return tagged(response, _reply(service, test_id))
+        return TestReply.model_validate(tagged(response, _reply(service, test_id)))
 
 
 @router.post(
@@ -202,7 +201,6 @@ def _readings(text: str | None) -> dict[str, float] | None:
 @router.post(
     "/{test_id}/steps:import",
     summary="Import a pair of image files as a step",
-    response_model=StepReply,
     status_code=201,
     responses=errors(404, 409, 413, 422, 507),
 )
@@ -226,7 +224,7 @@ def import_images(
         ),
     ] = None,
     key: KeyHeader = None,
-) -> dict[str, Any]:
+) -> StepReply:
     """Store two images as a step. File names are not used; the pixels are kept to the bit."""
     service.tests.path(test_id)
     data = {"cam1": cam1.file.read(), "cam2": cam2.file.read()}
@@ -241,15 +239,15 @@ def import_images(
         return {"n": import_step(service, test_id, data, facts)["n"]}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return step_reply(service, test_id, made["n"])
+    return StepReply.model_validate(step_reply(service, test_id, made["n"]))
 
 
-@router.get("/{test_id}/steps", summary="A test's steps, in order", response_model=StepList, responses=errors(404, 422))
-def list_steps(service: ServiceDep, test_id: TestId, page: PageDep) -> dict[str, Any]:
+@router.get("/{test_id}/steps", summary="A test's steps, in order", responses=errors(404, 422))
+def list_steps(service: ServiceDep, test_id: TestId, page: PageDep) -> StepList:
     """Return the complete steps."""
     service.tests.path(test_id)
     steps = page.of(service.catalog.entries("step", test_id), lambda s: f"{s['n']:04d}")
-    return {"steps": steps, "next_cursor": page.next_cursor}
+    return StepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 
 def step_reply(service: Service, test_id: str, n: int) -> dict[str, Any]:
@@ -257,21 +255,16 @@ def step_reply(service: Service, test_id: str, n: int) -> dict[str, Any]:
     return {k: v for k, v in service.tests.step(test_id, n).document.items() if k != "request"}
 
 
-@router.get("/{test_id}/steps/{n}", summary="One step", response_model=StepReply, responses=errors(404, 422))
-def get_step(service: ServiceDep, test_id: TestId, n: StepNumber, response: Response) -> dict[str, Any]:
+@router.get("/{test_id}/steps/{n}", summary="One step", responses=errors(404, 422))
+def get_step(service: ServiceDep, test_id: TestId, n: StepNumber, response: Response) -> StepReply:
     """Return a step's document; the header ETag names this state of it."""
-    return tagged(response, step_reply(service, test_id, n))
+    return StepReply.model_validate(tagged(response, step_reply(service, test_id, n)))
 
 
-@router.patch(
-    "/{test_id}/steps/{n}",
-    summary="Change a step's label",
-    response_model=StepReply,
-    responses=errors(404, 412, 422, 428, 507),
-)
+@router.patch("/{test_id}/steps/{n}", summary="Change a step's label", responses=errors(404, 412, 422, 428, 507))
 def patch_step(
     service: ServiceDep, test_id: TestId, n: StepNumber, body: StepPatch, response: Response, if_match: IfMatch = None
-) -> dict[str, Any]:
+) -> StepReply:
     """Change the label; what was taken stays as it is. If-Match says which state of the step was meant."""
     service.tests.step(test_id, n)
     with service.changes:
@@ -280,7 +273,7 @@ def patch_step(
         entry = step_entry(document)
         service.catalog.put_entry("step", test_id, f"{n:04d}", entry)
     service.hub.publish("step", {"test_id": test_id, **entry})
-    return tagged(response, step_reply(service, test_id, n))
+    return StepReply.model_validate(tagged(response, step_reply(service, test_id, n)))
 
 
 @router.get(

@@ -25,58 +25,47 @@ def _delete(service: Service, request: Request, kind: Kind, **ids: Any) -> dict[
     return delete(service, kind, ids, by=person_name(request))
 
 
-@router.delete("/tests/{test_id}", summary="Delete a test", response_model=TrashEntry, responses=_ERRORS)
-def delete_test(service: ServiceDep, request: Request, test_id: TestId) -> dict[str, Any]:
+@router.delete("/tests/{test_id}", summary="Delete a test", responses=_ERRORS)
+def delete_test(service: ServiceDep, request: Request, test_id: TestId) -> TrashEntry:
     """Move a test with its steps and analyses into the trash; refused while a job or a capture uses it."""
-    return _delete(service, request, "test", test_id=test_id)
+    return TrashEntry.model_validate(_delete(service, request, "test", test_id=test_id))
 
 
-@router.delete(
-    "/tests/{test_id}/steps/{n}", summary="Delete a step", response_model=TrashEntry, responses=_ERRORS | errors(422)
-)
-def delete_step(service: ServiceDep, request: Request, test_id: TestId, n: StepNumber) -> dict[str, Any]:
+@router.delete("/tests/{test_id}/steps/{n}", summary="Delete a step", responses=_ERRORS | errors(422))
+def delete_step(service: ServiceDep, request: Request, test_id: TestId, n: StepNumber) -> TrashEntry:
     """Move a step into the trash; its number is not given again, and analyses that used it read `stale`."""
-    return _delete(service, request, "step", test_id=test_id, n=n)
+    return TrashEntry.model_validate(_delete(service, request, "step", test_id=test_id, n=n))
 
 
-@router.delete(
-    "/tests/{test_id}/analyses/{analysis_id:plain_id}",
-    summary="Delete an analysis",
-    response_model=TrashEntry,
-    responses=_ERRORS,
-)
-def delete_analysis(service: ServiceDep, request: Request, test_id: TestId, analysis_id: AnalysisId) -> dict[str, Any]:
+@router.delete("/tests/{test_id}/analyses/{analysis_id:plain_id}", summary="Delete an analysis", responses=_ERRORS)
+def delete_analysis(service: ServiceDep, request: Request, test_id: TestId, analysis_id: AnalysisId) -> TrashEntry:
     """Move an analysis with its results into the trash; refused while its job runs."""
-    return _delete(service, request, "analysis", test_id=test_id, analysis_id=analysis_id)
+    return TrashEntry.model_validate(_delete(service, request, "analysis", test_id=test_id, analysis_id=analysis_id))
 
 
-@router.delete(
-    "/calibrations/{calibration_id}", summary="Delete a calibration", response_model=TrashEntry, responses=_ERRORS
-)
-def delete_calibration(service: ServiceDep, request: Request, calibration_id: CalibrationId) -> dict[str, Any]:
+@router.delete("/calibrations/{calibration_id}", summary="Delete a calibration", responses=_ERRORS)
+def delete_calibration(service: ServiceDep, request: Request, calibration_id: CalibrationId) -> TrashEntry:
     """Move a calibration into the trash; tests made with it keep their own copy."""
-    return _delete(service, request, "calibration", calibration_id=calibration_id)
+    return TrashEntry.model_validate(_delete(service, request, "calibration", calibration_id=calibration_id))
 
 
-@router.delete("/noise/{noise_id}", summary="Delete a noise measurement", response_model=TrashEntry, responses=_ERRORS)
-def delete_noise(service: ServiceDep, request: Request, noise_id: NoiseId) -> dict[str, Any]:
+@router.delete("/noise/{noise_id}", summary="Delete a noise measurement", responses=_ERRORS)
+def delete_noise(service: ServiceDep, request: Request, noise_id: NoiseId) -> TrashEntry:
     """Move a noise measurement into the trash; analyses made with it keep their own copy."""
-    return _delete(service, request, "noise", noise_id=noise_id)
+    return TrashEntry.model_validate(_delete(service, request, "noise", noise_id=noise_id))
 
 
-@router.get("/trash", summary="What was deleted, oldest first", response_model=TrashList, responses=errors(422))
-def list_trash(service: ServiceDep, page: PageDep) -> dict[str, Any]:
+@router.get("/trash", summary="What was deleted, oldest first", responses=errors(422))
+def list_trash(service: ServiceDep, page: PageDep) -> TrashList:
     """Return what lies in the trash, with the room that it takes."""
     trash = page.of(sorted(service.trash.entries(), key=lambda t: str(t["id"])), lambda t: str(t["id"]))
-    return {"trash": trash, "next_cursor": page.next_cursor}
+    return TrashList.model_validate({"trash": trash, "next_cursor": page.next_cursor})
 
 
-@router.post(
-    "/trash/{trash_id}/restore", summary="Restore from the trash", response_model=TrashEntry, responses=_ERRORS
-)
-def restore_trash(service: ServiceDep, trash_id: TrashId) -> dict[str, Any]:
+@router.post("/trash/{trash_id}/restore", summary="Restore from the trash", responses=_ERRORS)
+def restore_trash(service: ServiceDep, trash_id: TrashId) -> TrashEntry:
     """Move it back to where it was; refused if something lies there by now, or its test is in the trash too."""
-    return restore(service, trash_id)
+    return TrashEntry.model_validate(restore(service, trash_id))
 
 
 @router.delete(
@@ -88,16 +77,15 @@ def remove_trash(service: ServiceDep, trash_id: TrashId) -> None:
 
 
 @router.post(
-    "/tests/{test_id}/exported",
-    summary="Acknowledge that a copy lies elsewhere",
-    response_model=ExportedReply,
-    responses=errors(404, 409, 422, 507),
+    "/tests/{test_id}/exported", summary="Acknowledge that a copy lies elsewhere", responses=errors(404, 409, 422, 507)
 )
 def acknowledge_exported(
     service: ServiceDep, request: Request, test_id: TestId, body: ExportedRequest
-) -> dict[str, Any]:
+) -> ExportedReply:
     """Say that all of the test was copied elsewhere; the test shows it as `exported`, and nothing is deleted.
 
     What the copy holds is compared with what is there: a test that has grown meanwhile is refused.
     """
-    return acknowledge_export(service.tests, test_id, steps=body.steps, results=body.results, by=person_name(request))
+    return ExportedReply.model_validate(
+        acknowledge_export(service.tests, test_id, steps=body.steps, results=body.results, by=person_name(request))
+    )

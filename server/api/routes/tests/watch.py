@@ -25,12 +25,7 @@ WatchesDep = Annotated[Watches, Depends(get_watches)]
 router = APIRouter(prefix="/tests/{test_id}", tags=["tests"])
 
 
-@router.put(
-    "/watch",
-    summary="Take a step at each change of a channel",
-    response_model=WatchReply,
-    responses=errors(404, 412, 422, 507),
-)
+@router.put("/watch", summary="Take a step at each change of a channel", responses=errors(404, 412, 422, 507))
 def put_watch(
     service: ServiceDep,
     watches: WatchesDep,
@@ -38,7 +33,7 @@ def put_watch(
     body: WatchRequest,
     response: Response,
     if_match: IfMatch = None,
-) -> dict[str, Any]:
+) -> WatchReply:
     """Watch a channel of the readings posted to `/tests/{id}/channels`, in place of what was watched before.
 
     A reading takes a step when the channel differs from its value in the newest step that bears it by `threshold` or
@@ -52,19 +47,19 @@ def put_watch(
             raise PreconditionFailedError(f"Nothing is watched in test {test_id}.")
         require_match(if_match, etag_of(now), f"the watch of test {test_id}", required=False)
 
-    return tagged(response, watches.begin(test_id, body.model_dump(), allow))
+    return WatchReply.model_validate(tagged(response, watches.begin(test_id, body.model_dump(), allow)))
 
 
-@router.get("/watch", summary="What is watched", response_model=WatchReply, responses=errors(404))
-def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> dict[str, Any]:
+@router.get("/watch", summary="What is watched", responses=errors(404))
+def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> WatchReply:
     """Return channel and threshold, and the value that the next reading is compared with; ETag names this state."""
-    return tagged(response, watches.read(test_id))
+    return WatchReply.model_validate(tagged(response, watches.read(test_id)))
 
 
-@router.post("/watch:end", summary="End the watch", response_model=WatchReply, responses=errors(404, 507))
-def end_watch(watches: WatchesDep, test_id: TestId) -> dict[str, Any]:
+@router.post("/watch:end", summary="End the watch", responses=errors(404, 507))
+def end_watch(watches: WatchesDep, test_id: TestId) -> WatchReply:
     """Take no further steps; readings are refused from now on. Harmless when it has ended already."""
-    return watches.end(test_id)
+    return WatchReply.model_validate(watches.end(test_id))
 
 
 @router.post(
