@@ -6,7 +6,7 @@ import contextvars
 import json
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -97,7 +97,7 @@ def configure(level: str, form: LogFormat) -> None:
     root.setLevel(level.upper())
 
 
-def log_job_event(name: str, data: dict[str, Any]) -> None:
+def log_job_event(name: str, data: Mapping[str, Any]) -> None:
     """Write a line where the event hub tells of a job's new state."""
     if name != "job" or data.get("change") == "progress":
         return

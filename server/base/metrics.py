@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, disable_created_metrics
@@ -99,14 +99,14 @@ class Metrics:
         """Return what was counted, in the text format of Prometheus."""
         return generate_latest(self.registry)
 
-    def on_event(self, name: str, data: dict[str, Any]) -> None:
+    def on_event(self, name: str, data: Mapping[str, Any]) -> None:
         """Count what the event hub tells; by the monotonic clock, since the other one may be set."""
         if name == "result":
             self.results.inc()
         elif name == "job":
             self._on_job(data)
 
-    def _on_job(self, data: dict[str, Any]) -> None:
+    def _on_job(self, data: Mapping[str, Any]) -> None:
         now, kind, state = time.monotonic(), str(data["kind"]), str(data["state"])
         with self._lock:
             times = self._jobs.get(data["id"])

@@ -132,3 +132,17 @@ class Reply(BaseModel):
     """An answer; may gain fields in later versions."""
 
     model_config = ConfigDict(extra="allow")
+
+
+#: what names a thing that was made: ids, a step's number, a reading's value
+Ids = dict[str, str | int | float]
+
+
+class Document(BaseModel):
+    """A document as it is kept; it may hold more than this version knows."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    def plain(self) -> dict[str, object]:
+        """Return what the document says, and nothing that it does not."""
+        return self.model_dump(exclude_unset=True)

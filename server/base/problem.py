@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pydantic import Field
 
 from core.errors import StateError, StereorigError
 from server.base.json_values import without_nan
+from server.base.models import Document
+
+
+class JobProblem(Document):
+    """Why a job has no result."""
+
+    code: str = Field(description="Stable code.")
+    cause: str = Field(description="The cause, with the values that disagree.")
+    remedy: str = Field(description="What can be done.")
+    context: dict[str, object] = Field(default_factory=dict, description="Values that a program may want.")
+
 
 RESTART = StateError(
     "The service ended while the job was not finished.",
@@ -14,15 +25,11 @@ RESTART = StateError(
 )
 
 
-def problem_of(error: BaseException) -> dict[str, Any]:
-    """Describe an error as a job's ``problem``: code, cause, remedy and the values that a program may want."""
+def problem_of(error: BaseException) -> JobProblem:
+    """Describe an error as a job's problem: code, cause, remedy and the values that a program may want."""
     if isinstance(error, StereorigError):
         context = {k: v for k, v in error.context.items() if isinstance(v, str | int | float | bool | list | dict)}
-        described = {"code": error.code, "cause": error.cause, "remedy": error.remedy, "context": context}
-        return dict(without_nan(described))
-    return {
-        "code": "internal_error",
-        "cause": f"{type(error).__name__}: {error}",
-        "remedy": "Report this with the service's log.",
-        "context": {},
-    }
+        return JobProblem(code=error.code, cause=error.cause, remedy=error.remedy, context=without_nan(context))
+    return JobProblem(
+        code="internal_error", cause=f"{type(error).__name__}: {error}", remedy="Report this with the service's log."
+    )

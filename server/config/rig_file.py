@@ -302,8 +302,8 @@ class RigConfig(_Closed):
     stage: StageSection
     target: TargetSection
     calibration: CalibrationSection
-    service: ServiceSection = ServiceSection()  # type: ignore[call-arg]  # pydantic fills the defaults
-    compute: ComputeSection = ComputeSection()  # type: ignore[call-arg]
+    service: ServiceSection = ServiceSection()
+    compute: ComputeSection = ComputeSection()
     sim: dict[str, Any] | None = Field(None, description="The simulated world's truth; its own part reads it.")
 
     @model_validator(mode="after")

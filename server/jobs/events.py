@@ -9,9 +9,8 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 _AT_ONCE = 20
 
@@ -22,7 +21,7 @@ class Event:
 
     number: int
     name: str
-    data: dict[str, Any]
+    data: Mapping[str, object]
 
 
 class EventHub:
@@ -40,17 +39,17 @@ class EventHub:
         self._number = 0
         self._waiters: dict[asyncio.Event, asyncio.AbstractEventLoop] = {}
         self._closed = False
-        self._listeners: list[Callable[[str, dict[str, Any]], None]] = []
+        self._listeners: list[Callable[[str, Mapping[str, object]], None]] = []
 
     def number_from(self, start: int) -> None:
         """Let the events' numbers begin after ``start``; call it before the first event."""
         self._number = start
 
-    def listen(self, listener: Callable[[str, dict[str, Any]], None]) -> None:
+    def listen(self, listener: Callable[[str, Mapping[str, object]], None]) -> None:
         """Call ``listener`` with name and data of each event, in the publisher's thread: it must be quick."""
         self._listeners.append(listener)
 
-    def publish(self, name: str, data: dict[str, Any]) -> None:
+    def publish(self, name: str, data: Mapping[str, object]) -> None:
         """Add an event and wake the readers."""
         with self._lock:
             self._number += 1

@@ -11,9 +11,9 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from core.errors import StateError, StorageError
+from server.base.models import Ids
 from server.store.catalog import Catalog
 
 _log = logging.getLogger("stereorig.service")
@@ -37,13 +37,13 @@ class RequestMark:
     key: str | None
     body_sha256: str
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return what goes into the document of the thing that is made; nothing without a key."""
         if self.key is None:
             return {}
         return {"request": {"scope": self.scope, "key": self.key, "body_sha256": self.body_sha256}}
 
-    def made(self, ids: dict[str, Any]) -> tuple[str, str, str, dict[str, Any]] | None:
+    def made(self, ids: Ids) -> tuple[str, str, str, Ids] | None:
         """Return the row of the catalogue that says what it made."""
         return None if self.key is None else (self.scope, self.key, self.body_sha256, ids)
 
@@ -56,9 +56,9 @@ class OneEffect:
         self._guard = threading.Lock()
         self._locks: dict[tuple[str, str], tuple[threading.Lock, list[int]]] = {}
         # made, but the catalogue could not take it: good until the next start, which finds it in the folders
-        self._unwritten: dict[tuple[str, str], tuple[str, dict[str, Any]]] = {}
+        self._unwritten: dict[tuple[str, str], tuple[str, Ids]] = {}
 
-    def once(self, mark: RequestMark, make: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
+    def once(self, mark: RequestMark, make: Callable[[], Ids]) -> tuple[Ids, bool]:
         """Run ``make`` once per key; return what it made and whether it was made before.
 
         ``make`` returns the ids of what it made, from which the answer is built again.
@@ -85,7 +85,7 @@ class OneEffect:
             self._remember(mark, made)
         return made, False
 
-    def _remember(self, mark: RequestMark, made: dict[str, Any]) -> None:
+    def _remember(self, mark: RequestMark, made: Ids) -> None:
         assert mark.key is not None
         try:
             if self._catalog.request(mark.scope, mark.key) is None:  # a job brought it along

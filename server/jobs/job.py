@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from core.errors import Cancelled
+from server.base.models import JobState
+from server.base.problem import JobProblem
+from server.store.documents import JobRecord, Progress
 from server.store.folder import now_utc
 
-State = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
+State = JobState
 FINAL: tuple[State, ...] = ("succeeded", "failed", "cancelled", "interrupted")
 ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
 
@@ -21,7 +24,7 @@ class Phase:
     """One phase of a job: where it runs, and what; what ``run`` returns is merged into the job's result."""
 
     lane: Literal["hardware", "compute"]
-    run: Callable[[Job], dict[str, Any] | None]
+    run: Callable[[Job], Mapping[str, object] | None]
 
 
 class Waiting(Exception):
@@ -34,15 +37,15 @@ class Job:
 
     id: str
     kind: str
-    subject: dict[str, Any]
+    subject: dict[str, object]
     phases: Sequence[Phase]
     publish: Callable[[Job, str], None]
     state: State = "queued"
     created_utc: str = field(default_factory=now_utc)
     started_utc: str | None = None
     finished_utc: str | None = None
-    result: dict[str, Any] | None = None
-    problem: dict[str, Any] | None = None
+    result: dict[str, object] | None = None
+    problem: JobProblem | None = None
     stage: str = "waiting"
     done: int = 0
     total: int = 0
@@ -98,17 +101,17 @@ class Job:
         pace_s = (time.monotonic() - since) / (self.done - first)
         return round(pace_s * max(self.total - self.done, 0), 2)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> JobRecord:
         """Return the job as the API shows and the catalogue keeps it."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "state": self.state,
-            "subject": self.subject,
-            "progress": {"stage": self.stage, "done": self.done, "total": self.total, "eta_s": self.eta_s},
-            "created_utc": self.created_utc,
-            "started_utc": self.started_utc,
-            "finished_utc": self.finished_utc,
-            "result": self.result,
-            "problem": self.problem,
-        }
+        return JobRecord(
+            id=self.id,
+            kind=self.kind,
+            state=self.state,
+            subject=dict(self.subject),
+            progress=Progress(stage=self.stage, done=self.done, total=self.total, eta_s=self.eta_s),
+            created_utc=self.created_utc,
+            started_utc=self.started_utc,
+            finished_utc=self.finished_utc,
+            result=self.result,
+            problem=self.problem,
+        )

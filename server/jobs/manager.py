@@ -11,19 +11,20 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 from core.errors import Cancelled, StateError, StereorigError, StorageError
 from server.base.errors import NotFoundError, QueueFullError
 from server.base.json_values import without_nan
 from server.base.logs import about
+from server.base.models import Ids
 from server.base.problem import RESTART, problem_of
 from server.jobs.events import EventHub
 from server.jobs.hardware import HardwareGate
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import ACTIVE, Job, Phase, State, Waiting
 from server.store.catalog import Catalog
+from server.store.documents import JobRecord
 from server.store.folder import IdMaker, is_id, now_utc
 
 _log = logging.getLogger("stereorig.jobs")
@@ -48,7 +49,7 @@ class JobManager:
         self.queue_limit = queue_limit
         self._lock = threading.Lock()
         self._active: dict[str, Job] = {}
-        self._unsaved: dict[str, dict[str, Any]] = {}  # how jobs ended that a full disk has no room for
+        self._unsaved: dict[str, JobRecord] = {}  # how jobs ended that a full disk has no room for
         self._queue: deque[Job] = deque()
         self._parked: set[Job] = set()  # compute jobs that wait for something to do; they hold no lane
         self._reserved = 0  # jobs that will come to the compute lane after their hardware phase
@@ -63,11 +64,9 @@ class JobManager:
 
     def _interrupt_left_overs(self) -> None:
         for document in self._catalog.jobs():
-            self._ids.seen(document["id"])
+            self._ids.seen(document.id)
         for document in self._catalog.jobs(states=ACTIVE):
-            document |= {"state": "interrupted", "finished_utc": now_utc(), "problem": problem_of(RESTART)}
-            document["progress"]["eta_s"] = None
-            self._catalog.put_job(document["id"], "interrupted", document)
+            self._catalog.put_job(document.ended("interrupted", now_utc(), problem_of(RESTART)))
 
     # making and finding ----------------------------------------------------------------------------------------
 
@@ -75,10 +74,10 @@ class JobManager:
         self,
         kind: str,
         what: str,
-        subject: dict[str, Any],
+        subject: Mapping[str, object],
         phases: Sequence[Phase],
         *,
-        prepare: Callable[[Job], dict[str, Any]] | None = None,
+        prepare: Callable[[Job], Ids] | None = None,
         request: RequestMark | None = None,
         on_end: Callable[[Job, State], None] | None = None,
         on_cancel: Callable[[Job], None] | None = None,
@@ -125,7 +124,7 @@ class JobManager:
             made = prepare(job) if prepare is not None else {}
             job.subject |= made
             row = None if request is None else request.made({**made, "job_id": job.id})
-            self._catalog.put_job(job.id, job.state, job.document(), row)
+            self._catalog.put_job(job.document(), row)
         except BaseException:
             if token is not None:
                 self._gate.release(token)
@@ -134,7 +133,7 @@ class JobManager:
             raise
         with self._lock:
             self._active[job.id] = job
-        self._hub.publish("job", job.document())
+        self._hub.publish("job", job.document().plain())
         if token is not None:
             self._gate.start(lambda: self._run_hardware(job, token))
         else:
@@ -153,7 +152,7 @@ class JobManager:
         with self._lock:
             self._reserved -= 1
 
-    def document(self, job_id: str) -> dict[str, Any]:
+    def document(self, job_id: str) -> JobRecord:
         """Return a job of this or an earlier run."""
         with self._lock:
             job, ended = self._active.get(job_id), self._unsaved.get(job_id)
@@ -166,11 +165,11 @@ class JobManager:
             raise NotFoundError(f"There is no job {job_id[:40]!r}.", what="job")
         return found
 
-    def documents(self, limit: int, *, before: str | None = None) -> list[dict[str, Any]]:
+    def documents(self, limit: int, *, before: str | None = None) -> list[JobRecord]:
         """Return jobs, newest first; ``before``: only those older than this one."""
         with self._lock:
             active = self._unsaved | {j.id: j.document() for j in self._active.values()}
-        return [active.get(d["id"], d) for d in self._catalog.jobs(limit=limit, before=before)]
+        return [active.get(d.id, d) for d in self._catalog.jobs(limit=limit, before=before)]
 
     def is_active(self, job_id: str) -> bool:
         """Whether a job is not finished."""
@@ -187,7 +186,7 @@ class JobManager:
         with self._lock:
             return len(self._queue)
 
-    def cancel(self, job_id: str) -> dict[str, Any]:
+    def cancel(self, job_id: str) -> JobRecord:
         """Ask a job to stop.
 
         Raises
@@ -208,7 +207,7 @@ class JobManager:
                 elif job.state == "running":
                     job.state = "cancelling"
         if job is None:
-            state = self.document(job_id)["state"]
+            state = self.document(job_id).state
             raise StateError(
                 f"Job {job_id} is {state} already.",
                 code="job_finished",
@@ -234,7 +233,7 @@ class JobManager:
         for job in followers:
             self._rouse(job)
 
-    def finish(self, job_id: str) -> dict[str, Any]:
+    def finish(self, job_id: str) -> JobRecord:
         """Let a job that follows a test end once it has done what there is.
 
         Raises
@@ -343,7 +342,7 @@ class JobManager:
                     continue
                 break
             if result:
-                job.result = {**(job.result or {}), **without_nan(result)}
+                job.result = {**(job.result or {}), **without_nan(dict(result))}
             job.check()
         except Cancelled as error:
             self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
@@ -370,36 +369,34 @@ class JobManager:
         if job.let_go is not None:
             job.let_go()
         # nobody sees a job's end before it is on disk
-        self._save(job, state=state, finished_utc=ended)
+        self._save(job, job.document().ended(state, ended, job.problem))
         with self._lock:
             job.state, job.finished_utc = state, ended
             self._active.pop(job.id, None)
         self._show(job, "state")
 
-    def _save(self, job: Job, **final: Any) -> None:
+    def _save(self, job: Job, final: JobRecord | None = None) -> None:
         try:
             with job.saving:  # the newest document is the last one written
                 if job.ended:
                     return
-                job.ended = bool(final)
-                document = job.document() | final
-                if final:
-                    document["progress"]["eta_s"] = None
+                job.ended = final is not None
+                if final is not None:
                     with self._lock:
-                        self._unsaved[job.id] = document
-                self._catalog.put_job(job.id, document["state"], document)
+                        self._unsaved[job.id] = final
+                self._catalog.put_job(final or job.document())
                 with self._lock:
                     self._unsaved.pop(job.id, None)
-                    late = list(self._unsaved.items())
-            for job_id, document in late:  # there is room again
-                self._catalog.put_job(job_id, document["state"], document)
+                    late = list(self._unsaved.values())
+            for document in late:  # there is room again
+                self._catalog.put_job(document)
                 with self._lock:
-                    self._unsaved.pop(job_id, None)
+                    self._unsaved.pop(document.id, None)
         except StorageError:
             _log.exception("the state of job %s could not be written", job.id)
 
     def _show(self, job: Job, what: str) -> None:
-        document = {**job.document(), "change": what}
+        document = {**job.document().plain(), "change": what}
         if what == "progress":
             del document["result"]  # it may hold thousands of steps, and progress comes ten times a second
         self._hub.publish("job", document)

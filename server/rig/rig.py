@@ -87,7 +87,7 @@ class Rig:
                 self._home_at_start()
         except StereorigError as error:
             _log.exception("the rig could not be opened")
-            self._fault = problem_of(error)
+            self._fault = problem_of(error).plain()
             self._close_devices()
 
     def _home_at_start(self) -> None:

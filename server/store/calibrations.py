@@ -6,6 +6,7 @@ holds it is a calibration. What a verdict refused lies in ``rejected.json`` in i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ class CalibrationStore:
         """Write ``view.json``: every view with camera, read-back position and checksum."""
         write_json(self.path(calibration_id) / "view.json", {"views": views})
 
-    def put_failure(self, calibration_id: str, problem: dict[str, Any]) -> None:
+    def put_failure(self, calibration_id: str, problem: Mapping[str, object]) -> None:
         """Record why there is no calibration."""
         write_json(self.path(calibration_id) / "failure.json", problem)
 

@@ -10,12 +10,14 @@ import json
 import queue
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from core.errors import StorageError
+from server.base.models import Ids
+from server.store.documents import JobRecord
 
 T = TypeVar("T")
 
@@ -131,18 +133,12 @@ class Catalog:
         self._work.put(None)
         self._thread.join(timeout=30.0)
 
-    def put_job(
-        self,
-        job_id: str,
-        state: str,
-        document: dict[str, Any],
-        request: tuple[str, str, str, dict[str, Any]] | None = None,
-    ) -> None:
+    def put_job(self, job: JobRecord, request: tuple[str, str, str, Ids] | None = None) -> None:
         """Insert or update a job; with the request (scope, key, body_sha256, made) that asked for it, both or none."""
-        text = json.dumps(document)
+        text = json.dumps(job.plain())
 
         def write(c: sqlite3.Connection) -> None:
-            c.execute("INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job_id, state, text))
+            c.execute("INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job.id, job.state, text))
             if request is not None:
                 scope, key, digest, made = request
                 c.execute("INSERT OR REPLACE INTO requests VALUES (?, ?, ?, ?)", (scope, key, digest, json.dumps(made)))
@@ -151,10 +147,10 @@ class Catalog:
 
     def jobs(
         self, *, states: tuple[str, ...] | None = None, limit: int | None = None, before: str | None = None
-    ) -> list[dict[str, Any]]:
+    ) -> list[JobRecord]:
         """Return jobs, newest first; ``before``: only those whose id is smaller."""
 
-        def read(c: sqlite3.Connection) -> list[dict[str, Any]]:
+        def read(c: sqlite3.Connection) -> list[JobRecord]:
             terms: list[str] = []
             values: list[str] = []
             if states is not None:
@@ -165,23 +161,23 @@ class Catalog:
                 values.append(before)
             where = f"WHERE {' AND '.join(terms)}" if terms else ""
             rows = c.execute(f"SELECT document FROM jobs {where} ORDER BY id DESC LIMIT ?", (*values, limit or -1))
-            return [json.loads(row[0]) for row in rows]
+            return [JobRecord.model_validate_json(row[0]) for row in rows]
 
         return self.transact(read)
 
-    def job(self, job_id: str) -> dict[str, Any] | None:
+    def job(self, job_id: str) -> JobRecord | None:
         """Return one job's document."""
         row = self.transact(lambda c: c.execute("SELECT document FROM jobs WHERE id = ?", (job_id,)).fetchone())
-        return None if row is None else dict(json.loads(row[0]))
+        return None if row is None else JobRecord.model_validate_json(row[0])
 
-    def put_entry(self, kind: str, parent: str, entry_id: str, document: dict[str, Any]) -> None:
+    def put_entry(self, kind: str, parent: str, entry_id: str, document: Mapping[str, object]) -> None:
         """Insert or update an index entry (``calibration``, ``test``, ``step``, ``analysis``)."""
         text = json.dumps(document)
         self.transact(
             lambda c: c.execute("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", (kind, parent, entry_id, text))
         )
 
-    def entries(self, kind: str, parent: str = "") -> list[dict[str, Any]]:
+    def entries(self, kind: str, parent: str = "") -> list[dict[str, object]]:
         """Return the index entries of a kind, in order of their ids."""
         rows = self.transact(
             lambda c: c.execute(
@@ -200,7 +196,7 @@ class Catalog:
 
         self.transact(write)
 
-    def replace_entries(self, entries: list[tuple[str, str, str, dict[str, Any]]]) -> list[str]:
+    def replace_entries(self, entries: list[tuple[str, str, str, Mapping[str, object]]]) -> list[str]:
         """Make the index hold exactly ``entries`` (kind, parent, id, document); return the differences found."""
         wanted = {(k, p, i): json.dumps(d) for k, p, i, d in entries}
 
@@ -217,14 +213,14 @@ class Catalog:
 
         return self.transact(write)
 
-    def put_request(self, scope: str, key: str, body_sha256: str, made: dict[str, Any]) -> None:
+    def put_request(self, scope: str, key: str, body_sha256: str, made: Ids) -> None:
         """Remember what a request with an Idempotency-Key made."""
         text = json.dumps(made)
         self.transact(
             lambda c: c.execute("INSERT OR REPLACE INTO requests VALUES (?, ?, ?, ?)", (scope, key, body_sha256, text))
         )
 
-    def request(self, scope: str, key: str) -> tuple[str, dict[str, Any]] | None:
+    def request(self, scope: str, key: str) -> tuple[str, Ids] | None:
         """Return (body_sha256, made) of an earlier request."""
         row = self.transact(
             lambda c: c.execute(
@@ -241,9 +237,9 @@ class Catalog:
         """Return the id of every job."""
         return self.transact(lambda c: {row[0] for row in c.execute("SELECT id FROM jobs")})
 
-    def restore(self, jobs: list[dict[str, Any]], requests: list[tuple[str, str, str, dict[str, Any]]]) -> None:
+    def restore(self, jobs: list[JobRecord], requests: list[tuple[str, str, str, Ids]]) -> None:
         """Take over jobs and requests (scope, key, body_sha256, made) that were found elsewhere."""
-        job_rows = [(d["id"], d["state"], json.dumps(d)) for d in jobs]
+        job_rows = [(job.id, job.state, json.dumps(job.plain())) for job in jobs]
         request_rows = [(scope, key, digest, json.dumps(made)) for scope, key, digest, made in requests]
 
         def write(c: sqlite3.Connection) -> None:

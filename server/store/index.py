@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,7 @@ from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
 
-Entry = tuple[str, str, str, dict[str, Any]]  # kind, parent, id, document
+Entry = tuple[str, str, str, Mapping[str, object]]  # kind, parent, id, document
 
 
 def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def rebuild(
         try:
             if calibrations.read(calibration_id)["state"] == "unfinished":
                 # nobody works on it any more: the job that did ended with the last service
-                calibrations.put_failure(calibration_id, problem_of(RESTART))
+                calibrations.put_failure(calibration_id, problem_of(RESTART).plain())
             lost.calibration(calibrations.read(calibration_id))
             entries.append(("calibration", "", calibration_id, calibration_entry(calibrations, calibration_id)))
         except (FileFormatError, KeyError) as error:

@@ -6,10 +6,13 @@ a client that sends its request once more gets what it made, with its job as it 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from server.base.problem import RESTART, problem_of
+from server.base.models import Ids, JobState
+from server.base.problem import RESTART, JobProblem, problem_of
 from server.store.catalog import Catalog
+from server.store.documents import JobRecord, Progress
 from server.store.folder import IdMaker, is_id
 
 
@@ -17,11 +20,11 @@ class LostJobs:
     """Collects jobs and requests from documents, then adds those that the catalogue lacks."""
 
     def __init__(self) -> None:
-        self._jobs: dict[str, dict[str, Any]] = {}
-        self._requests: dict[tuple[str, str], tuple[str, dict[str, Any]]] = {}
+        self._jobs: dict[str, JobRecord] = {}
+        self._requests: dict[tuple[str, str], tuple[str, Ids]] = {}
         self._bursts: dict[str, list[dict[str, Any]]] = {}
 
-    def made(self, document: dict[str, Any], ids: dict[str, Any]) -> None:
+    def made(self, document: dict[str, Any], ids: Ids) -> None:
         """Take the request that a document was made for."""
         request = document.get("request")
         if request:
@@ -44,7 +47,9 @@ class LostJobs:
         if job_id is None:
             return
         problem = document.get("problem")
-        state = "succeeded" if document["state"] == "complete" else (problem or {}).get("job_state", "interrupted")
+        state: JobState = (
+            "succeeded" if document["state"] == "complete" else (problem or {}).get("job_state", "interrupted")
+        )
         self._job(job_id, kind, ids, state, plan["created_utc"], ids if state == "succeeded" else None, problem)
         self.made(plan, {**ids, "job_id": job_id})
 
@@ -79,28 +84,29 @@ class LostJobs:
         self,
         job_id: str,
         kind: str,
-        subject: dict[str, Any],
-        state: str,
+        subject: Mapping[str, object],
+        state: JobState,
         created_utc: str,
-        result: dict[str, Any] | None,
-        problem: dict[str, Any] | None,
+        result: Mapping[str, object] | None,
+        problem: object,
     ) -> None:
         if not is_id(job_id, "j"):  # a folder from elsewhere may say anything
             return
-        if state != "succeeded" and problem is None:
-            problem = problem_of(RESTART)
-        self._jobs[job_id] = {
-            "id": job_id,
-            "kind": kind,
-            "state": state,
-            "subject": subject,
-            "progress": {"stage": "done" if state == "succeeded" else "ended", "done": 0, "total": 0, "eta_s": None},
-            "created_utc": created_utc,
-            "started_utc": None,
-            "finished_utc": None,
-            "result": result,
-            "problem": problem,
-        }
+        told = JobProblem.model_validate(problem) if problem is not None else None
+        if state != "succeeded" and told is None:
+            told = problem_of(RESTART)
+        self._jobs[job_id] = JobRecord(
+            id=job_id,
+            kind=kind,
+            state=state,
+            subject=dict(subject),
+            progress=Progress(stage="done" if state == "succeeded" else "ended", done=0, total=0, eta_s=None),
+            created_utc=created_utc,
+            started_utc=None,
+            finished_utc=None,
+            result=None if result is None else dict(result),
+            problem=told,
+        )
 
     def _end_bursts(self) -> None:
         for job_id, steps in self._bursts.items():
@@ -116,7 +122,7 @@ class LostJobs:
                 for s in steps
             ]
             result = {**subject, "count": burst["count"], "steps": taken, "failures": []}
-            state = "succeeded" if len(steps) == burst["count"] else "interrupted"
+            state: JobState = "succeeded" if len(steps) == burst["count"] else "interrupted"
             self._job(job_id, "burst", subject, state, steps[0]["captured_utc"], result, None)
             self.made(steps[0], {**subject, "job_id": job_id})
 

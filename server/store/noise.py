@@ -7,6 +7,7 @@ it is a noise measurement.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ class NoiseStore:
             with contextlib.suppress(FileFormatError):  # one that is damaged must not keep the service from starting
                 if self.read(noise_id)["state"] == "unfinished":
                     # nobody works on it any more: the job that did ended with the last service
-                    self.put_failure(noise_id, problem_of(RESTART))
+                    self.put_failure(noise_id, problem_of(RESTART).plain())
 
     @property
     def _root(self) -> Path:
@@ -75,7 +76,7 @@ class NoiseStore:
         """Write ``frames.json``: every frame with camera and checksum, and the cameras' settings."""
         write_json(self.path(noise_id) / "frames.json", {**facts, "frames": frames})
 
-    def put_failure(self, noise_id: str, problem: dict[str, Any]) -> None:
+    def put_failure(self, noise_id: str, problem: Mapping[str, object]) -> None:
         """Record why there are no models."""
         write_json(self.path(noise_id) / "failure.json", problem)
 

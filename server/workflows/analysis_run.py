@@ -20,6 +20,7 @@ from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
+from server.store.documents import Finished
 from server.store.folder import now_utc
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
@@ -101,7 +102,7 @@ class AnalysisRun:
 
     def _load(self, job: Job) -> None:
         """Take over what another run finished; a result without summary, or damaged, is measured again."""
-        tests, analysis_id = self._service.tests, job.subject["analysis_id"]
+        tests, analysis_id = self._service.tests, str(job.subject["analysis_id"])
         self._document = tests.analysis(self._test_id, analysis_id)
         known = tests.step_summaries(self._test_id, analysis_id)
         for n in self._document["steps"]:
@@ -301,19 +302,19 @@ def images_of(n: int, step: StepFiles) -> StepImages:
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
     """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
-    found, document = job.result or {}, service.tests.analysis(test_id, analysis_id)
-    steps = found.get("steps", [])
+    found, document = Finished.model_validate(job.result or {}), service.tests.analysis(test_id, analysis_id)
     summary = SequenceSummary(
         state=state,
         software_version=software_version(),
         created=now_utc(),
         calibration={"sha256": document["inputs"]["calibration_sha256"]},
         settings=document["settings"],
-        seconds=round(sum(step.get("wall_s", 0.0) for step in steps), 3),
-        steps=steps,
-        steps_failed=found.get("steps_failed", {}),
+        seconds=round(sum(step.wall_s or 0.0 for step in found.steps), 3),
+        steps=[step.plain() for step in found.steps],
+        steps_failed={n: problem.plain() for n, problem in found.steps_failed.items()},
     ).document()
-    summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": job.problem}
+    problem = None if job.problem is None else job.problem.plain()
+    summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": problem}
     service.tests.put_summary(test_id, analysis_id, summary)
     if state == "succeeded":
         service.tests.drop_starts(test_id, analysis_id)

@@ -8,6 +8,7 @@ from typing import Any
 
 from core.errors import InputError, StateError
 from core.settings import AnalysisSettings
+from server.base.models import Ids
 from server.compute.region import make_grid
 from server.formats.files import sha256_of
 from server.formats.images import decode_mask, read_image
@@ -99,12 +100,7 @@ def check_region(
 
 
 def submit(
-    service: Service,
-    test_id: str,
-    prepare: Callable[[Job], dict[str, Any]],
-    request: RequestMark | None,
-    *,
-    follow: bool = False,
+    service: Service, test_id: str, prepare: Callable[[Job], Ids], request: RequestMark | None, *, follow: bool = False
 ) -> Job:
     """Queue the measurement of the analysis that ``prepare`` makes or finds.
 
@@ -121,9 +117,9 @@ def submit(
         prepare=prepare,
         request=request,
         follows=test_id if follow else None,
-        on_end=lambda job, state: close(service, job, test_id, job.subject["analysis_id"], state),
+        on_end=lambda job, state: close(service, job, test_id, str(job.subject["analysis_id"]), state),
     )
-    analysis_id = job.subject["analysis_id"]
+    analysis_id = str(job.subject["analysis_id"])
     stored = service.tests.analysis(test_id, analysis_id)
     service.catalog.put_entry("analysis", test_id, analysis_id, analysis_entry({**stored, "job_id": job.id}))
     return job
@@ -183,7 +179,7 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
             now=now,
         )
 
-    def prepare(job: Job) -> dict[str, Any]:
+    def prepare(job: Job) -> Ids:
         service.tests.add_analysis_job(test_id, analysis_id, {"job_id": job.id, **request.document()})
         return {"analysis_id": analysis_id}
 

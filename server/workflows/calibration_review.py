@@ -99,14 +99,14 @@ def newest_accepted(service: Service) -> str:
     StateError
         ``no_calibration_accepted``.
     """
-    accepted = [e["id"] for e in service.catalog.entries("calibration") if e.get("decision") == "accepted"]
+    accepted = [str(e["id"]) for e in service.catalog.entries("calibration") if e.get("decision") == "accepted"]
     if not accepted:
         raise StateError(
             "No calibration has been accepted.",
             code="no_calibration_accepted",
             remedy="Accept one (PUT /calibrations/{id}/judgement), or name one by its id.",
         )
-    return str(max(accepted))
+    return max(accepted)
 
 
 def check_not_discarded(service: Service, calibration_id: str) -> None:

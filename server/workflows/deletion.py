@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from core.errors import StateError, StereorigError
+from server.base.models import Ids
 from server.jobs.job import ACTIVE
 from server.store.index import calibration_entry, entries_of_test
 from server.store.lost_jobs import LostJobs
@@ -12,7 +14,7 @@ from server.store.trash import Kind
 from server.workflows.service import Service
 
 
-def delete(service: Service, kind: Kind, ids: dict[str, Any], *, by: str) -> dict[str, Any]:
+def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> dict[str, Any]:
     """Move something into the trash; return the trash's entry.
 
     Parameters
@@ -38,7 +40,7 @@ def delete(service: Service, kind: Kind, ids: dict[str, Any], *, by: str) -> dic
         trash_id = service.trash.put(service.folder, kind, ids, name=name, by=by, why="asked for")
     if kind != "noise":
         entry_id = f"{ids['n']:04d}" if kind == "step" else str(ids[f"{kind}_id"])
-        parent = ids["test_id"] if kind in ("step", "analysis") else ""
+        parent = str(ids["test_id"]) if kind in ("step", "analysis") else ""
         service.catalog.remove_entry(kind, parent, entry_id)
     service.hub.publish("deleted", {"kind": kind, **ids, "trash_id": trash_id})
     return service.trash.entry(trash_id)
@@ -58,42 +60,40 @@ def restore(service: Service, trash_id: str) -> dict[str, Any]:
     return document
 
 
-def _name(service: Service, kind: Kind, ids: dict[str, Any]) -> str:
+def _name(service: Service, kind: Kind, ids: Ids) -> str:
     """What people call it; also finds out whether it is there."""
     if kind == "test":
-        service.tests.path(ids["test_id"])
+        service.tests.path(str(ids["test_id"]))
         try:
-            return str(service.tests.read(ids["test_id"]).get("name", ""))
+            return str(service.tests.read(str(ids["test_id"])).get("name", ""))
         except StereorigError:
             return ""  # what is damaged can be deleted too
     if kind == "step":
         try:
-            return str(service.tests.step(ids["test_id"], ids["n"]).document.get("label", ""))
+            return str(service.tests.step(str(ids["test_id"]), int(ids["n"])).document.get("label", ""))
         except StereorigError as error:
             if error.code == "not_found":
                 raise
             return ""
     if kind == "analysis":
-        service.tests.analysis_path(ids["test_id"], ids["analysis_id"])
+        service.tests.analysis_path(str(ids["test_id"]), str(ids["analysis_id"]))
         return ""
     if kind == "calibration":
-        service.calibrations.path(ids["calibration_id"])
+        service.calibrations.path(str(ids["calibration_id"]))
         return ""
-    service.noise.path(ids["noise_id"])
+    service.noise.path(str(ids["noise_id"]))
     return ""
 
 
-def _check_unused(service: Service, kind: Kind, ids: dict[str, Any]) -> None:
+def _check_unused(service: Service, kind: Kind, ids: Ids) -> None:
     what = {k: v for k, v in ids.items() if k != "n"}
 
-    def uses(subject: dict[str, Any]) -> bool:
+    def uses(subject: Mapping[str, object]) -> bool:
         return all(subject.get(name) == value for name, value in what.items())
 
     for job in service.catalog.jobs(states=ACTIVE):
-        if service.jobs.is_active(job["id"]) and uses({**job["subject"], **(job["result"] or {})}):
-            raise _in_use(
-                kind, f"by job {job['id']} ({job['kind']})", "Wait for the job or cancel it.", job_id=job["id"]
-            )
+        if service.jobs.is_active(job.id) and uses({**job.subject, **(job.result or {})}):
+            raise _in_use(kind, f"by job {job.id} ({job.kind})", "Wait for the job or cancel it.", job_id=job.id)
     holder = service.gate.holder
     if holder is not None and uses(holder):
         raise _in_use(kind, f"by {holder['what']}", "Try again when that is done.")

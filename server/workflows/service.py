@@ -10,11 +10,12 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from core.errors import StereorigError, StorageError
 from server.base.logs import log_job_event
 from server.base.metrics import Metrics
+from server.base.models import Ids
 from server.base.streams import Streams
 from server.config.rig_file import RigConfig
 from server.exports.aside import ExportProcess
@@ -245,8 +246,6 @@ class Service:
         """Stop the stage first, then jobs, worker, rig and files; safe to call twice."""
         self._parts.close()
 
-    def once(
-        self, scope: str, key: str | None, body_sha256: str, make: Callable[[], dict[str, Any]]
-    ) -> tuple[dict[str, Any], bool]:
+    def once(self, scope: str, key: str | None, body_sha256: str, make: Callable[[], Ids]) -> tuple[Ids, bool]:
         """Run ``make`` once per Idempotency-Key, see :meth:`server.jobs.idempotency.OneEffect.once`."""
         return self._effects.once(RequestMark(scope, key, body_sha256), make)

@@ -20,10 +20,17 @@ import pytest
 from core.errors import StateError, StorageError
 from server.jobs.job import Phase
 from server.store.catalog import Catalog
+from server.store.documents import JobRecord, Progress
 from server.store.folder import DataFolder
 from tests.support.job_bench import Bench
 from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import TINY
+
+
+def record(job_id: str, **more: Any) -> JobRecord:
+    progress = Progress(stage="", done=0, total=0, eta_s=None)
+    said = {"id": job_id, "kind": "analysis", "state": "running", "subject": {}, "progress": progress}
+    return JobRecord.model_validate({**said, "created_utc": "2026-03-01T12:00:00Z", **more})
 
 
 def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
@@ -232,23 +239,23 @@ def test_a_job_that_ended_with_the_disk_full_never_reads_as_running(
     go.set()
     while bench.jobs.is_active(job.id):
         time.sleep(0.005)
-    assert bench.catalog.job(job.id)["state"] == "running"  # type: ignore[index]
-    assert bench.jobs.document(job.id)["state"] == "succeeded"
-    assert bench.jobs.documents(10)[0]["state"] == "succeeded"
+    assert bench.catalog.job(job.id).state == "running"  # type: ignore[union-attr]
+    assert bench.jobs.document(job.id).state == "succeeded"
+    assert bench.jobs.documents(10)[0].state == "succeeded"
     monkeypatch.undo()
     other = bench.jobs.submit("analysis", "an analysis", {}, [Phase("compute", lambda _: None)])
     bench.end_of(other)
     deadline = time.monotonic() + 20.0
-    while bench.catalog.job(job.id)["state"] != "succeeded" and time.monotonic() < deadline:  # type: ignore[index]
+    while bench.catalog.job(job.id).state != "succeeded" and time.monotonic() < deadline:  # type: ignore[union-attr]
         time.sleep(0.005)
-    assert bench.catalog.job(job.id)["state"] == "succeeded", "written once there is room"  # type: ignore[index]
+    assert bench.catalog.job(job.id).state == "succeeded", "written once there is room"  # type: ignore[union-attr]
     bench.close()
 
 
 @pytest.mark.fault(3)
 def test_a_catalogue_whose_commit_failed_works_again_once_there_is_room(tmp_path: Path) -> None:
     catalog = Catalog(tmp_path / "catalog.sqlite").open()
-    catalog.put_job("j000001-abcdef", "running", {"id": "j000001-abcdef"})
+    catalog.put_job(record("j000001-abcdef"))
 
     def limit(pages: int) -> None:
         catalog.transact(lambda c: c.execute(f"PRAGMA max_page_count = {pages}").fetchone())
@@ -256,9 +263,9 @@ def test_a_catalogue_whose_commit_failed_works_again_once_there_is_room(tmp_path
     limit(8)
     for _ in range(3):
         with pytest.raises(StorageError) as caught:
-            catalog.put_job("j000002-abcdef", "running", {"text": "x" * 30000})
+            catalog.put_job(record("j000002-abcdef", text="x" * 30000))
         assert caught.value.code == "storage_full", "and not that a transaction is still open"
     limit(100000)
-    catalog.put_job("j999999-abcdef", "succeeded", {"id": "j999999-abcdef"})
-    assert catalog.job("j999999-abcdef") == {"id": "j999999-abcdef"}
+    catalog.put_job(record("j999999-abcdef"))
+    assert catalog.job("j999999-abcdef") == record("j999999-abcdef")
     catalog.close()

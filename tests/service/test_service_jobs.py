@@ -55,7 +55,7 @@ def test_a_job_tells_stage_share_and_time_left(bench: Bench) -> None:
     job = bench.jobs.submit("walk", "a walk", {"x": 1}, compute(run))
     while job.done < 1:
         time.sleep(0.005)
-    document = bench.jobs.document(job.id)
+    document = bench.jobs.document(job.id).plain()
     assert document["state"] == "running"
     assert document["progress"]["stage"] == "walking"
     assert 0.2 < document["progress"]["eta_s"] < 3.0
@@ -135,7 +135,7 @@ def test_the_queue_is_bounded_and_recovers(bench: Bench) -> None:
     waiting = [bench.jobs.submit("analysis", "an analysis", {}, compute(lambda _: None)) for _ in range(2)]
     with pytest.raises(QueueFullError):
         bench.jobs.submit("analysis", "an analysis", {}, compute(lambda _: None))
-    assert bench.jobs.cancel(waiting[0].id)["state"] == "cancelled"
+    assert bench.jobs.cancel(waiting[0].id).state == "cancelled"
     third = bench.jobs.submit("analysis", "an analysis", {}, compute(lambda _: None))
     go.set()
     assert [bench.end_of(j)["state"] for j in (first, waiting[1], third)] == ["succeeded"] * 3
@@ -173,7 +173,7 @@ def test_what_ran_at_a_crash_reads_interrupted_after_the_next_start(tmp_path: Pa
     second = Bench(tmp_path / "copy")
     try:
         for job in (running, queued):
-            document = second.jobs.document(job.id)
+            document = second.jobs.document(job.id).plain()
             assert document["state"] == "interrupted"
             assert document["problem"]["code"] == "interrupted"
         fresh = second.jobs.submit("analysis", "an analysis", {}, compute(lambda _: None))

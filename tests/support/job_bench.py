@@ -32,7 +32,7 @@ class Bench:
     def end_of(self, job: Job, seconds: float = 20.0) -> dict[str, Any]:
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
-            document = self.jobs.document(job.id)
+            document = self.jobs.document(job.id).plain()
             if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
                 return document
             time.sleep(0.005)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Query, Request
 
@@ -22,12 +22,12 @@ Attached = Annotated[
 _ATTEND_S = 0.05
 
 
-async def job_reply(request: Request, service: Service, job_id: str, attached: bool) -> dict[str, Any]:
+async def job_reply(request: Request, service: Service, job_id: str, attached: bool) -> dict[str, object]:
     """Answer at once, or stay with the job to its end and stop it when the client goes away."""
-    while attached and service.jobs.document(job_id)["state"] not in FINAL:
+    while attached and service.jobs.document(job_id).state not in FINAL:
         if await request.is_disconnected():
             with contextlib.suppress(StateError):  # it ended just now
                 await asyncio.get_running_loop().run_in_executor(service.stop_thread, service.jobs.cancel, job_id)
             break
         await asyncio.sleep(_ATTEND_S)
-    return {"job": service.jobs.document(job_id)}
+    return {"job": service.jobs.document(job_id).plain()}

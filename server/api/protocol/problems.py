@@ -118,7 +118,7 @@ def _response_of(error: StereorigError) -> JSONResponse:
     status = status_of(error)
     described = problem_of(error)
     headers = {"Retry-After": str(RETRY_AFTER_S)} if status == 503 else None
-    context = {k: v for k, v in described["context"].items() if k not in Problem.model_fields}
+    context = {k: v for k, v in described.context.items() if k not in Problem.model_fields}
     return problem_response(status, error.code, error.cause, error.remedy, headers=headers, **context)
 
 

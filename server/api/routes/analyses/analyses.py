@@ -14,12 +14,14 @@ from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, 
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
+from server.base.models import Ids
 from server.compute.seeds import check_seeds
 from server.formats.images import read_image
 from server.formats.noise_json import load_noise
 from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job
+from server.store.documents import JobRecord
 from server.workflows import analysis_start
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
@@ -35,7 +37,7 @@ def create_analysis(
     request = mark(f"tests/{test_id}/analyses", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, lambda: _begin(service, test_id, body, request))
     return AnalysisAccepted.model_validate(
-        {"job": service.jobs.document(made["job_id"]), "analysis_id": made["analysis_id"]}
+        {"job": service.jobs.document(str(made["job_id"])).plain(), "analysis_id": made["analysis_id"]}
     )
 
 
@@ -68,7 +70,7 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
         **request.document(),
     }
 
-    def prepare(job: Job) -> dict[str, Any]:
+    def prepare(job: Job) -> Ids:
         run = {"job_id": job.id, **request.document()}
         stored = service.tests.create_analysis(test_id, document, mask, noise, run)
         return {"analysis_id": stored["id"]}
@@ -107,15 +109,15 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> dict[str
         known = service.tests.step_summaries(test_id, analysis_id)
         steps = [known[n] for n in document["steps"] if n in known]
         summary = {"analysis_id": analysis_id, "state": state, "job_id": job_id, "steps": steps} if steps else None
-    job: dict[str, Any] | None = None
+    job: JobRecord | None = None
     if job_id is not None:
         try:
-            job = service.jobs.document(job_id)
-            state = job["state"]
+            job = service.jobs.document(str(job_id))
+            state = job.state
         except NotFoundError:
             job_id = None  # the catalogue was lost with its jobs; the files tell the rest
     stale = analysis_start.stale_reasons(service, test_id, document)
-    problem = job["problem"] if job else (summary or {}).get("problem")
+    problem = job.plain()["problem"] if job else (summary or {}).get("problem")
     return {
         **{k: v for k, v in document.items() if k != "request"},
         "state": state,
@@ -164,13 +166,15 @@ def continue_analysis(
     service.tests.analysis_path(test_id, analysis_id)
     request = mark(f"tests/{test_id}/analyses/{analysis_id}:continue", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         service.require_room()
         job = analysis_start.continue_analysis(service, test_id, analysis_id, request, other_version=body.other_version)
         return {"analysis_id": analysis_id, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return AnalysisAccepted.model_validate({"job": service.jobs.document(made["job_id"]), "analysis_id": analysis_id})
+    return AnalysisAccepted.model_validate(
+        {"job": service.jobs.document(str(made["job_id"])).plain(), "analysis_id": analysis_id}
+    )
 
 
 @router.post(
@@ -184,4 +188,4 @@ def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisI
     service.tests.analysis_path(test_id, analysis_id)
     runs = service.tests.analysis_jobs(test_id, analysis_id)
     job_id = runs[-1]["job_id"] if runs else ""
-    return AnalysisAccepted.model_validate({"job": service.jobs.finish(job_id), "analysis_id": analysis_id})
+    return AnalysisAccepted.model_validate({"job": service.jobs.finish(job_id).plain(), "analysis_id": analysis_id})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
@@ -27,6 +28,7 @@ from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.base.json_values import without_nan
+from server.base.models import Ids
 from server.formats.calibrations.plausibility import check_calibration
 from server.formats.calibrations.recognise import imported_content, parse_calibration
 from server.formats.images import read_image
@@ -63,23 +65,23 @@ def create_calibration(
     )
     request = mark("calibrations", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         service.require_room()
         check_plan(plan)
         targets_of(service, plan)
         made: dict[str, Any] = {}
 
-        def prepare(job: Job) -> dict[str, Any]:
+        def prepare(job: Job) -> Ids:
             document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
             made["calibration_id"] = service.calibrations.create(
                 document, service.config.target.model_dump(mode="json")
             )
             return dict(made)
 
-        def hardware(job: Job) -> dict[str, Any]:
+        def hardware(job: Job) -> Mapping[str, object]:
             return take_views(service, job, made["calibration_id"], plan)
 
-        def compute(job: Job) -> dict[str, Any]:
+        def compute(job: Job) -> Mapping[str, object]:
             return fit(service, job, made["calibration_id"])
 
         job = service.jobs.submit(
@@ -96,7 +98,7 @@ def create_calibration(
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return CalibrationAccepted.model_validate(
-        {"job": service.jobs.document(made["job_id"]), "calibration_id": made["calibration_id"]}
+        {"job": service.jobs.document(str(made["job_id"])).plain(), "calibration_id": made["calibration_id"]}
     )
 
 
@@ -135,7 +137,7 @@ def import_calibration(
     data = file.file.read()
     request = mark("calibrations:import", key, None, data, label.encode())
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         content = imported_content(data, name="The file")
         checked = without_nan(asdict(check_calibration(parse_calibration(data, name="The file"))))
         plan = {"source": "import", "label": label, "check": checked, **request.document()}
@@ -146,7 +148,7 @@ def import_calibration(
         return {"calibration_id": calibration_id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return CalibrationReply.model_validate(service.calibrations.read(made["calibration_id"]))
+    return CalibrationReply.model_validate(service.calibrations.read(str(made["calibration_id"])))
 
 
 def complete(service: ServiceDep, calibration_id: str) -> FilePath:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path
@@ -14,6 +15,7 @@ from server.api.models.noise import NoiseFile
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
+from server.base.models import Ids
 from server.jobs.job import Job, Phase
 from server.workflows import noise_sequence
 
@@ -27,20 +29,20 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
     body = body or NoiseRequest.model_validate({})
     request = mark("noise", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         service.require_room()
         made: dict[str, Any] = {}
 
-        def prepare(job: Job) -> dict[str, Any]:
+        def prepare(job: Job) -> Ids:
             facts = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name}
             plan = {**facts, **request.document(), "job_id": job.id}
             made["noise_id"] = service.noise.create(plan)
             return dict(made)
 
-        def hardware(job: Job) -> dict[str, Any]:
+        def hardware(job: Job) -> Mapping[str, object]:
             return noise_sequence.take_frames(service, job, made["noise_id"], body.frames)
 
-        def compute(job: Job) -> dict[str, Any]:
+        def compute(job: Job) -> Mapping[str, object]:
             return noise_sequence.fit(service, job, made["noise_id"])
 
         job = service.jobs.submit(
@@ -55,7 +57,9 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
         return {**made, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return NoiseAccepted.model_validate({"job": service.jobs.document(made["job_id"]), "noise_id": made["noise_id"]})
+    return NoiseAccepted.model_validate(
+        {"job": service.jobs.document(str(made["job_id"])).plain(), "noise_id": made["noise_id"]}
+    )
 
 
 @router.get("", summary="Noise measurements, oldest first", responses=errors(422))

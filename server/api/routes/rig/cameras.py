@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import anyio
 import cv2
@@ -30,6 +30,7 @@ from server.api.models import (
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
 from server.api.protocol.problems import errors
+from server.base.models import Ids
 from server.formats.images import encode_tiff
 from server.jobs.job import Job, Phase
 from server.results.quality import image_quality
@@ -48,12 +49,12 @@ def get_rig(service: ServiceDep) -> RigReply:
 def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
     """Close and open every device; settings are pushed and read back."""
 
-    def run(job: Job) -> dict[str, Any]:
+    def run(job: Job) -> Mapping[str, object]:
         job.progress("reconnecting", 0, 1)
         service.rig.reconnect()
         return {"rig": service.rig.describe()["name"]}
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         job = service.jobs.submit(
             "reconnect", "a reconnection of the rig", {}, [Phase("hardware", run)], request=request
         )
@@ -61,7 +62,7 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
 
     request = mark("reconnect", key, None)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return Accepted.model_validate({"job": service.jobs.document(made["job_id"])})
+    return Accepted.model_validate({"job": service.jobs.document(str(made["job_id"])).plain()})
 
 
 @router.put(

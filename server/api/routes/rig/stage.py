@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
@@ -28,6 +28,7 @@ from server.api.protocol.attached import Attached, job_reply
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, get_service, mark
 from server.api.protocol.problems import errors
+from server.base.models import Ids
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.workflows.service import Service
@@ -65,11 +66,11 @@ def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
         here = rig.positions_mm(tuple(by))
         return {axis: here[axis] + distance for axis, distance in by.items()}
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         wanted = targets()
         rig.check_targets(wanted)
 
-        def run(job: Job) -> dict[str, Any]:
+        def run(job: Job) -> Mapping[str, object]:
             job.progress("moving", 0, 1)
             job.check()
             moved = rig.move(wanted)
@@ -99,12 +100,12 @@ async def home(
 def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> str:
     axes = tuple(body.axes) if body is not None and body.axes else service.config.axes
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         service.rig.check_axes(axes)
         for axis in service.rig.controls.in_configuration(axes):
             raise configuration_state(axis)
 
-        def run(job: Job) -> dict[str, Any]:
+        def run(job: Job) -> Mapping[str, object]:
             found = {}
             for index, axis in enumerate(axes):
                 job.progress("homing", index, len(axes))
@@ -208,19 +209,19 @@ def patch_axis(
 def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsent, key: KeyHeader = None) -> Accepted:
     """Leave the state in which it refuses every motion. This writes its flash memory, and `write_flash` consents."""
 
-    def run(job: Job) -> dict[str, Any]:
+    def run(job: Job) -> Mapping[str, object]:
         job.progress("leaving the configuration state", 0, 1)
         service.rig.controls.leave_configuration(axis)
         return {"axis": axis}
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         service.rig.check_axes((axis,))
         what = f"the leaving of the configuration state of axis {axis}"
         return {"job_id": _motion(service, request, "leave_configuration", what, {"axis": axis}, run)}
 
     request = mark(f"leave-configuration/{axis}", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return Accepted.model_validate({"job": service.jobs.document(made["job_id"])})
+    return Accepted.model_validate({"job": service.jobs.document(str(made["job_id"])).plain()})
 
 
 @router.get("/messages", summary="What the controller had to say")

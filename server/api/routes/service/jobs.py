@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends
 from fastapi.sse import EventSourceResponse, ServerSentEvent
@@ -15,11 +15,12 @@ from server.api.protocol.problems import errors
 from server.api.routes.service.system import EventStream, LastEventId
 from server.jobs.events import Event
 from server.jobs.job import FINAL
+from server.store.documents import JobRecord
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 
-def known_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
+def known_job(service: ServiceDep, job_id: JobId) -> JobRecord:
     """Return the job, or 404 before a stream begins."""
     return service.jobs.document(job_id)
 
@@ -27,20 +28,20 @@ def known_job(service: ServiceDep, job_id: JobId) -> dict[str, Any]:
 @router.get("", summary="Jobs, newest first", responses=errors(422))
 def list_jobs(service: ServiceDep, page: ShortPageDep) -> JobList:
     """Return a page of the jobs of this and earlier runs of the service."""
-    jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after), lambda j: str(j["id"]))
-    return JobList.model_validate({"jobs": jobs, "next_cursor": page.next_cursor})
+    jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after), lambda j: j.id)
+    return JobList.model_validate({"jobs": [job.plain() for job in jobs], "next_cursor": page.next_cursor})
 
 
 @router.get("/{job_id}", summary="One job", responses=errors(404))
 def get_job(service: ServiceDep, job_id: JobId) -> JobReply:
     """Return state, progress, and result or problem."""
-    return JobReply.model_validate(service.jobs.document(job_id))
+    return JobReply.model_validate(service.jobs.document(job_id).plain())
 
 
 @router.post("/{job_id}/cancel", summary="Cancel a job", status_code=202, responses=errors(404, 409))
 def cancel_job(service: ServiceDep, job_id: JobId) -> JobReply:
     """Ask the job to stop; it does within a second, and keeps what was finished."""
-    return JobReply.model_validate(service.jobs.cancel(job_id))
+    return JobReply.model_validate(service.jobs.cancel(job_id).plain())
 
 
 @router.get(
@@ -51,26 +52,26 @@ def cancel_job(service: ServiceDep, job_id: JobId) -> JobReply:
     dependencies=[EventStream],
 )
 async def job_events(
-    service: ServiceDep, job: Annotated[dict[str, Any], Depends(known_job)], last_event_id: LastEventId = None
+    service: ServiceDep, job: Annotated[JobRecord, Depends(known_job)], last_event_id: LastEventId = None
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow a job; the stream ends with the job. It begins with the job as it is, or resumes after `Last-Event-ID`.
 
     What came after that event is sent again. Where it is no longer kept, the job as it is now is sent instead.
     """
-    hub, job_id = service.hub, job["id"]
+    hub, job_id = service.hub, job.id
     after = hub.last_number if last_event_id is None else last_event_id
 
     def shown() -> ServerSentEvent:
         # the number first: what happens meanwhile is told twice, and never not at all
         number = hub.last_number
-        return ServerSentEvent(data=service.jobs.document(job_id), event="job", id=str(number))
+        return ServerSentEvent(data=service.jobs.document(job_id).plain(), event="job", id=str(number))
 
     if last_event_id is None:
         begin = shown()
         yield begin
         if begin.data["state"] in FINAL:
             return
-    elif service.jobs.document(job_id)["state"] in FINAL:
+    elif service.jobs.document(job_id).state in FINAL:
         left = [] if hub.gap(after) else [e for e in hub.after(after) if _of_job(e, job_id)]
         for event in left:
             yield ServerSentEvent(data=event.data, event=event.name, id=str(event.number))

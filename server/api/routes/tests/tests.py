@@ -31,7 +31,7 @@ from server.api.protocol.conditional import IfMatch, etag_of, require_match, tag
 from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, StepNumber, TestId, get_service, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
-from server.base.models import FormNumber
+from server.base.models import FormNumber, Ids
 from server.formats.images import read_image
 from server.jobs.idempotency import RequestMark
 from server.store.index import step_entry, test_entry
@@ -59,7 +59,7 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
     """Make a test; it gets its own copy of the calibration."""
     request = mark("tests", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         path = None
         calibration_id = newest_accepted(service) if body.calibration_id == "accepted" else body.calibration_id
         if calibration_id is not None:
@@ -81,7 +81,7 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
         return {"test_id": document["id"]}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return TestReply.model_validate(_reply(service, made["test_id"]))
+    return TestReply.model_validate(_reply(service, str(made["test_id"])))
 
 
 @router.get("", summary="Tests, oldest first", responses=errors(422))
@@ -157,18 +157,18 @@ def _capture(service: Service, test_id: str, body: StepRequest, key: str | None)
     service.tests.path(test_id)
     sent = mark(f"tests/{test_id}/steps", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         return {"n": capture_step(service, test_id, _facts(body, sent), frames=body.frames)["n"]}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
-    return step_reply(service, test_id, made["n"])
+    return step_reply(service, test_id, int(made["n"]))
 
 
 def _start_burst(service: Service, test_id: str, body: StepRequest, key: str | None) -> str:
     service.tests.path(test_id)
     sent = mark(f"tests/{test_id}/steps", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         job_id = start_burst(
             service,
             test_id,
@@ -233,13 +233,18 @@ def import_images(
     said = f"{label}\n{load_n}\n{stamp}\n{readings}".encode()
     request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], said)
 
-    def make() -> dict[str, Any]:
-        facts = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
-        facts |= request.document()
+    def make() -> Ids:
+        facts = {
+            "label": label,
+            "load_n": load_n,
+            "timestamp_utc": stamp,
+            "channels": readings or {},
+            **request.document(),
+        }
         return {"n": import_step(service, test_id, data, facts)["n"]}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return StepReply.model_validate(step_reply(service, test_id, made["n"]))
+    return StepReply.model_validate(step_reply(service, test_id, int(made["n"])))
 
 
 @router.get("/{test_id}/steps", summary="A test's steps, in order", responses=errors(404, 422))

@@ -12,6 +12,7 @@ from server.api.protocol.conditional import IfMatch, PreconditionFailedError, et
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.problems import errors
 from server.api.routes.tests.tests import step_reply
+from server.base.models import Ids
 from server.workflows.watch import Watches
 
 
@@ -83,7 +84,7 @@ def post_channels(
     service.tests.path(test_id)
     sent = mark(f"tests/{test_id}/channels", key, body)
 
-    def make() -> dict[str, Any]:
+    def make() -> Ids:
         facts = {
             "label": body.label,
             "load_n": body.load_n,
@@ -92,10 +93,11 @@ def post_channels(
             **sent.document(),
         }
         outcome = watches.reading(test_id, facts)
-        return {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
+        told = {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
+        return {name: value for name, value in told.items() if value is not None}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
-    step = None if made["n"] is None else step_reply(service, test_id, made["n"])
+    step = None if made.get("n") is None else step_reply(service, test_id, int(made["n"]))
     if step is not None and "reason" not in made:  # told by the step, the catalogue was lost
         watch = step.get("watch", {})
         made = {**made, "reason": "first" if watch.get("last_value") is None else "changed", **watch}
