@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-from core.matching.kernels.given import FitKernels, Given
+from core.matching.kernels.given import FitKernels
 from core.matching.kernels.motion import make_motion
 from core.matching.kernels.naming import entry
 from core.matching.kernels.shape import make_shape
@@ -36,15 +36,33 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
     def run(first, last, given, space, out, status, iterations):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
+        # taken apart before the loop: in it numba would count references at each attribute
+        reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting = given
         for i in range(first, last):
-            status[i], iterations[i] = _point(given, i, space, out[i])
+            status[i], iterations[i] = _point(
+                reference,
+                patches,
+                which[i],
+                images,
+                lens1,
+                lens2,
+                R,
+                t,
+                xy[i],
+                w[i],
+                G[i],
+                e[i],
+                setting,
+                space,
+                out[i],
+            )
 
     looped = FunctionType(run.__code__, {**globals(), "_point": kernel}, name, None, run.__closure__)
     looped.__qualname__ = name
     return entry(looped)
 
 
-def _point(given: Given, index: int, space: Any, out: Any) -> tuple[int, int]:
+def _point(*given: Any) -> tuple[int, int]:
     """Stand for an entry point's kernel, which is found under this name in globals of the entry point's own."""
     raise NotImplementedError
 

@@ -123,7 +123,10 @@ class Equations(NamedTuple):
 
 
 class WorkSpace(NamedTuple):
-    """Everything that a thread needs for one point after another, so that no point allocates."""
+    """Everything that a thread needs for one point after another, so that no point allocates.
+
+    Kernels take it apart at once: numba counts references at each attribute.
+    """
 
     ref: Any
     of_reference: ReferenceSpace

@@ -75,9 +75,9 @@ def make_motion(degree: int) -> FitKernels:
     @kernel(f"{degree}")
     def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid):
         """Set up and factor the normal equations; status."""
-        columns, half, normal = equations.columns, equations.half, equations.normal
-        joint_weights(levels, variances, 3, equations.weights)
-        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, equations.block, columns):
+        weights, block, columns, half, _, normal = equations
+        joint_weights(levels, variances, 3, weights)
+        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
         n = unknowns
         if few == 3 and rigid:
@@ -96,18 +96,17 @@ def make_motion(degree: int) -> FitKernels:
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def motion_point(given, index, space, out):
+    def motion_point(
+        reference, patches, which, images, lens1, lens2, R, t, xy, start_w, start_g, _e, setting, space, out
+    ):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
-        setting, lens1, lens2, R, t = given.setting, given.lens1, given.lens2, given.R, given.t
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
-        ref, of_reference, warp_space, equations = space.ref, space.of_reference, space.warp, space.equations
-        rhs, levels, M, moves = space.rhs, space.levels, space.M, space.moves
-        chain, inverse, G, rotation = space.chain, space.inverse, space.G, space.rotation
-        gram, columns, normal = of_reference.gram, equations.columns, equations.normal
-        subset, xy = setting.subset, given.xy[index]
-        seen = set_up_reference(
-            given.reference, given.patches, given.which[index], lens1, xy[0], xy[1], subset, ref, of_reference
+        ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain, work = (
+            space
         )
+        gram, columns, normal = of_reference.gram, equations.columns, equations.normal
+        subset = setting.subset
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -117,9 +116,8 @@ def make_motion(degree: int) -> FitKernels:
         gradients, weakest = texture(gram)
         if not (seen.white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
-        w, step, small = space.vectors[0], space.vectors[1], space.vectors[2]
+        w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
-        start_w, start_g = given.w[index], given.G[index]
         for j in range(few):
             w[j] = start_w[j]
             total += w[j]
@@ -137,7 +135,7 @@ def make_motion(degree: int) -> FitKernels:
             if not nearest_rotation(xc, yc, w, G, rotation):
                 return SINGULAR, 0
             rigid_columns(xc, yc, w, rotation, G)
-        images, lenses = given.images, (lens1, lens2)
+        lenses = (lens1, lens2)
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
@@ -216,7 +214,7 @@ def make_motion(degree: int) -> FitKernels:
         if setting.known_noise:
             variance = variances[0]
         covariance = out[at + 5 : at + 30]
-        covariance_of_last(normal, n, 5, space.work, covariance)
+        covariance_of_last(normal, n, 5, work, covariance)
         factor_on = share_correction(gradients, variance, p, setting.slope_noise, setting.slope_share)
         factor_on *= 1.0 if setting.known_noise else variance + above
         for i in range(25):

@@ -123,25 +123,12 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
-    def observed_point(given, index, space, out):
+    def observed_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
         """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status, and 0."""
-        setting, lens1, lens2, R, t = given.setting, given.lens1, given.lens2, given.R, given.t
         subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
-        fit, part, scores, pull, z = space.fit, space.part, space.scores, space.pull, space.z
-        ref, of_reference, warp_space, equations = fit.ref, fit.of_reference, fit.warp, fit.equations
-        rhs, levels, M, inverse, G, rotation, chain = (
-            fit.rhs,
-            fit.levels,
-            fit.M,
-            fit.inverse,
-            fit.G,
-            fit.rotation,
-            fit.chain,
-        )
-        xy, w, g, e = given.xy[index], given.w[index], given.G[index], given.e[index]
-        seen = set_up_reference(
-            given.reference, given.patches, given.which[index], lens1, xy[0], xy[1], subset, ref, of_reference
-        )
+        fit_space, part, scores, pull, z, sums = space
+        ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _ = fit_space
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -163,7 +150,7 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
         for k in range(images):
             lens = lens1 if k == 1 else lens2
             levels[k, GAIN], levels[k, SHIFT] = 1.0, 0.0
-            if not compare(given.images[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
+            if not compare(shown[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
                 return OUTSIDE_IMAGE, 0
             if levels[k, CONTRAST] == 0.0 or not levels[k, ZNCC] > 0.0:
                 return LOW_TEXTURE, 0
@@ -171,11 +158,11 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
             correlation = levels[k, ZNCC]
             warp[20] = levels[k, GAIN] / correlation
             warp[21] = (levels[k, SHIFT] + offset) / correlation - offset
-            coefficients, rows, cols, stride = given.images[k]
+            coefficients, rows, cols, stride = shown[k]
             base = set_up_warp(
                 lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.places, warp
             )
-            worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, space.sums, scores[k])
+            worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores[k])
         # the contrast of all is taken for the best one's: what another lacks of its correlation is noise of its own
         best = best_correlation(levels, images)
         n = unknowns
@@ -189,8 +176,8 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
         )
         if result != OK:
             return result, 0
-        weights, columns, normal = equations.weights, equations.columns, equations.normal
-        unit = fit.vectors[0]
+        weights, _, columns, _, _, normal = equations
+        unit = vectors[0]
         for i in range(last):
             for c in range(n):
                 unit[c] = 0.0

@@ -55,26 +55,21 @@ def make_shape(degree: int) -> FitKernels:
     @kernel(f"{degree}")
     def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, _chain, _rigid):
         """Set up and factor the normal equations; status."""
-        columns, normal = equations.columns, equations.normal
-        joint_weights(levels, variances, 1, equations.weights)
-        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, equations.block, columns):
+        weights, block, columns, _, _, normal = equations
+        joint_weights(levels, variances, 1, weights)
+        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
         assemble(equations, of_reference.gram)
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def shape_point(given, index, space, out):
+    def shape_point(reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, _e, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
-        setting, lens1, lens2, R, t = given.setting, given.lens1, given.lens2, given.R, given.t
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
-        ref, of_reference, warp_space, equations = space.ref, space.of_reference, space.warp, space.equations
-        rhs, levels, M, moves = space.rhs, space.levels, space.M, space.moves
-        inverse, G, rotation = space.inverse, space.G, space.rotation
+        ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work = space
         gram, columns, normal = of_reference.gram, equations.columns, equations.normal
-        subset, xy = setting.subset, given.xy[index]
-        seen = set_up_reference(
-            given.reference, given.patches, given.which[index], lens1, xy[0], xy[1], subset, ref, of_reference
-        )
+        subset = setting.subset
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -83,9 +78,9 @@ def make_shape(degree: int) -> FitKernels:
         gradients, weakest = texture(gram)
         if not (seen.white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
-        w, step, small = space.vectors[0], space.vectors[1], space.vectors[2]
+        w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
-        start, image2 = given.w[index], given.images[0]
+        image2 = images[0]
         for i in range(few):
             w[i] = start[i]
             total += w[i]
@@ -145,7 +140,7 @@ def make_shape(degree: int) -> FitKernels:
         out[few + 2] = math.sqrt(variance)
         if setting.known_noise:
             variance = variances[0]
-        covariance_of_last(normal, n, 2, space.work, small)
+        covariance_of_last(normal, n, 2, work, small)
         factor_on = share_correction(gradients, variance, p, setting.slope_noise, setting.slope_share)
         factor_on *= 1.0 if setting.known_noise else variance
         out[few + 3], out[few + 4], out[few + 5] = factor_on * small[0], factor_on * small[1], factor_on * small[3]
