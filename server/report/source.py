@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from core.errors import InputError, StereorigError
 from server.base.errors import NotFoundError
-from server.exports.source import results_in
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import known_sha256
 from server.formats.images import read_image
+from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import read_attributes
 from server.report.records import AnalysisRecord, RigRecord, StepRecord, TestRecord
 from server.results.metadata import TestFacts, parse_facts
@@ -138,7 +138,7 @@ def find_source(
         A result file that cannot be read, facts that cannot be.
     """
     folder = _results_folder(place, test, analysis)
-    files = {int(path.stem[5:]): path for path in results_in(folder)}
+    files = {number_of(path): path for path in results_in(folder)}
     if not files:
         raise InputError(
             f"There is no step_0000.nc or another step's result in {folder}.",

@@ -12,6 +12,7 @@ from typing import Any
 
 from core.names import CAMERAS
 from server.formats.files import known_sha256
+from server.formats.results.folder import number_of, results_in
 from server.store.durable import known_json
 
 
@@ -102,7 +103,7 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
 def _missing_results(folder: Path, summary: dict[str, Any]) -> list[str]:
     """Results that the measurement's own record names and that are not there."""
     listed = [s.get("step", s.get("n")) for s in summary.get("steps", []) if isinstance(s, dict)]
-    there = {int(path.stem.removeprefix("step_")) for path in folder.glob("step_[0-9]*.nc")}
+    there = set(map(number_of, results_in(folder)))
     return [f"the result of step {n} is gone" for n in listed if isinstance(n, int) and n not in there]
 
 

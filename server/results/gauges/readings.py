@@ -36,6 +36,7 @@ from server.formats.gauges.readings import (
     RigidMotionReading,
     StepReadings,
 )
+from server.formats.results.folder import number_of
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import read_attributes, read_field
 from server.formats.version import software_version
@@ -152,7 +153,7 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
             code="no_results",
             remedy="Measure first; a step's result can be read once the step is finished.",
         )
-    there = {_number_of(path): path for path in files}
+    there = {number_of(path): path for path in files}
     numbers = sorted(there) if wanted is None else sorted(set(wanted))
     missing = [n for n in numbers if n not in there]
     if missing:
@@ -162,10 +163,6 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
             remedy="Ask for steps that were measured.",
         )
     return [there[n] for n in numbers]
-
-
-def _number_of(path: Path) -> int:
-    return int(path.stem.removeprefix("step_"))
 
 
 def _listed(numbers: Sequence[int]) -> str:
