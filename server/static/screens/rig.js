@@ -1,9 +1,9 @@
 // Both cameras live, their settings and figures, and the stage.
-import * as api from "./api.js";
-import * as events from "./events.js";
-import { View } from "./view.js";
-import { chart } from "./plots.js";
-import { h, replace, field, number, select, action, facts, badge, num, count, quantity, notify, problemText, STATE_KIND } from "./dom.js";
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { View } from "../widgets/view.js";
+import { chart } from "../widgets/plots.js";
+import { h, replace, field, number, select, action, facts, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 const CAMERAS = ["cam1", "cam2"];
 const COURSE = 120; // samples of the focus figure that are kept

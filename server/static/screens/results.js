@@ -1,13 +1,13 @@
 // Results: which tests and analyses there are, and one analysis' fields over the image and in space.
-import * as api from "./api.js";
-import * as events from "./events.js";
-import { Result, all } from "./result.js";
-import { FieldMap, measured } from "./field_map.js";
-import { Scale } from "./scale.js";
-import { about, files } from "./about.js";
-import { gauges } from "./gauges.js";
-import { mark, pinned } from "./probe.js";
-import { h, replace, table, badge, when, num, count, quantity, field, select, action, facts, notify, problemText, STATE_KIND } from "./dom.js";
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { Result, all } from "./results/analysis.js";
+import { FieldMap, measured } from "../widgets/field_map.js";
+import { Scale } from "../widgets/scale.js";
+import { about, files } from "./results/about.js";
+import { gauges } from "./results/gauges.js";
+import { mark, pinned } from "./results/probe.js";
+import { h, replace, table, badge, when, num, count, quantity, field, select, action, facts, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 const MODES = [["image", "Image"], ["surface", "3-D surface"], ["compare", "Side by side"]];
 
@@ -198,7 +198,7 @@ async function show(root, testId, analysisId, query) {
       map.view.fit();
       return;
     }
-    const made = name === "surface" ? await (await import("./surface.js")).surface(screen) : await (await import("./compare.js")).compare(screen);
+    const made = name === "surface" ? await (await import("./results/surface.js")).surface(screen) : await (await import("./results/compare.js")).compare(screen);
     if (state.mode !== name || other || !document.contains(stage)) {
       made.close();
       return;

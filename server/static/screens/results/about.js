@@ -1,6 +1,6 @@
 // What an analysis was made with, how its steps came out, and its files to take away.
-import * as api from "./api.js";
-import { h, replace, table, badge, facts, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "./dom.js";
+import * as api from "../../lib/api.js";
+import { h, replace, table, badge, facts, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "../../lib/dom.js";
 
 /** Settings, software, inputs; each step's figures, checks and warnings. */
 export function about(screen) {

@@ -1,6 +1,6 @@
 // The colour scale: its controls, its bar, and the colouring of values with it.
-import { MAPS, ENTRIES, colours, entry, percentiles, suited, statusColour, bytes } from "./colour.js";
-import { h, replace, field, number, select, num, tick } from "./dom.js";
+import { MAPS, ENTRIES, colours, entry, percentiles, suited, statusColour, bytes } from "../lib/colour.js";
+import { h, replace, field, number, select, num, tick } from "../lib/dom.js";
 
 export class Scale {
   /**

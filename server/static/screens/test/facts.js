@@ -1,6 +1,6 @@
 // What only people know about a test: fields for the report.
-import * as api from "./api.js";
-import { h, replace, field, number, action, notify, problemText } from "./dom.js";
+import * as api from "../../lib/api.js";
+import { h, replace, field, number, action, notify, problemText } from "../../lib/dom.js";
 
 const GROUPS = [
   ["The test", [["purpose", "Purpose"], ["laboratory", "Laboratory"], ["operator", "Operator"], ["specimen", "Specimen"], ["material", "Material"], ["loading", "Loading"], ["environment", "Environment"]]],

@@ -1,10 +1,10 @@
 // Tests: make one, take or import its steps, tell what no device knows, choose what is measured and how.
-import * as api from "./api.js";
-import * as events from "./events.js";
-import { stepsPanel } from "./test_steps.js";
-import { factsPanel } from "./test_facts.js";
-import { measurePanel } from "./test_measure.js";
-import { h, replace, field, select, action, table, when, notify } from "./dom.js";
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { stepsPanel } from "./test/steps.js";
+import { factsPanel } from "./test/facts.js";
+import { measurePanel } from "./test/measure.js";
+import { h, replace, field, select, action, table, when, notify } from "../lib/dom.js";
 
 export async function open(root, { path }) {
   return path[0] ? one(root, path[0]) : all(root);

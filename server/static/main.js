@@ -1,14 +1,14 @@
 // The shell: bar with the stop button, screens by address, what is said about connection and key.
-import * as api from "./api.js";
-import * as events from "./events.js";
-import { h, replace, notify, badge, num, field, problemText, ask, modal } from "./dom.js";
+import * as api from "./lib/api.js";
+import * as events from "./lib/events.js";
+import { h, replace, notify, badge, num, field, problemText, ask, modal } from "./lib/dom.js";
 
 const SCREENS = {
-  rig: ["Rig", () => import("./rig.js")],
-  calibrate: ["Calibrate", () => import("./calibrate.js")],
-  test: ["Test", () => import("./test.js")],
-  results: ["Results", () => import("./results.js")],
-  jobs: ["Jobs & system", () => import("./jobs.js")],
+  rig: ["Rig", () => import("./screens/rig.js")],
+  calibrate: ["Calibrate", () => import("./screens/calibrate.js")],
+  test: ["Test", () => import("./screens/test.js")],
+  results: ["Results", () => import("./screens/results.js")],
+  jobs: ["Jobs & system", () => import("./screens/jobs.js")],
 };
 
 const main = document.getElementById("main");

@@ -1,6 +1,6 @@
 // A test's steps: capture with load and channels, what the pair is worth, thumbnails, import of existing pairs.
-import * as api from "./api.js";
-import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "./dom.js";
+import * as api from "../../lib/api.js";
+import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "../../lib/dom.js";
 
 const KIND = { ok: "good", dark: "warn", blurred: "warn", low_texture: "warn", saturated: "warn", blank: "bad", cameras_off_zero: "bad" };
 const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "little texture", saturated: "saturated", blank: "nothing to see", cameras_off_zero: "cameras are off their calibrated place" };

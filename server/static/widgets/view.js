@@ -1,7 +1,7 @@
 // A picture that can be zoomed and read, with a canvas and an SVG laid over it in its own pixels.
 //
 // Pixel coordinates are those of the API: the first pixel's centre is (0, 0).
-import { h, svg, num } from "./dom.js";
+import { h, svg, num } from "../lib/dom.js";
 
 const STEP = 1.25;
 const MOST = 64;

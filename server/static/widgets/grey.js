@@ -1,6 +1,6 @@
 // Grey levels of recorded images: read in tiles, so that a mouse that wanders asks seldom.
-import * as api from "./api.js";
-import { num } from "./dom.js";
+import * as api from "../lib/api.js";
+import { num } from "../lib/dom.js";
 
 const TILE = 64;
 const MOST = 256; // tiles that are kept

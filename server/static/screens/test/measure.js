@@ -1,9 +1,9 @@
 // Where and how a test is measured: region, seeds, subset over the speckle, texture, settings, start.
-import * as api from "./api.js";
-import { View, stroke } from "./view.js";
-import { greyOf } from "./grey.js";
-import { RegionEditor } from "./region_editor.js";
-import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText, STATE_KIND } from "./dom.js";
+import * as api from "../../lib/api.js";
+import { View, stroke } from "../../widgets/view.js";
+import { greyOf } from "../../widgets/grey.js";
+import { RegionEditor } from "../../widgets/region_editor.js";
+import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../../lib/dom.js";
 
 const LEVEL = { good: "good", usable: "warn", poor: "bad" };
 

@@ -1,7 +1,7 @@
 // The pictures of a calibration with what was found in them: lines, intersections, residual arrows.
-import * as api from "./api.js";
-import { View, stroke } from "./view.js";
-import { h, replace, svg, field, select, num, quantity } from "./dom.js";
+import * as api from "../../lib/api.js";
+import { View, stroke } from "../../widgets/view.js";
+import { h, replace, svg, field, select, num, quantity } from "../../lib/dom.js";
 
 const COLOUR = { lines: "#33c6ff", node: "#ffd23e", arrow: "#ff4d3d" };
 const LONGEST = 0.15; // of the picture's width

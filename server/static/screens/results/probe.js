@@ -1,6 +1,6 @@
 // The pinned point: every number that the service has of it.
-import { h, svg, replace, table, num, badge, STATE_KIND } from "./dom.js";
-import { shownUnit } from "./result.js";
+import { h, svg, replace, table, num, badge, STATE_KIND } from "../../lib/dom.js";
+import { shownUnit } from "./analysis.js";
 
 const CORRELATIONS = 3;
 

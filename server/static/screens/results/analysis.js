@@ -1,6 +1,6 @@
 // One analysis' results: what is read is kept, so that stepping and playing ask once.
-import * as api from "./api.js";
-import { Grid } from "./grid.js";
+import * as api from "../../lib/api.js";
+import { Grid } from "../../lib/point_grid.js";
 
 const MOST_BYTES = 300e6;
 const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;

@@ -1,5 +1,5 @@
 // Line plots: uPlot with this page's colours, loaded when the first one is drawn.
-import { num, tick, h } from "./dom.js";
+import { num, tick, h } from "../lib/dom.js";
 
 let library = null;
 async function uplot() {

@@ -1,10 +1,10 @@
 // The measured surface in space with the field on it: turned by mouse, finger or keys; its displacement magnified.
-import { h, replace, field, number, action, tick } from "./dom.js";
-import { ENTRIES } from "./colour.js";
+import { h, replace, field, number, action, tick } from "../../lib/dom.js";
+import { ENTRIES } from "../../lib/colour.js";
 
 let library = null;
 async function three() {
-  library ??= Promise.all([import("../vendor/three/three.module.js"), import("../vendor/three/OrbitControls.js")]);
+  library ??= Promise.all([import("../../vendor/three/three.module.js"), import("../../vendor/three/OrbitControls.js")]);
   const [THREE, { OrbitControls }] = await library;
   return { THREE, OrbitControls };
 }

@@ -1,7 +1,7 @@
 // What runs and ran, and how the machine is.
-import * as api from "./api.js";
-import * as events from "./events.js";
-import { h, replace, action, badge, facts, num, quantity, table, when, problemText, notify, STATE_KIND } from "./dom.js";
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { h, replace, action, badge, facts, num, quantity, table, when, problemText, notify, STATE_KIND } from "../lib/dom.js";
 
 export async function open(root) {
   const list = h("div");

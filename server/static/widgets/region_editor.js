@@ -1,7 +1,7 @@
 // Draw a region, holes, crack lines and seeds over the reference images: by mouse, by keyboard, by numbers.
 //
 // Everything is kept in camera 1's pixels, the first pixel's centre at (0, 0), to a tenth of a pixel.
-import { h, svg, replace, num } from "./dom.js";
+import { h, svg, replace, num } from "../lib/dom.js";
 import { stroke } from "./view.js";
 
 const TOOLS = [

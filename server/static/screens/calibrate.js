@@ -1,8 +1,8 @@
 // Calibrations: plan with its expected uncertainty, run, look, accept or discard, import, compare.
-import * as api from "./api.js";
-import * as events from "./events.js";
-import { calibrationViews } from "./calibration_views.js";
-import { h, replace, field, number, select, action, table, facts, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "./dom.js";
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { calibrationViews } from "./calibrate/views.js";
+import { h, replace, field, number, select, action, table, facts, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
 
 const LEVEL = { good: "good", warning: "warn", failed: "bad" };
 const DECISION = { accepted: "good", discarded: "bad" };

@@ -1,8 +1,8 @@
 // Gauges drawn on the picture: a line, extensometers, an area; read by the API's gauges operation.
-import * as api from "./api.js";
-import { chart } from "./plots.js";
-import { h, svg, replace, table, num, count, number, select, field, action, notify, problemText } from "./dom.js";
-import { shownUnit } from "./result.js";
+import * as api from "../../lib/api.js";
+import { chart } from "../../widgets/plots.js";
+import { h, svg, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
+import { shownUnit } from "./analysis.js";
 
 const TOOLS = [["probe", "Probe", "A click shows every number of a point; dragging moves the picture"], ["line", "Line", "Drag a line: values along it"],
   ["extensometer", "Extensometer", "Two clicks or a drag: elongation over the steps"], ["area", "Area", "Drag a rectangle: statistics of it"]];

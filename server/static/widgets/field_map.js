@@ -1,9 +1,9 @@
 // A field over an image: what is under the mouse, and the points' own numbers.
-import * as api from "./api.js";
+import * as api from "../lib/api.js";
 import { View } from "./view.js";
-import { num, quantity } from "./dom.js";
+import { num, quantity } from "../lib/dom.js";
 import { greyOf } from "./grey.js";
-import { statistics } from "./grid.js";
+import { statistics } from "../lib/point_grid.js";
 
 /** Values of the points that were measured. */
 export function measured(grid, values) {
@@ -36,7 +36,7 @@ export class FieldMap {
 
   /**
    * Read what is to be shown.
-   * @param {import("./result.js").Result} result
+   * @param {import("../screens/results/analysis.js").Result} result
    * @param {number} n step
    * @param {object} info entry of `result.fields`
    * @param {string} image "reference", "cam1" or "cam2"

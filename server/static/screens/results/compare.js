@@ -1,10 +1,10 @@
 // Two analyses beside each other: the same field with linked zoom, and their difference.
-import * as api from "./api.js";
-import { FieldMap } from "./field_map.js";
-import { Result, all } from "./result.js";
-import { Scale } from "./scale.js";
-import { chart } from "./plots.js";
-import { h, replace, select, field, facts, count, quantity, notify } from "./dom.js";
+import * as api from "../../lib/api.js";
+import { FieldMap } from "../../widgets/field_map.js";
+import { Result, all } from "./analysis.js";
+import { Scale } from "../../widgets/scale.js";
+import { chart } from "../../widgets/plots.js";
+import { h, replace, select, field, facts, count, quantity, notify } from "../../lib/dom.js";
 
 const BINS = 41;
 
