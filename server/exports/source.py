@@ -68,7 +68,8 @@ def source_of(folder: Path, files: list[Path]) -> Source:
 
 def _mask(folder: Path, settings: object) -> Path | None:
     """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
-    named = settings.get("mask") if isinstance(settings, dict) else None
+    region = settings.get("region") if isinstance(settings, dict) else None
+    named = region.get("mask") if isinstance(region, dict) else None
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):
         if path.is_file():
             return path

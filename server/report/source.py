@@ -92,7 +92,7 @@ class Source:
         n = self.reference
         head = self.heads.get(n, self.heads[max(self.heads)])
         inputs = head["inputs_sha256"]
-        sha256 = inputs.get(f"reference_{cam}") or inputs.get(f"step_{cam}") or inputs.get(cam)
+        sha256 = inputs.get(f"reference_{cam}") or inputs.get(cam)
         places = [] if self.test is None else [self.test / "steps" / f"{n:04d}" / f"{cam}.tif"]
         if n in self.heads and self.heads[n].get(f"{cam}_file"):
             named = Path(str(self.heads[n][f"{cam}_file"]))
@@ -228,7 +228,7 @@ def _calibration(
 ) -> tuple[LoadedCalibration | None, Path | None]:
     """Find the calibration that the results were measured with, by its checksum."""
     inputs = heads[max(heads)]["inputs_sha256"]
-    sha256 = inputs.get("calibration", inputs.get("calibration.json"))
+    sha256 = inputs.get("calibration")
     places = [] if given is None else [given]
     if given is None:
         places += [] if test is None else [test / "calibration.json"]

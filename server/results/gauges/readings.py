@@ -48,7 +48,6 @@ from server.results.staleness import stale_results
 
 _Placed = dict[str | None, list[tuple[float, float]]]
 MOST_NUMBERS = 3_000_000
-_CALIBRATION = ("calibration", "calibration.json")
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
 
@@ -189,7 +188,7 @@ def _check_same(step: _Step, first: Mapping[str, Any], grid: tuple[Float, Float]
         "points"
         if field.shape != grid[0].shape or (field.x_px != grid[0]).any() or (field.y_px != grid[1]).any()
         else "calibration"
-        if any(inputs.get(k) != others.get(k) for k in _CALIBRATION)
+        if inputs.get("calibration") != others.get("calibration")
         else "subset"
         if step.attributes["settings"].get("subset_px") != first["settings"].get("subset_px")
         else "smoothing"
