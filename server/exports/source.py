@@ -6,7 +6,7 @@ from pathlib import Path
 
 from core.errors import InputError
 from server.formats.results.folder import first_results, results_in
-from server.formats.results.reading import read_attributes
+from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
 from server.results.steps import Source
 from server.store.durable import known_json
@@ -40,12 +40,12 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
 
 def source_of(folder: Path, files: list[Path]) -> Source:
     """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
-    heads = [read_attributes(path) for path in files]
-    stale, mask = stale_results(files, heads), _mask(folder, heads[0].get("settings"))
+    heads = [read_head(path) for path in files]
+    stale, mask = stale_results(files, heads), _mask(folder, heads[0].settings)
     about: dict[str, object] = {}
     test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
     document = known_json(test / "test.json")
-    reference = int(heads[-1].get("reference_step", heads[0].get("step", 0)))
+    reference = heads[0].step if heads[-1].reference_step is None else heads[-1].reference_step
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
         about = {
@@ -59,7 +59,7 @@ def source_of(folder: Path, files: list[Path]) -> Source:
             about["analysis_id"] = folder.name
             name = f"{test.name}_{folder.name}"
         return Source(files, name, title, image, about, mask, stale)
-    said = str(heads[0].get("cam1_file", ""))
+    said = heads[0].image_file("cam1")
     calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
