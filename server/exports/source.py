@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from core.errors import InputError
+from server.formats.results.folder import first_results, results_in
 from server.formats.results.reading import read_attributes
 from server.results.staleness import stale_results
 from server.results.steps import Source
 from server.store.durable import known_json
-
-_RESULT = re.compile(r"step_\d{4,}\.nc")
-
-
-def results_in(folder: Path) -> list[Path]:
-    """Return a folder's result files, by step."""
-    return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))
 
 
 def find_source(folder: Path, analysis: str | None = None) -> Source:
@@ -42,14 +35,7 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
             code="option_conflict",
             remedy="Leave the analysis out, or give the test's folder.",
         )
-    files = results_in(folder)
-    if not files:
-        raise InputError(
-            f"There is no step_0000.nc or another step's result in {folder}.",
-            code="results_missing",
-            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-        )
-    return source_of(folder.absolute(), files)
+    return source_of(folder.absolute(), first_results(folder, [folder]))
 
 
 def source_of(folder: Path, files: list[Path]) -> Source:
@@ -82,7 +68,8 @@ def source_of(folder: Path, files: list[Path]) -> Source:
 
 def _mask(folder: Path, settings: object) -> Path | None:
     """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
-    named = settings.get("mask") if isinstance(settings, dict) else None
+    region = settings.get("region") if isinstance(settings, dict) else None
+    named = region.get("mask") if isinstance(region, dict) else None
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):
         if path.is_file():
             return path

@@ -231,7 +231,7 @@ def _outline(source: Source) -> NDArray[np.float64] | None:
     region = source.settings.get("region") or {}
     if region.get("polygon"):
         return np.asarray(region["polygon"], dtype=np.float64)
-    rectangle = region.get("rectangle") or source.settings.get("roi")
+    rectangle = region.get("rectangle")
     if not rectangle:
         return None
     x0, y0, x1, y1 = rectangle

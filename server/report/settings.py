@@ -115,7 +115,7 @@ def _points(measured: Measured) -> str:
 
 
 def _region(settings: Mapping[str, Any]) -> Value | None:
-    region = settings.get("region") or {"rectangle": settings.get("roi"), **settings}
+    region = settings.get("region") or {}
     rectangle, polygon = region.get("rectangle"), region.get("polygon")
     parts = []
     if rectangle:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from core.errors import InputError, StereorigError
 from server.base.errors import NotFoundError
-from server.exports.source import results_in
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import known_sha256
 from server.formats.images import read_image
+from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import read_attributes
 from server.report.records import AnalysisRecord, RigRecord, StepRecord, TestRecord
 from server.results.metadata import TestFacts, parse_facts
@@ -92,7 +92,7 @@ class Source:
         n = self.reference
         head = self.heads.get(n, self.heads[max(self.heads)])
         inputs = head["inputs_sha256"]
-        sha256 = inputs.get(f"reference_{cam}") or inputs.get(f"step_{cam}") or inputs.get(cam)
+        sha256 = inputs.get(f"reference_{cam}") or inputs.get(cam)
         places = [] if self.test is None else [self.test / "steps" / f"{n:04d}" / f"{cam}.tif"]
         if n in self.heads and self.heads[n].get(f"{cam}_file"):
             named = Path(str(self.heads[n][f"{cam}_file"]))
@@ -138,7 +138,7 @@ def find_source(
         A result file that cannot be read, facts that cannot be.
     """
     folder = _results_folder(place, test, analysis)
-    files = {int(path.stem[5:]): path for path in results_in(folder)}
+    files = {number_of(path): path for path in results_in(folder)}
     if not files:
         raise InputError(
             f"There is no step_0000.nc or another step's result in {folder}.",
@@ -228,7 +228,7 @@ def _calibration(
 ) -> tuple[LoadedCalibration | None, Path | None]:
     """Find the calibration that the results were measured with, by its checksum."""
     inputs = heads[max(heads)]["inputs_sha256"]
-    sha256 = inputs.get("calibration", inputs.get("calibration.json"))
+    sha256 = inputs.get("calibration")
     places = [] if given is None else [given]
     if given is None:
         places += [] if test is None else [test / "calibration.json"]

@@ -10,8 +10,6 @@ from server.formats.files import sha256_of
 from server.formats.version import software_version
 from server.results.steps import Source, StepResult
 
-_CALIBRATION = ("calibration", "calibration.json")  # as stereorig measure and the service name it
-
 
 def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, object]:
     """Return what every export says: software, frame, settings, calibration, inputs; values are plain.
@@ -52,7 +50,7 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
 def calibration_of(step: StepResult) -> str | None:
     """Return the SHA-256 of the calibration that a step was measured with; None where the file does not say."""
     inputs = _json(step, "inputs_sha256")
-    return next((str(inputs[name]) for name in _CALIBRATION if name in inputs), None)
+    return inputs.get("calibration")
 
 
 def notes_of(step: StepResult, source: Source) -> list[str]:

@@ -12,6 +12,8 @@ from typing import Any
 
 from core.names import CAMERAS
 from server.formats.files import known_sha256
+from server.formats.results.folder import number_of, results_in
+from server.formats.results.settings import current_summary
 from server.store.durable import known_json
 
 
@@ -67,7 +69,7 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
         Of each, as :func:`server.formats.results.reading.read_attributes` gives them.
     """
     folder = files[0].absolute().parent
-    summary = known_json(folder / "summary.json")
+    summary = current_summary(known_json(folder / "summary.json"))
     test = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
     heads = list(attributes)
     steps = {int(a["step"]): _images(a["inputs_sha256"]) for a in heads}
@@ -75,7 +77,7 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
     reference = int(heads[-1].get("reference_step", 0))
     steps.setdefault(reference, {cam: heads[-1]["inputs_sha256"].get(f"reference_{cam}") for cam in CAMERAS})
     calibration = None
-    if "calibration.json" in first and test is not None:
+    if test is not None and folder.parent.name == "analyses":
         calibration = test / "calibration.json"
     elif isinstance(summary.get("calibration"), dict):
         calibration = Path(str(summary["calibration"].get("file")))
@@ -83,7 +85,7 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
             calibration = test / "calibration.json"  # whatever folder the measurement was started from
         elif not calibration.is_absolute() and not calibration.is_file():
             calibration = None
-    sha256 = first.get("calibration", first.get("calibration.json"))
+    sha256 = first.get("calibration")
     found = _missing_results(folder, summary)
     if test is not None:
         return found + stale_inputs(
@@ -101,14 +103,14 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
 
 def _missing_results(folder: Path, summary: dict[str, Any]) -> list[str]:
     """Results that the measurement's own record names and that are not there."""
-    listed = [s.get("step", s.get("n")) for s in summary.get("steps", []) if isinstance(s, dict)]
-    there = {int(path.stem.removeprefix("step_")) for path in folder.glob("step_[0-9]*.nc")}
+    listed = [step["n"] for step in summary["steps"]]
+    there = set(map(number_of, results_in(folder)))
     return [f"the result of step {n} is gone" for n in listed if isinstance(n, int) and n not in there]
 
 
 def _images(inputs: Mapping[str, str]) -> dict[str, Any]:
-    """The step's own images' checksums; the service and the command line name them differently."""
-    return {cam: inputs.get(cam, inputs.get(f"step_{cam}")) for cam in CAMERAS}
+    """Return the checksums of the step's own images."""
+    return {cam: inputs.get(cam) for cam in CAMERAS}
 
 
 def _changed(path: Path, sha256: Any, what: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,9 @@ from core.errors import FileFormatError, InputError
 from core.field.region.cuts import Cuts, from_arrays
 from core.status import PointStatus
 from server.base.errors import NotFoundError
+from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
+from server.formats.results.settings import current_inputs, current_settings
 from server.results.reader import Variable
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
@@ -96,11 +99,6 @@ class Source:
     stale_reasons: Sequence[str] = ()
 
 
-def number_of(path: Path) -> int:
-    """Return the step's number in the name of a result file."""
-    return int(path.stem.removeprefix("step_"))
-
-
 def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
     """Return the result files of the steps asked for; all without a wish.
 
@@ -170,6 +168,8 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
         cuts = from_arrays(points, np.asarray(data.variables["cut_line"][...], dtype=np.int32))
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
+    for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
+        attributes[name] = json.dumps(current(json.loads(str(attributes.get(name, "{}")))))
     return StepResult(int(str(attributes.get("step", number_of(path)))), variables, attributes, cuts)
 
 

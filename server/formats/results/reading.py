@@ -17,8 +17,10 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field, References
 from core.field.points.smoothing_record import Smoothing
 from core.field.region.cuts import Cuts, from_arrays
+from core.status import PointStatus
 from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, HANDED_ON, MOTION, SHAPE
 from server.formats.results.netcdf import opened
+from server.formats.results.settings import current_inputs, current_settings
 
 
 @contextlib.contextmanager
@@ -75,7 +77,7 @@ def read_field(path: str | Path) -> Field:
 
 
 def read_measured(path: str | Path) -> Field:
-    """Read a result file back as it was measured: with its displacement before smoothing.
+    """Read a result file back as it was measured: before smoothing, and before points outside the volume were marked.
 
     Raises
     ------
@@ -83,18 +85,21 @@ def read_measured(path: str | Path) -> Field:
         As :func:`read_field`.
     """
     field = read_field(path)
-    if field.smoothing is None:
-        return field
     with _opened(Path(path)) as dataset:
-        if "measured_covariance" not in dataset.variables:
-            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
         read = {
             name: np.asarray(v[...], dtype=np.float64)
             for name, v in dataset.variables.items()
             if name.startswith("measured_")
         }
-    uvw = np.stack([read[f"measured_{name}_mm"] for name in ("u", "v", "w")], axis=-1)
-    return replace(field, uvw_mm=uvw, covariance=read["measured_covariance"], smoothing=None)
+    if field.smoothing is not None:
+        if "measured_u_mm" not in read:
+            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
+        uvw = np.stack([read[f"measured_{name}_mm"] for name in ("u", "v", "w")], axis=-1)
+        field = replace(field, uvw_mm=uvw, smoothing=None)
+    # files of format 1 have it only beside a smoothed displacement: there, marked points keep the calibration's part
+    covariance = read.get("measured_covariance", field.covariance)
+    status = np.where(field.status == PointStatus.EXTRAPOLATED, PointStatus.OK, field.status).astype(np.int8)
+    return replace(field, covariance=covariance, status=status)
 
 
 def read_attributes(path: str | Path) -> dict[str, Any]:
@@ -110,6 +115,8 @@ def read_attributes(path: str | Path) -> dict[str, Any]:
     for name in ("settings", "inputs_sha256", "patch_choice", "smoothing"):
         if name in attributes:
             attributes[name] = json.loads(attributes[name])
+    attributes["settings"] = current_settings(attributes.get("settings", {}))
+    attributes["inputs_sha256"] = current_inputs(attributes.get("inputs_sha256", {}))
     return attributes
 
 

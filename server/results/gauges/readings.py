@@ -36,6 +36,7 @@ from server.formats.gauges.readings import (
     RigidMotionReading,
     StepReadings,
 )
+from server.formats.results.folder import number_of
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import read_attributes, read_field
 from server.formats.version import software_version
@@ -47,7 +48,6 @@ from server.results.staleness import stale_results
 
 _Placed = dict[str | None, list[tuple[float, float]]]
 MOST_NUMBERS = 3_000_000
-_CALIBRATION = ("calibration", "calibration.json")
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
 
@@ -152,7 +152,7 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
             code="no_results",
             remedy="Measure first; a step's result can be read once the step is finished.",
         )
-    there = {_number_of(path): path for path in files}
+    there = {number_of(path): path for path in files}
     numbers = sorted(there) if wanted is None else sorted(set(wanted))
     missing = [n for n in numbers if n not in there]
     if missing:
@@ -162,10 +162,6 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
             remedy="Ask for steps that were measured.",
         )
     return [there[n] for n in numbers]
-
-
-def _number_of(path: Path) -> int:
-    return int(path.stem.removeprefix("step_"))
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -192,7 +188,7 @@ def _check_same(step: _Step, first: Mapping[str, Any], grid: tuple[Float, Float]
         "points"
         if field.shape != grid[0].shape or (field.x_px != grid[0]).any() or (field.y_px != grid[1]).any()
         else "calibration"
-        if any(inputs.get(k) != others.get(k) for k in _CALIBRATION)
+        if inputs.get("calibration") != others.get("calibration")
         else "subset"
         if step.attributes["settings"].get("subset_px") != first["settings"].get("subset_px")
         else "smoothing"

@@ -38,7 +38,8 @@ from sim.panel import CrackedPanel
 from sim.plate import CircularPlate
 from sim.rig import SimRig
 from sim.truth import Truth
-from tests.service.cli.test_demo import ROOT, field_of
+from tests.support.demo_field import field_of
+from tests.support.requirements import ROOT
 
 PANEL = SimRig.from_toml(ROOT / "config" / "sim_panel.toml")
 SUBSET = 21

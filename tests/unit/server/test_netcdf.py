@@ -22,7 +22,7 @@ from server.formats.results.writing import Provenance, write_field
 
 ROWS, COLS = 4, 6
 PROVENANCE = Provenance(
-    settings={"subset_px": 33, "roi": [1.0, 2.0, 3.0, 4.0]},
+    settings={"subset_px": 33, "region": {"rectangle": [1.0, 2.0, 3.0, 4.0]}},
     inputs={"ref1": "ab" * 32, "µ.tif": "cd" * 32},
     software_version="1.2.3",
     step=7,
