@@ -1,0 +1,229 @@
+// The shell: bar with the stop button, screens by address, what is said about connection and key.
+import * as api from "./lib/api.js";
+import * as events from "./lib/events.js";
+import { h, replace, notify, badge, num, field, problemText, ask, modal } from "./lib/dom.js";
+
+const SCREENS = {
+  rig: ["Rig", () => import("./screens/rig.js")],
+  calibrate: ["Calibrate", () => import("./screens/calibrate.js")],
+  test: ["Test", () => import("./screens/test.js")],
+  results: ["Results", () => import("./screens/results.js")],
+  jobs: ["Jobs & system", () => import("./screens/jobs.js")],
+};
+
+const main = document.getElementById("main");
+const bar = document.getElementById("bar");
+let leave = null;
+let visit = 0;
+
+/** "#/test/t000001-52d4a7?step=3" -> {screen, path, query} */
+function place() {
+  const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
+  const [screen, ...rest] = path.split("/").filter(Boolean).map(decodeURIComponent);
+  return { screen: SCREENS[screen] ? screen : "rig", path: rest, query: new URLSearchParams(query ?? "") };
+}
+
+async function open() {
+  const here = place();
+  visit += 1;
+  const mine = visit;
+  for (const link of bar.querySelectorAll("nav a")) {
+    if (link.dataset.screen === here.screen) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  document.title = `${SCREENS[here.screen][0]} · stereorig`;
+  leave?.();
+  leave = null;
+  replace(main, h("p.quiet", "Loading …"));
+  try {
+    const screen = await SCREENS[here.screen][1]();
+    if (mine !== visit) return;
+    const root = h("div", { "data-screen": here.screen });
+    const ended = await screen.open(root, here);
+    if (mine !== visit) {
+      ended?.();
+      return;
+    }
+    leave = ended;
+    replace(main, root);
+    root.dispatchEvent(new Event("shown"));
+  } catch (error) {
+    if (mine === visit) replace(main, h("div.panel", h("h1", SCREENS[here.screen][0]), problemText(error)));
+  }
+}
+
+async function stop() {
+  stopButton.textContent = "STOPPING …";
+  try {
+    const answer = await api.post("/stage/stop");
+    notify(`Stop is on the wire after ${num(answer.elapsed_ms, 3)} ms.${answer.cancelled_job ? " The job that moved was cancelled." : ""}`, "good");
+  } catch (error) {
+    notify(error);
+  } finally {
+    stopButton.textContent = "STOP";
+  }
+}
+
+const stopButton = h("button.stop", { type: "button", id: "stop", onclick: stop, title: "Stop every axis at once (Esc, twice)" }, "STOP");
+const stageText = h("span", { id: "bar-stage", title: "Stage position" });
+const jobText = h("a", { href: "#/jobs", id: "bar-job", hidden: true });
+const person = h("span");
+const lost = h("div.banner", { hidden: true, role: "alert" });
+
+function theme() {
+  const order = ["", "light", "dark"];
+  const now = document.documentElement.dataset.theme ?? "";
+  const next = order[(order.indexOf(now) + 1) % 3];
+  if (next) document.documentElement.dataset.theme = next;
+  else delete document.documentElement.dataset.theme;
+  localStorage.setItem("theme", next);
+  themeButton.title = `Colours: ${next || "as the system"}`;
+  window.dispatchEvent(new Event("themechange"));
+}
+const themeButton = h("button.plain", { type: "button", onclick: theme, "aria-label": "Light or dark colours" }, "◐");
+
+function drawBar() {
+  replace(
+    bar,
+    h("a.brand", { href: "#/rig" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "stereorig"),
+    h("nav", { "aria-label": "Screens" }, Object.entries(SCREENS).map(([name, [text]]) => h("a", { href: `#/${name}`, "data-screen": name }, text))),
+    h("div.status", jobText, stageText, person, h("a", { href: "/docs", title: "The HTTP API" }, "API"), keysButton, themeButton),
+    stopButton,
+    lost,
+  );
+}
+
+let escaped = -Infinity;
+// before anything else hears of it: the stop works wherever the focus is, in a drawing or a dialog too
+window.addEventListener("keydown", (event) => {
+  if (event.key !== "Escape") return;
+  if (event.timeStamp - escaped < 1500) stop();
+  escaped = event.timeStamp;
+}, true);
+window.addEventListener("stopstage", stop);
+
+const KEYS = [
+  ["Esc, twice", "Stops every axis at once, from anywhere"],
+  ["On a picture", ""],
+  ["arrow keys", "Move the picture; with Shift farther"],
+  ["+, −, 0, 1", "Zoom in, zoom out, fit, one picture pixel on one screen pixel"],
+  ["c", "Cross-hair on or off"],
+  ["Enter", "Begin to point: a cross-hair tells what lies under it"],
+  ["While pointing or drawing", ""],
+  ["arrow keys", "Move the cross-hair by 1 px; with Shift by 10 px, with Alt by 0.1 px"],
+  ["Enter", "Set a point, or read it; at the last point once more ends a polygon, hole or crack"],
+  ["Backspace", "Take one point back"],
+  ["Escape", "Leave"],
+  ["Ctrl+Z, Ctrl+Y", "Undo, redo"],
+  ["Corners and ends that are drawn", ""],
+  ["Tab", "Goes to them"],
+  ["arrow keys", "Move one by 1 px; with Shift by 10 px, with Alt by 0.1 px"],
+  ["Delete", "Removes one"],
+  ["On the surface in space", ""],
+  ["arrow keys, +, −, 0", "Turn it, zoom, put it back"],
+];
+function showKeys() {
+  const rows = KEYS.map(([keys, what]) => (what ? h("tr", h("td", h("kbd", keys)), h("td", what)) : h("tr", h("th", { colspan: 2, scope: "rowgroup" }, keys))));
+  return ask("Keys", h("div.scroll", { tabindex: 0, role: "region", "aria-label": "Keys and what they do" }, h("table.keys", h("tbody", rows))), [["Close", null]]);
+}
+const keysButton = h("button.plain", { type: "button", onclick: showKeys, "aria-label": "Keys", title: "Keys" }, "⌨");
+
+const active = new Map();
+function showJobs() {
+  const jobs = [...active.values()];
+  const job = jobs.find((one) => one.state === "running") ?? jobs[0];
+  if (!job) {
+    jobText.hidden = true; // a link without a text is none
+    return;
+  }
+  const { stage, done, total } = job.progress ?? {};
+  const share = total ? ` ${Math.floor((100 * done) / total)} %` : "";
+  jobText.hidden = false;
+  replace(jobText, badge(`${job.kind}: ${stage ?? job.state}${share}${jobs.length > 1 ? ` (+${jobs.length - 1})` : ""}`, "busy"));
+}
+
+events.on("job", (job) => {
+  if (["queued", "running", "cancelling"].includes(job.state)) active.set(job.id, job);
+  else active.delete(job.id);
+  showJobs();
+});
+events.on("open", () => { lost.hidden = true; });
+
+async function showStage() {
+  if (document.hidden) return;
+  try {
+    const stage = await api.get("/stage");
+    stageText.textContent = (stage.axes ?? [])
+      .map((axis) => `${axis.cameras?.join("+") || `axis ${axis.axis}`} ${num(axis.position_mm, 5)} mm${axis.moving ? " ▸" : ""}`)
+      .join("  ");
+    stageText.title = stage.fault ? stage.fault.cause ?? String(stage.fault) : "Stage position";
+  } catch {
+    stageText.textContent = "stage: not known";
+  }
+}
+
+let asking = false;
+async function askForKey() {
+  if (asking) return;
+  asking = true;
+  const input = h("input", { type: "password", autocomplete: "current-password", required: true });
+  const problem = h("div");
+  const dialog = h("dialog", { "aria-label": "Log in" },
+    h("form", { method: "dialog", onsubmit: async (event) => {
+      event.preventDefault();
+      try {
+        await api.login(input.value.trim());
+        dialog.close();
+        asking = false;
+        begin();
+      } catch (error) {
+        replace(problem, problemText(error));
+      }
+    } },
+    h("h2", "This service asks for a key"),
+    h("p.quiet", "An administrator makes one with ", h("code", "stereorig keys add NAME --role operator"), "."),
+    field("Key", input), problem,
+    h("div.row.end", h("button.primary", { type: "submit" }, "Log in"))));
+  dialog.addEventListener("cancel", (event) => event.preventDefault());
+  modal(dialog, input);
+}
+
+api.onConnection((state) => {
+  if (state === "login") askForKey();
+  lost.hidden = state !== "down";
+  if (state === "down") lost.textContent = "The service does not answer. What is shown may be old; the page goes on by itself once it is back.";
+});
+
+let ticking = null;
+async function begin() {
+  let who;
+  try {
+    who = await api.get("/session");
+  } catch (error) {
+    if (error.status !== 401) {
+      lost.hidden = false;
+      setTimeout(begin, 2000);
+    }
+    return;
+  }
+  if (who.name === "local") person.replaceChildren();
+  else replace(person, `${who.name} (${who.role}) `, h("button.plain", { type: "button", title: "Log out", onclick: async () => { await api.remove("/session"); location.reload(); } }, "⏏"));
+  events.start();
+  clearInterval(ticking);
+  ticking = setInterval(showStage, 1000);
+  showStage();
+  open();
+}
+
+const kept = localStorage.getItem("theme");
+if (kept) document.documentElement.dataset.theme = kept;
+drawBar();
+SCREENS[place().screen][1]().catch(() => {}); // its script comes while the service says who is there
+window.addEventListener("hashchange", open);
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault(); // the address names the screen
+  main.focus();
+});
+// what has the focus is not hidden under the bar
+new ResizeObserver(() => document.documentElement.style.setProperty("scroll-padding-top", `${bar.offsetHeight + 8}px`)).observe(bar);
+begin();

@@ -1,0 +1,356 @@
+// Calibrations: plan with its expected uncertainty, run, look, accept or discard, import, compare.
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { calibrationViews } from "./calibrate/views.js";
+import { h, replace, field, number, select, action, table, facts, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
+
+const LEVEL = { good: "good", warning: "warn", failed: "bad" };
+const DECISION = { accepted: "good", discarded: "bad" };
+const NAMES = ["phd_px", "cx_px", "cy_px", "kappa_per_px2", "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm"];
+const UNIT = { phd_px: "px", cx_px: "px", cy_px: "px", kappa_per_px2: "px⁻²", alpha_rad: "rad", beta_rad: "rad", gamma_rad: "rad", x0_mm: "mm", y0_mm: "mm", z0_mm: "mm" };
+const symbol = (name) => name.replace(/_(px|rad|mm|per_px2)$/, "");
+const um = (mm, digits = 3) => quantity(mm === null || mm === undefined ? null : 1000 * mm, "µm", digits);
+
+export async function open(root, { path }) {
+  const ends = [];
+  const rig = await api.get("/rig");
+  const shown = h("div", { "aria-live": "polite" });
+  const list = h("div");
+  let chosen = path[0] ?? null;
+  let entries = [];
+  let drawn = null; // which calibration, in which state, is shown
+  let closeShown = null;
+
+  async function refresh() {
+    entries = (await api.get("/calibrations")).calibrations.toReversed();
+    drawList();
+  }
+
+  function drawList() {
+    const compared = new Set([...list.querySelectorAll("input:checked")].map((input) => input.value));
+    replace(list, table([
+      ["Compare", (one) => h("input", { type: "checkbox", value: one.id, checked: compared.has(one.id), disabled: one.state !== "complete", "aria-label": `Compare ${one.id}` }), { unseen: true }],
+      ["Calibration", (one) => h("a", { href: `#/calibrate/${one.id}`, "aria-current": one.id === chosen ? "true" : null }, one.label || one.id)],
+      ["Made", (one) => when(one.created_utc)],
+      ["Verdict", (one) => [badge(one.verdict?.level ?? one.state, LEVEL[one.verdict?.level] ?? STATE_KIND[one.state] ?? ""), " ", one.decision ? badge(one.decision, DECISION[one.decision]) : null]],
+    ], entries, { caption: "Calibrations, newest first", empty: "No calibration yet: run one, or import one." }));
+  }
+
+  async function show(again = false) {
+    const id = chosen ?? entries.find((one) => one.state === "complete")?.id;
+    if (!id) {
+      replace(shown, h("section.panel", h("p.quiet", "What a calibration found is shown here.")));
+      return;
+    }
+    try {
+      const document_ = await api.get(`/calibrations/${id}`);
+      const state = JSON.stringify([id, document_.state, document_.judgement, Boolean(document_.taken)]);
+      if (!again && state === drawn) return;
+      drawn = state;
+      closeShown?.();
+      closeShown = null;
+      const parts = await one(document_);
+      closeShown = parts.close;
+      replace(shown, parts.nodes);
+    } catch (error) {
+      drawn = null;
+      replace(shown, h("section.panel", h("h2", id), problemText(error)));
+    }
+  }
+
+  async function one(document_) {
+    const { id, plan } = document_;
+    const heading = h("div.spread", h("h2", plan.label || "Calibration", " ", h("code", id)),
+      h("span.row", badge(document_.state, STATE_KIND[document_.state]), document_.judgement ? badge(document_.judgement.decision, DECISION[document_.judgement.decision]) : null));
+    const decide = h("div.row", decisions(document_, async () => { await refresh(); await show(true); }, async () => {
+      chosen = null;
+      await refresh();
+      if (location.hash === "#/calibrate") await show(true);
+      else location.hash = "#/calibrate";
+    }));
+    const { problem } = document_;
+    // one that its verdict refused is shown like any other: what was wrong is in its residuals
+    if (document_.state !== "complete" && !document_.verdict) {
+      return { nodes: h("section.panel", heading,
+        problem ? problemText(Object.assign(new Error(problem.cause ?? problem.detail), problem)) : h("p.quiet", "It is not complete yet; the job's course is above, or under Jobs."),
+        document_.state === "unfinished" ? null : decide, await viewsOf(document_, null)), close: () => {} };
+    }
+    let residuals = null;
+    try {
+      if (document_.taken) residuals = (await api.get(`/calibrations/${id}/residuals`)).views;
+    } catch (error) {
+      if (error.status !== 404) notify(error);
+    }
+    const made = await calibrationViews(document_, residuals);
+    return {
+      nodes: [
+        h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), decide),
+        made ? h("section.panel", { "aria-label": "Views" }, h("h2", "Views"), made.root) : null,
+        h("div.grid.tables", { style: { marginTop: "var(--gap)" } },
+          h("section.panel", h("h2", "Checks"), measures(document_), viewTable(document_)),
+          h("section.panel", h("h2", "Parameters"), parameters(document_), correlations(document_))),
+      ],
+      close: () => made?.close(),
+    };
+  }
+
+  async function viewsOf(document_) {
+    if (!document_.taken?.length) return null;
+    const made = await calibrationViews(document_, null);
+    ends.push(made.close);
+    return h("div", h("h3", "Views that were taken"), made.root);
+  }
+
+  ends.push(events.on("calibration", () => { refresh().then(() => show()).catch(notify); }));
+  const running = run(rig, ends, async (id) => { chosen = id; await refresh(); await show(); });
+  const compare = action("Compare the two chosen", () => comparison(list));
+  await refresh();
+  await show();
+  replace(root, h("h1", "Calibrate"),
+    h("div.grid.side", h("div.grid", running, shown),
+      h("section.panel", list, h("div.row", { style: { marginTop: "0.5rem" } }, compare), importer(async (id) => { chosen = id; await refresh(); await show(); }))));
+  return () => { closeShown?.(); ends.forEach((end) => end()); };
+}
+
+/** The plan, what it may be expected to leave uncertain, and its run. */
+function run(rig, ends, done) {
+  const usual = rig.calibration_plan ?? {};
+  const list_ = (values) => (values ?? []).map((value) => String(value)).join(", ");
+  const positions = h("input", { type: "text", value: list_(usual.positions_mm), inputmode: "decimal", autocomplete: "off" });
+  const held = h("input", { type: "text", value: list_(usual.held_out_mm), inputmode: "decimal", autocomplete: "off" });
+  const frames = number(usual.frames ?? 4, { min: 1, max: 256, step: 1 });
+  const localiser = select([["profile", "profile (finest)"], ["paper", "paper (1996)"]], usual.localiser ?? "profile");
+  const label = h("input", { type: "text", maxlength: 300, placeholder: "what it is for" });
+  const roll = number(0, { min: -180, max: 180 });
+  const noise = number(0.005, { min: 0.0001, max: 10 });
+  const expected = h("div", { role: "status", "data-role": "expected" });
+  const progress = h("div", { role: "status", "data-role": "progress" });
+  const start = action("Calibrate", begin, { kind: "primary" });
+
+  function numbers(input, name) {
+    const parts = input.value.split(/[\s;,]+/).filter(Boolean);
+    const values = parts.map(Number);
+    if (values.some((value) => !Number.isFinite(value))) throw Object.assign(new Error(`${name}: “${input.value}” is no list of numbers.`), { remedy: "Write millimetres with a point, between commas: 0, 2.5, 5." });
+    return values;
+  }
+  const plan = () => ({ positions_mm: numbers(positions, "Fitted positions"), held_out_mm: numbers(held, "Held-out positions"), localiser: localiser.value });
+
+  let asked = 0;
+  async function foresee() {
+    asked += 1;
+    const mine = asked;
+    try {
+      const told = await api.post("/calibrations:expect", { ...plan(), roll_deg: Number(roll.value), noise_px: Number(noise.value) });
+      if (mine === asked) replace(expected, foreseen(told));
+    } catch (error) {
+      if (mine === asked) replace(expected, problemText(error));
+    }
+  }
+  let timer = null;
+  for (const input of [positions, held, localiser, roll, noise]) input.addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(foresee, 350); });
+  ends.push(() => clearTimeout(timer));
+  foresee();
+
+  async function begin() {
+    const { job, calibration_id: id } = await api.post("/calibrations", { ...plan(), frames: Number(frames.value), label: label.value });
+    await follow(job, id);
+  }
+
+  const stopped = new AbortController();
+  ends.push(() => stopped.abort());
+  async function follow(job, id) {
+    start.setAttribute("aria-disabled", "true");
+    const bar = h("progress", { max: 1, "aria-label": "Progress of the calibration" });
+    const text = h("span");
+    replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}/cancel`), { kind: "danger" })));
+    try {
+      const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
+        const { stage, done: ready, total } = now.progress ?? {};
+        if (total) bar.value = ready / total;
+        text.textContent = now.state === "queued" ? "waiting" : `${{ views: "taking views", grid: "finding the grid", calibration: "adjusting" }[stage] ?? stage ?? ""} ${total ? `${ready} of ${total}` : ""}`;
+      } });
+      replace(progress, ended.state === "succeeded"
+        ? h("p", badge("succeeded", "good"), " ", ended.result?.verdict ? `Verdict: ${ended.result.verdict.level}.` : "")
+        : ended.state === "cancelled" ? h("p", badge("cancelled", "warn"), " The axes were stopped; nothing was made of the views.") : problemText(api.jobProblem(ended)));
+      if (id) await done(id);
+    } catch (error) {
+      if (error.name !== "AbortError") throw error;
+    } finally {
+      start.removeAttribute("aria-disabled");
+    }
+  }
+  // one that runs already is followed, whoever began it
+  api.get("/jobs", { limit: 20 }).then(({ jobs }) => {
+    const job = jobs.find((one) => one.kind === "calibration" && ["queued", "running", "cancelling"].includes(one.state));
+    if (job) return follow(job, job.subject?.calibration_id);
+  }).catch((error) => { if (error.name !== "AbortError") notify(error); });
+
+  const target = rig.target ?? {};
+  return h("section.panel", { "aria-label": "New calibration" }, h("h2", "New calibration"),
+    h("p.quiet", `Target of the rig file: ${target.lines?.join(" × ")} lines, ${target.dark_lines ? "dark" : "bright"}, ${quantity(target.pitch_mm, "mm")} apart, ${quantity(target.line_width_mm, "mm")} wide, known to ±${um(target.node_tolerance_mm)}.`),
+    h("div.fields",
+      field("Fitted positions", positions, "mm", "dZ, away from the target"), field("Held-out positions", held, "mm", "for an independent check"),
+      field("Frames averaged", frames), field("Localiser", localiser), field("Label", label)),
+    h("details", { open: true }, h("summary", "Expected uncertainty"),
+      h("div.fields", field("Assumed noise of an intersection", noise, "px"), field("Grid turned by", roll, "°", "in the images; 45 if it stands on a corner")), expected),
+    h("div.row", start), progress);
+}
+
+function foreseen(told) {
+  const middle = told.points[0];
+  const corners = told.points.slice(1);
+  const worst = [0, 1, 2].map((axis) => Math.max(...corners.map((point) => point.sigma_mm[axis])));
+  const sigma = (cam, name) => told.parameters[`${cam}.${name}`].sigma;
+  return [
+    told.refused ? h("div.problem", h("p", h("strong", "Such views would be refused.")), h("ul", told.reasons.map((text) => h("li", text))), h("p", "Let the positions lie further apart.")) : null,
+    table([["Point", (row) => row[0]], ...["X", "Y", "Z"].map((axis, k) => [`σ ${axis}`, (row) => um(row[1][k]), { numeric: true }])],
+      [["middle of the volume", middle.sigma_mm], ["worst corner", worst]], { caption: `What the parameters' uncertainty does to a point; the corners lie at ±${num(Math.abs(corners[0].xyz_mm[0]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[1]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[2]), 3)} mm` }),
+    h("details", h("summary", "Parameters and assumptions"),
+      table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]], ...["cam1", "cam2"].map((cam) => [`σ ${cam}`, (name) => num(sigma(cam, name), 3), { numeric: true }])], NAMES, { caption: "Expected standard deviations" }),
+      facts([["shape", `${um(told.shape_rms_mm)} rms over the volume`], ["scale", quantity(100 * told.scale, "%", 2)], ["intersections seen", `cam1 ${num(100 * told.seen_share.cam1, 3)} %, cam2 ${num(100 * told.seen_share.cam2, 3)} %`]]),
+      h("p.quiet", told.assumed.text)),
+  ];
+}
+
+function verdict(document_) {
+  const { verdict: v, uncertainty: u, checks } = document_;
+  if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it brings no verdict.`);
+  return [
+    h("p", badge(v.level, LEVEL[v.level])), h("ul", (v.reasons ?? []).map((text) => h("li", text))),
+    document_.problem ? h("p", document_.problem.remedy, " ", h("code.quiet", document_.problem.code)) : null,
+    u ? facts([["shape", `${um(u.shape_rms_mm)} rms, expected from this calibration alone`], ["Z at the middle, at the corners", `${um(u.centre_z_mm)}, ${um(u.corner_z_mm)}`], ["common scale", quantity(100 * u.scale, "%", 2)]]) : null,
+    checks?.made ? h("details", h("summary", "What was checked, and what was not"), h("ul", checks.made.map((check) => h("li", badge(check.made ? "checked" : "not checked", check.made ? "good" : "warn"), " ", check.text)))) : null,
+    document_.judgement?.note ? h("p.quiet", `${document_.judgement.decision} by ${document_.judgement.by}: ${document_.judgement.note}`) : null,
+  ];
+}
+
+function decisions(document_, changed, gone) {
+  const { id, state } = document_;
+  const now = document_.judgement?.decision;
+  const put = (decision, note = "") => api.put(`/calibrations/${id}/judgement`, { decision, note }).then(changed);
+  return [
+    state === "complete" && now !== "accepted" ? action("Accept", () => put("accepted"), { kind: "primary", title: "New tests measure with the newest accepted calibration" }) : null,
+    now !== "discarded" ? action("Discard", async () => {
+      const note = h("input", { type: "text", maxlength: 300 });
+      if (await ask("Discard this calibration?", h("div", h("p", "No new test can be made with it. It stays on disk, and the decision can be taken back."), field("Why", note)), [["Cancel", null], ["Discard", "yes"]])) await put("discarded", note.value);
+    }, { kind: "danger" }) : null,
+    now ? action("Take the decision back", () => put(null)) : null,
+    action("Delete …", async () => {
+      if (await ask("Delete this calibration?", h("p", "It goes to the trash; tests made with it keep their own copy."), [["Cancel", null], ["Delete", "yes"]])) {
+        await api.remove(`/calibrations/${id}`);
+        await gone();
+      }
+    }),
+    state === "complete" ? h("a.button", { href: api.address(`/calibrations/${id}/file`), download: `${id}.json` }, "Download") : null,
+  ];
+}
+
+function measures(document_) {
+  const { checks } = document_;
+  if (!checks) return h("p.quiet", "It brings no checks.");
+  const rows = [];
+  for (const [name, text] of [["fitted", "fitted"], ["held_out", "held out"]]) {
+    const check = checks[name];
+    if (!check) continue;
+    rows.push([text, "both", check, check.positions_mm]);
+    for (const cam of ["cam1", "cam2"]) if (check.per_camera?.[cam]) rows.push([text, cam, check.per_camera[cam], null]);
+  }
+  return [
+    table([["Positions", (row) => [row[0], row[3] ? h("small.quiet", ` ${[...new Set(Object.values(row[3]).flat())].map((mm) => num(mm, 3)).join(", ")} mm`) : null]], ["Camera", (row) => row[1]],
+      ["RBE", (row) => quantity(row[2].rbe_px, "px", 3), { numeric: true }], ["RAZ", (row) => um(row[2].raz_mm), { numeric: true }], ["NSCE", (row) => num(row[2].nsce, 3), { numeric: true }], ["Points", (row) => count(row[2].points), { numeric: true }]],
+    rows, { caption: "Reprojection error (RBE), its size on the target (RAZ), normalised (NSCE)" }),
+    checks.drift_px ? h("p.quiet", `Back at zero the grid lay ${num(checks.drift_px.cam1, 2)} px (cam1) and ${num(checks.drift_px.cam2, 2)} px (cam2) from where it was first seen.`) : null,
+  ];
+}
+
+function viewTable(document_) {
+  if (!Array.isArray(document_.views)) return null;
+  return h("details", h("summary", "Each view"), table([["View", (v) => v.name], ["dZ", (v) => quantity(v.dz_mm, "mm", 4), { numeric: true }], ["Role", (v) => (v.held_out ? "held out" : "fitted")],
+    ["RBE", (v) => quantity(v.rbe_px, "px", 3), { numeric: true }], ["RAZ", (v) => um(v.raz_mm), { numeric: true }], ["NSCE", (v) => num(v.nsce, 3), { numeric: true }]], document_.views, { caption: "Measures of each view" }));
+}
+
+function withSigma(value, sigma) {
+  if (value === undefined || value === null) return "–";
+  if (!(sigma > 0)) return num(value, 6);
+  const decimals = Math.min(Math.max(1 - Math.floor(Math.log10(sigma)), 0), 12);
+  return Math.abs(value) < 1e-4 ? `${num(value, 4)} ± ${num(sigma, 2)}` : `${value.toFixed(Math.min(decimals, 8)).replace("-", "−")} ± ${num(sigma, 2)}`;
+}
+
+function parameters(document_) {
+  const sigma = document_.sigma ?? {};
+  return table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]],
+    ...["cam1", "cam2"].map((cam) => [`${cam} ± σ`, (name) => withSigma(document_[cam]?.[name], sigma[`${cam}.${name}`]), { numeric: true }]),
+    ["nominal", (name) => nominal(document_, name), { numeric: true }]], NAMES, { caption: "Ten parameters of each camera, with their standard deviations" });
+}
+
+function nominal(document_, name) {
+  const of = (cam) => {
+    const n = document_.nominal?.[cam];
+    if (!n) return null;
+    return { phd_px: n.phd_px, z0_mm: n.standoff_mm, gamma_rad: (n.angle_deg * Math.PI) / 180, cx_px: (n.image_size_px[0] - 1) / 2, cy_px: (n.image_size_px[1] - 1) / 2 }[name] ?? null;
+  };
+  const [a, b] = [of("cam1"), of("cam2")];
+  if (a === null && b === null) return "";
+  return a === b ? num(a, 5) : `${num(a, 4)}; ${num(b, 4)}`;
+}
+
+function correlations(document_) {
+  const covariance = document_.covariance;
+  if (!Array.isArray(covariance?.matrix)) return null;
+  const { names, matrix } = covariance;
+  const r = matrix.map((row, i) => row.map((value, k) => value / Math.sqrt(matrix[i][i] * matrix[k][k])));
+  const strongest = [];
+  names.forEach((a, i) => names.forEach((b, k) => { if (k > i && Math.abs(r[i][k]) > 0.9) strongest.push([a, b, r[i][k]]); }));
+  strongest.sort((a, b) => Math.abs(b[2]) - Math.abs(a[2]));
+  const SIZE = 14;
+  const canvas = h("canvas", { width: names.length * SIZE, height: names.length * SIZE, role: "img", "aria-label": "Correlation of all parameters: blue negative, orange positive", style: { maxWidth: "100%", display: "block" } });
+  const pen = canvas.getContext("2d");
+  r.forEach((row, i) => row.forEach((value, k) => {
+    pen.fillStyle = value < 0 ? `rgba(40, 120, 220, ${Math.abs(value)})` : `rgba(230, 120, 0, ${Math.abs(value)})`;
+    pen.fillRect(k * SIZE, i * SIZE, SIZE - 1, SIZE - 1);
+  }));
+  const under = h("p.quiet", { role: "status" }, "Point at a square to read it.");
+  canvas.addEventListener("pointermove", (event) => {
+    const box = canvas.getBoundingClientRect();
+    const [k, i] = [Math.floor(((event.clientX - box.left) / box.width) * names.length), Math.floor(((event.clientY - box.top) / box.height) * names.length)];
+    if (r[i]?.[k] !== undefined) under.textContent = `${names[i]} and ${names[k]}: ${num(r[i][k], 4)}`;
+  });
+  return h("details", h("summary", "Correlation of the parameters"),
+    h("p.quiet", "Strongly correlated parameters nearly cancel in space; judge by the uncertainty of points."), canvas, under,
+    table([["One", (row) => row[0]], ["Other", (row) => row[1]], ["Correlation", (row) => row[2].toFixed(5).replace("-", "−"), { numeric: true }]], strongest.slice(0, 12), { caption: "Strongest, above 0.9", empty: "None above 0.9." }));
+}
+
+async function comparison(list) {
+  const ids = [...list.querySelectorAll("input:checked")].map((input) => input.value);
+  if (ids.length !== 2) throw Object.assign(new Error(`${ids.length} calibrations are chosen.`), { remedy: "Tick two complete calibrations in the list." });
+  const [a, b] = await Promise.all(ids.map((id) => api.get(`/calibrations/${id}`)));
+  const rows = [];
+  for (const cam of ["cam1", "cam2"]) for (const name of NAMES) {
+    const key = `${cam}.${name}`;
+    const [sa, sb] = [a.sigma?.[key], b.sigma?.[key]];
+    const difference = (b[cam]?.[name] ?? NaN) - (a[cam]?.[name] ?? NaN);
+    const both = sa > 0 && sb > 0 ? Math.hypot(sa, sb) : null;
+    rows.push([`${cam} ${symbol(name)}`, UNIT[name], withSigma(a[cam]?.[name], sa), withSigma(b[cam]?.[name], sb), difference, both ? difference / both : null]);
+  }
+  const checks = [["fitted", "RBE fitted"], ["held_out", "RBE held out"]].map(([name, text]) => [text, quantity(a.checks?.[name]?.rbe_px, "px", 3), quantity(b.checks?.[name]?.rbe_px, "px", 3)]);
+  checks.push(["verdict", a.verdict?.level ?? "–", b.verdict?.level ?? "–"], ["made", when(a.plan.created_utc), when(b.plan.created_utc)], ["shape", um(a.uncertainty?.shape_rms_mm), um(b.uncertainty?.shape_rms_mm)]);
+  await ask("Two calibrations", h("div", { "data-role": "comparison" },
+    table([["Check", (row) => row[0]], [a.plan.label || a.id, (row) => row[1], { numeric: true }], [b.plan.label || b.id, (row) => row[2], { numeric: true }]], checks, { caption: "Checks" }),
+    table([["Parameter", (row) => [row[0], " ", h("span.quiet", row[1])]], [a.id, (row) => row[2], { numeric: true }], [b.id, (row) => row[3], { numeric: true }], ["difference", (row) => num(row[4], 3), { numeric: true }],
+      ["in σ", (row) => (row[5] === null ? "–" : h(Math.abs(row[5]) > 3 ? "strong" : "span", num(row[5], 2))), { numeric: true }]], rows, { caption: "Parameters; a difference beyond 3 σ of both together is bold" })), [["Close", null]]);
+}
+
+function importer(done) {
+  const file = h("input", { type: "file", accept: ".json,.xml,.yml,.yaml,.caldat,.z3d" });
+  const label = h("input", { type: "text", maxlength: 300 });
+  return h("details", { style: { marginTop: "0.75rem" } }, h("summary", "Import a calibration"), field("File", file, "", "calibration.json, DICe XML, OpenCV YAML of a stereo pair"), field("Label", label),
+    action("Import", async () => {
+      if (!file.files.length) throw Object.assign(new Error("No file is chosen."), { remedy: "Choose the file of a stereo calibration." });
+      const form = new FormData();
+      form.append("file", file.files[0]);
+      form.append("label", label.value || file.files[0].name);
+      const made = await api.upload("/calibrations:import", form);
+      notify(`${made.id} is imported.`, "good");
+      await done(made.id);
+    }));
+}

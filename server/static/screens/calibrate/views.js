@@ -1,0 +1,99 @@
+// The pictures of a calibration with what was found in them: lines, intersections, residual arrows.
+import * as api from "../../lib/api.js";
+import { View, stroke } from "../../widgets/view.js";
+import { h, replace, svg, field, select, num, quantity } from "../../lib/dom.js";
+
+const COLOUR = { lines: "#33c6ff", node: "#ffd23e", arrow: "#ff4d3d" };
+const LONGEST = 0.15; // of the picture's width
+const ROLE = { fitted: "fitted", held_out: "held out", zero: "zero", zero_again: "zero, again" };
+
+/** Both cameras' views of one position side by side; {root, close}, or null where none were taken. */
+export async function calibrationViews(calibration, residuals) {
+  const taken = calibration.taken ?? [];
+  if (!taken.length) return null;
+  const indices = [...new Set(taken.map((view) => view.index))].sort((a, b) => a - b);
+  const at = (index, cam) => taken.find((view) => view.index === index && view.camera === cam);
+  const text = (index) => { const view = at(index, "cam1") ?? at(index, "cam2"); return `${quantity(view.dz_commanded_mm ?? view.dz_mm, "mm", 4)} · ${ROLE[view.role] ?? view.role}`; };
+  const position = select(indices.map((index) => [index, text(index)]), indices[0]);
+  const magnification = h("input", { type: "range", min: 0, max: 4, step: 0.05, value: Math.log10(exaggeration(residuals, calibration.image_size_px?.cam1?.[0] ?? 640)).toFixed(2) });
+  const told = h("output");
+  const lines = h("input", { type: "checkbox", checked: true });
+  const arrows = h("input", { type: "checkbox", checked: true });
+  const views = ["cam1", "cam2"].map((cam) => {
+    const view = new View({ label: `Calibration view of ${cam}` });
+    const caption = h("p.quiet", { style: { margin: "0.25rem 0 0" } });
+    view.image.addEventListener("error", () => view.image.getAttribute("src") && view.blank("This view cannot be read."));
+    return { cam, view, caption, layer: svg("g", { "data-role": "found" }), root: h("div", h("h3", cam), view.root, caption) };
+  });
+  for (const one of views) one.view.svg.append(one.layer);
+
+  function draw() {
+    const times = 10 ** Number(magnification.value);
+    told.textContent = `${num(times, 3)} ×`;
+    for (const { cam, view, caption, layer } of views) {
+      const index = Number(position.value);
+      const taken_ = at(index, cam);
+      const name = taken_?.file.split("/").pop();
+      // a look back at zero is compared, not fitted: it has no residuals of its own
+      const found = residuals?.find((one) => one.name === name);
+      caption.textContent = taken_ ? `${ROLE[taken_.role] ?? taken_.role}, dZ ${quantity(taken_.dz_mm, "mm", 6)} as read back, ${taken_.frames} frames averaged${found ? `; RBE ${quantity(found.rbe_px, "px", 3)}, RAZ ${quantity(1000 * found.raz_mm, "µm", 3)}` : ""}` : "no view";
+      replace(layer, ...(found ? drawing(found, times, lines.checked, arrows.checked) : []));
+      view.svg.parentNode.append(view.svg);
+    }
+  }
+
+  function load() {
+    for (const { cam, view } of views) view.show(api.address(`/calibrations/${calibration.id}/views/${position.value}/${cam}/preview`));
+    draw();
+  }
+  position.addEventListener("change", load);
+  for (const input of [magnification, lines, arrows]) input.addEventListener("input", draw);
+  load();
+  const root = h("div",
+    h("div.fields", field("Position", position),
+      residuals ? [field("Arrows are longer than residuals by", h("span.control", Object.assign(magnification, { id: "magnification" }), told)),
+        h("label.check", { style: { alignSelf: "center" } }, lines, "lines and intersections"), h("label.check", { style: { alignSelf: "center" } }, arrows, "residual arrows")] : null),
+    h("div.grid.two.views", views.map((one) => one.root)));
+  magnification.setAttribute("aria-label", "Magnification of the residual arrows");
+  return { root, close: () => views.forEach((one) => one.view.close()) };
+}
+
+/** By how much arrows are longer at first: a thousand times, less where the longest would leave the picture. */
+function exaggeration(residuals, width) {
+  let longest = 1e-9;
+  for (const view of residuals ?? []) for (const r of view.residual_px?.flat() ?? []) if (there(r)) longest = Math.max(longest, Math.hypot(...r));
+  return Math.min(1000, Math.max(1, LONGEST * width / longest));
+}
+
+const fine = (colour, width = 1) => stroke(colour, width);
+const there = (xy) => xy && xy[0] !== null && xy[1] !== null && Number.isFinite(xy[0]);
+
+function drawing({ found_px: found, residual_px: residual }, times, lines, arrows) {
+  const parts = [];
+  if (lines) {
+    const path = [];
+    const course = (points) => {
+      let open = false;
+      for (const xy of points) {
+        if (there(xy)) { path.push(`${open ? "L" : "M"}${xy[0]} ${xy[1]}`); open = true; } else open = false;
+      }
+    };
+    found.forEach(course);
+    found[0]?.forEach((_, k) => course(found.map((row) => row[k])));
+    parts.push(svg("path", { ...fine(COLOUR.lines), d: path.join(""), "data-role": "lines" }));
+    // a cross of a point of no length keeps its size on the screen at any zoom
+    parts.push(svg("path", { ...fine(COLOUR.node, 5), "stroke-linecap": "round", "data-role": "nodes", d: found.flat().filter(there).map(([x, y]) => `M${x} ${y}h0.001`).join("") }));
+  }
+  if (arrows && residual) {
+    const path = [];
+    found.forEach((row, i) => row.forEach((xy, k) => {
+      const r = residual[i]?.[k];
+      if (!there(xy) || !there(r)) return;
+      const [dx, dy] = [r[0] * times, r[1] * times];
+      const head = 0.25;
+      path.push(`M${xy[0]} ${xy[1]}l${dx} ${dy}`, `m${-head * (dx - 0.5 * dy)} ${-head * (dy + 0.5 * dx)}L${xy[0] + dx} ${xy[1] + dy}l${-head * (dx + 0.5 * dy)} ${-head * (dy - 0.5 * dx)}`);
+    }));
+    parts.push(svg("path", { ...fine(COLOUR.arrow, 1.5), d: path.join(""), "data-role": "arrows" }));
+  }
+  return parts;
+}

@@ -1,0 +1,104 @@
+// What runs and ran, and how the machine is.
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { h, replace, action, badge, facts, num, quantity, table, when, problemText, notify, STATE_KIND } from "../lib/dom.js";
+
+export async function open(root) {
+  const list = h("div");
+  const detail = h("section.panel", { "aria-live": "polite" }, h("p.quiet", "Choose a job to see its course."));
+  const health = h("section.panel");
+  const jobs = new Map();
+  let chosen = null;
+  const log = new Map(); // job id -> lines
+
+  function note(job) {
+    const { stage, done, total } = job.progress ?? {};
+    const line = `${new Date().toLocaleTimeString()}  ${job.state}  ${stage ?? ""} ${total ? `${done}/${total}` : ""}`.trim();
+    const lines = log.get(job.id) ?? [];
+    const key = `${job.state} ${stage}`;
+    if (lines.length && lines[lines.length - 1].key === key) lines[lines.length - 1] = { key, line };
+    else lines.push({ key, line });
+    log.set(job.id, lines.slice(-200));
+  }
+
+  function draw() {
+    const rows = [...jobs.values()].sort((a, b) => b.id.localeCompare(a.id));
+    replace(list, table([
+      ["Job", (job) => h("button.plain", { type: "button", onclick: () => { chosen = job.id; show(); } }, h("code", job.id))],
+      ["Kind", (job) => job.kind],
+      ["State", (job) => badge(job.state, STATE_KIND[job.state])],
+      ["Progress", (job) => progress(job)],
+      ["Begun", (job) => when(job.started_utc ?? job.created_utc)],
+      ["Cancel", (job) => (["queued", "running"].includes(job.state) ? cancel(job) : null), { unseen: true }],
+    ], rows, { caption: "Jobs, newest first", onrow: (job) => { chosen = job.id; show(); }, empty: "No job has run yet." }));
+  }
+
+  function progress(job) {
+    const { stage, done, total, eta_s: eta } = job.progress ?? {};
+    if (["succeeded", "failed", "cancelled", "interrupted"].includes(job.state)) return job.finished_utc && job.started_utc ? quantity((new Date(job.finished_utc) - new Date(job.started_utc)) / 1000, "s", 3) : "";
+    return h("div", h("progress", { value: total ? done : null, max: total || 1, "aria-label": `Progress of ${job.kind}` }),
+      h("small", `${stage ?? ""} ${total ? `${num(100 * done / total, 3)} %` : ""}${eta ? `, ${num(eta, 2)} s left` : ""}`));
+  }
+
+  const cancel = (job) => action("Cancel", async () => { take(await api.post(`/jobs/${job.id}/cancel`)); }, { kind: "danger", "aria-label": `Cancel ${job.kind} ${job.id}` });
+
+  function show() {
+    const job = jobs.get(chosen);
+    if (!job) return;
+    const problem = job.problem ? Object.assign(new Error(job.problem.detail ?? job.problem.cause ?? job.problem.title), job.problem) : null;
+    replace(detail,
+      h("div.spread", h("h2", `${job.kind} `, h("code", job.id)), badge(job.state, STATE_KIND[job.state])),
+      facts([["created", when(job.created_utc)], ["started", when(job.started_utc)], ["finished", when(job.finished_utc)],
+        ...Object.entries(job.subject ?? {}).map(([name, value]) => [name, link(name, value, job.subject)])]),
+      problem ? problemText(problem) : null,
+      h("h3", "Course"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Course of the job" }, (log.get(job.id) ?? []).map((one) => `${one.line}\n`)),
+      job.result ? h("details", h("summary", "Result as the API gives it"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Result of the job" }, JSON.stringify(job.result, null, 1))) : null);
+  }
+
+  function link(name, value, subject) {
+    if (name === "test_id") return h("a", { href: `#/test/${value}` }, value);
+    if (name === "analysis_id" && subject.test_id) return h("a", { href: `#/results/${subject.test_id}/${value}` }, value);
+    if (name === "calibration_id") return h("a", { href: `#/calibrate/${value}` }, value);
+    return typeof value === "object" ? JSON.stringify(value) : String(value);
+  }
+
+  function take(job) {
+    jobs.set(job.id, { ...jobs.get(job.id), ...job });
+    note(job);
+    draw();
+    if (job.id === chosen) show();
+  }
+
+  async function refresh() {
+    for (const job of (await api.get("/jobs", { limit: 100 })).jobs) {
+      jobs.set(job.id, job);
+      if (!log.has(job.id)) note(job);
+    }
+    draw();
+  }
+
+  async function system() {
+    if (document.hidden) return;
+    try {
+      const [well, metrics] = await Promise.all([api.get("/healthz"), api.raw("/metrics").then((r) => r.text())]);
+      const value = (name) => { const found = new RegExp(`^${name}(?:\\{[^}]*\\})? ([-+0-9.eE]+)$`, "m").exec(metrics); return found ? Number(found[1]) : null; };
+      const free = value("stereorig_disk_free_bytes");
+      const ready = value("stereorig_ready") === 1;
+      replace(health, h("div.spread", h("h2", "System"), badge(ready ? "ready" : "not ready", ready ? "good" : "warn")),
+        ready ? null : action("Why not?", () => api.get("/readyz")),
+        facts([["version", well.version], ["up for", quantity(well.uptime_s, "s", 6)], ["rig", badge(well.rig, STATE_KIND[well.rig])], ["compute worker", badge(well.worker, STATE_KIND[well.worker])],
+          ["free on the disk", free === null ? "–" : quantity(free / 2 ** 30, "GiB", 4)], ["jobs active", num(value("stereorig_jobs_active"), 4)], ["waiting to compute", num(value("stereorig_compute_queue"), 4)],
+          ["worker started", value("stereorig_worker_starts_total") === null ? "–" : `${value("stereorig_worker_starts_total")} times`]]),
+        h("p", h("a", { href: `${api.BASE}/metrics` }, "All figures"), " · ", h("a", { href: "/docs" }, "HTTP API")));
+    } catch (error) {
+      replace(health, h("h2", "System"), problemText(error));
+    }
+  }
+
+  const ended = events.on("job", take);
+  await refresh();
+  system();
+  const timer = setInterval(system, 3000);
+  replace(root, h("h1", "Jobs and system"), h("div.grid.side", h("div", h("section.panel", list), detail), health));
+  return () => { ended(); clearInterval(timer); };
+}

@@ -1,0 +1,259 @@
+// Results: which tests and analyses there are, and one analysis' fields over the image and in space.
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { Result, all } from "./results/analysis.js";
+import { FieldMap, measured } from "../widgets/field_map.js";
+import { Scale } from "../widgets/scale.js";
+import { about, files } from "./results/about.js";
+import { gauges } from "./results/gauges.js";
+import { mark, pinned } from "./results/probe.js";
+import { h, replace, table, badge, when, num, count, quantity, field, select, action, facts, notify, problemText, STATE_KIND } from "../lib/dom.js";
+
+const MODES = [["image", "Image"], ["surface", "3-D surface"], ["compare", "Side by side"]];
+
+export async function open(root, here) {
+  const [testId, analysisId] = here.path;
+  return testId && analysisId ? show(root, testId, analysisId, here.query) : list(root, testId);
+}
+
+async function list(root, testId) {
+  const tests = (await all("/tests", "tests")).reverse();
+  const detail = h("section.panel", { "aria-live": "polite" });
+  const chosen = tests.find((one) => one.id === testId) ?? tests[0];
+  async function choose(test) {
+    replace(detail, h("p.quiet", "Loading …"));
+    try {
+      const whole = await api.get(`/tests/${test.id}`);
+      replace(detail, h("div.spread", h("h2", whole.name), h("a", { href: `#/test/${whole.id}` }, "the test")),
+        facts([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.steps.length)], ["calibration", whole.calibration_id ?? "–"]]),
+        h("h3", "Analyses"),
+        table([
+          ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
+          ["Kind", (one) => one.kind],
+          ["Begun", (one) => when(one.created_utc)],
+        ], [...whole.analyses].reverse(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
+          onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
+    } catch (error) {
+      replace(detail, problemText(error));
+    }
+  }
+  replace(root, h("h1", "Results"), h("div.grid.two",
+    h("section.panel", table([
+      ["Test", (one) => h("button.plain", { type: "button", onclick: () => choose(one) }, one.name || one.id)],
+      ["Specimen", (one) => one.specimen],
+      ["Made", (one) => when(one.created_utc)],
+    ], tests, { caption: "Tests, newest first", onrow: choose, empty: "There is no test yet. Make one on the Test screen." })),
+    detail));
+  if (chosen) choose(chosen);
+  else replace(detail, h("p.quiet", "Results appear here once a test was measured."));
+  return events.on("result", (event) => event.test_id === chosen?.id && choose(chosen));
+}
+
+async function show(root, testId, analysisId, query) {
+  const result = await Result.open(testId, analysisId);
+  const ends = [];
+  const state = {
+    step: Number(query.get("step") ?? NaN), field: query.get("field"), image: "reference", mode: "image", info: null, playing: null,
+  };
+  if (!result.steps.includes(state.step)) state.step = result.steps.at(-1) ?? null;
+
+  const map = new FieldMap("Field over the image of camera 1", (x, y, event) => screen.onpick(x, y, event));
+  ends.push(() => map.close());
+  const scale = new Scale(() => redraw().catch(notify));
+  const fieldChoice = h("select", { "aria-label": "Field" });
+  const imageChoice = select([["reference", "reference, camera 1"], ["cam1", "this step, camera 1"], ["cam2", "this step, camera 2"]], "reference");
+  const opacity = h("input", { type: "range", min: 0, max: 100, value: 75 });
+  const slider = h("input", { type: "range", min: 0, max: Math.max(result.steps.length - 1, 0), step: 1, "aria-label": "Step" });
+  const stepText = h("output", { "data-role": "step" });
+  const status = h("div");
+  const statistics = h("dl.facts", { "data-role": "statistics" });
+  const probe = h("div", { "data-role": "probe" }, h("p.quiet", "Click a place to see every number of its point."));
+  const message = h("p.quiet", { role: "status" });
+  const modes = h("div.row", { role: "group", "aria-label": "View" }, MODES.map(([name, text]) =>
+    h("button", { type: "button", "data-mode": name, "aria-pressed": String(name === "image"), onclick: () => setMode(name).catch(notify) }, text)));
+  const stage = h("div", map.view.root);
+  const below = h("div");
+  const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
+  const screen = {
+    result, state, map, scale, stage, below, ends, probe, message,
+    get step() { return state.step; },
+    get info() { return state.info; },
+    onpick: (x, y) => pick(x, y),
+    drawn: new Set(), // told after each change of step, field or scale
+    redraw: () => redraw(),
+    setStep: (n) => setStep(n),
+  };
+
+  async function drawFields() {
+    if (state.step === null) return;
+    const { shown } = await result.fields(state.step);
+    let key = state.field;
+    if (!shown.some((one) => one.key === key)) {
+      // what this step lacks (a shape has no displacement) stays chosen for the others
+      key = key ?? (shown.some((one) => one.key === "w_mm") ? "w_mm" : "z_mm");
+    }
+    state.info = shown.find((one) => one.key === key) ?? null;
+    if (!state.info && !state.field) state.info = shown[0];
+    state.field = state.info?.key ?? key;
+    const groups = [...new Set(shown.map((one) => one.group))];
+    replace(fieldChoice, state.info ? null : h("option", { value: state.field, selected: true }, `${state.field} (not in this step)`),
+      groups.map((group) => h("optgroup", { label: group }, shown.filter((one) => one.group === group).map((one) =>
+        h("option", { value: one.key, selected: one.key === state.field, title: one.about }, one.unit ? `${one.text} (${one.unit})` : one.text)))));
+  }
+
+  async function refresh() {
+    if (state.step === null) {
+      message.textContent = "No step is finished yet. The page goes on by itself.";
+      return;
+    }
+    slider.max = String(Math.max(result.steps.length - 1, 0));
+    slider.value = String(result.steps.indexOf(state.step));
+    slider.setAttribute("aria-valuetext", result.stepText(state.step));
+    stepText.textContent = `${result.stepText(state.step)} · ${result.steps.indexOf(state.step) + 1} of ${result.steps.length}`;
+    await drawFields();
+    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field)}`;
+    if (location.hash !== address && location.hash.startsWith(`#/results/${testId}/${analysisId}`)) history.replaceState(null, "", address);
+    if (!state.info) {
+      message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference, from which displacements are counted." : "choose another field."}`;
+      const z = (await result.fields(state.step)).shown.find((one) => one.key === "z_mm");
+      if (!z || !(await map.load(result, state.step, z, state.image))) return;
+      map.put(new Float32Array(map.now.values.length).fill(NaN), { ...z, key: state.field, text: state.field, unit: "" });
+      await redraw();
+      return;
+    }
+    message.textContent = state.info.about;
+    if (!(await map.load(result, state.step, state.info, state.image))) return;
+    await redraw();
+  }
+
+  async function redraw() {
+    if (!map.now) return;
+    const { info } = map.now;
+    let values = [map.measured];
+    if (scale.overAll && !info.flags && state.info && map.now.n === state.step) {
+      const each = [];
+      for (const n of result.steps) {
+        const { shown } = await result.fields(n);
+        if (!shown.some((one) => one.key === info.key)) continue;
+        const [grid, of] = await Promise.all([result.grid(n), result.values(n, info.key)]);
+        each.push(measured(grid, of));
+      }
+      if (map.now.info !== info) return;
+      if (each.length) values = each;
+    }
+    scale.lay(values, info.unit, info.flags, Boolean(info.signed));
+    map.redraw(scale);
+    const s = map.now.statistics;
+    replace(statistics, [...facts([
+      ["smallest", quantity(s.min, info.unit)], ["largest", quantity(s.max, info.unit)], ["mean", quantity(s.mean, info.unit)], ["sd", quantity(s.sd, info.unit, 3)],
+      ["measured", `${count(s.count)} of ${count(s.within)} points (${num(s.within ? (100 * s.count) / s.within : null, 4)} %)`],
+    ]).children]);
+    for (const listener of screen.drawn) await listener();
+  }
+
+  async function setStep(n) {
+    state.step = n;
+    await refresh();
+  }
+
+  async function playing(on) {
+    play.setAttribute("aria-pressed", String(on));
+    play.textContent = on ? "❚❚ Pause" : "▶ Play";
+    const mine = on ? {} : null;
+    state.playing = mine;
+    while (state.playing === mine && mine && document.contains(play)) {
+      const at = (result.steps.indexOf(state.step) + 1) % result.steps.length;
+      const began = performance.now();
+      try {
+        await setStep(result.steps[at]);
+      } catch (error) {
+        notify(error);
+        playing(false);
+        return;
+      }
+      await new Promise((resolve) => setTimeout(resolve, Math.max(400 - (performance.now() - began), 30)));
+    }
+  }
+
+  async function pick(x, y) {
+    const { i } = map.nearest(x, y);
+    if (i < 0) return;
+    const { grid } = map.now;
+    state.pinned = i;
+    const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step });
+    pinned(screen, answer);
+  }
+
+  let other = null; // what stands in the place of the map: the surface, or two maps
+  async function setMode(name) {
+    state.mode = name;
+    for (const button of modes.children) button.setAttribute("aria-pressed", String(button.dataset.mode === name));
+    if (other) {
+      screen.drawn.delete(other.update);
+      other.close();
+      other = null;
+    }
+    replace(stage, map.view.root);
+    if (name === "image") {
+      map.view.fit();
+      return;
+    }
+    const made = name === "surface" ? await (await import("./results/surface.js")).surface(screen) : await (await import("./results/compare.js")).compare(screen);
+    if (state.mode !== name || other || !document.contains(stage)) {
+      made.close();
+      return;
+    }
+    other = made;
+    replace(stage, made.root);
+    made.attach?.();
+    screen.drawn.add(made.update);
+    await made.update();
+  }
+  ends.push(() => other?.close());
+
+  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; scale.forget(); refresh().catch(notify); });
+  imageChoice.addEventListener("change", () => { state.image = imageChoice.value; refresh().catch(notify); });
+  slider.addEventListener("input", () => setStep(result.steps[Number(slider.value)]).catch(notify));
+  const fade = () => { map.view.canvas.style.opacity = String(opacity.value / 100); };
+  opacity.addEventListener("input", fade);
+  fade();
+  const move = (by) => setStep(result.steps[Math.min(Math.max(result.steps.indexOf(state.step) + by, 0), result.steps.length - 1)]).catch(notify);
+
+  function drawStatus() {
+    const { analysis } = result;
+    const problem = analysis.problem ? Object.assign(new Error(analysis.problem.detail ?? analysis.problem.cause), analysis.problem) : null;
+    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]), analysis.stale ? badge("out of date", "warn") : null),
+      analysis.stale ? h("p", h("strong", "Out of date: "), analysis.stale_reasons.join("; ")) : null, problem ? problemText(problem) : null);
+  }
+
+  replace(root,
+    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes),
+    h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
+      field("Image", imageChoice), field("Opacity", opacity, "%"),
+      h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
+        h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
+        h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText))),
+    h("div.grid.side.measured", h("div", stage, message),
+      h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, h("h2", "Probe"), probe), below));
+
+  drawStatus();
+  screen.drawn.add(() => mark(screen));
+  const told = about(screen);
+  below.append(gauges(screen), files(screen), told.root);
+  await refresh();
+  ends.push(events.on("result", async (event) => {
+    if (event.analysis_id !== analysisId) return;
+    const first = state.step === null;
+    await result.refresh();
+    drawStatus();
+    slider.max = String(Math.max(result.steps.length - 1, 0));
+    told.draw();
+    if (first) await setStep(result.steps.at(-1) ?? null);
+  }), events.on("job", async (job) => {
+    if (job.id !== result.analysis.job_id || job.state === result.analysis.state) return;
+    await result.refresh();
+    drawStatus();
+    told.draw();
+  }), () => { state.playing = null; });
+  return () => ends.forEach((end) => end());
+}

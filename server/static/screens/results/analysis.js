@@ -1,0 +1,153 @@
+// One analysis' results: what is read is kept, so that stepping and playing ask once.
+import * as api from "../../lib/api.js";
+import { Grid } from "../../lib/point_grid.js";
+
+const MOST_BYTES = 300e6;
+const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;
+const NAMES = {
+  x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
+  max_shear: "largest shear", von_mises: "von Mises strain", strain_angle_rad: "direction of e1", epipolar_px: "epipolar residual", noise_grey: "image noise",
+  status: "status", strain_status: "status of the strain", iterations: "iterations", theta_rad: "theta", phi_rad: "phi", zp_mm: "zp",
+};
+const GROUPS = [
+  ["Displacement", /^[uvw]_mm$/], ["Shape", /^[xyz]_mm$/], ["Strain", /^(exx|eyy|exy|e1|e2|max_shear|von_mises|strain_angle_rad)$/],
+  ["Quality", /^(zncc|epipolar_px|noise_grey|status|strain_status|iterations|reference_step)/], ["Standard uncertainty", /^sigma_/], ["Strain of the patches", /_patch$/], ["Other", /./],
+];
+
+/** Unit that a variable is shown in, and what its stored numbers are multiplied by. */
+export function shownUnit(name, units) {
+  if (STRAIN.test(name)) return { unit: "µm/m", factor: 1e6 };
+  return { unit: units === "pixel" ? "px" : units === "1" ? "" : units === "count" ? "grey" : units, factor: 1 };
+}
+
+const pretty = (name) => NAMES[name] ?? (name.startsWith("sigma_") ? `σ of ${NAMES[name.slice(6)] ?? name.slice(6)}` : name.replace(/_/g, " "));
+
+export class Result {
+  constructor(testId, analysisId) {
+    this.testId = testId;
+    this.analysisId = analysisId;
+    this.path = `/tests/${testId}/analyses/${analysisId}`;
+    this.kept = new Map();
+    this.bytes = 0;
+  }
+
+  static async open(testId, analysisId) {
+    const result = new Result(testId, analysisId);
+    await result.refresh();
+    return result;
+  }
+
+  async refresh() {
+    [this.analysis, this.test] = await Promise.all([api.get(this.path), api.get(`/tests/${this.testId}`)]);
+    this.steps = [...this.analysis.steps_finished].sort((a, b) => a - b);
+    this.reference = this.analysis.settings?.reference ?? this.analysis.steps?.[0] ?? 0;
+  }
+
+  /** Short text of a step: its number and label. */
+  stepText(n) {
+    const step = (this.test.steps ?? []).find((one) => one.n === n);
+    return `step ${n}${step?.label ? `: ${step.label}` : ""}${n === this.reference ? " (reference)" : ""}`;
+  }
+
+  #keep(key, make) {
+    const held = this.kept.get(key);
+    if (held) {
+      this.kept.delete(key); // what was used last is dropped last
+      this.kept.set(key, held);
+      return held.promise;
+    }
+    const entry = { bytes: 0 };
+    entry.promise = make().then((value) => {
+      entry.bytes = value.bytes ?? 0;
+      this.bytes += entry.bytes;
+      for (const [old, one] of this.kept) {
+        if (this.bytes <= MOST_BYTES || old === key) break;
+        this.kept.delete(old);
+        this.bytes -= one.bytes;
+      }
+      return value;
+    });
+    entry.promise.catch(() => this.kept.delete(key));
+    this.kept.set(key, entry);
+    return entry.promise;
+  }
+
+  /** What can be shown of a step: [{key, name, component, group, text, unit, about, flags}]. */
+  fields(n) {
+    return this.#keep(`${n}`, async () => {
+      const { fields, cuts_px: cuts } = await api.get(`${this.path}/steps/${n}/fields`);
+      const shown = [];
+      for (const one of fields) {
+        const group = GROUPS.find(([, pattern]) => pattern.test(one.name))[0];
+        const { unit } = shownUnit(one.name, one.units);
+        const common = { name: one.name, group, unit, about: one.long_name, flags: one.flags ?? null };
+        if (one.dimensions.join() === "row,col" && !["x_px", "y_px"].includes(one.name)) shown.push({ ...common, key: one.name, component: null, text: pretty(one.name) });
+        if (one.name === "zncc") {
+          for (let k = 0; k < one.shape[2]; k += 1) {
+            const pair = (one.comparisons?.[k] ?? String(k)).replace("__", " with ").replace(/_/g, " ");
+            shown.push({ ...common, key: `zncc:${k}`, component: k, text: `correlation ${pair}` });
+          }
+        }
+      }
+      const order = GROUPS.map(([name]) => name);
+      shown.sort((a, b) => order.indexOf(a.group) - order.indexOf(b.group));
+      return { shown, cuts, all: new Set(fields.map((one) => one.name)) };
+    });
+  }
+
+  array(n, name) {
+    return this.#keep(`${n}/${name}`, async () => {
+      const got = await api.npy(`${this.path}/steps/${n}/fields/${name}`, { format: "npy" });
+      return { ...got, bytes: got.data.byteLength };
+    });
+  }
+
+  /** Where the points lie in a step's image of a camera. */
+  places(n, cam) {
+    return this.#keep(`${n}/${cam}`, async () => {
+      const got = await api.npy(`${this.path}/steps/${n}/places/${cam}`, { format: "npy" });
+      return { ...got, bytes: got.data.byteLength };
+    });
+  }
+
+  grid(n) {
+    return this.#keep(`${n} grid`, async () => {
+      const { cuts } = await this.fields(n);
+      const [x, y, status] = await Promise.all(["x_px", "y_px", "status"].map((name) => this.array(n, name)));
+      const [rows, cols] = status.shape;
+      return new Grid({ rows, cols, x: x.data, y: y.data, status: status.data, cuts });
+    });
+  }
+
+  /** Values of one entry of `fields`, in the unit it is shown in. */
+  async values(n, key) {
+    const [name, component] = key.split(":");
+    const { data, shape } = await this.array(n, name);
+    const { factor } = shownUnit(name, "");
+    if (component === undefined && factor === 1) return data;
+    return this.#keep(`${n}/${key} shown`, async () => {
+      const each = component === undefined ? 1 : shape[2];
+      const out = new Float32Array(data.length / each);
+      for (let i = 0; i < out.length; i += 1) out[i] = factor * data[i * each + Number(component ?? 0)];
+      return Object.assign(out, { bytes: out.byteLength });
+    });
+  }
+
+  /** Standard uncertainties beside them, null where the file has none. */
+  async sigma(n, key) {
+    const { all } = await this.fields(n);
+    return all.has(`sigma_${key}`) ? this.values(n, `sigma_${key}`) : null;
+  }
+}
+
+/** Every page of a list, whatever the API calls the rest. */
+export async function all(path, name, query = {}) {
+  const out = [];
+  let cursor = null;
+  do {
+    const page = await api.get(path, { ...query, cursor });
+    out.push(...page[name]);
+    cursor = page.next_cursor ?? null;
+  } while (cursor);
+  return out;
+}

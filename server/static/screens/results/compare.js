@@ -1,0 +1,180 @@
+// Two analyses beside each other: the same field with linked zoom, and their difference.
+import * as api from "../../lib/api.js";
+import { FieldMap } from "../../widgets/field_map.js";
+import { Result, all } from "./analysis.js";
+import { Scale } from "../../widgets/scale.js";
+import { chart } from "../../widgets/plots.js";
+import { h, replace, select, field, facts, count, quantity, notify } from "../../lib/dom.js";
+
+const BINS = 41;
+
+/** Values of B at the points of A: the same where the grids are, else between B's points by the rule of the map. */
+export function onto(gridA, gridB, values) {
+  if (gridA.same(gridB)) return { values: Float64Array.from(values, (v, i) => (gridB.valid[i] ? v : NaN)), interpolated: false };
+  const out = new Float64Array(gridA.x.length);
+  for (let i = 0; i < out.length; i += 1) out[i] = gridB.at(values, gridA.x[i], gridA.y[i]);
+  return { values: out, interpolated: true };
+}
+
+/** Differences A - B at A's points, and the standard uncertainty of each where both have one. */
+export function difference(a, b) {
+  const other = onto(a.grid, b.grid, b.values);
+  const sigmaB = b.sigma ? onto(a.grid, b.grid, b.sigma).values : null;
+  const values = new Float64Array(a.values.length);
+  const sigma = a.sigma && sigmaB ? new Float64Array(values.length) : null;
+  for (let i = 0; i < values.length; i += 1) {
+    values[i] = a.grid.valid[i] ? a.values[i] - other.values[i] : NaN;
+    if (sigma) sigma[i] = Math.hypot(a.sigma[i], sigmaB[i]);
+  }
+  return { values, sigma, interpolated: other.interpolated };
+}
+
+export async function compare(screen) {
+  const { map, result } = screen;
+  const right = new FieldMap("Field of the other analysis over the image of camera 1");
+  right.view.canvas.dataset.role = "map-other";
+  const scale = new Scale(() => update().catch(notify), false);
+  const choice = h("select", { "data-role": "other" });
+  const stepChoice = h("select", {});
+  const show = select([["side", "the field of each"], ["difference", "the difference"]], "side");
+  const note = h("p.quiet", { role: "status" });
+  const figures = h("dl.facts", { "data-role": "difference" });
+  const histogramPlace = h("div", { "data-role": "difference-histogram" });
+  const bar = h("div", scale.root);
+  let other = null;
+  let plot = null;
+  let asked = 0;
+
+  const options = [];
+  for (const test of (await all("/tests", "tests")).reverse()) {
+    const own = test.id === result.testId ? result.test : null;
+    if (own) options.unshift([own.name, test.id, own.analyses]);
+    else options.push([test.name || test.id, test.id, null]);
+  }
+  // analyses of other tests are asked for when their test is chosen
+  const testChoice = select(options.map(([name, id]) => [id, name]), result.testId);
+  async function fillAnalyses() {
+    const of = options.find(([, id]) => id === testChoice.value);
+    of[2] ??= (await api.get(`/tests/${of[1]}`)).analyses;
+    const others = of[2].filter((one) => one.id !== result.analysisId);
+    replace(choice, others.length ? null : h("option", { value: "" }, "no other analysis"), others.map((one) => h("option", { value: one.id }, one.label || one.id)));
+    await choose();
+  }
+  async function choose() {
+    other = choice.value ? await Result.open(testChoice.value, choice.value) : null;
+    replace(stepChoice, h("option", { value: "same" }, "the same step"), (other?.steps ?? []).map((n) => h("option", { value: n }, other.stepText(n))));
+    await update();
+  }
+  testChoice.addEventListener("change", () => fillAnalyses().catch(notify));
+  choice.addEventListener("change", () => choose().catch(notify));
+  stepChoice.addEventListener("change", () => update().catch(notify));
+  show.addEventListener("change", () => update().catch(notify));
+
+  // what one view shows, the other shows too
+  let following = false;
+  const follow = (from, to) => () => {
+    if (following || !from.view.width || !to.view.width) return;
+    following = true;
+    const box = from.view.frame.getBoundingClientRect();
+    to.view.lookAt((box.width / 2 - from.view.left) / from.view.scale - 0.5, (box.height / 2 - from.view.top) / from.view.scale - 0.5, from.view.scale);
+    following = false;
+  };
+  const [there, back] = [follow(map, right), follow(right, map)];
+  map.view.root.addEventListener("viewchange", there);
+  right.view.root.addEventListener("viewchange", back);
+  const fade = () => { right.view.canvas.style.opacity = map.view.canvas.style.opacity; };
+
+  const left = h("div", h("h2", "This analysis"));
+  const rightName = h("h2", "The other");
+  const root = h("div", { "data-role": "compare" },
+    h("div.row", field("Test", testChoice), field("Compared with", choice), field("At", stepChoice), field("Right view", show)),
+    h("div.grid.two.views", left, h("div", rightName, right.view.root)), note,
+    h("div.grid.two", { hidden: true, "data-role": "difference-panel" }, h("div.panel", bar, figures), h("div.panel", histogramPlace)));
+  const panel = root.lastChild;
+
+  async function update() {
+    asked += 1;
+    const mine = asked;
+    if (!map.now) return;
+    fade();
+    if (!other) {
+      right.view.blank("There is no other analysis to compare with.");
+      panel.hidden = true;
+      return;
+    }
+    const n = stepChoice.value === "same" ? map.now.n : Number(stepChoice.value);
+    const key = screen.state.field;
+    const found = other.steps.includes(n) ? (await other.fields(n)).shown.find((one) => one.key === key) : null;
+    if (mine !== asked) return;
+    if (!found || !screen.info) {
+      right.view.blank(`The other analysis has no ${key} at step ${n}.`);
+      panel.hidden = true;
+      note.textContent = "";
+      return;
+    }
+    if (!(await right.load(other, n, found, map.now.image)) || mine !== asked) return;
+    right.view.empty.hidden = true;
+    const differ = show.value === "difference";
+    const named = `${other.analysis.label || other.analysisId}, step ${n}`;
+    rightName.textContent = differ ? `This less ${named}` : named;
+    panel.hidden = !differ;
+    if (!differ) {
+      right.redraw(screen.scale); // one scale for both
+      note.textContent = "Both have the colours of the scale on the left view's analysis.";
+      there();
+      return;
+    }
+    const a = map.now;
+    await Promise.all([a.withSigma, right.now.withSigma]);
+    if (mine !== asked) return;
+    const d = difference(a, right.now);
+    const info = { ...found, key: `${key} difference`, text: `difference of ${found.text}`, flags: null, signed: true };
+    Object.assign(right.now, { grid: a.grid, places: a.places });
+    right.put(d.values, info, d.sigma);
+    scale.lay([right.measured], found.unit, null, true);
+    right.redraw(scale);
+    const s = right.now.statistics;
+    let squares = 0;
+    let told = 0;
+    if (d.sigma) d.values.forEach((v, i) => { if (Number.isFinite(v) && Number.isFinite(d.sigma[i])) { squares += d.sigma[i] ** 2; told += 1; } });
+    const rmsTold = told ? Math.sqrt(squares / told) : null;
+    replace(figures, [...facts([
+      ["mean difference", quantity(s.mean, found.unit)], ["rms", quantity(s.rms, found.unit)], ["sd", quantity(s.sd, found.unit)], ["told σ of a difference, rms", quantity(rmsTold, found.unit)],
+      ["smallest", quantity(s.min, found.unit)], ["largest", quantity(s.max, found.unit)], ["points compared", `${count(s.count)} of ${count(a.values.length)}`],
+    ]).children]);
+    Object.assign(figures.dataset, { rms: String(s.rms), mean: String(s.mean), count: String(s.count), told: String(rmsTold) });
+    note.textContent = `This analysis less the other${d.interpolated ? "; the points differ, so the other's values are taken between its points" : ", point by point"}${found.unit ? `, in ${found.unit}` : ""}. The told σ takes both as independent; analyses of the same images are not.`;
+    await histogram(right.measured, s, found, rmsTold);
+    there();
+  }
+
+  async function histogram(values, s, info, sigma) {
+    plot?.close();
+    plot = null;
+    if (!(s.max > s.min)) {
+      replace(histogramPlace, h("p.quiet", s.count ? `Every difference is ${quantity(s.min, info.unit)}.` : "No point has a value in both."));
+      return;
+    }
+    const width = (s.max - s.min) / BINS;
+    const bins = new Array(BINS).fill(0);
+    for (const v of values) bins[Math.min(Math.floor((v - s.min) / width), BINS - 1)] += 1;
+    const x = bins.map((_, k) => s.min + (k + 0.5) * width);
+    const normal = sigma ? x.map((v) => (s.count * width * Math.exp(-0.5 * ((v - s.mean) / sigma) ** 2)) / (sigma * Math.sqrt(2 * Math.PI))) : null;
+    plot = await chart(histogramPlace, { x: `difference${info.unit ? ` (${info.unit})` : ""}`, y: "points", height: 220, bars: [true, false], series: [{ label: "points" }, ...(normal ? [{ label: "by the told σ, about the mean" }] : [])],
+      data: [x, bins, ...(normal ? [normal] : [])], label: "Histogram of the difference" });
+  }
+
+  await fillAnalyses().catch(notify);
+  return {
+    root, update,
+    /** The left view moves in, and back out when this is closed. */
+    attach: () => { left.append(map.view.root); map.view.fit(); },
+    close: () => {
+      asked += 1;
+      map.view.root.removeEventListener("viewchange", there);
+      right.view.root.removeEventListener("viewchange", back);
+      plot?.close();
+      right.close();
+    },
+  };
+}

@@ -1,0 +1,352 @@
+// Gauges drawn on the picture: a line, extensometers, an area; read by the API's gauges operation.
+import * as api from "../../lib/api.js";
+import { chart } from "../../widgets/plots.js";
+import { h, svg, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
+import { shownUnit } from "./analysis.js";
+
+const TOOLS = [["probe", "Probe", "A click shows every number of a point; dragging moves the picture"], ["line", "Line", "Drag a line: values along it"],
+  ["extensometer", "Extensometer", "Two clicks or a drag: elongation over the steps"], ["area", "Area", "Drag a rectangle: statistics of it"]];
+const INK = { line: "#ff9d1e", extensometer: "#ff5fa2", area: "#5ad1ff" };
+const EXTENSOMETER = [["strain", "strain"], ["elongation_mm", "elongation (mm)"], ["length_mm", "length (mm)"], ["true_strain", "true strain"]];
+
+export function gauges(screen) {
+  const { result, map } = screen;
+  const { view } = map;
+  const layer = svg("g", { class: "gauges" });
+  view.svg.append(layer);
+  view.svg.removeAttribute("aria-hidden");
+  view.svg.setAttribute("role", "group");
+  view.svg.setAttribute("aria-label", "Gauges drawn over the picture");
+  const state = { tool: "probe", line: null, area: null, extensometers: [], serial: 0, first: null };
+  const rigid = h("input", { type: "checkbox" });
+  const body = (more) => ({ ...more, ...(rigid.checked ? { remove_rigid: {} } : {}) });
+
+  // tools ------------------------------------------------------------------------------------------------------
+  const buttons = TOOLS.map(([name, text, title]) => h("button", { type: "button", title, "data-tool": name, "aria-pressed": String(name === "probe"), onclick: (event) => choose(name, event.detail === 0) }, text));
+  view.tools.append(h("span.row", { role: "group", "aria-label": "Tool" }, buttons));
+  function choose(name, byKey = false) {
+    state.tool = name;
+    state.first = null;
+    view.drawing = name !== "probe";
+    if (view.aim) view.setAim(null);
+    if (view.drawing) {
+      screen.message.textContent = inReference() ? "By keyboard: arrow keys move the cross-hair (Shift 10 px, Alt 0.1 px), Enter sets an end, Escape leaves." : "Gauges are drawn on the reference image: choose it under Image.";
+      if (byKey) view.frame.focus();
+    } else screen.message.textContent = screen.info?.about ?? "";
+    for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === name));
+    view.frame.style.cursor = name === "probe" ? "" : "cell";
+    if (name !== "probe") panels[name].open = true;
+    draw();
+  }
+
+  const inReference = () => map.now?.image === "reference";
+  view.onleave = () => choose("probe");
+  view.onaim = (aim) => state.first && draw(aim && [aim.x, aim.y]);
+  const probe = screen.onpick;
+  screen.onpick = (x, y, event) => {
+    if (state.tool === "probe") return void probe(x, y);
+    if (event?.type !== "keydown" || !inReference()) return; // the mouse draws below
+    if (!state.first) {
+      state.first = [x, y];
+      return draw([x, y]);
+    }
+    const from = state.first;
+    state.first = null;
+    made(state.tool, from, [x, y]);
+  };
+  let drag = null;
+  view.frame.addEventListener("pointerdown", (event) => {
+    if (state.tool === "probe" || event.button !== 0 || !inReference() || event.target.closest(".grab")) return;
+    event.stopImmediatePropagation();
+    event.preventDefault();
+    view.frame.focus();
+    view.frame.setPointerCapture(event.pointerId);
+    const { x, y } = view.at(event);
+    drag = { from: [x, y], to: [x, y], at: [event.clientX, event.clientY], moved: false };
+  }, true);
+  view.frame.addEventListener("pointermove", (event) => {
+    const { x, y } = view.at(event);
+    if (drag) {
+      drag.to = [x, y];
+      if (Math.hypot(event.clientX - drag.at[0], event.clientY - drag.at[1]) > 4) drag.moved = true;
+      draw();
+    } else if (state.first) draw([x, y]);
+  });
+  const up = (event) => {
+    if (!drag) return;
+    const done = drag;
+    drag = null;
+    if (event.type === "pointercancel") return draw();
+    if (!done.moved) { // the first of two clicks
+      if (!state.first) { state.first = done.from; return draw(); }
+      done.from = state.first;
+    }
+    state.first = null;
+    made(state.tool, done.from, done.to);
+  };
+  view.frame.addEventListener("pointerup", up);
+  view.frame.addEventListener("pointercancel", up);
+  view.frame.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || !(drag || state.first) || view.aim) return;
+    drag = null;
+    state.first = null;
+    draw();
+  });
+
+  /** Gauges lie inside the grid of points. */
+  function within([x, y]) {
+    const { grid } = map.now;
+    const clip = (v, a, b) => Math.min(Math.max(v, Math.min(a, b)), Math.max(a, b));
+    return [clip(x, grid.x0, grid.x0 + (grid.cols - 1) * grid.dx), clip(y, grid.y0, grid.y0 + (grid.rows - 1) * grid.dy)].map((v) => Math.round(v * 10) / 10);
+  }
+
+  function made(tool, a, b) {
+    const [from, to] = [within(a), within(b)];
+    if (Math.hypot(from[0] - to[0], from[1] - to[1]) < 1) return draw();
+    if (tool === "line") state.line = [from, to];
+    if (tool === "area") state.area = [Math.min(from[0], to[0]), Math.min(from[1], to[1]), Math.max(from[0], to[0]), Math.max(from[1], to[1])];
+    if (tool === "extensometer") { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: from, b: to }); }
+    changed(tool);
+  }
+
+  function changed(tool) {
+    draw();
+    fillInputs();
+    const read = { line: readLine, area: readArea, extensometer: readExtensometers }[tool];
+    panels[tool].open = true;
+    return read().catch(notify);
+  }
+
+  // drawing ----------------------------------------------------------------------------------------------------
+  const stroke = (colour, extra = {}) => ({ stroke: colour, fill: "none", "stroke-width": 2, "vector-effect": "non-scaling-stroke", ...extra });
+  function path(d, colour) {
+    return [svg("path", { d, ...stroke("#000", { "stroke-width": 4, opacity: 0.6 }) }), svg("path", { d, ...stroke(colour) })];
+  }
+  let later = null;
+  screen.ends.push(() => clearTimeout(later));
+  function handle(at, colour, move, tool, name) {
+    const grab = svg("circle", { class: "grab", tabindex: 0, role: "button", "data-handle": name, "aria-label": `${name}, at ${num(at[0], 5)}, ${num(at[1], 5)} px`, cx: at[0], cy: at[1], fill: colour, stroke: "#000", "stroke-width": 1, "vector-effect": "non-scaling-stroke", style: { r: "calc(6px * var(--px))" } });
+    grab.addEventListener("pointerdown", (event) => {
+      event.stopPropagation();
+      grab.setPointerCapture(event.pointerId);
+      const moving = (e) => { const { x, y } = view.at(e); const [u, v] = within([x, y]); move(u, v); grab.setAttribute("cx", u); grab.setAttribute("cy", v); };
+      grab.addEventListener("pointermove", moving);
+      grab.addEventListener("pointerup", () => { grab.removeEventListener("pointermove", moving); changed(tool); }, { once: true });
+    });
+    grab.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey) return;
+      const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
+      const by = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] }[event.key];
+      if (!by) return;
+      event.preventDefault();
+      event.stopPropagation();
+      move(...within([at[0] + by[0], at[1] + by[1]]));
+      draw();
+      clearTimeout(later); // read once the keys rest
+      later = setTimeout(() => changed(tool), 300);
+    });
+    return grab;
+  }
+  function draw(mouse = null) {
+    const parts = [];
+    if (inReference()) {
+      const segment = (a, b) => `M${a[0]} ${a[1]}L${b[0]} ${b[1]}`;
+      const box = ([x0, y0, x1, y1]) => `M${x0} ${y0}H${x1}V${y1}H${x0}Z`;
+      if (state.area) parts.push(...path(box(state.area), INK.area), handle(state.area.slice(0, 2), INK.area, (x, y) => { state.area = [Math.min(x, state.area[2] - 1), Math.min(y, state.area[3] - 1), state.area[2], state.area[3]]; }, "area", "Upper left corner of the area"),
+        handle(state.area.slice(2), INK.area, (x, y) => { state.area = [state.area[0], state.area[1], Math.max(x, state.area[0] + 1), Math.max(y, state.area[1] + 1)]; }, "area", "Lower right corner of the area"));
+      if (state.line) parts.push(...path(segment(...state.line), INK.line), ...[0, 1].map((k) => handle(state.line[k], INK.line, (x, y) => { state.line[k] = [x, y]; }, "line", `${k ? "End" : "Beginning"} of the line`)));
+      for (const one of state.extensometers) {
+        parts.push(...path(segment(one.a, one.b), INK.extensometer), ...["a", "b"].map((k) => handle(one[k], INK.extensometer, (x, y) => { one[k] = [x, y]; }, "extensometer", `End ${k} of extensometer ${one.name}`)),
+          svg("text", { x: (one.a[0] + one.b[0]) / 2, y: (one.a[1] + one.b[1]) / 2, fill: "#fff", stroke: "#000", "stroke-width": 3, "paint-order": "stroke", style: { fontSize: "calc(13px * var(--px))", strokeWidth: "calc(3px * var(--px))" } }, ` ${one.name}`));
+      }
+      const going = drag ? [drag.from, drag.to] : state.first && mouse ? [state.first, mouse] : null;
+      if (going) parts.push(...path(state.tool === "area" ? box([...going[0], ...going[1]]) : segment(...going), INK[state.tool] ?? "#fff"));
+      else if (state.first) parts.push(svg("circle", { cx: state.first[0], cy: state.first[1], fill: INK[state.tool], style: { r: "calc(5px * var(--px))" } }));
+    }
+    replace(layer, parts);
+  }
+
+  // numbers by keyboard ----------------------------------------------------------------------------------------
+  const four = (names, set) => {
+    const inputs = names.map((name) => number(null, { "aria-label": name, placeholder: name.split(" ").slice(1).join(" "), style: "width:6em" }));
+    const use = action("Use", async () => {
+      const v = inputs.map((one) => Number(one.value));
+      if (inputs.some((one) => one.value === "") || !v.every(Number.isFinite)) throw new Error("Give all four numbers, in pixels of camera 1's reference image.");
+      await set(v);
+    });
+    return { inputs, use, row: h("div.row", inputs, h("span.unit", "px"), use) };
+  };
+  const lineInputs = four(["Line from x", "Line from y", "Line to x", "Line to y"], (v) => { state.line = [v.slice(0, 2), v.slice(2)]; return changed("line"); });
+  const areaInputs = four(["Area left", "Area top", "Area right", "Area bottom"], (v) => { state.area = v; return changed("area"); });
+  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], (v) => { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: v.slice(0, 2), b: v.slice(2) }); return changed("extensometer"); });
+  function fillInputs() {
+    if (state.line) state.line.flat().forEach((v, k) => { lineInputs.inputs[k].value = v; });
+    if (state.area) state.area.forEach((v, k) => { areaInputs.inputs[k].value = v; });
+  }
+
+  // reading ----------------------------------------------------------------------------------------------------
+  const answers = { line: null, extensometer: null };
+  const plots = {};
+  async function plot(name, place, options) {
+    plots[name]?.close();
+    plots[name] = null;
+    plots[name] = await chart(place, options);
+  }
+
+  const lineChart = h("div", { "data-role": "line-chart" });
+  const lineText = h("div");
+  const along = select([["mm", "mm along the surface"], ["px", "pixels of the image"]], "mm");
+  along.addEventListener("change", () => drawLine().catch(notify));
+  async function readLine() {
+    if (!state.line || !screen.info) return;
+    if (screen.info.component !== null) return void replace(lineText, h("p.quiet", "A line reads variables of one number a point; choose another field."));
+    const name = screen.info.name;
+    replace(lineText, h("p.quiet", "Reading …"));
+    const answer = await api.post(`${result.path}/gauges`, body({ lines: [{ vertices_px: state.line }], variables: [name, "x_mm", "y_mm", "z_mm"].filter((v, k, each) => each.indexOf(v) === k), steps: [screen.step] }));
+    const step = answer.steps[0];
+    if (step.problem) return void replace(lineText, problemText(Object.assign(new Error(step.problem.detail ?? step.problem.cause), step.problem)));
+    answers.line = { line: step.lines[0], name };
+    await drawLine();
+  }
+  async function drawLine() {
+    if (!answers.line) return;
+    const { line, name } = answers.line;
+    const { value, sigma, units } = line.values[name];
+    const { unit, factor } = shownUnit(name, units);
+    const scaled = (list) => list.map((v) => (v === null ? null : v * factor));
+    const values = scaled(value);
+    const errors = scaled(sigma);
+    const place = { x: line.values.x_mm.value, y: line.values.y_mm.value, z: line.values.z_mm.value };
+    let length = 0;
+    const mm = values.map((_, k) => {
+      if (k && place.x[k] !== null && place.x[k - 1] !== null) length += Math.hypot(...["x", "y", "z"].map((a) => place[a][k] - place[a][k - 1]));
+      return length;
+    });
+    const whole = place.x.every((v) => v !== null);
+    const inMm = along.value === "mm" && whole;
+    const x = inMm ? mm : line.distance_px;
+    const band = (sign) => values.map((v, k) => (v === null || errors[k] === null ? null : v + sign * errors[k]));
+    const missing = value.filter((v) => v === null).length;
+    replace(lineText, h("p.quiet", `${count(value.length)} places from (${state.line[0].join(", ")}) to (${state.line[1].join(", ")}) px`,
+      missing ? `; ${missing} without a value: ${[...new Set(line.missing.filter(Boolean))].join(", ").replace(/_/g, " ")}` : "",
+      along.value === "mm" && !whole ? "; the way in mm is not known where points are missing, so it is in pixels" : "", errors.some((v) => v !== null) ? "; the band is one standard uncertainty" : "; its uncertainty is not known"));
+    lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
+    await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 230,
+      series: [{ label: name }, { label: "+ σ", edge: true }, { label: "− σ", edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
+  }
+
+  const extChart = h("div", { "data-role": "extensometer-chart" });
+  const extTable = h("div");
+  const what = select(EXTENSOMETER, "strain");
+  const over = select([["n", "step number"]], "n");
+  what.addEventListener("change", () => drawExtensometers().catch(notify));
+  over.addEventListener("change", () => drawExtensometers().catch(notify));
+  async function readExtensometers() {
+    if (!state.extensometers.length) {
+      answers.extensometer = null;
+      plots.extensometer?.close();
+      plots.extensometer = null;
+      extChart.replaceChildren();
+      extTable.replaceChildren();
+      return;
+    }
+    if (!answers.extensometer) replace(extTable, h("p.quiet", "Reading …"));
+    answers.extensometer = await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }));
+    await abscissas();
+    await drawExtensometers();
+  }
+  const channels = new Map(); // step -> its document, for channels
+  async function abscissas() {
+    const listed = result.test.steps ?? [];
+    const found = [["n", "step number"]];
+    if (listed.some((one) => one.captured_utc)) found.push(["time", "time (s)"]);
+    if (listed.some((one) => one.load_n !== null && one.load_n !== undefined)) found.push(["load", "load (N)"]);
+    const wanted = result.steps.filter((n) => !channels.has(n));
+    // what steps carry is in their own documents; a few at a time
+    for (let k = 0; k < wanted.length; k += 8) {
+      await Promise.all(wanted.slice(k, k + 8).map(async (n) => channels.set(n, await api.get(`/tests/${result.testId}/steps/${n}`).catch(() => ({})))));
+    }
+    const names = new Set([...channels.values()].flatMap((one) => Object.keys(one.channels ?? {})));
+    for (const name of names) found.push([`channel:${name}`, name]);
+    if (listed.some((one) => Number.isFinite(parseFloat(one.label)))) found.push(["label", "number in the label"]);
+    const before = over.value;
+    replace(over, found.map(([value, text]) => h("option", { value, selected: value === before }, text)));
+  }
+  function abscissa(n) {
+    const step = (result.test.steps ?? []).find((one) => one.n === n) ?? {};
+    const first = (result.test.steps ?? []).find((one) => one.n === result.reference) ?? {};
+    const time = (one) => new Date(one.timestamp_utc ?? one.captured_utc).valueOf();
+    if (over.value === "n") return n;
+    if (over.value === "time") return (time(step) - time(first)) / 1000;
+    if (over.value === "load") return step.load_n ?? null;
+    if (over.value === "label") return Number.isFinite(parseFloat(step.label)) ? parseFloat(step.label) : null;
+    return channels.get(n)?.channels?.[over.value.slice(8)] ?? null;
+  }
+  async function drawExtensometers() {
+    if (!answers.extensometer) return;
+    const name = what.value;
+    const steps = answers.extensometer.steps.filter((one) => !one.problem);
+    const rows = steps.map((one) => ({ n: one.n, label: one.label, x: abscissa(one.n), each: one.extensometers })).filter((one) => one.x !== null && Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
+    const strain = name.endsWith("strain");
+    const factor = strain ? 1e6 : 1;
+    const of = (one, k, part) => one.each[k]?.values[name]?.[part] ?? null;
+    const series = [];
+    const bands = [];
+    const data = [rows.map((one) => one.x)];
+    state.extensometers.forEach((gauge, k) => {
+      const value = rows.map((one) => of(one, k, "value")).map((v) => (v === null ? null : v * factor));
+      const sigma = rows.map((one) => of(one, k, "sigma")).map((v) => (v === null ? null : v * factor));
+      const at = data.length;
+      data.push(value, value.map((v, i) => (v === null || sigma[i] === null ? null : v + sigma[i])), value.map((v, i) => (v === null || sigma[i] === null ? null : v - sigma[i])));
+      series.push({ label: gauge.name, colour: k, dots: true }, { label: `${gauge.name} + σ`, edge: true, colour: k }, { label: `${gauge.name} − σ`, edge: true, colour: k });
+      bands.push([at + 1, at + 2]);
+    });
+    extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
+    const unit = strain ? "µm/m" : "mm";
+    await plot("extensometer", extChart, { x: over.selectedOptions[0].textContent, y: `${EXTENSOMETER.find(([v]) => v === name)[1].replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
+    const told = (one, k) => { const v = of(one, k, "value"); const s = of(one, k, "sigma"); return v === null ? one.each[k]?.missing?.replace(/_/g, " ") || "–" : `${num(v * factor, 5)}${s === null ? "" : ` ± ${num(s * factor, 2)}`}`; };
+    replace(extTable, table([
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [[over.selectedOptions[0].textContent, (one) => num(one.x, 6), { numeric: true }]]),
+      ...state.extensometers.map((gauge, k) => [`${gauge.name} (${unit})`, (one) => told(one, k), { numeric: true }]),
+    ], rows, { caption: "With one standard uncertainty" }),
+    h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
+  }
+
+  const areaBox = h("div", { "data-role": "area" });
+  async function readArea() {
+    if (!state.area || !screen.info) return;
+    if (screen.info.component !== null) return void replace(areaBox, h("p.quiet", "An area reads variables of one number a point; choose another field."));
+    const { name } = screen.info;
+    if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
+    const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }));
+    const { unit, factor } = shownUnit(name, answer.steps.at(-1)?.areas[0]?.values[name]?.units ?? "");
+    const cell = (one, part, digits = 5) => { const v = one.areas?.[0]?.values[name]?.[part]; return num(v === null || v === undefined ? null : v * factor, digits); };
+    areaBox.dataset.answer = JSON.stringify(answer.steps.map((one) => one.areas?.[0]?.values[name] ?? null));
+    replace(areaBox, table([
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], ["± σ", (one) => cell(one, "mean_sigma", 2), { numeric: true }],
+      ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Smallest", (one) => cell(one, "min"), { numeric: true }], ["Largest", (one) => cell(one, "max"), { numeric: true }],
+      ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas[0].valid} of ${one.areas[0].points}`), { numeric: true }],
+    ], answer.steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle` }));
+  }
+
+  rigid.addEventListener("change", () => { for (const read of [readLine, readArea, readExtensometers]) read().catch(notify); });
+  const clear = (tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else areaBox.replaceChildren(); draw(); } }, "Clear");
+  const panels = {
+    line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart),
+    extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),
+    area: h("details.panel", h("summary", "Area"), h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."), h("div.row", areaInputs.row, clear("area")), areaBox),
+  };
+  const root = h("div", h("label.check", rigid, "Gauges without the rigid motion of the whole field"), panels.line, panels.extensometer, panels.area);
+
+  let last = "";
+  screen.drawn.add(async () => {
+    draw();
+    const now = `${screen.step} ${screen.info?.key}`;
+    if (now === last) return;
+    last = now;
+    if (state.line) await readLine().catch(notify);
+    if (state.area && screen.info) await readArea().catch(notify);
+  });
+  screen.ends.push(() => Object.values(plots).forEach((one) => one?.close()));
+  return root;
+}

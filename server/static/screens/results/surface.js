@@ -1,0 +1,331 @@
+// The measured surface in space with the field on it: turned by mouse, finger or keys; its displacement magnified.
+import { h, replace, field, number, action, tick } from "../../lib/dom.js";
+import { ENTRIES } from "../../lib/colour.js";
+
+let library = null;
+async function three() {
+  library ??= Promise.all([import("../../vendor/three/three.module.js"), import("../../vendor/three/OrbitControls.js")]);
+  const [THREE, { OrbitControls }] = await library;
+  return { THREE, OrbitControls };
+}
+
+/** 1, 2 or 5 times a power of ten, not above `value`. */
+function round125(value) {
+  if (!(value > 0) || !Number.isFinite(value)) return 1;
+  const power = 10 ** Math.floor(Math.log10(value));
+  return ([5, 2, 1].find((one) => one * power <= value) ?? 1) * power;
+}
+
+/** Even marks between two numbers. */
+function marks(low, high, most = 5) {
+  const rough = (high - low) / most;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
+  const out = [];
+  for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : Number(v.toPrecision(12)));
+  return out;
+}
+
+export async function surface(screen) {
+  const { THREE, OrbitControls } = await three();
+  const { result, map, scale } = screen;
+  const place = h("div.space", { tabindex: 0, role: "application", "aria-label": "Surface in space: arrow keys turn it, + and − zoom, 0 puts it back" });
+  const labels = h("div.labels", { "aria-hidden": "true" });
+  const magnification = number(null, { min: 0, "data-role": "magnification" });
+  const depth = number(1, { min: 0 });
+  const grid = h("input", { type: "checkbox" });
+  const note = h("span.quiet", { role: "status" });
+  const reset = h("button", { type: "button", onclick: () => look() }, "Reset view");
+  const root = h("div.panel", { "data-role": "surface" },
+    h("div.row", field("Displacement ×", magnification), field("Depth ×", depth), h("label.check", grid, "grid lines"), reset, action("Save picture", save), note), place);
+
+  let renderer;
+  try {
+    renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
+  } catch {
+    replace(place, h("p", "This browser cannot draw in space (no WebGL). The map over the image shows the same field."));
+    return { root, close: () => {}, update: async () => {} };
+  }
+  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+  place.append(renderer.domElement, labels);
+  const scene = new THREE.Scene();
+  const camera = new THREE.PerspectiveCamera(30, 1, 0.01, 1e6);
+  const controls = new OrbitControls(camera, renderer.domElement);
+  controls.addEventListener("change", () => draw());
+  scene.add(new THREE.AmbientLight(0xffffff, 1.6));
+  const lamp = new THREE.DirectionalLight(0xffffff, 1.6);
+  scene.add(camera);
+  camera.add(lamp);
+  lamp.position.set(-0.6, 0.8, 0.6);
+  const texture = new THREE.DataTexture(new Uint8Array(4 * ENTRIES), ENTRIES, 1, THREE.RGBAFormat);
+  texture.colorSpace = THREE.SRGBColorSpace;
+  texture.minFilter = THREE.NearestFilter;
+  texture.magFilter = THREE.NearestFilter;
+  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide });
+  const plain = new THREE.MeshLambertMaterial({ color: 0x9aa3a8, side: THREE.DoubleSide }); // measured, but without a value of this field
+  const mesh = new THREE.Mesh(new THREE.BufferGeometry(), [material, plain]);
+  const wire = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: 0x000000, transparent: true, opacity: 0.35 }));
+  const box = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: 0x808a90 }));
+  scene.add(mesh, wire, box);
+
+  let held = null; // {step, position, motion, valid}
+  let bounds = null;
+  let ticks = [];
+  let triangles = [];
+  let asked = 0;
+
+  async function read() {
+    const n = map.now.n;
+    const grid_ = map.now.grid;
+    const { all } = await result.fields(n);
+    const of = (names) => Promise.all(names.map((name) => result.array(n, name).then((one) => one.data)));
+    const [position, motion] = await Promise.all([of(["x_mm", "y_mm", "z_mm"]), all.has("u_mm") ? of(["u_mm", "v_mm", "w_mm"]) : null]);
+    return { n, grid: grid_, position, motion };
+  }
+
+  const factor = (input, usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Number(input.value));
+
+  /** Triangles over cells whose corners all have a place: never over a missing point or a cut. */
+  function build() {
+    const { grid: g, position, motion } = held;
+    const count = g.x.length;
+    let most = 0;
+    const low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
+    for (let i = 0; i < count; i += 1) {
+      if (!g.valid[i]) continue;
+      for (let k = 0; k < 3; k += 1) {
+        if (position[k][i] < low[k]) low[k] = position[k][i];
+        if (position[k][i] > high[k]) high[k] = position[k][i];
+      }
+      if (motion) most = Math.max(most, Math.hypot(motion[0][i], motion[1][i], motion[2][i]));
+    }
+    if (!(high[0] >= low[0])) return false;
+    const size = Math.hypot(...[0, 1, 2].map((k) => high[k] - low[k])) || 1;
+    const usual = most > 0 ? Math.max(round125((0.12 * size) / most), 1) : 1;
+    magnification.placeholder = String(usual);
+    magnification.disabled = !motion;
+    const times = motion ? factor(magnification, usual) : 0;
+    const deep = factor(depth, 1);
+    const middle = (low[2] + high[2]) / 2;
+    const at = new Float32Array(3 * count);
+    const uv = new Float32Array(2 * count).fill(0.5);
+    const span = [[Infinity, -Infinity], [Infinity, -Infinity], [Infinity, -Infinity]];
+    const origin = [0, 1, 2].map((k) => (low[k] + high[k]) / 2);
+    for (let i = 0; i < count; i += 1) {
+      if (!g.valid[i]) continue;
+      for (let k = 0; k < 3; k += 1) {
+        let v = position[k][i];
+        if (k === 2) v = middle + deep * (v - middle);
+        if (motion) v += times * motion[k][i];
+        if (Number.isFinite(v)) { span[k][0] = Math.min(span[k][0], v); span[k][1] = Math.max(span[k][1], v); }
+        at[3 * i + k] = v - origin[k];
+      }
+    }
+    triangles = [];
+    const lines = [];
+    const whole = (i) => g.valid[i] && Number.isFinite(at[3 * i]) && (!motion || Number.isFinite(motion[0][i]));
+    for (let r = 0; r < g.rows - 1; r += 1) {
+      for (let c = 0; c < g.cols - 1; c += 1) {
+        const cell = r * g.cols + c;
+        if (g.cutCells.has(cell)) continue;
+        const [p, q, s, t] = g.corners(cell);
+        const good = [whole(p), whole(q), whole(s), whole(t)];
+        const number_ = good.filter(Boolean).length;
+        if (number_ === 4) triangles.push(p, s, q, q, s, t);
+        else if (number_ === 3) triangles.push(...[p, s, t, q].filter((_, k) => good[[0, 2, 3, 1][k]]));
+        else continue;
+        if (good[0] && good[1]) lines.push(p, q);
+        if (good[0] && good[2]) lines.push(p, s);
+      }
+    }
+    const attribute = new THREE.BufferAttribute(at, 3);
+    mesh.geometry.dispose();
+    mesh.geometry = new THREE.BufferGeometry();
+    mesh.geometry.setAttribute("position", attribute);
+    mesh.geometry.setAttribute("uv", new THREE.BufferAttribute(uv, 2));
+    mesh.geometry.setIndex(triangles);
+    mesh.geometry.computeVertexNormals();
+    wire.geometry.dispose();
+    wire.geometry = new THREE.BufferGeometry();
+    wire.geometry.setAttribute("position", attribute);
+    wire.geometry.setIndex(lines);
+    wire.visible = grid.checked;
+    // a flat surface still needs a box to stand in
+    for (const one of span) if (one[1] - one[0] < 0.02 * size) { const m = (one[0] + one[1]) / 2; one[0] = m - 0.01 * size; one[1] = m + 0.01 * size; }
+    bounds = { span, origin, size, times, deep, middle, motion: Boolean(motion) };
+    axes();
+    place.dataset.triangles = String(triangles.length / 3);
+    place.dataset.magnification = String(times);
+    note.textContent = `${motion ? `displacement × ${tick(times)}${times === 1 ? " (as it is)" : ""}` : "shape; this step has no displacement"}${deep === 1 ? "" : `, depth × ${tick(deep)}`}; axes in mm`;
+    return true;
+  }
+
+  function axes() {
+    const { span, origin } = bounds;
+    const v = [];
+    const corner = (i, j, k) => [span[0][i] - origin[0], span[1][j] - origin[1], span[2][k] - origin[2]];
+    const edge = (a, b) => v.push(...a, ...b);
+    for (const j of [0, 1]) for (const k of [0, 1]) {
+      edge(corner(0, j, k), corner(1, j, k));
+      edge(corner(j, 0, k), corner(j, 1, k));
+      edge(corner(j, k, 0), corner(j, k, 1));
+    }
+    ticks = [];
+    const long = 0.015 * bounds.size;
+    const put = (axis, value, from, out) => {
+      const a = [...from];
+      a[axis] = value - origin[axis];
+      const b = a.map((x, k) => x + out[k] * long);
+      edge(a, b);
+      return a.map((x, k) => x + 3 * out[k] * long);
+    };
+    const most = (axis) => Math.max(2, Math.min(5, Math.round((6 * (span[axis][1] - span[axis][0])) / bounds.size)));
+    // X along the lower edge of the picture, Y along the left one, Z along the far left corner; Y_sys points down in it
+    for (const value of marks(...span[0], most(0))) ticks.push({ at: put(0, value, corner(0, 1, 0), [0, 1, 0]), text: tick(value) });
+    for (const value of marks(...span[1], most(1))) ticks.push({ at: put(1, value, corner(0, 0, 0), [-1, 0, 0]), text: tick(value) });
+    for (const value of bounds.times > 1 || bounds.deep !== 1 ? [] : marks(...span[2], most(2))) ticks.push({ at: put(2, value, corner(1, 1, 0), [1, 0, 0]), text: tick(value) });
+    const mid = (axis, from, out) => { const a = [...from]; a[axis] = (span[axis][0] + span[axis][1]) / 2 - origin[axis]; return a.map((x, k) => x + 7 * out[k] * long); };
+    ticks.push({ at: mid(0, corner(0, 1, 0), [0, 1, 0]), text: "X (mm)" }, { at: mid(1, corner(0, 0, 0), [-1, 0, 0]), text: "Y (mm)" },
+      { at: mid(2, corner(1, 1, 0), [0.6, 0, 0]), text: bounds.times > 1 || bounds.deep !== 1 ? "Z (magnified)" : "Z (mm)" });
+    replace(labels, ticks.map((one) => h("span", one.text)));
+    box.geometry.dispose();
+    box.geometry = new THREE.BufferGeometry();
+    box.geometry.setAttribute("position", new THREE.Float32BufferAttribute(v, 3));
+  }
+
+  /** The field's colours on the points. */
+  function paint() {
+    const { values, grid: g, info } = map.now;
+    if (values.length !== g.x.length || !mesh.geometry.attributes.uv || mesh.geometry.attributes.uv.count !== g.x.length) return;
+    const uv = mesh.geometry.attributes.uv;
+    const flags = Boolean(info.flags);
+    for (let i = 0; i < values.length; i += 1) {
+      const share = flags ? (values[i] + 0.5) / ENTRIES : (values[i] - scale.low) / (scale.high - scale.low);
+      uv.array[2 * i] = Number.isFinite(share) ? Math.min(Math.max(share, 0.5 / ENTRIES), 1 - 0.5 / ENTRIES) : 0.5;
+    }
+    uv.needsUpdate = true;
+    const coloured = [];
+    const others = [];
+    for (let k = 0; k < triangles.length; k += 3) {
+      const three_ = [triangles[k], triangles[k + 1], triangles[k + 2]];
+      const each = three_.map((i) => values[i]);
+      const told = each.every(Number.isFinite) && (!flags || (each[0] === each[1] && each[1] === each[2]));
+      (told ? coloured : others).push(...three_);
+    }
+    mesh.geometry.setIndex(coloured.concat(others));
+    mesh.geometry.clearGroups();
+    mesh.geometry.addGroup(0, coloured.length, 0);
+    mesh.geometry.addGroup(coloured.length, others.length, 1);
+    const data = texture.image.data;
+    for (let i = 0; i < ENTRIES; i += 1) {
+      const rgb = flags ? scale.colour(i) : [scale.rgb[3 * i], scale.rgb[3 * i + 1], scale.rgb[3 * i + 2]];
+      data.set([...rgb, 255], 4 * i);
+    }
+    texture.needsUpdate = true;
+  }
+
+  /** From where camera 1 stands: X to the right, Y down, a little from above. */
+  function look() {
+    if (!bounds) return;
+    const far = bounds.size * 1.75;
+    camera.up.set(0, -1, 0);
+    controls.target.set(0, 0, 0);
+    for (let k = 0; k < 3; k += 1) controls.target.setComponent(k, (bounds.span[k][0] + bounds.span[k][1]) / 2 - bounds.origin[k]);
+    camera.position.copy(controls.target).add(new THREE.Vector3(-0.35, -0.62, -0.75).normalize().multiplyScalar(far));
+    camera.near = bounds.size / 100;
+    camera.far = bounds.size * 100;
+    camera.updateProjectionMatrix();
+    controls.update();
+    draw();
+  }
+
+  let waiting = false;
+  function draw() {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => {
+      waiting = false;
+      const width = place.clientWidth;
+      const height = place.clientHeight;
+      if (!width || !height) return;
+      const size = renderer.getSize(new THREE.Vector2());
+      if (size.x !== width || size.y !== height) {
+        renderer.setSize(width, height);
+        camera.aspect = width / height;
+        camera.updateProjectionMatrix();
+      }
+      renderer.render(scene, camera);
+      const v = new THREE.Vector3();
+      ticks.forEach((one, k) => {
+        v.set(...one.at).project(camera);
+        const span = labels.children[k];
+        if (!span) return;
+        span.style.transform = `translate(${((v.x + 1) / 2) * width}px, ${((1 - v.y) / 2) * height}px) translate(-50%, -50%)`;
+        span.hidden = v.z > 1;
+      });
+      place.dataset.drawn = `${map.now.n} ${map.now.info.key}`;
+    });
+  }
+
+  async function save() {
+    renderer.render(scene, camera);
+    const blob = await new Promise((resolve) => renderer.domElement.toBlob(resolve, "image/png"));
+    const link = h("a", { href: URL.createObjectURL(blob), download: `${result.testId}_${result.analysisId}_step${map.now.n}_surface.png` });
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  }
+
+  async function update() {
+    asked += 1;
+    const mine = asked;
+    if (!map.now) return;
+    const fresh = !held || held.n !== map.now.n;
+    if (fresh) {
+      const got = await read();
+      if (mine !== asked) return;
+      const first = !bounds;
+      held = got;
+      if (!build()) {
+        note.textContent = "No point of this step was measured.";
+        return;
+      }
+      paint();
+      if (first) look();
+    } else paint();
+    draw();
+  }
+
+  for (const input of [magnification, depth]) input.addEventListener("change", () => { if (held && build()) { paint(); draw(); } });
+  grid.addEventListener("change", () => { wire.visible = grid.checked; draw(); });
+  place.addEventListener("keydown", (event) => {
+    const turn = { ArrowLeft: [0.12, 0], ArrowRight: [-0.12, 0], ArrowUp: [0, 0.12], ArrowDown: [0, -0.12] }[event.key];
+    const off = camera.position.clone().sub(controls.target);
+    if (turn) {
+      const polar = new THREE.Spherical().setFromVector3(off.clone().applyQuaternion(new THREE.Quaternion().setFromUnitVectors(camera.up, new THREE.Vector3(0, 1, 0))));
+      polar.theta += turn[0];
+      polar.phi = Math.min(Math.max(polar.phi - turn[1], 0.05), Math.PI - 0.05);
+      off.setFromSpherical(polar).applyQuaternion(new THREE.Quaternion().setFromUnitVectors(camera.up, new THREE.Vector3(0, 1, 0)).invert());
+    } else if (event.key === "+" || event.key === "=") off.multiplyScalar(1 / 1.2);
+    else if (event.key === "-") off.multiplyScalar(1.2);
+    else if (event.key === "0") { look(); event.preventDefault(); return; }
+    else return;
+    event.preventDefault();
+    camera.position.copy(controls.target).add(off);
+    controls.update();
+    draw();
+  });
+  const observer = new ResizeObserver(() => draw());
+  observer.observe(place);
+  const close = () => {
+    asked += 1;
+    observer.disconnect();
+    controls.dispose();
+    for (const one of [mesh, wire, box]) one.geometry.dispose();
+    for (const one of [material, plain, wire.material, box.material]) one.dispose();
+    texture.dispose();
+    renderer.dispose();
+    renderer.forceContextLoss();
+  };
+  return { root, update, close };
+}

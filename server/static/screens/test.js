@@ -1,0 +1,87 @@
+// Tests: make one, take or import its steps, tell what no device knows, choose what is measured and how.
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { stepsPanel } from "./test/steps.js";
+import { factsPanel } from "./test/facts.js";
+import { measurePanel } from "./test/measure.js";
+import { h, replace, field, select, action, table, when, notify } from "../lib/dom.js";
+
+export async function open(root, { path }) {
+  return path[0] ? one(root, path[0]) : all(root);
+}
+
+/** Calibrations to choose from: the newest accepted one first, then the newest. */
+export async function calibrationChoice(chosen, attributes = {}) {
+  const usable = (await api.get("/calibrations")).calibrations.filter((c) => c.state === "complete" && c.decision !== "discarded").toReversed();
+  const first = usable.find((c) => c.decision === "accepted") ?? usable[0];
+  const text = (c) => `${c.label || c.id} · ${c.verdict?.level ?? "imported"}${c.decision === "accepted" ? " · accepted" : ""} · ${when(c.created_utc)}`;
+  return select([...usable.map((c) => [c.id, text(c)]), ["", "none: images only"]], chosen ?? first?.id ?? "", attributes);
+}
+
+async function all(root) {
+  const name = h("input", { type: "text", maxlength: 300, required: true });
+  const specimen = h("input", { type: "text", maxlength: 300 });
+  const notes = h("textarea", { rows: 2, maxlength: 20000 });
+  const calibration = await calibrationChoice(null);
+  const make = action("Make the test", async () => {
+    if (!name.value.trim()) {
+      name.focus();
+      throw Object.assign(new Error("The test has no name."), { remedy: "Give it one; it can be changed later." });
+    }
+    const made = await api.post("/tests", { name: name.value.trim(), specimen: specimen.value, notes: notes.value, calibration_id: calibration.value || null });
+    location.hash = `#/test/${made.id}`;
+  }, { kind: "primary" });
+  const list = h("div");
+  async function refresh() {
+    const { tests } = await api.get("/tests");
+    replace(list, table([
+      ["Test", (test) => h("a", { href: `#/test/${test.id}` }, test.name)], ["Specimen", (test) => test.specimen || "–"],
+      ["Calibration", (test) => (test.calibration_id ? h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id) : "none")],
+      ["Made", (test) => when(test.created_utc)], ["Id", (test) => h("code", test.id)],
+    ], tests.toReversed(), { caption: "Tests, newest first", onrow: (test) => { location.hash = `#/test/${test.id}`; }, empty: "No test yet." }));
+  }
+  await refresh();
+  replace(root, h("h1", "Tests"), h("div.grid.side", h("section.panel", list),
+    h("section.panel", { "aria-label": "New test" }, h("h2", "New test"), field("Name", name), field("Specimen", specimen), field("Calibration", calibration, "", "The test keeps its own copy."), field("Notes", notes), make)));
+  return events.on("test", () => refresh().catch(notify));
+}
+
+async function one(root, id) {
+  const ends = [];
+  let test = await api.get(`/tests/${id}`);
+  const head = h("section.panel");
+  const analyses = h("section.panel", { "aria-label": "Analyses" });
+
+  function drawHead() {
+    const name = h("input", { type: "text", maxlength: 300, value: test.name });
+    const specimen = h("input", { type: "text", maxlength: 300, value: test.specimen });
+    const notes = h("textarea", { rows: 3, maxlength: 20000, value: test.notes });
+    replace(head, h("p", test.specimen ? `${test.specimen} · ` : "", test.calibration_id ? ["calibration ", h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id)] : "no calibration: its images can be looked at, not measured", ` · made ${when(test.created_utc)} · `, h("code", test.id)),
+      test.notes ? h("p.quiet", test.notes) : null,
+      h("details", h("summary", "Name, specimen and notes"), h("div.fields", field("Name", name), field("Specimen", specimen)), field("Notes", notes),
+        action("Save", async () => { test = await api.patch(`/tests/${id}`, { name: name.value, specimen: specimen.value, notes: notes.value }); title.textContent = test.name; drawHead(); notify("Saved.", "good"); })),
+      factsPanel(id));
+  }
+  function drawAnalyses() {
+    replace(analyses, h("h2", "Analyses"), table([
+      ["Analysis", (a) => h("a", { href: `#/results/${id}/${a.id}` }, a.label || a.id)], ["Kind", (a) => a.kind], ["Made", (a) => when(a.created_utc)],
+    ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
+  }
+  const title = h("h1", test.name);
+  const steps = await stepsPanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); return test; });
+  const measure = await measurePanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); drawAnalyses(); });
+  steps.onchange = (fresh) => { test = fresh; measure.steps(fresh); };
+  drawHead();
+  drawAnalyses();
+  let later = null;
+  ends.push(
+    events.on("step", (event) => {
+      if (event.test_id !== id) return;
+      clearTimeout(later);
+      later = setTimeout(() => steps.refresh().catch(notify), 200);
+    }),
+    () => clearTimeout(later),
+  );
+  replace(root, h("div.spread", title, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, analyses));
+  return () => ends.forEach((end) => end());
+}

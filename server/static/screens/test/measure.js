@@ -1,0 +1,241 @@
+// Where and how a test is measured: region, seeds, subset over the speckle, texture, settings, start.
+import * as api from "../../lib/api.js";
+import { View, stroke } from "../../widgets/view.js";
+import { greyOf } from "../../widgets/grey.js";
+import { RegionEditor } from "../../widgets/region_editor.js";
+import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../../lib/dom.js";
+
+const LEVEL = { good: "good", usable: "warn", poor: "bad" };
+
+export async function measurePanel(id, test, ends, done) {
+  const root = h("section.panel", { "aria-label": "Region and analysis" }, h("h2", "Region and analysis"));
+  const body = h("div");
+  root.append(body);
+  let built = null;
+
+  async function steps(fresh) {
+    test = fresh;
+    if (!test.steps.length) {
+      replace(body, h("p.quiet", "The region is drawn over the reference step: capture or import it first."));
+      return;
+    }
+    built ??= await build();
+    built.steps();
+  }
+
+  async function build() {
+    const noise = (await api.get("/noise").catch(() => ({ noise: [] }))).noise ?? [];
+    const views = ["cam1", "cam2"].map((cam) => new View({ label: `Reference image of ${cam}`, grey: (x, y) => greyOf({ test: id, step: Number(reference.value), cam }, x, y) }));
+    ends.push(() => views.forEach((view) => view.close()));
+    const editor = new RegionEditor(views[0], views[1], () => changed());
+    const sample = svg("g", { "aria-hidden": "true", "data-role": "sample" });
+    views[0].svg.insertBefore(sample, views[0].svg.firstChild);
+
+    const reference = select([], 0, { "aria-label": "Reference step" });
+    const subset = number(33, { min: 9, max: 255, step: 2 });
+    const step = number(10, { min: 1, max: 1000, step: 1 });
+    const showSample = h("input", { type: "checkbox", checked: true });
+    const showTexture = h("input", { type: "checkbox" });
+    const legend = h("span.quiet");
+    const overlays = views.map((view) => { const image = h("img", { alt: "", hidden: true }); view.content.insertBefore(image, view.svg); return image; });
+    const texture = h("div", { role: "status", "data-role": "texture" });
+
+    let shownStep = null;
+    function showReference() {
+      const n = Number(reference.value);
+      if (n === shownStep) return;
+      shownStep = n;
+      views.forEach((view, k) => view.show(api.address(`/tests/${id}/steps/${n}/cam${k + 1}/preview`)));
+      changed();
+    }
+    reference.addEventListener("change", showReference);
+
+    // the subsets, to scale
+    function drawSample() {
+      const parts = [];
+      const [cx, cy] = editor.middle().map(Math.round);
+      const half = Number(subset.value) / 2;
+      const apart = Number(step.value);
+      const path = (d, colour, width, more = {}, dashes = []) => svg("path", { d, ...stroke(colour, width, dashes), ...more });
+      if (showSample.checked && half > 0 && apart > 0) {
+        const square = (x, y) => `M${x - half} ${y - half}h${2 * half}v${2 * half}h${-2 * half}z`;
+        parts.push(path(square(cx + apart, cy) + square(cx, cy + apart), "#33c6ff", 1, {}, [4, 3]), path(square(cx, cy), "#33c6ff", 2, { "data-role": "subset" }));
+        const dots = [];
+        for (let i = -3; i <= 3; i += 1) for (let k = -3; k <= 3; k += 1) dots.push(`M${cx + i * apart} ${cy + k * apart}h0.001`);
+        parts.push(path(dots.join(""), "#33c6ff", 4, { "stroke-linecap": "round", "data-role": "points" }));
+      }
+      replace(sample, parts);
+    }
+
+    let asked = 0;
+    async function judge() {
+      asked += 1;
+      const mine = asked;
+      const region = editor.region();
+      if (!region) {
+        replace(texture, h("p.quiet", "Draw a region to see whether its texture carries such subsets."));
+        return;
+      }
+      try {
+        const told = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), step_px: Number(step.value), noise_id: noiseChoice.value || null });
+        if (mine !== asked) return;
+        replace(texture,
+          h("p", badge({ good: "good texture", usable: "usable texture", poor: "poor texture" }[told.level] ?? told.level, LEVEL[told.level] ?? ""), ` ${num(100 * told.good_share, 3)} % of ${count(told.subsets)} subsets below ${told.good_px} px, ${num(100 * told.usable_share, 3)} % below ${told.usable_px} px; median ${quantity(told.median_error_px, "px", 2)} at a noise of ${num(told.noise_grey, 3)} grey levels.`),
+          told.proposed_subset_px && told.proposed_subset_px !== told.subset_px ? h("p.row", `The smallest subset that would do: ${told.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = told.proposed_subset_px; changed(); } }, "Take it")) : null,
+          told.proposed_subset_px ? null : h("p", "No subset up to 91 px would do: the pattern is too faint, or too coarse."),
+          h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${told.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${told.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], told.sizes, { caption: "Share of the region's subsets with an expected random error" })));
+      } catch (error) {
+        if (mine === asked) replace(texture, problemText(error));
+      }
+    }
+
+    let shownMaps = [];
+    async function layTexture() {
+      const on = showTexture.checked;
+      overlays.forEach((image) => { image.hidden = !on; });
+      legend.textContent = "";
+      if (!on) return;
+      const answers = await Promise.all(views.map((_, k) => api.raw(`/tests/${id}/steps/${reference.value}/cam${k + 1}/maps/texture`, { subset_px: Number(subset.value) })));
+      legend.textContent = answers[0].headers.get("X-Legend") ?? "";
+      const fresh = await Promise.all(answers.map(async (answer) => URL.createObjectURL(await answer.blob())));
+      overlays.forEach((image, k) => { image.src = fresh[k]; });
+      shownMaps.forEach((url) => URL.revokeObjectURL(url));
+      shownMaps = fresh;
+    }
+    ends.push(() => shownMaps.forEach((url) => URL.revokeObjectURL(url)));
+
+    let seedsAsked = "[]";
+    async function checkSeeds() {
+      const told = editor.seeds();
+      const question = JSON.stringify([told, reference.value]);
+      if (question === seedsAsked) return;
+      seedsAsked = question;
+      if (!told.seeds) {
+        editor.tellLines([]);
+        return;
+      }
+      try {
+        const answer = await api.post(`/tests/${id}/seeds:check`, { ...told, reference: Number(reference.value) });
+        if (question === seedsAsked) editor.tellLines(answer.seeds);
+      } catch (error) {
+        notify(error);
+      }
+    }
+
+    let timer = null;
+    ends.push(() => clearTimeout(timer));
+    function changed() {
+      drawSample();
+      drawGauge();
+      checkSeeds();
+      clearTimeout(timer);
+      timer = setTimeout(() => { judge(); if (showTexture.checked) layTexture().catch(notify); }, 300);
+    }
+    for (const input of [subset, step]) input.addEventListener("input", () => Number(input.value) > 0 && changed());
+    showSample.addEventListener("change", drawSample);
+    showTexture.addEventListener("change", () => layTexture().catch(notify));
+    views[0].image.addEventListener("load", drawSample);
+
+    // settings
+    const kind = select([["displacement", "shape and displacement"], ["profile", "shape only"]], "displacement");
+    const patch = select([["auto", "auto: plane or curved"], ["stretch", "stretch (plane)"], ["rigid", "rigid (the paper's)"], ["curved", "curved"]], "auto");
+    const interpolation = select([["quintic", "quintic B-spline"], ["cubic", "cubic B-spline"]], "quintic");
+    const prefilter = number(0, { min: 0, max: 64 });
+    const smoothing = number(null, { min: 3, step: 2, placeholder: "none" });
+    const strain = h("input", { type: "checkbox", checked: true });
+    const window_ = number(9, { min: 3, step: 2 });
+    const order = select([[1, "planes"], [2, "quadratics"]], 1);
+    const tensor = select([["green_lagrange", "Green-Lagrange"], ["infinitesimal", "infinitesimal"], ["hencky", "Hencky (logarithmic)"]], "green_lagrange");
+    const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, one.label || one.id])], "");
+    noiseChoice.addEventListener("change", changed);
+    const update = select([["auto", "auto"], ["never", "never (total)"], ["always", "always (incremental)"]], "auto");
+    const which = h("input", { type: "text", placeholder: "all", "aria-describedby": "which-hint" });
+    const follow_ = h("input", { type: "checkbox" });
+    const label = h("input", { type: "text", maxlength: 300 });
+    const gauge = h("small.hint");
+    function drawGauge() {
+      gauge.textContent = strain.checked ? `Virtual gauge: ${num((Number(window_.value) - 1) * Number(step.value) + Number(subset.value), 4)} px wide.` : "";
+    }
+    for (const input of [window_, strain]) input.addEventListener("input", drawGauge);
+
+    const progress = h("div", { role: "status", "data-role": "progress" });
+    const stopped = new AbortController();
+    ends.push(() => stopped.abort());
+    const start = action("Measure", async () => {
+      const region = editor.region();
+      if (!region) throw Object.assign(new Error("There is no region."), { remedy: "Draw a rectangle or a polygon over camera 1's image." });
+      const body_ = {
+        kind: kind.value, region, subset_px: Number(subset.value), step_px: Number(step.value), patch: patch.value, interpolation: interpolation.value, prefilter_px: Number(prefilter.value),
+        reference: Number(reference.value), reference_update: update.value, noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
+        smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? { window: Number(window_.value), order: Number(order.value), tensor: tensor.value } : null,
+      };
+      const wanted = stepList(which.value);
+      if (wanted) body_.steps = wanted;
+      if (follow_.checked) body_.follow = true;
+      const { job, analysis_id: analysis } = await api.post(`/tests/${id}/analyses`, body_);
+      await done();
+      follow(job, analysis).catch((error) => error.name === "AbortError" || notify(error));
+    }, { kind: "primary" });
+
+    async function follow(job, analysis) {
+      const bar = h("progress", { max: 1, "aria-label": "Progress of the analysis" });
+      const text = h("span");
+      const link = h("a.button", { href: `#/results/${id}/${analysis}` }, "Show results");
+      replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}/cancel`), { kind: "danger" }), link));
+      const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
+        const { stage, done: ready, total, eta_s: eta } = now.progress ?? {};
+        if (total) bar.value = ready / total;
+        text.textContent = now.state === "queued" ? "waiting" : `${stage ?? ""}${eta ? `, ${num(eta, 2)} s left` : ""}`;
+      } });
+      const problem = ["succeeded", "cancelled"].includes(ended.state) ? null : problemText(api.jobProblem(ended));
+      replace(progress, h("div.row", badge(ended.state, STATE_KIND[ended.state]), link), problem);
+      await done();
+    }
+
+    replace(body,
+      h("div.row", h("label", { for: "reference-step" }, "Reference step"), Object.assign(reference, { id: "reference-step" }), editor.bar), editor.hint,
+      h("div.grid.two.views", { style: { marginTop: "0.5rem" } }, views.map((view, k) => h("div", h("h3", `cam${k + 1}`), view.root))),
+      h("div.grid.two", { style: { marginTop: "var(--gap)" } },
+        h("div",
+          h("fieldset", h("legend", "Region and seeds"), editor.list,
+            h("p.hint", "Seeds are found by themselves where none are given. Where the texture repeats itself, click three points that are no line, each in both views.")),
+          h("fieldset", h("legend", "Subsets and texture"),
+            h("div.fields", field("Subset", subset, "px", "odd"), field("Step", step, "px", "from point to point")),
+            h("div.row", h("label.check", showSample, "draw them to scale"), h("button", { type: "button", onclick: () => views[0].lookAt(...editor.middle(), 6) }, "Look at them"), h("label.check", showTexture, "texture map"), legend), texture)),
+        h("div",
+          h("fieldset", h("legend", "How it is measured"),
+            h("div.fields", field("Measure", kind), field("Patch", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Noise", noiseChoice),
+              field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
+          h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge),
+          h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "go on with each step that lands"),
+          h("div.row", { style: { marginTop: "0.5rem" } }, start), progress)));
+    editor.use("rectangle");
+    editor.drawList();
+    drawGauge();
+
+    return {
+      steps() {
+        const kept = reference.value;
+        replace(reference, test.steps.map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)));
+        if (reference.selectedIndex < 0) reference.selectedIndex = 0;
+        showReference();
+      },
+    };
+  }
+
+  await steps(test);
+  return { root, steps: (fresh) => steps(fresh).catch(notify) };
+}
+
+/** "1-5, 8" -> [1, 2, 3, 4, 5, 8]; nothing where all are meant. */
+export function stepList(text) {
+  if (!text.trim() || text.trim() === "all") return null;
+  const out = [];
+  for (const part of text.split(/[\s,;]+/).filter(Boolean)) {
+    const found = /^(\d+)(?:[-–](\d+))?$/.exec(part);
+    if (!found) throw Object.assign(new Error(`“${part}” is no step.`), { remedy: "Write numbers and spans between commas: 1-5, 8." });
+    const last = Number(found[2] ?? found[1]);
+    for (let n = Number(found[1]); n <= last && out.length <= 10000; n += 1) out.push(n);
+  }
+  return out;
+}

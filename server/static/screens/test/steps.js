@@ -1,0 +1,166 @@
+// A test's steps: capture with load and channels, what the pair is worth, thumbnails, import of existing pairs.
+import * as api from "../../lib/api.js";
+import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "../../lib/dom.js";
+
+const KIND = { ok: "good", dark: "warn", blurred: "warn", low_texture: "warn", saturated: "warn", blank: "bad", cameras_off_zero: "bad" };
+const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "little texture", saturated: "saturated", blank: "nothing to see", cameras_off_zero: "cameras are off their calibrated place" };
+
+export async function stepsPanel(id, test, ends, reread) {
+  const panel = { onchange: () => {}, root: null, refresh };
+  const thumbs = h("div.thumbs", { "data-role": "thumbnails", style: { maxHeight: "22rem", overflow: "auto" }, tabindex: 0, role: "region", "aria-label": "Thumbnails" });
+  const detail = h("div", { role: "status", "data-role": "quality" });
+  let chosen = null;
+
+  async function refresh() {
+    test = await reread();
+    draw();
+    panel.onchange(test);
+  }
+
+  function draw() {
+    if (!test.steps.length) {
+      replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference."));
+      return;
+    }
+    replace(thumbs, test.steps.map((step) => h("figure", { "data-step": step.n },
+      h("button.plain", { type: "button", style: { padding: 0, display: "block", width: "100%" }, "aria-pressed": String(step.n === chosen), "aria-label": `Step ${step.n}${step.label ? `, ${step.label}` : ""}`, onclick: () => show(step.n).catch(notify) },
+        h("img", { loading: "lazy", alt: "", width: 132, src: api.address(`/tests/${id}/steps/${step.n}/cam1/preview`, { width_px: 132 }) })),
+      h("figcaption", h("strong", `${step.n}`), ` ${step.label ?? ""} `, step.load_n !== null && step.load_n !== undefined ? `${quantity(step.load_n, "N", 4)} ` : "", step.quality && step.quality !== "ok" ? badge(WORDS[step.quality] ?? step.quality, KIND[step.quality] ?? "warn") : null))),
+    (test.incomplete_steps ?? []).length ? h("p.quiet", `Incomplete: ${test.incomplete_steps.join(", ")}.`) : null);
+  }
+
+  async function show(n) {
+    chosen = n;
+    tell(await api.get(`/tests/${id}/steps/${n}`));
+    for (const button of thumbs.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.closest("[data-step]").dataset.step === String(n)));
+  }
+
+  function tell(step) {
+    const quality = step.quality ?? {};
+    const rows = [
+      ["verdict", (q) => badge(WORDS[q.code] ?? q.code, KIND[q.code] ?? "warn")], ["mean grey", (q) => `${num(q.mean_grey, 4)}${q.mean_share ? ` (${num(100 * q.mean_share, 3)} %)` : ""}`],
+      ["saturated", (q) => quantity(100 * q.saturated_share, "%", 3)], ["contrast", (q) => quantity(q.contrast_grey, "grey", 3)],
+      ["texture", (q) => quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", (q) => num(q.focus, 3)], ["exposure", (q) => quantity(q.exposure_ms, "ms")], ["gain", (q) => quantity(q.gain_db, "dB")],
+    ];
+    const channels = Object.entries(step.channels ?? {}).map(([name, value]) => `${name} ${num(value, 6)}`).join(", ");
+    replace(detail,
+      h("div.spread", h("h3", `Step ${step.n}${step.label ? `: ${step.label}` : ""}`), h("span.row", badge(WORDS[quality.code] ?? quality.code ?? "not judged", KIND[quality.code] ?? ""),
+        action("Delete …", async () => {
+          if (await ask(`Delete step ${step.n}?`, h("p", "It goes to the trash; its number is not given again, and analyses that used it are stale."), [["Cancel", null], ["Delete", "yes"]])) {
+            await api.remove(`/tests/${id}/steps/${step.n}`);
+            replace(detail);
+            await refresh();
+          }
+        }))),
+      h("p.quiet", [when(step.captured_utc), step.load_n !== null && step.load_n !== undefined ? `load ${quantity(step.load_n, "N", 6)}` : null, channels || null, step.skew_ms !== null && step.skew_ms !== undefined ? `skew ${quantity(step.skew_ms, "ms", 3)}${quality.max_skew_ms ? ` of ${quantity(quality.max_skew_ms, "ms", 3)} allowed` : ""}` : null, step.frames > 1 ? `${step.frames} frames averaged` : null].filter(Boolean).join(" · ")),
+      table([["Figure", (row) => row[0], { unseen: true }], ["cam1", (row) => (quality.cam1 ? row[1](quality.cam1) : "–"), { numeric: true }], ["cam2", (row) => (quality.cam2 ? row[1](quality.cam2) : "–"), { numeric: true }]], rows, { caption: "What the pair is worth" }));
+  }
+
+  panel.root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
+    h("div.grid.side", h("div", thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; tell(step); await refresh(); }, ends, refresh)));
+  draw();
+  return panel;
+}
+
+function capture(id, done, ends, refresh) {
+  const label = h("input", { type: "text", maxlength: 300, placeholder: "1.25 kN" });
+  const load = number(null);
+  const channels = h("input", { type: "text", placeholder: "stroke_mm = 0.42, temperature_c = 21.3" });
+  const frames = number(1, { min: 1, max: 256, step: 1 });
+  const count = number(1, { min: 1, max: 10000, step: 1 });
+  const interval = number(0, { min: 0 });
+  const progress = h("div", { role: "status" });
+  const stopped = new AbortController();
+  ends.push(() => stopped.abort());
+
+  const take = action("Capture", async () => {
+    const body = { label: label.value, channels: parseChannels(channels.value), frames: Number(frames.value) };
+    if (load.value !== "") body.load_n = Number(load.value);
+    if (Number(count.value) > 1) Object.assign(body, { count: Number(count.value), interval_ms: Number(interval.value) });
+    const made = await api.post(`/tests/${id}/steps`, body);
+    if (!made.job) return done(made);
+    const bar = h("progress", { max: 1, "aria-label": "Progress of the burst" });
+    replace(progress, bar, action("Cancel", () => api.post(`/jobs/${made.job.id}/cancel`), { kind: "danger" }));
+    const ended = await api.finished(made.job.id, { signal: stopped.signal, onprogress: (job) => { if (job.progress?.total) bar.value = job.progress.done / job.progress.total; } });
+    replace(progress, ["succeeded", "cancelled"].includes(ended.state) ? h("p", `${count.value} steps were asked for; see above.`) : problemText(api.jobProblem(ended)));
+    return refresh();
+  }, { kind: "primary" });
+  for (const input of [label, load, channels]) input.addEventListener("keydown", (event) => event.key === "Enter" && take.click());
+  return h("div", { role: "group", "aria-label": "Capture" }, h("h3", "Capture a step"),
+    h("div.fields", field("Label", label), field("Load", load, "N"), field("Frames averaged", frames)), field("Channels", channels, "", "name = number, between commas"),
+    h("details", h("summary", "A burst"), h("div.fields", field("Steps", count), field("One every", interval, "ms"))), h("div.row", take), progress);
+}
+
+/** "stroke_mm = 0.42, temperature_c = 21.3" -> {stroke_mm: 0.42, ...} */
+export function parseChannels(text) {
+  const out = {};
+  for (const part of text.split(/[,;\n]+/).map((one) => one.trim()).filter(Boolean)) {
+    const [name, value, ...more] = part.split("=").map((one) => one.trim());
+    if (!name || more.length || !value || !Number.isFinite(Number(value))) throw Object.assign(new Error(`“${part}” is no channel.`), { remedy: "Write name = number, with a point, between commas." });
+    out[name] = Number(value);
+  }
+  return out;
+}
+
+/** Pairs of files in the order of their names, numbers in them counted as numbers. */
+export function pairsOf(one, two) {
+  const order = new Intl.Collator("en", { numeric: true });
+  const sorted = (files) => [...files].sort((a, b) => order.compare(a.name, b.name));
+  const [first, second] = [sorted(one), sorted(two)];
+  if (first.length !== second.length || !first.length) throw Object.assign(new Error(`Camera 1 has ${first.length} images, camera 2 has ${second.length}.`), { remedy: "Choose as many images of each camera; they are matched in the order of their names." });
+  return first.map((file, index) => [file, second[index]]);
+}
+
+function importPairs(id, refresh, ends) {
+  const accept = ".tif,.tiff,.png,.bmp,.jpg,.jpeg";
+  const one = h("input", { type: "file", multiple: true, accept });
+  const two = h("input", { type: "file", multiple: true, accept });
+  const matched = h("div", { role: "status" });
+  const progress = h("div", { role: "status" });
+  const byName = h("input", { type: "checkbox", checked: true });
+  let going = null;
+  ends.push(() => going?.abort());
+
+  function match() {
+    if (!one.files.length || !two.files.length) return replace(matched);
+    try {
+      const pairs = pairsOf(one.files, two.files);
+      return replace(matched, table([["Number", (row) => String(row[2] + 1), { unseen: true }], ["Camera 1", (row) => row[0].name], ["Camera 2", (row) => row[1].name]], pairs.map((pair, k) => [...pair, k]).slice(0, 200), { caption: `${pairs.length} pairs, in the order of their names` }));
+    } catch (error) {
+      return replace(matched, problemText(error));
+    }
+  }
+  one.addEventListener("change", match);
+  two.addEventListener("change", match);
+  const start = action("Import", async () => {
+    const pairs = pairsOf(one.files, two.files);
+    going = new AbortController();
+    const bar = h("progress", { max: pairs.length, value: 0, "aria-label": "Progress of the import" });
+    const text = h("span");
+    replace(progress, h("div.row", h("span", { style: { flex: 1 } }, bar), text, h("button.danger", { type: "button", onclick: () => going.abort() }, "Stop")));
+    let ready = 0;
+    try {
+      for (const [first, second] of pairs) {
+        if (going.signal.aborted) break;
+        text.textContent = `${ready} of ${pairs.length}: ${first.name}`;
+        const form = new FormData();
+        form.append("cam1", first);
+        form.append("cam2", second);
+        form.append("label", byName.checked ? first.name.replace(/\.[^.]*$/, "").slice(0, 300) : "");
+        try {
+          await api.upload(`/tests/${id}/steps:import`, form);
+        } catch (error) {
+          error.message = `${first.name} and ${second.name}: ${error.message}`;
+          throw error;
+        }
+        ready += 1;
+        bar.value = ready;
+      }
+    } finally {
+      replace(progress, h("p", badge(ready === pairs.length ? "imported" : "stopped", ready === pairs.length ? "good" : "warn"), ` ${ready} of ${pairs.length} pairs are steps now.`));
+      await refresh();
+    }
+  }, { kind: "primary" });
+  return h("details", { style: { marginTop: "0.75rem" } }, h("summary", "Import existing pairs"), h("div.fields", field("Images of camera 1", one), field("Images of camera 2", two)),
+    h("label.check", byName, "label each step by its file's name"), matched, h("div.row", { style: { marginTop: "0.5rem" } }, start), progress);
+}

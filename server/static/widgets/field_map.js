@@ -1,0 +1,142 @@
+// A field over an image: what is under the mouse, and the points' own numbers.
+import * as api from "../lib/api.js";
+import { View } from "./view.js";
+import { num, quantity } from "../lib/dom.js";
+import { greyOf } from "./grey.js";
+import { statistics } from "../lib/point_grid.js";
+
+/** Values of the points that were measured. */
+export function measured(grid, values) {
+  const out = new Float64Array(values.length);
+  let count = 0;
+  for (let i = 0; i < values.length; i += 1) if (grid.valid[i] && Number.isFinite(values[i])) out[count++] = values[i];
+  return out.subarray(0, count);
+}
+
+export class FieldMap {
+  /** @param {string} label for those who do not see it; `onpick(x, y, event)` hears clicks and the Enter key, in the pixels of the picture shown */
+  constructor(label, onpick = null) {
+    this.view = new View({ label, grey: (x, y) => this.#under(x, y), onpick: (x, y, event) => onpick?.(x, y, event) });
+    this.view.canvas.dataset.role = "map";
+    this.now = null;
+    this.asked = 0;
+    this.canvasSize = null;
+    this.view.image.addEventListener("load", () => { this.noImage = false; this.redraw(); });
+    this.view.image.addEventListener("error", () => {
+      if (!this.view.image.getAttribute("src")) return;
+      this.noImage = true;
+      this.redraw();
+    });
+  }
+
+  close() {
+    this.asked += 1;
+    this.view.close();
+  }
+
+  /**
+   * Read what is to be shown.
+   * @param {import("../screens/results/analysis.js").Result} result
+   * @param {number} n step
+   * @param {object} info entry of `result.fields`
+   * @param {string} image "reference", "cam1" or "cam2"
+   * @returns {Promise<boolean>} false if something newer was asked for meanwhile
+   */
+  async load(result, n, info, image) {
+    this.asked += 1;
+    const mine = this.asked;
+    const of = image === "reference" ? [result.reference, "cam1"] : [n, image];
+    const address = api.address(`/tests/${result.testId}/steps/${of[0]}/${of[1]}/preview`);
+    if (!this.address) { // the first picture comes while the numbers do; later ones come with their numbers
+      this.address = address;
+      this.view.show(address);
+    }
+    const [grid, values, places] = await Promise.all([
+      result.grid(n), result.values(n, info.key), image === "reference" ? null : result.places(n, image).then((one) => one.data),
+    ]);
+    if (mine !== this.asked) return false;
+    if (this.address !== address) {
+      this.address = address;
+      this.view.show(address);
+    }
+    const now = { result, n, info, image, grid, values, sigma: null, places, statistics: statistics(grid, values) };
+    this.now = now;
+    // what the picture does not need may come after it
+    now.withSigma = result.sigma(n, info.key).then((sigma) => { if (now.info === info) now.sigma = sigma; return sigma; }, () => null);
+    this.raster = null;
+    this.view.readout.textContent = ""; // what it said was of another field or step
+    return true;
+  }
+
+  /** Show other values on the same points (a difference). */
+  put(values, info, sigma = null) {
+    Object.assign(this.now, { values, info, sigma, statistics: statistics(this.now.grid, values) });
+    this.raster = null;
+  }
+
+  /** Measured values, for the colour scale. */
+  get measured() {
+    if (!this.now) return [];
+    const { grid, values } = this.now;
+    return measured(grid, values);
+  }
+
+  redraw(scale = this.scale) {
+    this.scale = scale;
+    if (!this.now || !scale) return;
+    if (this.noImage && this.now.image === "reference") {
+      // no picture: the points say how large it must have been
+      const { grid } = this.now;
+      this.view.size(Math.ceil(Math.max(...[0, grid.cols - 1].map((c) => grid.x0 + c * grid.dx)) + grid.x0), Math.ceil(grid.y0 * 2 + (grid.rows - 1) * grid.dy));
+    }
+    const { width, height } = this.view;
+    if (!width) return; // drawn when the picture has come
+    const size = `${width} ${height}`;
+    if (!this.raster || this.size !== size) {
+      const { grid, values, places, info } = this.now;
+      this.raster = grid.raster(values, width, height, places, Boolean(info.flags));
+      this.size = size;
+    }
+    scale.paint(this.view.canvas, width, height, this.raster);
+    this.view.canvas.dataset.shown = `${this.now.n} ${this.now.info.key} ${this.now.image}`;
+    this.view.root.dispatchEvent(new CustomEvent("drawn"));
+  }
+
+  /** Number of the point nearest to a place in the picture shown, and how far off it is, px. */
+  nearest(x, y) {
+    const { grid, places } = this.now;
+    const i = places ? grid.nearestOf(places, x, y) : grid.nearest(x, y);
+    if (i < 0) return { i, distance: Infinity };
+    const at = places ? [places[2 * i], places[2 * i + 1]] : [grid.x[i], grid.y[i]];
+    return { i, distance: Math.hypot(at[0] - x, at[1] - y) };
+  }
+
+  /** Where a point lies in the picture shown. */
+  placeOf(i) {
+    const { grid, places } = this.now;
+    return places ? [places[2 * i], places[2 * i + 1]] : [grid.x[i], grid.y[i]];
+  }
+
+  async #under(column, row) {
+    const hover = this.view.hover;
+    if (!hover || !this.now) return null;
+    const { result, n, image } = this.now;
+    const [step, cam] = image === "reference" ? [result.reference, "cam1"] : [n, image];
+    const said = this.#value(hover);
+    const grey = await greyOf({ test: result.testId, step, cam }, column, row).catch(() => null); // its image may be gone
+    return [said, grey].filter(Boolean).join("   ") || null;
+  }
+
+  #value(hover) {
+    const { grid, values, sigma, info } = this.now;
+    const { i, distance } = this.nearest(hover.x, hover.y);
+    const step = Math.max(Math.abs(grid.dx), Math.abs(grid.dy));
+    if (i < 0 || distance > 1.5 * step) return null;
+    this.view.readout.dataset.point = String(i);
+    this.view.readout.dataset.value = String(values[i]);
+    if (info.flags) return `${info.text}: ${(info.flags[values[i]] ?? values[i]).toString().replace(/_/g, " ")}`;
+    if (!grid.valid[i] || !Number.isFinite(values[i])) return `${info.text}: not measured`;
+    const told = sigma && Number.isFinite(sigma[i]) ? ` ± ${num(sigma[i], 2)}` : "";
+    return `${info.text} ${told ? num(values[i], 5) + told : ""}${told ? `\u00a0${info.unit}` : quantity(values[i], info.unit, 5)}`;
+  }
+}

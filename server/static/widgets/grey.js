@@ -1,0 +1,27 @@
+// Grey levels of recorded images: read in tiles, so that a mouse that wanders asks seldom.
+import * as api from "../lib/api.js";
+import { num } from "../lib/dom.js";
+
+const TILE = 64;
+const MOST = 256; // tiles that are kept
+
+const tiles = new Map();
+
+function tile(image, column, row) {
+  const path = `/tests/${image.test}/steps/${image.step}/${image.cam}/pixels`;
+  const query = { x_px: column * TILE, y_px: row * TILE, columns: TILE, rows: TILE };
+  const key = api.address(path, query);
+  const held = tiles.get(key) ?? api.get(path, query);
+  tiles.delete(key); // what was used last is dropped last
+  tiles.set(key, held);
+  held.catch(() => tiles.delete(key));
+  if (tiles.size > MOST) tiles.delete(tiles.keys().next().value);
+  return held;
+}
+
+/** Text about a pixel of a step's image: image is {test, step, cam}. */
+export async function greyOf(image, x, y) {
+  const { values, grey_scale: scale, full_scale: full } = await tile(image, Math.floor(x / TILE), Math.floor(y / TILE));
+  const value = values[y % TILE]?.[x % TILE];
+  return value === undefined ? null : `grey ${scale === 1 ? value : num(value / scale, 5)} of ${full / scale}`;
+}

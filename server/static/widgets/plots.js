@@ -1,0 +1,97 @@
+// Line plots: uPlot with this page's colours, loaded when the first one is drawn.
+import { num, tick, h } from "../lib/dom.js";
+
+let library = null;
+async function uplot() {
+  if (!library) {
+    document.head.append(h("link", { rel: "stylesheet", href: "/static/vendor/uplot/uPlot.min.css" }));
+    library = (await import("../vendor/uplot/uPlot.esm.js")).default;
+  }
+  return library;
+}
+
+/** As wide as the longest number of an axis needs, so that its name stands beside and not over it. */
+function wide(plot, values, index, cycle) {
+  const axis = plot.axes[index];
+  if (cycle > 1) return axis._size; // it may not go on for ever
+  const longest = (values ?? []).reduce((most, one) => (one.length > most.length ? one : most), "");
+  plot.ctx.font = axis.font[0];
+  return Math.max(50, Math.ceil(axis.ticks.size + axis.gap + plot.ctx.measureText(longest).width / (window.devicePixelRatio || 1) + 4));
+}
+
+const COLOURS = ["#1f83b4", "#e07b00", "#29a37a", "#b5486e", "#7a6bd0", "#8a7a2d"];
+
+/** The page's colours for an axis, as they are now. */
+function axes() {
+  const css = getComputedStyle(document.documentElement);
+  const probe = h("span", { style: { color: "var(--soft)" } });
+  const faint = h("span", { style: { color: "var(--line)" } });
+  document.body.append(probe, faint);
+  const soft = getComputedStyle(probe).color;
+  const grid = getComputedStyle(faint).color;
+  probe.remove();
+  faint.remove();
+  return (text) => ({ label: text, labelSize: 18, labelGap: 0, stroke: soft, size: 50, font: `12px ${css.fontFamily}`, labelFont: `12px ${css.fontFamily}`,
+    grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, values: (_, ticks) => ticks.map(tick) });
+}
+
+/**
+ * Draw into `place`; returns {set(data), close()}.
+ * @param {object} options
+ * @param {string} options.x name and unit of the abscissa
+ * @param {string} options.y name and unit of the ordinate
+ * @param {{label: string, points?: boolean, dots?: boolean, edge?: boolean, colour?: number}[]} options.series `edge`: of a band, without a line of its own
+ * @param {boolean|boolean[]} [options.bars] whether (which of) the series are bars
+ * @param {number[][]} [options.bands] pairs of series (counted from 1) between which the ground is shaded
+ */
+export async function chart(place, { x, y, series, height = 200, data, bars = false, bands = [], label }) {
+  const Plot = await uplot();
+  const options = () => {
+    const axis = axes();
+    return {
+      width: Math.max(place.clientWidth, 200),
+      height,
+      scales: { x: { time: false } },
+      axes: [{ ...axis(x), size: 34 }, { ...axis(y), size: wide }],
+      legend: { show: series.filter((one) => !one.edge).length > 1, live: true },
+      cursor: { y: false },
+      series: [
+        { label: x, value: (_, v) => num(v, 5) },
+        ...series.map((one, index) => {
+          const colour = COLOURS[(one.colour ?? index) % COLOURS.length];
+          return {
+            label: one.label, class: one.edge ? "edge" : null, stroke: colour, width: one.points || one.edge ? 0 : 1.5, points: { show: Boolean(one.points || one.dots), size: 5 },
+            value: (_, v) => num(v, 5), spanGaps: false, paths: (bars[index] ?? bars) === true ? Plot.paths.bars({ size: [1, 100] }) : undefined,
+            fill: (bars[index] ?? bars) === true ? `${colour}99` : undefined,
+          };
+        }),
+      ],
+      bands: bands.map(([high, low]) => ({ series: [high, low], fill: `${COLOURS[(series[high - 1].colour ?? 0) % COLOURS.length]}40` })),
+    };
+  };
+  place.replaceChildren();
+  place.classList.add("chart");
+  place.setAttribute("role", "img");
+  place.setAttribute("aria-label", label ?? `${y} over ${x}`);
+  let now = data;
+  let plot = new Plot(options(), now, place);
+  // a canvas keeps the colours that it was drawn with
+  const recolour = () => {
+    plot.destroy();
+    plot = new Plot(options(), now, place);
+  };
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  window.addEventListener("themechange", recolour);
+  system.addEventListener("change", recolour);
+  const observer = new ResizeObserver(() => place.clientWidth > 0 && plot.setSize({ width: place.clientWidth, height }));
+  observer.observe(place);
+  return {
+    set: (next) => { now = next; plot.setData(next); },
+    close: () => {
+      observer.disconnect();
+      window.removeEventListener("themechange", recolour);
+      system.removeEventListener("change", recolour);
+      plot.destroy();
+    },
+  };
+}

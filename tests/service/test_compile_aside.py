@@ -1,0 +1,64 @@
+"""The process that compiles ahead: what it leaves on disk is what a measurement then takes, and no process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from server.compute.compile_aside import CompileAside
+
+WOULD_COMPILE = """
+import sys
+import numpy as np
+from core.compiling import told_when_compiling
+from core.matching.fit import fit_motion
+from core.matching.options import MatchOptions
+from tests.support.matching_scene import paper_pair
+
+told = []
+picture = np.random.default_rng(2).integers(0, 255, (80, 90)).astype(np.uint8)
+with told_when_compiling(lambda: told.append(True)):
+    fit_motion(paper_pair(), *[picture] * 4, [[40.0, 40.0]], [[0.002, 0.0, 0.0]], None, MatchOptions(subset_px=15))
+print(len(told))
+"""
+
+
+@pytest.fixture(autouse=True)
+def two_processors(monkeypatch):
+    monkeypatch.setattr("core.threads.available_threads", lambda: 2)
+
+
+@pytest.mark.deep
+def test_what_it_compiled_nobody_compiles_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    with CompileAside("auto") as aside:
+        aside.start()
+        aside.wait()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run([sys.executable, "-c", WOULD_COMPILE], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["0"]
+
+
+def test_after_the_wait_nothing_is_started(tmp_path, monkeypatch):
+    started = []
+    monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(a))
+    with CompileAside("auto") as aside:
+        aside.wait()
+        aside.start()
+    assert not started
+
+
+def test_leaving_early_ends_the_process(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    before = time.monotonic()
+    with CompileAside("curved") as aside:
+        aside.start()
+        process = aside._process
+    assert process is not None
+    assert process.poll() is not None
+    assert time.monotonic() - before < 10.0
