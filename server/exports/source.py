@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from core.errors import InputError
-from server.formats.results.reading import read_attributes
+from server.formats.results.folder import first_results, results_in
+from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
 from server.results.steps import Source
 from server.store.durable import known_json
-
-_RESULT = re.compile(r"step_\d{4,}\.nc")
-
-
-def results_in(folder: Path) -> list[Path]:
-    """Return a folder's result files, by step."""
-    return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))
 
 
 def find_source(folder: Path, analysis: str | None = None) -> Source:
@@ -42,24 +35,17 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
             code="option_conflict",
             remedy="Leave the analysis out, or give the test's folder.",
         )
-    files = results_in(folder)
-    if not files:
-        raise InputError(
-            f"There is no step_0000.nc or another step's result in {folder}.",
-            code="results_missing",
-            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-        )
-    return source_of(folder.absolute(), files)
+    return source_of(folder.absolute(), first_results(folder, [folder]))
 
 
 def source_of(folder: Path, files: list[Path]) -> Source:
     """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
-    heads = [read_attributes(path) for path in files]
-    stale, mask = stale_results(files, heads), _mask(folder, heads[0].get("settings"))
+    heads = [read_head(path) for path in files]
+    stale, mask = stale_results(files, heads), _mask(folder, heads[0].settings)
     about: dict[str, object] = {}
     test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
     document = known_json(test / "test.json")
-    reference = int(heads[-1].get("reference_step", heads[0].get("step", 0)))
+    reference = heads[0].step if heads[-1].reference_step is None else heads[-1].reference_step
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
         about = {
@@ -73,7 +59,7 @@ def source_of(folder: Path, files: list[Path]) -> Source:
             about["analysis_id"] = folder.name
             name = f"{test.name}_{folder.name}"
         return Source(files, name, title, image, about, mask, stale)
-    said = str(heads[0].get("cam1_file", ""))
+    said = heads[0].image_file("cam1")
     calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])

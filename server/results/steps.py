@@ -15,6 +15,7 @@ from core.errors import FileFormatError, InputError
 from core.field.region.cuts import Cuts, from_arrays
 from core.status import PointStatus
 from server.base.errors import NotFoundError
+from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_inputs, current_settings
 from server.results.reader import Variable
@@ -96,11 +97,6 @@ class Source:
     about: dict[str, object] = field(default_factory=dict)
     mask: Path | None = None
     stale_reasons: Sequence[str] = ()
-
-
-def number_of(path: Path) -> int:
-    """Return the step's number in the name of a result file."""
-    return int(path.stem.removeprefix("step_"))
 
 
 def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:

@@ -118,6 +118,12 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
         assert client.post(f"/jobs/{rest.json()['job']['id']}/cancel").status_code == 202
         again = client.post(f"{test}/analyses", json={**body, "steps": [1]})
         assert again.status_code == 202
+        assert client.post(f"/jobs/{again.json()['job']['id']}/cancel").status_code == 202
+        deadline = time.monotonic() + 60
+        for ending in (rest, again):  # what still runs may be writing
+            while client.get(f"/jobs/{ending.json()['job']['id']}").json()["finished_utc"] is None:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
         assert not list((tmp_path / "data").rglob(".*.part"))
     finally:
         process.terminate()

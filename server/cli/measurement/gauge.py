@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -15,12 +14,12 @@ from server.formats.files import make_folder, write_bytes
 from server.formats.gauges.matlab import gauges_mat
 from server.formats.gauges.readings import GaugeReadings, LineReading, Number, StepReadings
 from server.formats.gauges.table import gauges_csv
+from server.formats.results.folder import first_results
 from server.formats.results.summary import to_json
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
 
-_RESULT = re.compile(r"step_\d{4,}\.nc")
 _FORMS = {".csv": gauges_csv, ".json": lambda readings: to_json(readings.document()), ".mat": gauges_mat}
 
 
@@ -117,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
             remedy="Give file.csv, file.json or file.mat.",
         )
     request = _request(args)
-    files = result_files(args.folder)
+    files = first_results(args.folder, (args.folder, args.folder / "exports" / "measure"))
     fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
     readings = read_gauges(files, request, fields)
     print("\n".join(report(readings)))
@@ -128,25 +127,6 @@ def run(args: argparse.Namespace) -> int:
         write_bytes(args.out, _FORMS[args.out.suffix.lower()](readings))
         print(f"written: {args.out}")
     return 0
-
-
-def result_files(folder: Path) -> list[Path]:
-    """Return the result files of a folder, or of a test's folder where ``stereorig measure`` put them.
-
-    Raises
-    ------
-    InputError
-        ``results_missing``.
-    """
-    for place in (folder, folder / "exports" / "measure"):
-        files = sorted(p for p in place.glob("step_*.nc") if _RESULT.fullmatch(p.name))
-        if files:
-            return files
-    raise InputError(
-        f"There is no step_0000.nc or another step's result in {folder}.",
-        code="results_missing",
-        remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-    )
 
 
 def _request(args: argparse.Namespace) -> GaugeRequest:

@@ -32,7 +32,7 @@ STYLE: Any = {  # rc_context wants every key spelled out in its type
     "savefig.bbox": "tight",
     "image.interpolation": "nearest",
 }
-HEIGHT, DIFFERENCE = "viridis", "RdBu_r"
+HEIGHT = "viridis"
 
 
 def upright_mm(xyz_mm: Float) -> tuple[Float, Float]:
@@ -72,6 +72,12 @@ def draw_map(axis: Any, result: Field, values: Float, title: str, unit: str, **o
     bar = axis.figure.colorbar(drawn, ax=axis, fraction=0.046 * min(1.0, rows / columns), pad=0.03)
     bar.set_label(unit)
     bar.outline.set_visible(False)
+
+
+def draw_difference(axis: Any, result: Field, values: Float, title: str, unit: str, limit: float | None = None) -> None:
+    """Draw values about zero in two colours, up to ``limit``; without one, up to their own."""
+    limit = colour_limit(values) if limit is None else limit
+    draw_map(axis, result, values, title, unit, cmap="RdBu_r", vmin=-limit, vmax=limit)
 
 
 def _draw_cuts(axis: Any, result: Field, colour: str = "black") -> None:
@@ -183,16 +189,8 @@ def plate(
             values = 1e3 * last.uvw_mm[..., k]  # type: ignore[index]
             error = 1e3 * comparison.error_mm[..., k]
             draw_map(axes[0, k], last, values, f"{name} measured at {pressures_kpa[-1]:.0f} kPa", "um", cmap=HEIGHT)
-            limit = colour_limit(error)
-            draw_map(
-                axes[1, k],
-                last,
-                error,
-                f"{name} measured minus true, rms {np.sqrt(np.nanmean(error**2)):.2f} um",
-                "um",
-                cmap=DIFFERENCE,
-                vmin=-limit,
-                vmax=limit,
+            draw_difference(
+                axes[1, k], last, error, f"{name} measured minus true, rms {np.sqrt(np.nanmean(error**2)):.2f} um", "um"
             )
         figure.tight_layout()
         save(figure, out / "plate_maps.png")
@@ -227,10 +225,9 @@ def steel(
     limit = max(colour_limit(found_um), colour_limit(true_um))
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 3, figsize=(12.5, 3.4))
-        options = {"cmap": DIFFERENCE, "vmin": -limit, "vmax": limit}
-        draw_map(axes[0], result, found_um, "height over the best plane, one pair", "um", **options)
-        draw_map(axes[1], result, true_um, "true surface as the subset sees it", "um", **options)
-        draw_map(axes[2], result, found_um - true_um, "difference", "um", **options)
+        draw_difference(axes[0], result, found_um, "height over the best plane, one pair", "um", limit)
+        draw_difference(axes[1], result, true_um, "true surface as the subset sees it", "um", limit)
+        draw_difference(axes[2], result, found_um - true_um, "difference", "um", limit)
         figure.tight_layout()
         save(figure, out / "steel_heights.png")
 
@@ -284,16 +281,8 @@ def panel(
             opening = result.uvw_mm @ np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
             draw_map(axes[0, k], result, opening, f"along the load, {load:g} kN", "mm", cmap=HEIGHT)
             error = 1e3 * comparison.error_mm[..., 2]
-            limit = colour_limit(error)
-            draw_map(
-                axes[1, k],
-                result,
-                error,
-                f"w minus true, rms {np.sqrt(np.nanmean(error**2)):.1f} um",
-                "um",
-                cmap=DIFFERENCE,
-                vmin=-limit,
-                vmax=limit,
+            draw_difference(
+                axes[1, k], result, error, f"w minus true, rms {np.sqrt(np.nanmean(error**2)):.1f} um", "um"
             )
         figure.tight_layout()
         save(figure, out / "panel_maps.png")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from server.formats.results.reading import read_attributes, read_field, read_measured
+from server.formats.results.reading import read_field, read_head, read_measured
 from server.formats.results.settings import current_summary, stored_settings
 from server.results.provenance import calibration_of
 from server.results.steps import read_step
@@ -24,7 +24,7 @@ def folder(request: pytest.FixtureRequest) -> Path:
 
 
 def test_settings_are_told_by_todays_names(folder: Path) -> None:
-    settings = read_attributes(folder / "step_0001.nc")["settings"]
+    settings = read_head(folder / "step_0001.nc").settings
     assert "roi" not in settings
     assert settings["region"]["rectangle"] == [110.0, 105.0, 150.0, 145.0]
     stored = stored_settings(settings)
@@ -34,7 +34,7 @@ def test_settings_are_told_by_todays_names(folder: Path) -> None:
 
 
 def test_inputs_are_told_by_todays_names(folder: Path) -> None:
-    inputs = read_attributes(folder / "step_0001.nc")["inputs_sha256"]
+    inputs = read_head(folder / "step_0001.nc").inputs_sha256
     assert inputs.keys() == {"calibration", "reference_cam1", "reference_cam2", "cam1", "cam2"}
     assert calibration_of(read_step(folder / "step_0001.nc")) == inputs["calibration"]
 
