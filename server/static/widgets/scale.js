@@ -152,7 +152,7 @@ export class Scale {
     }
     const context = pen(canvas);
     context.clearRect(0, 0, width, height);
-    if (!raster || !raster.width) return;
+    if (!raster?.width) return;
     const image = new ImageData(raster.width, raster.height);
     const out = new Uint32Array(image.data.buffer);
     const { values } = raster;
@@ -171,7 +171,7 @@ export class Scale {
       const each = ENTRIES / (this.high - this.low);
       for (let i = 0; i < out.length; i += 1) {
         const v = values[i];
-        if (v !== v) continue; // NaN
+        if (Number.isNaN(v)) continue;
         const k = Math.floor((v - low) * each);
         out[i] = table[k < 0 ? 0 : k >= ENTRIES ? ENTRIES - 1 : k];
       }
