@@ -5,18 +5,22 @@ SHELL := /bin/bash
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PROGRAM := $(VENV)/.program
 STAMP := $(VENV)/.installed
+ARAVIS := $(VENV)/.aravis
 PEER := .venv-bench
 PEER_STAMP := $(PEER)/.installed
 ARGS ?=
 # test files side by side, a process each; more than four only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 4 ? 4 : n)))
 
-.PHONY: help demo test serve check check-page bench format accuracy fuzz load openapi torture pagespeed pagepictures clean
+.PHONY: help demo quick test test-deep serve check check-page bench format accuracy fuzz load openapi torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
-	@echo "make test    run every test (WORKERS=1: one file at a time)"
+	@echo "make quick   the tests that need no service and no device: minutes"
+	@echo "make test    the whole behaviour at normal depth (WORKERS=1: one file at a time)"
+	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls; lint and types of the page's scripts"
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a few minutes)"
@@ -27,26 +31,42 @@ help:
 	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/page.md"
 	@echo "make accuracy   measure every figure of docs/accuracy.md again (about twenty minutes)"
 
-$(STAMP): pyproject.toml
+$(PROGRAM): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "stereorig needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) -V 2>&1). Name another: make PYTHON=python3.12 ..."; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "Python's venv module is missing. Install it: apt-get install python3-venv"; exit 1; }
 	@rm -rf $(VENV)
 	@echo "Setting up $(VENV) (once) ..."
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; rm -rf $(VENV); exit 1; }
-	@# needs headers and a compiler, so it is not part of what everybody must have
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e . || { echo "pip could not install the packages of pyproject.toml; its message is above."; rm -rf $(VENV); exit 1; }
+	@touch $@
+
+# needs headers and a compiler, so it is not part of what everybody must have
+$(ARAVIS): $(PROGRAM)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[aravis]' >$(VENV)/aravis.log 2>&1 \
 		|| echo "No Aravis cameras here: PyGObject could not be built. For them: apt-get install gir1.2-aravis-0.8 aravis-tools libgirepository1.0-dev libcairo2-dev pkg-config gcc python3-dev, then make clean."
 	@touch $@
 
-demo: $(STAMP)
+$(STAMP): $(PROGRAM) $(ARAVIS)
+	@echo "Adding what the tests and checks need (once) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; exit 1; }
+	@touch $@
+
+demo: $(PROGRAM)
 	$(BIN)/stereorig demo $(ARGS)
 
-test: $(STAMP)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-serve: $(STAMP)
+quick: $(STAMP)
+	$(PYTEST) -m 'not deep and not devices' tests/unit tests/contract $(ARGS)
+
+test: $(STAMP)
+	$(PYTEST) $(ARGS)
+
+test-deep: $(STAMP)
+	$(PYTEST) -m deep $(ARGS)
+
+serve: $(PROGRAM) $(ARAVIS)
 	$(BIN)/stereorig serve $(ARGS)
 
 check: $(STAMP)
@@ -86,7 +106,7 @@ load: $(STAMP)
 	$(BIN)/python -m tests.bench.reliability.load --page $(ARGS)
 
 fuzz: $(STAMP)
-	cd tests && PYTHONPATH=.:.. ../$(BIN)/python api_fuzz.py $(ARGS)
+	$(BIN)/python -m tests.support.api_fuzz $(ARGS)
 
 openapi: $(STAMP)
 	$(BIN)/python -m tests.bench.documents.problem_list

@@ -1,8 +1,15 @@
-"""Fixtures that several test files share."""
+"""Tiers by folder, and fixtures that several test files share.
+
+`unit` mirrors the packages and needs no service, no process and no rendered field; `contract` is one suite over every
+backend of cameras and stages; `service` runs the service and the command line; `accuracy` compares rendered scenes and
+drawn noise with their truth; `browser` looks at the page; `crash` kills, fills, fuzzes and loads. The folder's name is
+the marker of its tests. Depth is a second marker, `deep`: long forms that `make test` leaves to `make test-deep`.
+"""
 
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,55 +28,24 @@ if TYPE_CHECKING:  # most tests need neither
 pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions say what they found
 
 
-# Real programs on the wire, by the real clock, beside what else the machine does: what fails twice more is broken
-_AGAINST_THE_CLOCK = frozenset(
-    {
-        "test_aravis.py",
-        "test_camera_contract.py",
-        "test_cluster.py",
-        "test_connections.py",
-        "test_continue_follow.py",
-        "test_death.py",
-        "test_demo.py",
-        "test_doctor.py",
-        "test_ending.py",
-        "test_event_streams.py",
-        "test_exports_api.py",
-        "test_fake_gige_bench.py",
-        "test_gige_service.py",
-        "test_logs.py",
-        "test_reader.py",
-        "test_rig_pairs.py",
-        "test_names_and_clocks.py",
-        "test_security.py",
-        "test_serial_line.py",
-        "test_service_worker.py",
-        "test_stage_contract.py",
-        "test_stage_http.py",
-        "test_stage_lines.py",
-        "test_stage_stop.py",
-        "test_stage_witnesses.py",
-    }
-)
-_USES_A_SERVICE = frozenset({"client", "service", "page", "chromium"})
-# Nothing may be lost once: only what took too long is tried again
-_STRICT = frozenset({"test_load.py", "test_real_disks.py", "test_service_kill.py", "test_torture.py", "test_trash.py"})
-# Minutes each: begun first, so that nobody waits for them at the end
-_LONGEST = ("test_torture.py", "test_fuzz_more.py", "test_fuzz.py", "test_v4l2_in_qemu.py")
-_TOO_LONG = ["Timeout", "ConnectError", "ReadError", "is silent", "did not answer"]
+TESTS = Path(__file__).parent
+
+# A run that was started in the background ignores Ctrl-C, and what it starts would inherit that
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the longest; let tests against other programs be tried again: the machine may stall one of them."""
-    items.sort(key=lambda item: _LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
-    if not config.pluginmanager.hasplugin("rerunfailures"):  # as in the guest of test_v4l2_in_qemu.py
-        return
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark every test with its tier, which is the folder that it lies in, and what is left to the deep tier."""
     for item in items:
-        name = item.path.name
-        if name in _STRICT:
-            item.add_marker(pytest.mark.flaky(reruns=1, only_rerun=_TOO_LONG))
-        elif name in _AGAINST_THE_CLOCK or _USES_A_SERVICE & set(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.flaky(reruns=2))
+        folders = item.path.relative_to(TESTS).parts
+        item.add_marker(folders[0])
+        if "devices" in folders or "aravis" in item.name:
+            item.add_marker("devices")
+        normal = item.get_closest_marker("normal_depth")
+        if normal is not None and item.callspec.id not in normal.args:  # type: ignore[attr-defined]
+            item.add_marker("deep")
 
 
 @pytest.fixture(scope="session")

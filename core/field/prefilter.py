@@ -7,9 +7,7 @@ images as they are. What the blur does to noise and covariance stands in ``core.
 from __future__ import annotations
 
 from core.errors import InputError
-
-MOST_OF_SUBSET = 0.25
-"""A wider Gaussian would leave a handful of independent pixels in the subset."""
+from core.settings import PREFILTER_OF_SUBSET
 
 
 def check_prefilter(prefilter_px: float, subset_px: int) -> None:
@@ -20,10 +18,10 @@ def check_prefilter(prefilter_px: float, subset_px: int) -> None:
     InputError
         ``prefilter_invalid``.
     """
-    if isinstance(prefilter_px, bool) or not 0.0 <= prefilter_px <= MOST_OF_SUBSET * subset_px:
+    if isinstance(prefilter_px, bool) or not 0.0 <= prefilter_px <= PREFILTER_OF_SUBSET * subset_px:
         raise InputError(
             f"the prefilter is {prefilter_px} px; it must lie in 0 (off) to a quarter of the subset, "
-            f"{MOST_OF_SUBSET * subset_px:g} px.",
+            f"{PREFILTER_OF_SUBSET * subset_px:g} px.",
             code="prefilter_invalid",
             remedy="Give 0.5 to 1, for example, or 0 for none; against noise a larger subset does more.",
         )

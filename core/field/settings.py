@@ -6,12 +6,20 @@ from dataclasses import dataclass, field
 
 from core.errors import InputError
 from core.field.checks.gates import GateOptions
-from core.field.points.patch import DEFAULT_PATCH, PATCH_SETTINGS, PatchSetting
 from core.field.prefilter import check_prefilter
 from core.field.region.region import check_subset
 from core.matching.blur import Blur
-from core.matching.options import Interpolation, MatchOptions, Patch
+from core.matching.options import MatchOptions, Patch
 from core.noise import NoiseModel
+from core.settings import (
+    DEFAULT_INTERPOLATION,
+    DEFAULT_PATCH,
+    PATCH_SETTINGS,
+    SUBSET_PX,
+    AnalysisSettings,
+    Interpolation,
+    PatchSetting,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +29,7 @@ class MeasureOptions:
     Parameters
     ----------
     subset_px
-        Width of the square subset, odd, 9 or more.
+        Width of the square subset.
     patch
         ``stretch`` (default) or the paper's ``rigid``: plane patches. ``curved``: second-order surface and
         displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever errs less on the field
@@ -40,9 +48,9 @@ class MeasureOptions:
         points scatter. None: from what a match leaves, all pixels alike.
     """
 
-    subset_px: int = 33
+    subset_px: int = SUBSET_PX.default
     patch: PatchSetting = DEFAULT_PATCH
-    interpolation: Interpolation = "quintic"
+    interpolation: Interpolation = DEFAULT_INTERPOLATION
     least_zncc: float = 0.6
     gates: GateOptions = field(default_factory=GateOptions)
     prefilter_px: float = 0.0
@@ -58,6 +66,19 @@ class MeasureOptions:
                 f"patch is {self.patch!r}, it must be one of {', '.join(PATCH_SETTINGS)}.", code="option_out_of_range"
             )
         self.match_options()
+
+    @staticmethod
+    def of(
+        settings: AnalysisSettings, noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
+    ) -> MeasureOptions:
+        """Return the options that an analysis' settings say."""
+        return MeasureOptions(
+            subset_px=settings.subset_px,
+            patch=settings.patch,
+            interpolation=settings.interpolation,
+            prefilter_px=settings.prefilter_px,
+            noise=noise,
+        )
 
     @property
     def blur(self) -> Blur | None:

@@ -18,9 +18,10 @@ from core.arrays import Float32
 from core.errors import ImageError, InputError
 from core.matching.blur import Blur, fitted_share, spread_of
 from core.matching.filters import correlate, derivative, in_bands, prefilter
-from core.matching.options import SPLINE_ORDER, Interpolation
+from core.matching.options import SPLINE_ORDER
 from core.matching.slopes import SlopeFilter, slope_filter
 from core.noise import NoiseModel
+from core.settings import Interpolation
 
 PAD = 4
 """Mirrored coefficients kept around the image, so that no tap needs a test (quintic: 2 left, 3 right, and rounding)."""

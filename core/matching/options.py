@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from core.errors import InputError
+from core.settings import SUBSET_PX, Interpolation
 
-Interpolation = Literal["cubic", "quintic"]
 Patch = Literal["rigid", "stretch", "curved"]
 PATCHES: tuple[Patch, ...] = get_args(Patch)
 
@@ -40,7 +40,7 @@ class MatchOptions:
         A Gauss-Newton step that moves a corner of the subset further is cut down to this, px.
     """
 
-    subset_px: int = 33
+    subset_px: int = SUBSET_PX.default
     patch: Patch = "stretch"
     interpolation: Interpolation = "quintic"
     max_iterations: int = 30
@@ -49,8 +49,8 @@ class MatchOptions:
     max_step_px: float = 4.0
 
     def __post_init__(self) -> None:
-        if not 5 <= self.subset_px <= 401:
-            raise InputError(f"subset_px is {self.subset_px}, it must lie in 5 to 401.", code="option_out_of_range")
+        if not SUBSET_PX.holds(self.subset_px):
+            raise InputError(f"subset_px is {self.subset_px}, it must be {SUBSET_PX}.", code="option_out_of_range")
         if self.patch not in PATCHES:
             raise InputError(
                 f"patch is {self.patch!r}, it must be 'rigid', 'stretch' or 'curved'.", code="option_out_of_range"

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from core.errors import InputError
-
-StrainTensor = Literal["green_lagrange", "infinitesimal", "hencky"]
-"""Which strain is told."""
-STRAIN_TENSORS: tuple[StrainTensor, ...] = get_args(StrainTensor)
-DEFAULT_WINDOW = 9
-"""Points across a window unless asked otherwise."""
-WIDEST_WINDOW = 101
+from core.settings import STRAIN_TENSORS, STRAIN_WINDOW, StrainSettings, StrainTensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +18,7 @@ class StrainOptions:
     Parameters
     ----------
     window
-        Points across the square window, odd, 3 to 101. The gauge is (window - 1) step + subset wide.
+        Points across the square window, odd. The gauge is (window - 1) step + subset wide.
     order
         1: the window's positions are fitted by planes; 2: by quadratics. In a whole window both give the same strain,
         since its quadratic terms do not touch the slope in its middle. In a window that an edge has cut, planes tell
@@ -46,19 +40,23 @@ class StrainOptions:
         ``strain_window_invalid`` or ``option_out_of_range``.
     """
 
-    window: int = DEFAULT_WINDOW
+    window: int = STRAIN_WINDOW.default
     order: Literal[1, 2] = 1
     tensor: StrainTensor = "green_lagrange"
     least_share: float = 0.5
     most_amplification: float = 12.0
 
+    @staticmethod
+    def of(settings: StrainSettings | None) -> StrainOptions | None:
+        """Return the options that an analysis' settings say; None: no strain."""
+        return None if settings is None else StrainOptions(**settings.model_dump())
+
     def __post_init__(self) -> None:
-        w = self.window
-        if isinstance(w, bool) or int(w) != w or not 3 <= w <= WIDEST_WINDOW or w % 2 == 0:
+        if not STRAIN_WINDOW.holds(self.window):
             raise InputError(
-                f"the strain window is {w} points wide; it must be an odd whole number, 3 to {WIDEST_WINDOW}.",
+                f"the strain window is {self.window} points wide; it must be {STRAIN_WINDOW}.",
                 code="strain_window_invalid",
-                remedy=f"Give {DEFAULT_WINDOW}, for example, or switch strain off.",
+                remedy=f"Give {STRAIN_WINDOW.default}, for example, or switch strain off.",
             )
         if self.order not in (1, 2):
             _refuse("order", self.order, "1 or 2")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
-from core.strain.options import StrainTensor
+from core.settings import StrainTensor
 from core.strain.result import principal_of
 
 

@@ -18,7 +18,8 @@ from pydantic import (
     WithJsonSchema,
 )
 from pydantic.config import JsonDict
-from pydantic_core import PydanticCustomError
+
+from core.settings import Real, Whole
 
 
 def _not_a_truth_value(value: Any) -> Any:
@@ -26,12 +27,6 @@ def _not_a_truth_value(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError("must be a number, not true or false")
     return value
-
-
-def _a_number(value: Any) -> Any:
-    if isinstance(value, str):
-        raise ValueError("must be a number, not text")
-    return _not_a_truth_value(value)
 
 
 AXIS_PATTERN = r"^([1-9]|[12][0-9]|3[01])$"
@@ -63,8 +58,6 @@ def utc_text(value: datetime) -> str:
     return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
-Real = Annotated[float, BeforeValidator(_a_number)]
-Whole = Annotated[int, BeforeValidator(_a_number)]
 #: true or false, and no number or text that could be read so
 Switch = Annotated[bool, Field(strict=True)]
 Number = Annotated[Real, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
@@ -96,7 +89,6 @@ Timestamp = Annotated[
     PlainSerializer(utc_text, return_type=str),
     Field(examples=["2026-03-01T12:00:00.250Z"]),
 ]
-Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled", "interrupted"]
 
 
@@ -104,11 +96,6 @@ class Request(BaseModel):
     """A body: closed, finite numbers only."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-def disagreement(text: str) -> PydanticCustomError:
-    """Return the error for values that are right each by itself and cannot be together."""
-    return PydanticCustomError("values_disagree", "{text}", {"text": text})
 
 
 def one_of(*names: str) -> JsonDict:
@@ -129,9 +116,6 @@ def not_both(*names: str) -> JsonDict:
 def given(name: str) -> JsonDict:
     """Return the schema's words for: this field is there, and not null."""
     return {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
-
-
-ODD: JsonDict = {"not": {"multipleOf": 2}}
 
 
 class Listing(BaseModel):

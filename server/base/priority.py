@@ -14,8 +14,6 @@ import signal
 import sys
 from pathlib import Path
 
-import psutil
-
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
 _SWITCH_S = 0.001
@@ -38,8 +36,8 @@ def lower_worker() -> None:
 
 
 def _set_nice(nice: int) -> None:
-    with contextlib.suppress(psutil.Error):
-        psutil.Process().nice(nice)
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
     # the session's share is ours to change only where we lead it; else it is a terminal's
     with contextlib.suppress(OSError, AttributeError):
         if os.getsid(0) == os.getpid():

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from core.cameras.stereo import StereoPair
 from core.errors import RegionError
 from core.field.seeding.epipolar_search import visible_depths
 from core.field.seeding.seeds import Seed
+from core.settings import AnalysisSettings
 from server.formats.calibrations.recognise import load_calibration
 
 #: a click is good to some pixels; further from the epipolar line it is another point
@@ -20,20 +20,16 @@ FARTHEST_PX = 8.0
 Place = Sequence[float]
 
 
-def seeds_of(settings: Mapping[str, Any]) -> list[Seed] | None:
+def seeds_of(settings: AnalysisSettings) -> list[Seed] | None:
     """Return the seeds of an analysis's settings; None where they are to be found."""
-    one = settings["seeds"]
+    one = settings.seeds
     if one is None:
         return None
-    # analyses from before camera 2's places could be told do not name them
-    two = settings.get("seeds_cam2") or [None] * len(one)
-    return [
-        Seed((float(a[0]), float(a[1])), None if b is None else (float(b[0]), float(b[1])))
-        for a, b in zip(one, two, strict=True)
-    ]
+    two = settings.seeds_cam2 or [None] * len(one)
+    return [Seed(a, b) for a, b in zip(one, two, strict=True)]
 
 
-def check_seeds(calibration: Path, settings: Mapping[str, Any], size2_px: tuple[int, int]) -> None:
+def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[int, int]) -> None:
     """Refuse a seed whose two places cannot be one point.
 
     Parameters

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from server.demo.client import Calibrated
 from server.demo.session import Check, Session, table
+from server.formats.calibrations.record import ChecksRecord
 
 HELD_OUT_LIMIT_PX = 0.1  # the band of a good calibration
+
+
+@dataclass(frozen=True, eq=False)
+class ViewResiduals:
+    """One view's intersections (n, 2), and measured minus projected (n, 2)."""
+
+    title: str
+    held_out: bool
+    xy_px: NDArray[np.float64]
+    residual_px: NDArray[np.float64]
+
+    @property
+    def rbe_px(self) -> float:
+        """Mean distance of found and projected intersections."""
+        return float(np.mean(np.linalg.norm(self.residual_px, axis=1)))
 
 
 @dataclass
@@ -18,49 +35,31 @@ class CalibrationReport:
 
     lines: list[str] = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
-    views: list[dict[str, Any]] = field(default_factory=list)
+    views: list[ViewResiduals] = field(default_factory=list)
 
 
-def describe(session: Session, document: dict[str, Any]) -> CalibrationReport:
+def describe(session: Session, made: Calibrated) -> CalibrationReport:
     """Tell a calibration's checks and verdict, and fetch its residuals for the picture."""
     report = CalibrationReport()
-    checks = document["checks"]
+    checks, verdict = made.record.checks or ChecksRecord(), made.record.verdict
     rows = []
-    for name in ("fitted", "held_out"):
-        measures = checks.get(name)
+    for name, measures in (("fitted", checks.fitted), ("held out", checks.held_out)):
         if measures is not None:
-            rows.append(
-                [
-                    name.replace("_", " "),
-                    f"{measures['rbe_px']:.4f}",
-                    f"{1e3 * measures['raz_mm']:.3f}",
-                    f"{measures['nsce']:.4f}",
-                ]
-            )
-    verdict = document["verdict"]
+            raz_um = None if measures.raz_mm is None else 1e3 * measures.raz_mm
+            rows.append([name, f"{measures.rbe_px:.4f}", f"{raz_um:.3f}", f"{measures.nsce:.4f}"])
     report.lines = [
         "",
         *table(["calibration", "RBE px", "RAZ um", "NSCE"], rows),
-        f"verdict: {verdict['level']}",
-        *(f"  {reason}" for reason in verdict["reasons"]),
+        f"verdict: {verdict.level}",
+        *(f"  {reason}" for reason in verdict.reasons),
     ]
-    held_out = checks.get("held_out")
-    if held_out is not None:
-        rbe = float(held_out["rbe_px"])
+    if checks.held_out is not None and checks.held_out.rbe_px is not None:
+        rbe = checks.held_out.rbe_px
         report.checks = [Check("held-out RBE of the calibration", "px", rbe, None, rbe, HELD_OUT_LIMIT_PX)]
-    for view in session.client.get(f"/calibrations/{document['id']}/residuals")["views"]:
-        report.views.append(_view(view))
+    for view in session.client.get(f"/calibrations/{made.id}/residuals")["views"]:
+        xy = np.asarray(view["found_px"], dtype=np.float64).reshape(-1, 2)
+        residual = np.asarray(view["residual_px"], dtype=np.float64).reshape(-1, 2)
+        use = np.isfinite(xy).all(axis=1) & np.isfinite(residual).all(axis=1)
+        title = f"{view['camera']}, dZ {float(view['dz_mm']):+.3f} mm"
+        report.views.append(ViewResiduals(title, bool(view["held_out"]), xy[use], residual[use]))
     return report
-
-
-def _view(view: dict[str, Any]) -> dict[str, Any]:
-    xy = np.asarray(view["found_px"], dtype=np.float64).reshape(-1, 2)
-    residual = np.asarray(view["residual_px"], dtype=np.float64).reshape(-1, 2)
-    use = np.isfinite(xy).all(axis=1) & np.isfinite(residual).all(axis=1)
-    return {
-        "title": f"{view['camera']}, dZ {float(view['dz_mm']):+.3f} mm",
-        "held_out": bool(view["held_out"]),
-        "rbe_px": float(np.mean(np.linalg.norm(residual[use], axis=1))),
-        "xy_px": xy[use],
-        "residual_px": residual[use],
-    }

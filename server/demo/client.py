@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import httpx
 import numpy as np
+from pydantic import TypeAdapter
 
 from core.arrays import Float
 from core.errors import MeasurementError, StateError, StorageError
+from server.formats.calibrations.record import CalibrationRecord
+from server.formats.gauges.readings import StepReadings
+from server.formats.records import Record
 
 OnProgress = Callable[[str, int, int, float | None], None]
 
 _POLL_S = 0.25
 _REQUEST_TIMEOUT_S = 60.0
+_READINGS = TypeAdapter(list[StepReadings])
 _ENDED = ("succeeded", "failed", "cancelled", "interrupted")
 
 
@@ -27,7 +32,39 @@ class AnalysisHandle:
 
     test_id: str
     analysis_id: str
-    job: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration that has ended: its record, and what the service says of its checks."""
+
+    id: str
+    record: CalibrationRecord
+    checks: object
+    verdict: object
+
+
+class _Progress(Record):
+    stage: str | None = None
+    done: int = 0
+    total: int = 0
+    eta_s: float | None = None
+
+
+class _Problem(Record):
+    code: str = "job_failed"
+    cause: str | None = None
+    detail: str = "no reason given"
+    remedy: str = "Look at the service's log."
+
+
+class Job(Record):
+    """A job of the service."""
+
+    kind: str
+    state: str
+    progress: _Progress = _Progress()
+    problem: _Problem = _Problem()
 
 
 class ServiceClient:
@@ -95,37 +132,33 @@ class ServiceClient:
 
     def set_scene(self, scene: str, load: float = 0.0, **params: Any) -> None:
         """Put a scene before the simulated cameras; load in kPa (plate) or kN (panel)."""
-        body: dict[str, Any] = {"scene": scene, "load": load}
-        if params:
-            body["params"] = params
-        self.call("PUT", "/sim/scene", json=body)
+        body = {"scene": scene, "load": load}
+        self.call("PUT", "/sim/scene", json=body | ({"params": params} if params else {}))
 
-    def calibrate(self, **plan: Any) -> dict[str, Any]:
+    def calibrate(self, **plan: Any) -> Calibrated:
         """Run the calibration sequence; return what ``GET /calibrations/{id}`` then says."""
         accepted = self.call("POST", "/calibrations", json=plan).json()
         self.wait(accepted["job"]["id"])
-        document: dict[str, Any] = self.get(f"/calibrations/{accepted['calibration_id']}")
-        document.setdefault("id", accepted["calibration_id"])
-        return document
+        calibration_id = str(accepted["calibration_id"])
+        told = self.get(f"/calibrations/{calibration_id}")
+        record = CalibrationRecord.model_validate(told)
+        return Calibrated(calibration_id, record, told.get("checks"), told.get("verdict"))
 
     def create_test(self, name: str, calibration_id: str, specimen: str = "") -> str:
         """Make a test; return its id."""
         body = {"name": name, "calibration_id": calibration_id, "specimen": specimen}
         return str(self.call("POST", "/tests", json=body).json()["id"])
 
-    def capture(self, test_id: str, label: str, *, load_n: float | None = None) -> dict[str, Any]:
-        """Capture one step; return its record."""
-        step: dict[str, Any] = self.call(
-            "POST", f"/tests/{test_id}/steps", json={"label": label, "load_n": load_n}
-        ).json()
-        return step
+    def capture(self, test_id: str, label: str, *, load_n: float | None = None) -> None:
+        """Capture one step."""
+        self.call("POST", f"/tests/{test_id}/steps", json={"label": label, "load_n": load_n})
 
-    def analyse(self, test_id: str, kind: str, region: dict[str, Any], **settings: Any) -> AnalysisHandle:
+    def analyse(self, test_id: str, kind: str, region: Mapping[str, object], **settings: Any) -> AnalysisHandle:
         """Run an analysis to its end; the region as the API takes it."""
         body = {"kind": kind, "region": region, **settings}
         accepted = self.call("POST", f"/tests/{test_id}/analyses", json=body).json()
-        job = self.wait(accepted["job"]["id"])
-        return AnalysisHandle(test_id, str(accepted["analysis_id"]), job)
+        self.wait(accepted["job"]["id"])
+        return AnalysisHandle(test_id, str(accepted["analysis_id"]))
 
     def field(self, analysis: AnalysisHandle, step: int, name: str) -> Float:
         """Fetch one variable of one step."""
@@ -133,11 +166,10 @@ class ServiceClient:
         data = self.call("GET", path, params={"format": "npy"}).content
         return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
 
-    def gauges(self, analysis: AnalysisHandle, **request: Any) -> dict[str, Any]:
+    def gauges(self, analysis: AnalysisHandle, **request: Any) -> Sequence[StepReadings]:
         """Read gauges in every step; the request as ``POST .../gauges`` takes it."""
         path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/gauges"
-        document: dict[str, Any] = self.call("POST", path, json=request).json()
-        return document
+        return _READINGS.validate_python(self.call("POST", path, json=request).json()["steps"])
 
     def export(self, analysis: AnalysisHandle, step: int) -> bytes:
         """Fetch the result file of one step."""
@@ -147,8 +179,8 @@ class ServiceClient:
             raise StorageError(f"The export of step {step} came back empty.")
         return data
 
-    def wait(self, job_id: str) -> dict[str, Any]:
-        """Wait for a job's end and return it.
+    def wait(self, job_id: str) -> None:
+        """Wait for a job's end.
 
         Raises
         ------
@@ -156,24 +188,17 @@ class ServiceClient:
             With the job's problem, if it did not succeed.
         """
         while True:
-            job: dict[str, Any] = self.get(f"/jobs/{job_id}")
-            progress = job.get("progress") or {}
+            job = Job.model_validate(self.get(f"/jobs/{job_id}"))
+            at = job.progress
             if self._on_progress is not None:
-                self._on_progress(
-                    str(progress.get("stage", job["state"])),
-                    int(progress.get("done") or 0),
-                    int(progress.get("total") or 0),
-                    progress.get("eta_s"),
-                )
-            if job["state"] in _ENDED:
+                self._on_progress(at.stage or job.state, at.done, at.total, at.eta_s)
+            if job.state in _ENDED:
                 break
             time.sleep(_POLL_S)
-        if job["state"] != "succeeded":
-            problem = job.get("problem") or {}
-            reason = problem.get("cause", problem.get("detail", "no reason given"))
+        if job.state != "succeeded":
+            problem = job.problem
             raise MeasurementError(
-                f"The {job['kind']} job {job_id} ended as {job['state']}: {reason}",
-                code=str(problem.get("code", "job_failed")),
-                remedy=str(problem.get("remedy", "Look at the service's log.")),
+                f"The {job.kind} job {job_id} ended as {job.state}: {problem.cause or problem.detail}",
+                code=problem.code,
+                remedy=problem.remedy,
             )
-        return job

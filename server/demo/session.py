@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.points.result import Field
-from server.demo.client import AnalysisHandle, ServiceClient
+from server.demo.client import AnalysisHandle, Calibrated, ServiceClient
 from server.formats.files import make_folder, write_bytes
 from server.formats.results.reading import read_field
 from sim.rig import SimRig
@@ -67,7 +66,7 @@ class Outcome:
     checks: list[Check] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
     pictures: dict[str, str] = field(default_factory=dict)
-    data: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,17 +93,12 @@ class Session:
     out: Path
     say: Callable[[str], None]
 
-    def nominal(self) -> dict[str, Any]:
-        """Return the rig file's tables, as a user knows the rig."""
-        return tomllib.loads(self.config.read_text())
-
-    def calibrate(self) -> dict[str, Any]:
-        """Calibrate before the grid; save and return the calibration's document."""
+    def calibrate(self) -> Calibrated:
+        """Calibrate before the grid; save the calibration's file."""
         self.client.set_scene("grid")
-        document = self.client.calibrate()
-        content = self.client.call("GET", f"/calibrations/{document['id']}/file").content
-        write_bytes(self.out / "calibration.json", content)
-        return document
+        made = self.client.calibrate()
+        write_bytes(self.out / "calibration.json", self.client.call("GET", f"/calibrations/{made.id}/file").content)
+        return made
 
     def fetch(self, analysis: AnalysisHandle, steps: Sequence[int], folder: str = "results") -> list[Field]:
         """Fetch the result files of an analysis over HTTP, keep them, and read them."""

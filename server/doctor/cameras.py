@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from core.errors import CameraError
 from core.names import CAMERAS, CameraName
@@ -33,6 +33,9 @@ _QUALITY = {
     "low_texture": "Nothing here could be matched: put a speckled specimen (or the grid) before the camera, and focus.",
     "blurred": "Focus the lens, or expose for a shorter time if something moves.",
 }
+
+
+_Count = TypeVar("_Count", int, float)
 
 
 @dataclass
@@ -166,7 +169,7 @@ def _link(unit: CameraUnit) -> dict[str, float]:
     return {name: float(value) for name, value in unit.statistics().items()}
 
 
-def _grown(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+def _grown(now: Mapping[str, _Count], before: Mapping[str, _Count]) -> dict[str, _Count]:
     return {name: value - before.get(name, 0) for name, value in now.items()}
 
 

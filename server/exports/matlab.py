@@ -13,7 +13,8 @@ import scipy.io
 
 from core.errors import InputError
 from server.formats.files import written_aside
-from server.results.steps import Source, StepResult, provenance
+from server.results.provenance import provenance
+from server.results.steps import Source, StepResult
 
 _LONGEST = 63  # namelengthmax
 _KEYWORDS = frozenset(
@@ -73,7 +74,7 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
                     remedy="Choose variables, or the format h5.",
                 )
             names = {name: matlab_name(name) for name in step.variables}
-            held: dict[str, Any] = {
+            held: dict[str, object] = {
                 "n": float(step.n),
                 "load_n": np.nan if step.load_n is None else step.load_n,
                 "label": step.label,

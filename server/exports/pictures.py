@@ -18,7 +18,8 @@ from server.formats.figure import Picture, PictureForm, draw, draw_pixels, scale
 from server.formats.figure_options import Look
 from server.formats.files import write_bytes, written_aside
 from server.formats.images import read_image
-from server.results.steps import Source, StepResult, columns_of, each, notes_of, provenance
+from server.results.provenance import notes_of, provenance
+from server.results.steps import Source, StepResult, columns_of, each
 
 FPS_RANGE = (0.1, 60.0)
 # VP9, which browsers play; MPEG-4 part 2, which they do not, only where OpenCV was built without libvpx
@@ -62,11 +63,11 @@ def picture_of(step: StepResult, name: str, source: Source, image: NDArray[np.ge
         units=variable.units,
         flags=variable.flags,
         title=f"{source.title or source.name}, step {step.n}{label}{load}",
-        notes=notes_of(document),
+        notes=notes_of(step, source),
         image=image,
         cuts=cuts,
         metadata={
-            "Software": document["software"],
+            "Software": str(document["software"]),
             "Variable": name,
             "Units": variable.units,
             "Provenance": json.dumps(document, sort_keys=True),

@@ -19,17 +19,9 @@ from server.exports.table import write_table
 from server.exports.vtu import NEEDS, write_pvd, write_vtu
 from server.formats.files import written_aside
 from server.formats.images import read_mask
-from server.results.steps import (
-    Source,
-    chosen,
-    columns_of,
-    each,
-    number_of,
-    provenance,
-    read_step,
-    require_known,
-    variables_of,
-)
+from server.formats.results.folder import number_of
+from server.results.provenance import provenance
+from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of
 
 _PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")
 

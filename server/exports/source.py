@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import re
 from pathlib import Path
-from typing import Any
 
 from core.errors import InputError
-from server.formats.results.reading import read_attributes
+from server.formats.results.folder import first_results, results_in
+from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
 from server.results.steps import Source
-
-_RESULT = re.compile(r"step_\d{4,}\.nc")
-
-
-def results_in(folder: Path) -> list[Path]:
-    """Return a folder's result files, by step."""
-    return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))
+from server.store.durable import known_json
 
 
 def find_source(folder: Path, analysis: str | None = None) -> Source:
@@ -43,48 +35,41 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
             code="option_conflict",
             remedy="Leave the analysis out, or give the test's folder.",
         )
-    files = results_in(folder)
-    if not files:
-        raise InputError(
-            f"There is no step_0000.nc or another step's result in {folder}.",
-            code="results_missing",
-            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-        )
-    return source_of(folder.absolute(), files)
+    return source_of(folder.absolute(), first_results(folder, [folder]))
 
 
 def source_of(folder: Path, files: list[Path]) -> Source:
     """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
-    heads = [read_attributes(path) for path in files]
-    stale = stale_results(files, heads)
-    about: dict[str, Any] = {"stale_reasons": stale} if stale else {}
+    heads = [read_head(path) for path in files]
+    stale, mask = stale_results(files, heads), _mask(folder, heads[0].settings)
+    about: dict[str, object] = {}
     test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
-    document = _json(test / "test.json")
-    reference = int(heads[-1].get("reference_step", heads[0].get("step", 0)))
+    document = known_json(test / "test.json")
+    reference = heads[0].step if heads[-1].reference_step is None else heads[-1].reference_step
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
-        about |= {
+        about = {
             "test_id": document.get("id", test.name),
             "test": document.get("name", ""),
             "calibration_id": document.get("calibration_id"),
             "specimen": document.get("specimen", ""),
         }
+        name, title = test.name, str(document.get("name") or test.name)
         if folder.parent.name == "analyses":
             about["analysis_id"] = folder.name
-        name = f"{test.name}_{folder.name}" if folder.parent.name == "analyses" else test.name
-        return Source(files, name, str(document.get("name") or test.name), image, about, _mask(folder, heads[0]))
-    said = str(heads[0].get("cam1_file", ""))
-    calibration = _json(folder / "summary.json").get("calibration")
+            name = f"{test.name}_{folder.name}"
+        return Source(files, name, title, image, about, mask, stale)
+    said = heads[0].image_file("cam1")
+    calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
-    return Source(
-        files, folder.name or "results", folder.name, Path(said) if said else None, about, _mask(folder, heads[0])
-    )
+    return Source(files, folder.name or "results", folder.name, Path(said) if said else None, about, mask, stale)
 
 
-def _mask(folder: Path, head: dict[str, Any]) -> Path | None:
+def _mask(folder: Path, settings: object) -> Path | None:
     """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
-    named = head["settings"].get("mask") if isinstance(head.get("settings"), dict) else None
+    region = settings.get("region") if isinstance(settings, dict) else None
+    named = region.get("mask") if isinstance(region, dict) else None
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):
         if path.is_file():
             return path
@@ -114,11 +99,3 @@ def _of_test(test: Path, analysis: str | None) -> Path:
             remedy="Name one with --analysis, or give its folder.",
         )
     return there[0] if there else test
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 
-from server.formats.files import written_aside
-from server.formats.results.netcdf import library
-from server.results.steps import Source, StepResult, chosen, each, provenance, require_same_grid
+from server.formats.results.netcdf import written_dataset
+from server.results.provenance import provenance
+from server.results.steps import Source, StepResult, chosen, each, require_same_grid
 
 _NO_STATE = -1  # of an integer variable in a step that does not have it
 _COMMON = ("x_px", "y_px")
@@ -33,20 +32,13 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
     """
     count = len(chosen(source, steps))
     first: StepResult | None = None
-    with written_aside(path) as aside:
-        with library:
-            data = netCDF4.Dataset(aside, "w", format="NETCDF4")
-        try:
-            for k, step in enumerate(each(source, steps, names)):
-                with library:
-                    if first is None:
-                        _begin(data, step, count)
-                        first = step
-                    require_same_grid(step, first)
-                    _put(data, k, step, source)
-        finally:
-            with library:
-                data.close()
+    with written_dataset(path, classic=False) as data:
+        for k, step in enumerate(each(source, steps, names)):
+            if first is None:
+                _begin(data, step, count)
+                first = step
+            require_same_grid(step, first)
+            _put(data, k, step, source)
 
 
 def _begin(data: Any, step: StepResult, count: int) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.formats.files import written_aside
-from server.results.steps import Source, StepResult, columns_of, provenance
+from server.results.provenance import provenance
+from server.results.steps import Source, StepResult, columns_of
 
 _LINES_AT_ONCE = 2000
 

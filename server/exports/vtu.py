@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from server.exports.mesh import triangles_of, turned_as
 from server.formats.files import write_bytes, written_aside
-from server.results.steps import Source, StepResult, columns_of, provenance
+from server.results.provenance import provenance
+from server.results.reader import Variable
+from server.results.steps import Source, StepResult, columns_of
 
 NEEDS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status", "u_mm", "v_mm", "w_mm", "normal_x", "normal_y", "normal_z")
 _VECTORS = {"displacement": ("u_mm", "v_mm", "w_mm"), "normal": ("normal_x", "normal_y", "normal_z")}
@@ -102,7 +104,7 @@ def write_pvd(path: Path, files: Iterable[tuple[int, str]]) -> None:
     write_bytes(path, "\n".join(text).encode())
 
 
-def _vector(columns: dict[str, Any], parts: tuple[str, ...]) -> NDArray[np.float64] | None:
+def _vector(columns: dict[str, Variable], parts: tuple[str, ...]) -> NDArray[np.float64] | None:
     if not all(name in columns for name in parts):
         return None
     return np.stack([columns[name].values.ravel().astype(np.float64) for name in parts], axis=1)
@@ -117,7 +119,7 @@ def _field_data(out: TextIO, step: StepResult, about: str) -> None:
     _array(out, "provenance_json_utf8", text, tuples=text.size)
 
 
-def _about(step: StepResult, source: Source, columns: dict[str, Any]) -> str:
+def _about(step: StepResult, source: Source, columns: dict[str, Variable]) -> str:
     units = {name: v.units for name, v in columns.items()} | {"displacement": "mm", "normal": "1", "Points": "mm"}
     states = {name: {str(k): t for k, t in v.flags.items()} for name, v in columns.items() if v.flags is not None}
     document = {**provenance(step, source), "units": units, "states": states}

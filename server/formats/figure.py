@@ -5,6 +5,7 @@ Drawn without pyplot, one picture at a time: nothing here is shared with other t
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import textwrap
@@ -127,7 +128,7 @@ def draw_pixels(picture: Picture, look: Look) -> NDArray[np.uint8]:
         return np.ascontiguousarray(pixels[:height, :width])
 
 
-def _metadata(picture: Picture, form: PictureForm) -> dict[str, Any]:
+def _metadata(picture: Picture, form: PictureForm) -> dict[str, str]:
     texts = {"Title": picture.title, **picture.metadata}
     if form == "png":
         return texts
@@ -189,7 +190,7 @@ def _draw_image(axis: Any, image: NDArray[Any], look: Look) -> None:
 def _draw_map(axis: Any, picture: Picture, look: Look) -> tuple[Any, list[str] | None]:
     opacity = look.opacity if picture.image is not None else 1.0
     extent = extent_of(picture.x_px, picture.y_px)
-    options: dict[str, Any] = {"extent": extent, "interpolation": "nearest", "alpha": opacity}
+    show = functools.partial(axis.imshow, extent=extent, interpolation="nearest", alpha=opacity)
     ticks = None
     if picture.flags is not None:
         present = [value for value in picture.flags if (picture.values == value).any()]
@@ -199,11 +200,11 @@ def _draw_map(axis: Any, picture: Picture, look: Look) -> tuple[Any, list[str] |
         ticks = [picture.flags[value] for value in present]
         palette = [mpl.colormaps["tab20"](2 * value % 20 + value // 10) for value in present]
         norm = BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present))
-        drawn = axis.imshow(values, cmap=ListedColormap(palette), norm=norm, **options)
+        drawn = show(values, cmap=ListedColormap(palette), norm=norm)
     else:
         scale = scale_of(picture.values, look)
         low, high = scale if scale is not None else (0.0, 1.0)
-        drawn = axis.imshow(picture.values, cmap=look.colours, vmin=low, vmax=high, **options)
+        drawn = show(picture.values, cmap=look.colours, vmin=low, vmax=high)
         if not np.isfinite(picture.values).any():
             axis.text(0.5, 0.5, "no values", transform=axis.transAxes, ha="center", va="center", color="0.4")
     axis.set_aspect("equal")

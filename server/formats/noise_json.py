@@ -31,26 +31,26 @@ class LoadedNoise:
         Of camera 1 and camera 2; None where the file has none.
     sha256
         Of the file's bytes.
-    content
-        All of it.
+    created
+        When it was measured, as the file says it.
     """
 
     models: tuple[NoiseModel | None, NoiseModel | None]
     sha256: str
-    content: dict[str, Any]
+    created: object
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, object]:
         """Return what a result file keeps of it: the numbers that were used, and where they come from."""
         cameras: dict[str, object] = {
             cam: None if model is None else {"coefficients": list(model.coefficients), "frames": model.frames}
             for cam, model in zip(CAMERAS, self.models, strict=True)
         }
-        return {"sha256": self.sha256, "created": self.content.get("created"), **cameras}
+        return {"sha256": self.sha256, "created": self.created, **cameras}
 
 
 def noise_content(
-    models: Mapping[str, NoiseModel], *, sources: Mapping[str, Any] | None = None, **more: Any
-) -> dict[str, Any]:
+    models: Mapping[str, NoiseModel], *, sources: Mapping[str, object] | None = None, **more: object
+) -> dict[str, object]:
     """Return the content of noise.json; ``sources`` says by camera what was measured."""
     return {
         "format": FORMAT,
@@ -62,7 +62,7 @@ def noise_content(
     }
 
 
-def write_noise(path: Path, content: Mapping[str, Any], *, checksum: bool = False) -> None:
+def write_noise(path: Path, content: Mapping[str, object], *, checksum: bool = False) -> None:
     """Write noise.json aside, sync it and rename it.
 
     Raises
@@ -111,11 +111,11 @@ def noise_from(data: bytes, *, name: str) -> LoadedNoise:
     models = [_model(content[cam], f"{name}, {cam}") if content.get(cam) is not None else None for cam in CAMERAS]
     if models == [None, None]:
         raise _unreadable(name, "it has neither cam1 nor cam2")
-    return LoadedNoise((models[0], models[1]), hashlib.sha256(data).hexdigest(), content)
+    return LoadedNoise((models[0], models[1]), hashlib.sha256(data).hexdigest(), content.get("created"))
 
 
-def _plain(model: NoiseModel) -> dict[str, Any]:
-    plain: dict[str, Any] = {}
+def _plain(model: NoiseModel) -> dict[str, object]:
+    plain: dict[str, object] = {}
     for field in fields(model):
         value = getattr(model, field.name)
         if isinstance(value, tuple):

@@ -228,13 +228,12 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[
 
 def _outline(source: Source) -> NDArray[np.float64] | None:
     """Corners of the region that was asked for, in camera 1's reference image."""
-    region = source.settings.get("region") or {}
-    if region.get("polygon"):
-        return np.asarray(region["polygon"], dtype=np.float64)
-    rectangle = region.get("rectangle") or source.settings.get("roi")
-    if not rectangle:
+    region = source.settings.region
+    if region.polygon:
+        return np.asarray(region.polygon, dtype=np.float64)
+    if region.rectangle is None:
         return None
-    x0, y0, x1, y1 = rectangle
+    x0, y0, x1, y1 = region.rectangle
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float64)
 
 
@@ -276,16 +275,16 @@ def _maps(shown: Shown) -> list[Picture]:
 
 def _origin(source: Source) -> Origin:
     first = source.heads[max(source.heads)]
-    inputs = {n: dict(head["inputs_sha256"]) for n, head in source.heads.items()}
+    inputs = {n: head.inputs_sha256 for n, head in source.heads.items()}
     common = {k: v for k, v in inputs[max(inputs)].items() if all(found.get(k) == v for found in inputs.values())}
     rows = [("all steps", sorted(common.items()))]
     for n, path in source.files.items():
-        written = str(source.heads[n].get("created", ""))
+        written = source.heads[n].created
         name = f"{path.name}, written {written}" if written else path.name
         rows.append((name, sorted((k, v) for k, v in inputs[n].items() if k not in common)))
     told = source.facts.document()
     return Origin(
-        settings=json.dumps(first.get("settings", {}), sort_keys=True, ensure_ascii=False),
+        settings=json.dumps(first.settings, sort_keys=True, ensure_ascii=False),
         facts=json.dumps(told, ensure_ascii=False) if told else "",
         inputs=rows,
     )

@@ -285,7 +285,7 @@ def _pattern_size(source: Source, measured: Measured) -> PatternSize | None:
     image = source.reference_image("cam1")
     if image is None:
         return None
-    field, half = measured.reference, int(source.settings.get("subset_px", 21)) // 2
+    field, half = measured.reference, int(source.settings.subset_px or 21) // 2
     inside = np.zeros(image.shape, dtype=bool)
     for x, y in zip(field.x_px[field.valid], field.y_px[field.valid], strict=True):
         c, r = round(float(x)), round(float(y))
@@ -294,20 +294,19 @@ def _pattern_size(source: Source, measured: Measured) -> PatternSize | None:
 
 
 def _noise(source: Source, measured: Measured) -> tuple[Value | None, ...]:
-    record = source.settings.get("noise")
     depth = source.reference_step.bit_depth
     residual = measured.noise_grey
     values: list[Value | None] = []
     for cam in CAMERAS:
-        model = record.get(cam) if isinstance(record, dict) else None
-        if isinstance(model, dict):
+        model = getattr(source.settings.noise, cam)
+        if model is not None:
             image = source.reference_image(cam)
-            a = [float(c) for c in model["coefficients"]]
+            a = model.coefficients
             grey = None if image is None else float(np.median(image))
             formula = " + ".join(f"{c:.4g}{('', ' g', ' g^2')[k]}" for k, c in enumerate(a[:3]))
             sd = None if grey is None else float(np.sqrt(max(sum(c * grey**k for k, c in enumerate(a)), 0.0)))
             at = "" if sd is None else f"{sd:.3g} at grey level {grey:.0f}; "
-            values.append(Value(f"{at}variance {formula}, from {model['frames']} frames", sd, "from the noise model"))
+            values.append(Value(f"{at}variance {formula}, from {model.frames} frames", sd, "from the noise model"))
         elif cam == "cam1" and residual is not None:
             full = f" ({100.0 * residual / (2.0 ** depth[cam] - 1.0):.2f} % of full scale)" if cam in depth else ""
             values.append(

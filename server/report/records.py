@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field
 
@@ -79,7 +78,7 @@ class TestRecord(Record):
     name: str = ""
     specimen: str = ""
     notes: str = ""
-    facts: dict[str, Any] = Field(default={})
+    facts: dict[str, object] = Field(default={})
 
 
 class CalibrationFile(Record):
@@ -94,3 +93,42 @@ class AnalysisRecord(Record):
     id: str = ""
     label: str = ""
     calibration: CalibrationFile | None = None
+
+
+class RegionRecord(Record):
+    """Where points were laid, px of camera 1's reference image."""
+
+    rectangle: tuple[float, float, float, float] | None = None
+    polygon: list[tuple[float, float]] | None = None
+    cracks: list[object] | None = None
+    holes: list[object] | None = None
+    mask: object = None
+
+
+class NoiseRecord(Record):
+    """A camera's noise model: variance by powers of the grey level."""
+
+    coefficients: list[float]
+    frames: int
+
+
+class NoiseRecords(Record):
+    """The noise models that were measured with."""
+
+    cam1: NoiseRecord | None = None
+    cam2: NoiseRecord | None = None
+
+
+class SettingsRecord(Record):
+    """Settings of the analysis, as its result files have them."""
+
+    reference: int = 0
+    subset_px: float | None = None
+    step_px: float | None = None
+    prefilter_px: float | None = None
+    interpolation: str | None = None
+    reference_update: str | None = None
+    patch: str | None = None
+    strain: object = None
+    noise: NoiseRecords = NoiseRecords()
+    region: RegionRecord = RegionRecord()

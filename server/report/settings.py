@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from server.formats.version import software_version
 from server.report.geometry import Geometry
 from server.report.items import MEASURED, SETTINGS, Item, Value, one
+from server.report.records import SettingsRecord
 from server.report.source import Source
 from server.report.steps import Measured
 
@@ -45,13 +43,13 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
 
     needs = "the result files do not say it: measure again with this program"
     head = source.heads[max(source.heads)]
-    version = f"stereorig {head['software_version']} (results), stereorig {software_version()} (this report)"
-    interpolation = settings.get("interpolation")
+    version = f"stereorig {head.software_version} (results), stereorig {software_version()} (this report)"
+    interpolation = settings.interpolation
     return [
         one("software", "Software", Value(version, None, "written in the results")),
         one("prefilter", "Image filtering", _prefilter(settings), needs),
-        one("subset", "Subset size", length(settings.get("subset_px")), needs, "width of the square subset"),
-        one("step", "Step size", length(settings.get("step_px")), needs, "distance of the points"),
+        one("subset", "Subset size", length(settings.subset_px), needs, "width of the square subset"),
+        one("step", "Step size", length(settings.step_px), needs, "distance of the points"),
         one("shape_function", "Subset shape function", _shape_function(measured, settings), needs),
         one("criterion", "Matching criterion", Value(_CRITERION, None, "of this program")),
         one(
@@ -63,23 +61,23 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
         one("reference_update", "Reference", _reference(settings), needs, _matched(measured)),
         one("smoothing", "Smoothing of displacements", _smoothing(measured)),
         *_strain_items(source, measured),
-        one("frame", "Coordinate system", Value(str(head.get("frame", "")), None, "written in the results")),
+        one("frame", "Coordinate system", Value(head.frame, None, "written in the results")),
         one("points", "Points", Value(_points(measured), float(measured.steps[0].summary.points), MEASURED)),
         one("region", "Region", _region(settings), needs),
     ]
 
 
-def _prefilter(settings: Mapping[str, Any]) -> Value | None:
-    blur = settings.get("prefilter_px")
+def _prefilter(settings: SettingsRecord) -> Value | None:
+    blur = settings.prefilter_px
     if blur is None:
         return None
     text = f"Gaussian, standard deviation {blur:g} px, on all images" if blur else "none"
     return Value(text, float(blur), SETTINGS)
 
 
-def _reference(settings: Mapping[str, Any]) -> Value | None:
-    update = settings.get("reference_update")
-    return None if update is None else Value(_REFERENCES.get(update, str(update)), None, SETTINGS)
+def _reference(settings: SettingsRecord) -> Value | None:
+    update = settings.reference_update
+    return None if update is None else Value(_REFERENCES.get(update, update), None, SETTINGS)
 
 
 def _smoothing(measured: Measured) -> Value:
@@ -92,9 +90,9 @@ def _smoothing(measured: Measured) -> Value:
     return Value(text, float(smoothing.resolution_px), SETTINGS)
 
 
-def _shape_function(measured: Measured, settings: Mapping[str, Any]) -> Value | None:
+def _shape_function(measured: Measured, settings: SettingsRecord) -> Value | None:
     choice = measured.steps[-1].summary.patch
-    name = choice.patch if choice else settings.get("patch")
+    name = choice.patch if choice else settings.patch
     if name is None:
         return None
     asked = f"; {choice.reason}" if choice and choice.asked == "auto" else ""
@@ -114,25 +112,22 @@ def _points(measured: Measured) -> str:
     )
 
 
-def _region(settings: Mapping[str, Any]) -> Value | None:
-    region = settings.get("region") or {"rectangle": settings.get("roi"), **settings}
-    rectangle, polygon = region.get("rectangle"), region.get("polygon")
+def _region(settings: SettingsRecord) -> Value:
+    region = settings.region
     parts = []
-    if rectangle:
-        parts.append("rectangle {:g}, {:g} to {:g}, {:g} px".format(*rectangle))
-    if polygon:
-        parts.append(f"polygon of {len(polygon)} corners")
-    for name in ("cracks", "holes"):
-        if region.get(name):
-            parts.append(f"{len(region[name])} {name}")
-    if region.get("mask"):
-        parts.append("mask")
-    return Value(", ".join(parts), None, SETTINGS) if parts else Value("the whole image", None, SETTINGS)
+    if region.rectangle:
+        parts.append("rectangle {:g}, {:g} to {:g}, {:g} px".format(*region.rectangle))
+    if region.polygon:
+        parts.append(f"polygon of {len(region.polygon)} corners")
+    parts += [f"{len(region.cracks)} cracks"] if region.cracks else []
+    parts += [f"{len(region.holes)} holes"] if region.holes else []
+    parts += ["mask"] if region.mask else []
+    return Value(", ".join(parts) or "the whole image", None, SETTINGS)
 
 
 def _strain_items(source: Source, measured: Measured) -> list[Item]:
     strain = next((s.strain for s in reversed(measured.steps) if s.strain), None)
-    settings = source.settings.get("strain")
+    settings = source.settings.strain
     if strain is None:
         text = "no strain was computed" if not settings else "no strain: no window of points was whole enough"
         if all(not s.summary.displacement_mm for s in measured.steps):

@@ -10,13 +10,14 @@ from typing import Any
 from numpy.typing import NDArray
 
 from core.errors import InputError, StereorigError
+from core.names import CameraName
 from server.base.errors import NotFoundError
-from server.exports.source import results_in
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import known_sha256
 from server.formats.images import read_image
-from server.formats.results.reading import read_attributes
-from server.report.records import AnalysisRecord, RigRecord, StepRecord, TestRecord
+from server.formats.results.folder import number_of, results_in
+from server.formats.results.reading import ResultHead, read_head
+from server.report.records import AnalysisRecord, RigRecord, SettingsRecord, StepRecord, TestRecord
 from server.results.metadata import TestFacts, parse_facts
 from server.results.staleness import stale_results
 from server.store.durable import known_json
@@ -31,7 +32,7 @@ class Source:
     files
         Result files by step, ascending.
     heads
-        Their attributes, as :func:`server.formats.results.reading.read_attributes` gives them.
+        What they say of themselves.
     test
         The test's folder, None where the results lie alone; ``test_record`` is its ``test.json``.
     analysis
@@ -49,7 +50,7 @@ class Source:
     """
 
     files: dict[int, Path]
-    heads: dict[int, dict[str, Any]]
+    heads: dict[int, ResultHead]
     test: Path | None
     test_record: TestRecord
     analysis: AnalysisRecord
@@ -63,8 +64,8 @@ class Source:
     @property
     def reference(self) -> int:
         """Number of the reference step; of shapes alone, of the first."""
-        shapes = [n for n, head in self.heads.items() if head["kind"] == "shape"]
-        return min(shapes) if shapes else int(self.settings.get("reference", 0))
+        shapes = [n for n, head in self.heads.items() if head.kind == "shape"]
+        return min(shapes) if shapes else self.settings.reference
 
     @property
     def reference_step(self) -> StepRecord:
@@ -77,25 +78,24 @@ class Source:
         return self.reference_step.rig
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> SettingsRecord:
         """Settings of the analysis, from the files themselves."""
-        found = self.heads[max(self.heads)].get("settings", {})
-        return found if isinstance(found, dict) else {}
+        return SettingsRecord.model_validate(self.heads[max(self.heads)].settings)
 
     @property
     def title(self) -> str:
         """Name of the test; without one, of the folder."""
         return self.test_record.name or self.files[min(self.files)].absolute().parent.name
 
-    def reference_image(self, cam: str) -> NDArray[Any] | None:
+    def reference_image(self, cam: CameraName) -> NDArray[Any] | None:
         """Image of the reference; None where it is gone or not the one that was measured."""
         n = self.reference
         head = self.heads.get(n, self.heads[max(self.heads)])
-        inputs = head["inputs_sha256"]
-        sha256 = inputs.get(f"reference_{cam}") or inputs.get(f"step_{cam}") or inputs.get(cam)
+        inputs = head.inputs_sha256
+        sha256 = inputs.get(f"reference_{cam}") or inputs.get(cam)
         places = [] if self.test is None else [self.test / "steps" / f"{n:04d}" / f"{cam}.tif"]
-        if n in self.heads and self.heads[n].get(f"{cam}_file"):
-            named = Path(str(self.heads[n][f"{cam}_file"]))
+        if n in self.heads and self.heads[n].image_file(cam):
+            named = Path(self.heads[n].image_file(cam))
             places += [named, self.files[n].parent / named.name]
         for path in places:
             try:
@@ -138,7 +138,7 @@ def find_source(
         A result file that cannot be read, facts that cannot be.
     """
     folder = _results_folder(place, test, analysis)
-    files = {int(path.stem[5:]): path for path in results_in(folder)}
+    files = {number_of(path): path for path in results_in(folder)}
     if not files:
         raise InputError(
             f"There is no step_0000.nc or another step's result in {folder}.",
@@ -146,7 +146,7 @@ def find_source(
             remedy="Measure first, or give the folder that stereorig measure --out wrote.",
         )
     folder = folder.absolute()
-    heads = {n: read_attributes(path) for n, path in sorted(files.items())}
+    heads = {n: read_head(path) for n, path in sorted(files.items())}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
     test_record, steps = TestRecord(), {n: StepRecord() for n in heads}
     if home is not None:
@@ -165,7 +165,7 @@ def find_source(
         calibration=loaded,
         calibration_file=file,
         facts=parse_facts(test_record.facts, name="the facts of the test") if facts is None else facts,
-        stale=stale_results(list(files.values()), heads.values()),
+        stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
     )
 
@@ -220,15 +220,11 @@ def _one_analysis(test: Path, wanted: str | None) -> Path:
 
 
 def _calibration(
-    given: Path | None,
-    test: Path | None,
-    made: AnalysisRecord,
-    heads: Mapping[int, Mapping[str, Any]],
-    doubts: list[str],
+    given: Path | None, test: Path | None, made: AnalysisRecord, heads: Mapping[int, ResultHead], doubts: list[str]
 ) -> tuple[LoadedCalibration | None, Path | None]:
     """Find the calibration that the results were measured with, by its checksum."""
-    inputs = heads[max(heads)]["inputs_sha256"]
-    sha256 = inputs.get("calibration", inputs.get("calibration.json"))
+    inputs = heads[max(heads)].inputs_sha256
+    sha256 = inputs.get("calibration")
     places = [] if given is None else [given]
     if given is None:
         places += [] if test is None else [test / "calibration.json"]

@@ -195,17 +195,14 @@ def read_steps(source: Source) -> Measured:
 
 
 def _label(source: Source, n: int) -> str:
-    return source.steps[n].label or str(source.heads[n].get("label", ""))
+    return source.steps[n].label or source.heads[n].label
 
 
 def _load(source: Source, n: int) -> float | None:
     recorded = source.steps[n].load_n
     if recorded is not None or "load_n" in source.steps[n].model_fields_set:
         return recorded
-    try:
-        return float(source.heads[n]["load_n"])
-    except (KeyError, TypeError, ValueError):
-        return None
+    return source.heads[n].load_n
 
 
 def _figures(

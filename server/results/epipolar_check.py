@@ -13,7 +13,8 @@ from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError, InputError
 from server.formats.calibrations.plausibility import Residual
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.results.steps import calibration_of, read_step
+from server.results.provenance import calibration_of
+from server.results.steps import read_step
 
 
 @dataclass(frozen=True)

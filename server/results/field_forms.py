@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import cv2
-import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError
-from server.formats.results.netcdf import library
+from server.formats.results.netcdf import dataset_bytes
 from server.results.reader import Variable
 
 FieldForm = Literal["json", "npy", "csv", "nc", "f32", "png"]
@@ -183,8 +182,8 @@ def _csv(part: FieldPart) -> bytes:
 def _netcdf(part: FieldPart) -> bytes:
     """Return a NetCDF-4 file with the variable, its place in the grid and in the image."""
     pixels = {of: part.place(of) for of in ("x_px", "y_px")}
-    with library:
-        data = netCDF4.Dataset("field.nc", "w", memory=1 << 16, format="NETCDF4_CLASSIC")
+
+    def fill(data: Any) -> None:
         data.setncattr("Conventions", "CF-1.8")
         for name, places in (("row", part.rows), ("col", part.cols)):
             data.createDimension(name, len(places))
@@ -198,11 +197,12 @@ def _netcdf(part: FieldPart) -> bytes:
             for name, size in zip(more, part.values.shape[2:], strict=True):
                 data.createDimension(name, size)
             kind = {"b": "i1", "i": "i4", "u": "i4"}.get(part.values.dtype.kind, part.values.dtype.str[1:])
-            fill = np.nan if kind.startswith("f") else None
-            variable = data.createVariable(part.name, kind, ("row", "col", *more), fill_value=fill)
+            missing = np.nan if kind.startswith("f") else None
+            variable = data.createVariable(part.name, kind, ("row", "col", *more), fill_value=missing)
             variable[:] = part.values
             variable.units, variable.long_name = part.variable.units, part.variable.long_name
-        return bytes(data.close())
+
+    return dataset_bytes(fill)
 
 
 def _png(part: FieldPart) -> bytes:

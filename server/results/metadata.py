@@ -68,7 +68,7 @@ class TestFacts(ClosedFacts):
         return self.model_dump(mode="json", exclude_none=True)
 
 
-def parse_facts(document: Mapping[str, Any], *, name: str) -> TestFacts:
+def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
     """Read facts.
 
     Raises

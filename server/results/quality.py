@@ -37,7 +37,7 @@ class ImageQuality:
     texture_grey_per_px: float
     focus: float
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, str | float]:
         """Names and rounded numbers."""
         return {
             "code": self.code,

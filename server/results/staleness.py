@@ -6,18 +6,21 @@ committed are not read again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from core.names import CAMERAS
 from server.formats.files import known_sha256
+from server.formats.results.folder import number_of, results_in
+from server.formats.results.reading import ResultHead
+from server.formats.results.settings import current_summary
 from server.store.durable import known_json
 
 
 def stale_inputs(
     test: Path,
-    steps: Mapping[int, Mapping[str, Any]],
+    steps: Mapping[int, Mapping[str, str | None]],
     *,
     calibration: Path | None,
     calibration_sha256: str | None,
@@ -56,26 +59,24 @@ def stale_inputs(
     return found
 
 
-def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]) -> list[str]:
+def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[str]:
     """Return what was found to be gone or replaced since result files were written.
 
     Parameters
     ----------
     files
         Result files of one measurement.
-    attributes
-        Of each, as :func:`server.formats.results.reading.read_attributes` gives them.
+    heads
+        What each says of itself.
     """
     folder = files[0].absolute().parent
-    summary = known_json(folder / "summary.json")
+    summary = current_summary(known_json(folder / "summary.json"))
     test = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
-    heads = list(attributes)
-    steps = {int(a["step"]): _images(a["inputs_sha256"]) for a in heads}
-    first = heads[0]["inputs_sha256"]
-    reference = int(heads[-1].get("reference_step", 0))
-    steps.setdefault(reference, {cam: heads[-1]["inputs_sha256"].get(f"reference_{cam}") for cam in CAMERAS})
+    steps = {head.step: _images(head.inputs_sha256) for head in heads}
+    reference = heads[-1].reference_step or 0
+    steps.setdefault(reference, {cam: heads[-1].inputs_sha256.get(f"reference_{cam}") for cam in CAMERAS})
     calibration = None
-    if "calibration.json" in first and test is not None:
+    if test is not None and folder.parent.name == "analyses":
         calibration = test / "calibration.json"
     elif isinstance(summary.get("calibration"), dict):
         calibration = Path(str(summary["calibration"].get("file")))
@@ -83,7 +84,7 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
             calibration = test / "calibration.json"  # whatever folder the measurement was started from
         elif not calibration.is_absolute() and not calibration.is_file():
             calibration = None
-    sha256 = first.get("calibration", first.get("calibration.json"))
+    sha256 = heads[0].inputs_sha256.get("calibration")
     found = _missing_results(folder, summary)
     if test is not None:
         return found + stale_inputs(
@@ -93,25 +94,25 @@ def stale_results(files: Sequence[Path], attributes: Iterable[Mapping[str, Any]]
         found += _changed(calibration, sha256, calibration.name)
     for head in heads:
         for cam in CAMERAS:
-            image = Path(str(head.get(f"{cam}_file", "")))
+            image = Path(head.image_file(cam))
             if image.is_file():
-                found += _changed(image, _images(head["inputs_sha256"]).get(cam), f"{cam} of step {int(head['step'])}")
+                found += _changed(image, head.inputs_sha256.get(cam), f"{cam} of step {head.step}")
     return found
 
 
 def _missing_results(folder: Path, summary: dict[str, Any]) -> list[str]:
     """Results that the measurement's own record names and that are not there."""
-    listed = [s.get("step", s.get("n")) for s in summary.get("steps", []) if isinstance(s, dict)]
-    there = {int(path.stem.removeprefix("step_")) for path in folder.glob("step_[0-9]*.nc")}
+    listed = [step["n"] for step in summary["steps"]]
+    there = set(map(number_of, results_in(folder)))
     return [f"the result of step {n} is gone" for n in listed if isinstance(n, int) and n not in there]
 
 
-def _images(inputs: Mapping[str, str]) -> dict[str, Any]:
-    """The step's own images' checksums; the service and the command line name them differently."""
-    return {cam: inputs.get(cam, inputs.get(f"step_{cam}")) for cam in CAMERAS}
+def _images(inputs: Mapping[str, str]) -> dict[str, str | None]:
+    """Return the checksums of the step's own images."""
+    return {cam: inputs.get(cam) for cam in CAMERAS}
 
 
-def _changed(path: Path, sha256: Any, what: str) -> list[str]:
+def _changed(path: Path, sha256: str | None, what: str) -> list[str]:
     if not path.is_file():
         return [f"{what} is gone"]
     return [] if sha256 is None or known_sha256(path) == sha256 else [f"{what} was replaced"]
@@ -122,6 +123,6 @@ def _touched_after(image: Path, mark: Path) -> bool:
     return image.stat().st_ctime_ns > mark.stat().st_ctime_ns
 
 
-def _recorded(mark: Path) -> dict[str, Any] | None:
+def _recorded(mark: Path) -> dict[str, object] | None:
     found = known_json(mark).get("sha256")
     return found if isinstance(found, dict) else None

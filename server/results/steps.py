@@ -1,4 +1,4 @@
-"""What an export is made of: one step at a time, read from its result file as it is, with where it comes from."""
+"""Steps as exports need them: one at a time, read from its result file as it is."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from core.errors import FileFormatError, InputError
 from core.field.region.cuts import Cuts, from_arrays
 from core.status import PointStatus
 from server.base.errors import NotFoundError
-from server.formats.files import sha256_of
+from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
-from server.formats.version import software_version
+from server.formats.results.settings import current_inputs, current_settings
 from server.results.reader import Variable
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
 _GRID = ("row", "col")
-_CALIBRATION = ("calibration", "calibration.json")  # as stereorig measure and the service name it
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class StepResult:
 
     n: int
     variables: dict[str, Variable]
-    attributes: dict[str, Any]
+    attributes: dict[str, object]
     cuts: Cuts | None
 
     @property
@@ -61,7 +60,7 @@ class StepResult:
     def load_n(self) -> float | None:
         """Load in newtons; None where it is not known."""
         text = self.attributes.get("load_n")
-        return None if text is None else float(text)
+        return None if text is None else float(str(text))
 
     @property
     def label(self) -> str:
@@ -87,19 +86,17 @@ class Source:
         Further facts for every export: ids of test, analysis and calibration.
     mask
         The image that says where points may lie, where there was one.
+    stale_reasons
+        What is gone or was replaced since they were measured.
     """
 
     files: Sequence[Path]
     name: str
     title: str = ""
     image: Path | None = None
-    about: dict[str, Any] = field(default_factory=dict)
+    about: dict[str, object] = field(default_factory=dict)
     mask: Path | None = None
-
-
-def number_of(path: Path) -> int:
-    """Return the step's number in the name of a result file."""
-    return int(path.stem.removeprefix("step_"))
+    stale_reasons: Sequence[str] = ()
 
 
 def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
@@ -171,79 +168,15 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
         cuts = from_arrays(points, np.asarray(data.variables["cut_line"][...], dtype=np.int32))
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
-    return StepResult(int(attributes.get("step", number_of(path))), variables, attributes, cuts)
+    for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
+        attributes[name] = json.dumps(current(json.loads(str(attributes.get(name, "{}")))))
+    return StepResult(int(str(attributes.get("step", number_of(path)))), variables, attributes, cuts)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return value.item() if isinstance(value, np.generic) else value
-
-
-def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, Any]:
-    """Return what every export says: software, frame, settings, calibration, inputs; values are plain.
-
-    Parameters
-    ----------
-    path
-        The result file, to say its checksum.
-    """
-    said = step.attributes
-    inputs = json.loads(said.get("inputs_sha256", "{}"))
-    document: dict[str, Any] = {
-        "software": f"stereorig {software_version()}",
-        "measured_with": said.get("source", ""),
-        "measured": said.get("created", ""),
-        "kind": said.get("kind", ""),
-        "frame": said.get("frame", ""),
-        "length_unit": "mm",
-        "settings": json.loads(said.get("settings", "{}")),
-        "calibration_sha256": calibration_of(step),
-        "inputs_sha256": inputs,
-        **source.about,
-    }
-    for name in ("strain", "smoothing", "patch_choice", "transformation"):
-        if name in said:
-            document[name] = json.loads(said[name])
-    for name in ("strain_axes", "strain_note", "patch", "patch_reason", "made_from"):
-        if name in said:
-            document[name] = said[name]
-    document["step"] = step.n
-    document["label"], document["load_n"] = step.label, step.load_n
-    if path is not None:
-        document["result_file"] = path.name
-        document["result_sha256"] = sha256_of(path)
-    return document
-
-
-def calibration_of(step: StepResult) -> str | None:
-    """Return the SHA-256 of the calibration that a step was measured with; None where the file does not say."""
-    inputs = json.loads(step.attributes.get("inputs_sha256", "{}"))
-    return next((str(inputs[name]) for name in _CALIBRATION if name in inputs), None)
-
-
-def notes_of(document: dict[str, Any]) -> list[str]:
-    """Return the few lines that a picture says of its provenance."""
-    settings = document["settings"]
-    said = [
-        f"{name} {settings[key]}{unit}"
-        for name, key, unit in (
-            ("subset", "subset_px", " px"),
-            ("step", "step_px", " px"),
-            ("patch", "patch", ""),
-            ("interpolation", "interpolation", ""),
-            ("prefilter", "prefilter_px", " px"),
-            ("smoothing window", "smoothing_window", " points"),
-        )
-        if settings.get(key)
-    ]
-    strain = document.get("strain")
-    if strain:
-        mm = strain.get("gauge_mm")
-        said.append(f"gauge {strain['gauge_px']:g} px{'' if mm is None else f' = {mm:.3g} mm'}, {strain['tensor']}")
-    calibration = document.get("calibration_id"), (document["calibration_sha256"] or "")[:12]
-    known = " ".join(str(part) for part in calibration if part) or "not known"
-    return [f"frame: {document['frame']}", f"{', '.join(said)}; calibration {known}; {document['measured_with']}"]
 
 
 def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | None = None) -> Iterator[StepResult]:

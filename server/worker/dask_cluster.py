@@ -145,11 +145,11 @@ class ClusterExecutor(TaskExecutor):
         with_files = self._images == "scatter" and len(args) == 1 and isinstance(args[0], StepTask)
         more: dict[str, Any] = {"key": f"stereorig-{future.name}-{attempt}", "pure": False}
         if with_files:
-            contents = {path: _content(client, path) for path in _files_of(args[0])}
+            contents = {path: _content(client, path) for path in args[0].files()}
             future.remote = client.submit(dask_task.run_with_files, *head, args[0], contents, **more)
         else:
             future.remote = client.submit(dask_task.run, *head, *args, **more)
-        folder = Path(args[0].folder) if with_files else None
+        folder = args[0].folder if with_files else None
         future.remote.add_done_callback(lambda remote: self._done(future, remote, fn, args, attempt, folder))
 
     def _done(
@@ -218,23 +218,9 @@ class ClusterExecutor(TaskExecutor):
                 client.close(timeout=2)
 
 
-def _files_of(task: StepTask) -> list[str]:
-    """Every file that a step reads."""
-    folder = Path(task.folder)
-    paths = [task.calibration, *task.images.values(), *(p for step in task.earlier.values() for p in step.images)]
-    if task.noise is not None:
-        paths.append(task.noise)
-    results = {task.reference, *([] if task.previous is None else [task.previous]), *task.earlier} - {task.n}
-    if task.kind == "motion":
-        for n in sorted(results):
-            paths += [str(folder / f"step_{n:04d}.nc"), str(folder / f"starts_{n:04d}.npz")]
-    paths.append(str(folder / "mask.png"))
-    return [path for path in dict.fromkeys(paths) if Path(path).is_file()]
-
-
-def _content(client: Any, path: str) -> Any:
+def _content(client: Any, path: Path) -> Any:
     """A file's content on the cluster; the same content is sent once."""
-    return client.scatter(Path(path).read_bytes(), hash=True, direct=False)
+    return client.scatter(path.read_bytes(), hash=True, direct=False)
 
 
 def _keep(folder: Path, answer: Any, written: dict[str, bytes]) -> Any:

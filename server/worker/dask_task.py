@@ -15,7 +15,6 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +95,12 @@ def _prepare(threads: int) -> None:
 
 
 def run_with_files(
-    name: str, topic: str, threads: int, function: Callable[[StepTask], Any], task: StepTask, contents: dict[str, bytes]
+    name: str,
+    topic: str,
+    threads: int,
+    function: Callable[[StepTask], Any],
+    task: StepTask,
+    contents: dict[Path, bytes],
 ) -> tuple[Any, dict[str, bytes]]:
     """Run a step with the content of its files; return the function's answer, and the files that it wrote.
 
@@ -105,40 +109,31 @@ def run_with_files(
     contents
         By path on the service's machine, every file that the step reads.
     """
-    place = _folder() / hashlib.sha256(task.folder.encode()).hexdigest()[:24]
-    local = {path: place / f"{hashlib.sha256(path.encode()).hexdigest()[:16]}-{Path(path).name}" for path in contents}
+    place = _folder() / hashlib.sha256(str(task.folder).encode()).hexdigest()[:24]
     folder = place / "results"
     folder.mkdir(parents=True, exist_ok=True)
+    there = {}
     for path, content in contents.items():
-        target = folder / Path(path).name if Path(path).parent == Path(task.folder) else local[path]
-        local[path] = target
+        name = (
+            path.name
+            if path.parent == task.folder
+            else f"{hashlib.sha256(str(path).encode()).hexdigest()[:16]}-{path.name}"
+        )
+        target = there[path] = (folder if path.parent == task.folder else place) / name
         # the reference's files are the same each time: what is there is not written again
         if not target.exists() or target.stat().st_size != len(content) or target.read_bytes() != content:
             aside = target.with_name(f".{target.name}.{os.getpid()}.part")
             aside.write_bytes(content)
             aside.replace(target)
-    there = {str(path): str(target) for path, target in local.items()}
-    moved = replace(
-        task,
-        folder=str(folder),
-        calibration=there[task.calibration],
-        images={which: there[path] for which, path in task.images.items()},
-        noise=None if task.noise is None else there[task.noise],
-        averages={there[path]: value for path, value in task.averages.items() if path in there},
-        earlier={
-            n: replace(step, images=(there[step.images[0]], there[step.images[1]])) for n, step in task.earlier.items()
-        },
-        following=None,
-    )
+    moved = task.moved(folder, there)
     answer = run(name, topic, threads, function, moved)
     written = {}
-    for file in (f"starts_{task.n:04d}.npz", f"step_{task.n:04d}.nc"):  # the result last
+    for file in (f"starts_{task.step.n:04d}.npz", f"step_{task.step.n:04d}.nc"):  # the result last
         if (folder / file).is_file():
             written[file] = (folder / file).read_bytes()
     with contextlib.suppress(OSError):  # read once
-        for which in ("cur1", "cur2"):
-            if task.images[which] not in (task.images["ref1"], task.images["ref2"]):
-                Path(moved.images[which]).unlink(missing_ok=True)
+        for image in set(moved.step.files) - set(moved.reference.files):
+            image.unlink(missing_ok=True)
     return answer, written
 
 

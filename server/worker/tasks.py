@@ -6,27 +6,40 @@ The functions import the numerical modules when they are called, so that only th
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from core.settings import StoredSettings
 
 
-@dataclass(frozen=True)
-class EarlierStep:
-    """Images of a step that was measured.
+@dataclass(frozen=True, kw_only=True)
+class StepImages:
+    """One step's images, and what is known about them.
 
-    Parameters
+    Attributes
     ----------
-    images
-        Paths of camera 1's and camera 2's.
-    sha256
-        Of their files, as recorded.
+    n
+        Number of the step.
+    files, sha256
+        Of camera 1 and camera 2.
+    averages
+        How many frames each is the mean of, and what its grey levels were multiplied by.
     """
 
-    images: tuple[str, str]
+    n: int
+    files: tuple[Path, Path]
     sha256: tuple[str, str]
+    averages: tuple[int, float] = (1, 1.0)
 
 
-@dataclass(frozen=True)
+def averages_of(step: Mapping[str, Any]) -> tuple[int, float]:
+    """How many frames a step's images are means of, and what their grey levels were multiplied by."""
+    return int(step.get("frames") or 1), float(step.get("grey_scale") or 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class StepTask:
     """One step of one analysis; plain paths and values, so that any executor can carry it.
 
@@ -36,26 +49,20 @@ class StepTask:
         The analysis' folder; the result goes there as ``step_<nnnn>.nc``.
     calibration
         Path of the test's calibration.
-    kind
-        ``shape`` of the pair ``ref1``, ``ref2``, or ``motion`` from it to ``cur1``, ``cur2``.
-    n
-        Number of the step that is measured.
+    settings
+        Of the analysis.
     reference
-        Number of the reference step, whose shape is measured first.
-    images
-        Paths ``ref1``, ``ref2``, ``cur1``, ``cur2``.
+        The step whose shape is measured first.
+    step
+        The step to measure; the reference itself for its shape.
     previous
         Number of the step measured before, whose field gives start values.
-    settings
-        Region, subset and models, as in ``analysis.json``.
-    inputs
-        Name and SHA-256 of each input file.
+    about
+        Further text attributes of the result file.
     following
-        Paths of the images of the step that will probably be asked for next, to be read meanwhile.
+        The step that will probably be asked for next, to be read meanwhile.
     noise
         Path of the noise models, or None.
-    averages
-        By an image's path: how many frames it is the mean of, and what its grey levels were multiplied by.
     earlier
         By number, the steps between the reference and this one that were measured: this one may be matched against
         them.
@@ -63,22 +70,47 @@ class StepTask:
         Whether later steps start from what this one finds.
     """
 
-    folder: str
-    calibration: str
-    kind: Literal["shape", "motion"]
-    n: int
-    reference: int
-    images: dict[str, str]
+    folder: Path
+    calibration: Path
+    settings: StoredSettings
+    reference: StepImages
+    step: StepImages
     previous: int | None
-    settings: dict[str, Any]
-    inputs: dict[str, str]
-    label: str
-    load_n: float | None
-    following: tuple[str, str] | None = None
-    noise: str | None = None
-    averages: dict[str, tuple[int, float]] = field(default_factory=dict)
-    earlier: dict[int, EarlierStep] = field(default_factory=dict)
+    about: dict[str, str] = field(default_factory=dict)
+    following: StepImages | None = None
+    noise: Path | None = None
+    earlier: dict[int, StepImages] = field(default_factory=dict)
     keeps_starts: bool = True
+
+    def files(self) -> list[Path]:
+        """Return every file that the step reads, as far as they are there."""
+        steps = [self.reference, self.step, *self.earlier.values()]
+        paths = [self.calibration, *(path for step in steps for path in step.files)]
+        if self.noise is not None:
+            paths.append(self.noise)
+        if self.step.n != self.reference.n:
+            results = {self.reference.n, *([] if self.previous is None else [self.previous]), *self.earlier}
+            for n in sorted(results - {self.step.n}):
+                paths += [self.folder / f"step_{n:04d}.nc", self.folder / f"starts_{n:04d}.npz"]
+        paths.append(self.folder / "mask.png")
+        return [path for path in dict.fromkeys(paths) if path.is_file()]
+
+    def moved(self, folder: Path, there: Mapping[Path, Path]) -> StepTask:
+        """Return the same step with its files elsewhere, and nothing to be read ahead."""
+
+        def at(step: StepImages) -> StepImages:
+            return replace(step, files=(there[step.files[0]], there[step.files[1]]))
+
+        return replace(
+            self,
+            folder=folder,
+            calibration=there[self.calibration],
+            reference=at(self.reference),
+            step=at(self.step),
+            following=None,
+            noise=None if self.noise is None else there[self.noise],
+            earlier={n: at(step) for n, step in self.earlier.items()},
+        )
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,16 @@ from core.errors import Cancelled, FileFormatError, MeasurementError, StereorigE
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
 from server.formats.files import sha256_of
+from server.formats.results.settings import stored_settings
+from server.formats.results.summary import SequenceSummary
+from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
+from server.store.folder import now_utc
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
-from server.worker.tasks import EarlierStep, StepTask, measure_step
+from server.worker.tasks import StepImages, StepTask, averages_of, measure_step
 from server.workflows.camera_identity import check_same_cameras
-from server.workflows.noise_sequence import averages_of
 from server.workflows.service import Service
 from server.workflows.waiting import run_side_by_side, run_task
 
@@ -204,7 +207,8 @@ class AnalysisRun:
     def _note(self, job: Job, n: int, summary: dict[str, Any], started: float) -> None:
         """A step is finished: durable first, then told."""
         service, analysis_id = self._service, self._document["id"]
-        summary = without_nan({"n": n, **summary, "wall_s": round(time.monotonic() - started, 3)})
+        seconds = round(time.monotonic() - started, 3)
+        summary = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
         service.tests.put_step_summary(self._test_id, analysis_id, n, summary)
         self._summaries[n] = summary
         self._done[n] = service.tests.step(self._test_id, n)
@@ -260,63 +264,57 @@ def task_of(
             )
     if sha256_of(service.tests.calibration_file(test_id)) != document["inputs"]["calibration_sha256"]:
         raise calibration_changed(f"of test {test_id}, on which the analysis rests,")
-    checksums = {
-        "calibration.json": document["inputs"]["calibration_sha256"],
-        **{f"reference_{cam}": digest for cam, digest in ref.document["sha256"].items()},
-        **{f"step_{cam}": digest for cam, digest in now.document["sha256"].items()},
-    }
-    noise = document["settings"].get("noise")
-    if noise:
-        checksums["noise.json"] = noise["sha256"]
+    settings = stored_settings(document["settings"])
     earlier: dict[int, StepFiles] = {}
-    if displacement and document["settings"].get("reference_update", "never") != "never":
+    if displacement and settings.reference_update != "never":
         earlier = {k: step for k, step in done.items() if k != reference}
     after = None
     if following is not None and displacement:
         with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
             after = service.tests.step(test_id, following)
+    about = {"label": str(now.document["label"]), "test_step": str(n)}
+    if now.document["load_n"] is not None:
+        about["load_n"] = repr(now.document["load_n"])
+    folder = service.tests.analysis_path(test_id, document["id"])
     return StepTask(
-        folder=str(service.tests.analysis_path(test_id, document["id"])),
-        calibration=str(service.tests.calibration_file(test_id)),
-        kind="motion" if n != reference else "shape",
-        n=n,
-        reference=reference,
-        images={"ref1": str(ref.cam1), "ref2": str(ref.cam2), "cur1": str(now.cam1), "cur2": str(now.cam2)},
+        folder=folder,
+        calibration=service.tests.calibration_file(test_id),
+        settings=settings,
+        reference=images_of(reference, ref),
+        step=images_of(n, now),
         previous=next(reversed(done), None),
+        about=about,
+        following=None if after is None or following is None else images_of(following, after),
+        noise=folder / "noise.json" if settings.noise is not None else None,
+        earlier={k: images_of(k, step) for k, step in earlier.items()},
         keeps_starts=displacement and (n == reference or not is_independent(document)),
-        settings=document["settings"],
-        inputs=checksums,
-        noise=str(service.tests.analysis_path(test_id, document["id"]) / "noise.json") if noise else None,
-        averages={
-            str(path): averages_of(step.document)
-            for step in (ref, now, after, *earlier.values())
-            if step is not None
-            for path in (step.cam1, step.cam2)
-        },
-        label=now.document["label"],
-        load_n=now.document["load_n"],
-        following=None if after is None else (str(after.cam1), str(after.cam2)),
-        earlier={
-            k: EarlierStep(
-                (str(step.cam1), str(step.cam2)), (step.document["sha256"]["cam1"], step.document["sha256"]["cam2"])
-            )
-            for k, step in earlier.items()
-        },
+    )
+
+
+def images_of(n: int, step: StepFiles) -> StepImages:
+    """Return a stored step's images as the worker is told of them."""
+    sha256 = step.document["sha256"]
+    return StepImages(
+        n=n, files=(step.cam1, step.cam2), sha256=(sha256["cam1"], sha256["cam2"]), averages=averages_of(step.document)
     )
 
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
     """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
-    found = job.result or {}
-    document = {
-        "analysis_id": analysis_id,
-        "state": state,
-        "job_id": job.id,
-        "problem": job.problem,
-        "steps": found.get("steps", []),
-        "steps_failed": found.get("steps_failed", {}),
-    }
-    service.tests.put_summary(test_id, analysis_id, document)
+    found, document = job.result or {}, service.tests.analysis(test_id, analysis_id)
+    steps = found.get("steps", [])
+    summary = SequenceSummary(
+        state=state,
+        software_version=software_version(),
+        created=now_utc(),
+        calibration={"sha256": document["inputs"]["calibration_sha256"]},
+        settings=document["settings"],
+        seconds=round(sum(step.get("wall_s", 0.0) for step in steps), 3),
+        steps=steps,
+        steps_failed=found.get("steps_failed", {}),
+    ).document()
+    summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": job.problem}
+    service.tests.put_summary(test_id, analysis_id, summary)
     if state == "succeeded":
         service.tests.drop_starts(test_id, analysis_id)
     else:

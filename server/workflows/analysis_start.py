@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import InputError, StateError
+from core.settings import AnalysisSettings
 from server.compute.region import make_grid
 from server.formats.files import sha256_of
 from server.formats.images import decode_mask, read_image
@@ -89,7 +90,9 @@ def check_calibration(service: Service, test_id: str, calibration: Path) -> None
         raise calibration_changed(f"of test {test_id}")
 
 
-def check_region(service: Service, test_id: str, reference: int, settings: dict[str, Any], mask: bytes | None) -> None:
+def check_region(
+    service: Service, test_id: str, reference: int, settings: AnalysisSettings, mask: bytes | None
+) -> None:
     """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
     image = read_image(service.tests.step(test_id, reference).cam1)
     make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))

@@ -41,8 +41,3 @@ def close(service: Service, job: Job, noise_id: str, state: str) -> None:
     if state != "succeeded" and job.problem is not None:
         service.noise.put_failure(noise_id, {**job.problem, "job_state": state})
     service.hub.publish("noise", {"noise_id": noise_id, "state": service.noise.read(noise_id)["state"]})
-
-
-def averages_of(step: dict[str, Any]) -> tuple[int, float]:
-    """How many frames a step's images are means of, and what their grey levels were multiplied by."""
-    return int(step.get("frames") or 1), float(step.get("grey_scale") or 1.0)

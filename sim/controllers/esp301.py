@@ -7,15 +7,17 @@ CR LF. The list of error texts is the manual's (appendix A).
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Unpack
 
-from sim.controllers.axis import SimAxis, SimClock, Trouble
-from sim.controllers.wire import WireController
+from sim.controllers.axis import SimAxis, Trouble
+from sim.controllers.wire import Motion, WireAxis, WireController
 
 _COMMAND = re.compile(r"(\d*)([A-Z]{2})(.*)")
 _LONGEST_LINE = 80
@@ -61,12 +63,7 @@ class _Refusal(Exception):
 
 
 @dataclass
-class _Axis:
-    motor: SimAxis
-    low_mm: float
-    high_mm: float
-    max_velocity_mm_s: float
-    max_acceleration_mm_s2: float
+class _Axis(WireAxis):
     power: bool = False
     homing: bool = False
     unit: int = 2
@@ -90,6 +87,31 @@ class _Axis:
         return value * self.mm_per_unit
 
 
+@dataclass(frozen=True)
+class _Setting:
+    """A value that a word shows and sets: its name, of the motor or of the axis, and the error where it is refused."""
+
+    name: str
+    allowed: Callable[[_Axis, float], bool] = lambda _axis, _value: True
+    code: int = 0
+    of_motor: bool = False
+
+
+def _accelerates(axis: _Axis, value: float) -> bool:
+    return 0 < value <= axis.max_acceleration_mm_s2
+
+
+_SETTINGS = {
+    "VA": _Setting("velocity_mm_s", lambda axis, value: 0 < value <= axis.max_velocity_mm_s, 10, of_motor=True),
+    "AC": _Setting("acceleration_mm_s2", _accelerates, 11, of_motor=True),
+    "AG": _Setting("deceleration_mm_s2", _accelerates, 11),
+    "VU": _Setting("max_velocity_mm_s", lambda _axis, value: value > 0, 1),
+    "AU": _Setting("max_acceleration_mm_s2", lambda _axis, value: value > 0, 1),
+    "SL": _Setting("low_mm"),
+    "SR": _Setting("high_mm"),
+}
+
+
 class SimESP301(WireController):
     """The simulated controller.
 
@@ -97,44 +119,17 @@ class SimESP301(WireController):
     ----------
     axes
         How many axes, 1 to 3.
-    travel_mm
-        (low, high) software limits that it reports, measured from home.
-    velocity_mm_s, acceleration_mm_s2
-        Power-on values.
-    time_scale
-        How many times faster than real its axes run; the speeds that it reports stay those of the stage.
-    start_mm
-        Where the axes stand at power-on, from home.
+    motion
+        See `sim.controllers.wire.Motion`.
     """
 
     terminator = b"\r"
 
-    def __init__(
-        self,
-        *,
-        axes: int = 3,
-        travel_mm: tuple[float, float] = (-50.0, 50.0),
-        velocity_mm_s: float = 10.0,
-        acceleration_mm_s2: float = 40.0,
-        time_scale: float = 1.0,
-        start_mm: float = 0.0,
-    ) -> None:
-        super().__init__()
+    def __init__(self, *, axes: int = 3, **motion: Unpack[Motion]) -> None:
+        super().__init__(motion.get("time_scale", 1.0))
         if not 1 <= axes <= 3:
             raise ValueError(f"an ESP301 has 1 to 3 axes, not {axes}")
-        self.clock = SimClock(time_scale)
-        self._axes = {
-            number: _Axis(
-                SimAxis(
-                    self.clock, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2, start_mm=start_mm
-                ),
-                travel_mm[0],
-                travel_mm[1],
-                max_velocity_mm_s=4 * velocity_mm_s,
-                max_acceleration_mm_s2=10 * acceleration_mm_s2,
-            )
-            for number in range(1, axes + 1)
-        }
+        self._axes = {number: _Axis.make(self.clock, **motion) for number in range(1, axes + 1)}
         self._queue: deque[tuple[int, int]] = deque(maxlen=10)
         self._words: dict[str, Callable[[int, _Axis, str], str | None]] = {
             "PA": self._pa,
@@ -149,14 +144,8 @@ class SimESP301(WireController):
             "OR": self._or,
             "DH": self._dh,
             "ST": self._st,
-            "VA": self._va,
-            "VU": self._vu,
-            "AU": self._au,
-            "AC": self._ac,
-            "AG": self._ag,
-            "SL": self._sl,
-            "SR": self._sr,
             "SN": self._sn,
+            **{word: functools.partial(self._setting, setting) for word, setting in _SETTINGS.items()},
             "ID": lambda number, _a, _p: f"SIM-LTA-HS, SN{number:04d}",
         }
 
@@ -307,43 +296,14 @@ class SimESP301(WireController):
             self._error(20, number)
         return None
 
-    def _va(self, number: int, axis: _Axis, parameter: str) -> str | None:
+    def _setting(self, setting: _Setting, number: int, axis: _Axis, parameter: str) -> str | None:
+        owner = axis.motor if setting.of_motor else axis
         if parameter == "?":
-            return axis.show(axis.motor.velocity_mm_s)
+            return axis.show(getattr(owner, setting.name))
         value = axis.take(parameter)
-        if not 0 < value <= axis.max_velocity_mm_s:
-            raise _Refusal(10, number)
-        axis.motor.velocity_mm_s = value
-        return None
-
-    def _ac(self, number: int, axis: _Axis, parameter: str) -> str | None:
-        if parameter == "?":
-            return axis.show(axis.motor.acceleration_mm_s2)
-        value = axis.take(parameter)
-        if not 0 < value <= axis.max_acceleration_mm_s2:
-            raise _Refusal(11, number)
-        axis.motor.acceleration_mm_s2 = value
-        return None
-
-    def _ag(self, number: int, axis: _Axis, parameter: str) -> str | None:
-        if parameter == "?":
-            return axis.show(axis.deceleration_mm_s2)
-        value = axis.take(parameter)
-        if not 0 < value <= axis.max_acceleration_mm_s2:
-            raise _Refusal(11, number)
-        axis.deceleration_mm_s2 = value
-        return None
-
-    def _sl(self, _number: int, axis: _Axis, parameter: str) -> str | None:
-        if parameter == "?":
-            return axis.show(axis.low_mm)
-        axis.low_mm = axis.take(parameter)
-        return None
-
-    def _sr(self, _number: int, axis: _Axis, parameter: str) -> str | None:
-        if parameter == "?":
-            return axis.show(axis.high_mm)
-        axis.high_mm = axis.take(parameter)
+        if not setting.allowed(axis, value):
+            raise _Refusal(setting.code, number)
+        setattr(owner, setting.name, value)
         return None
 
     def _sn(self, number: int, axis: _Axis, parameter: str) -> str | None:
@@ -352,22 +312,4 @@ class SimESP301(WireController):
         if int(parameter) not in _UNITS:
             raise _Refusal(1, number)
         axis.unit = int(parameter)  # as with the real one, the stage stays where it is and its numbers change
-        return None
-
-    def _vu(self, number: int, axis: _Axis, parameter: str) -> str | None:
-        if parameter == "?":
-            return axis.show(axis.max_velocity_mm_s)
-        value = axis.take(parameter)
-        if not value > 0:
-            raise _Refusal(1, number)
-        axis.max_velocity_mm_s = value
-        return None
-
-    def _au(self, number: int, axis: _Axis, parameter: str) -> str | None:
-        if parameter == "?":
-            return axis.show(axis.max_acceleration_mm_s2)
-        value = axis.take(parameter)
-        if not value > 0:
-            raise _Refusal(1, number)
-        axis.max_acceleration_mm_s2 = value
         return None

@@ -7,13 +7,14 @@ leaving that state writes; elsewhere velocity, acceleration and limits are worki
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Unpack
 
-from sim.controllers.axis import SimAxis, SimClock, Trouble
-from sim.controllers.wire import WireController
+from sim.controllers.axis import SimAxis, Trouble
+from sim.controllers.wire import Motion, WireAxis, WireController
 
 _COMMAND = re.compile(r"(\d*)(FRM|FRS|QIL|[A-Z]{2})(\?|[A-Z@]$|[-+.\dEe]*)")
 
@@ -74,19 +75,15 @@ class _Refusal(Exception):
 
 
 @dataclass
-class _Unit:
-    motor: SimAxis
-    low_mm: float
-    high_mm: float
-    max_velocity_mm_s: float
-    max_acceleration_mm_s2: float
-    stored_low_mm: float
-    stored_high_mm: float
+class _Unit(WireAxis):
     kept: dict[str, float] = field(default_factory=lambda: {word: value for word, (value, _, _) in _KEPT.items()})
     flash_writes: int = 0
     state: int = 0x0A
     errors: int = 0
     letter: str = "@"
+
+    def __post_init__(self) -> None:
+        self.stored_low_mm, self.stored_high_mm = self.low_mm, self.high_mm
 
     def group(self) -> str:
         """Return the letter for a command that this state does not allow."""
@@ -103,50 +100,22 @@ class SimSMC100(WireController):
     ----------
     addresses
         Addresses on the chain, 1 to 31.
-    travel_mm
-        (low, high) software limits that each reports, measured from home.
-    velocity_mm_s, acceleration_mm_s2
-        Power-on values.
-    time_scale
-        How many times faster than real the axes run; the speeds that they report stay those of the stage.
-    start_mm
-        Where the axes stand at power-on, from home.
     model
         What each controller says it is.
+    motion
+        See `sim.controllers.wire.Motion`.
     """
 
     terminator = b"\r\n"
 
     def __init__(
-        self,
-        *,
-        addresses: tuple[int, ...] = (1, 2),
-        travel_mm: tuple[float, float] = (-50.0, 50.0),
-        velocity_mm_s: float = 10.0,
-        acceleration_mm_s2: float = 40.0,
-        time_scale: float = 1.0,
-        start_mm: float = 0.0,
-        model: Model = "SMC100CC",
+        self, *, addresses: tuple[int, ...] = (1, 2), model: Model = "SMC100CC", **motion: Unpack[Motion]
     ) -> None:
-        super().__init__()
+        super().__init__(motion.get("time_scale", 1.0))
         self.model: Model = model
         if not addresses or not all(1 <= address <= 31 for address in addresses):
             raise ValueError(f"addresses lie between 1 and 31, got {addresses}")
-        self.clock = SimClock(time_scale)
-        self._units = {
-            address: _Unit(
-                SimAxis(
-                    self.clock, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2, start_mm=start_mm
-                ),
-                travel_mm[0],
-                travel_mm[1],
-                max_velocity_mm_s=4 * velocity_mm_s,
-                max_acceleration_mm_s2=10 * acceleration_mm_s2,
-                stored_low_mm=travel_mm[0],
-                stored_high_mm=travel_mm[1],
-            )
-            for address in addresses
-        }
+        self._units = {address: _Unit.make(self.clock, **motion) for address in addresses}
         self._words: dict[str, Callable[[_Unit, str], str | None]] = {
             "PA": self._pa,
             "PR": self._pr,
@@ -159,10 +128,10 @@ class SimSMC100(WireController):
             "OR": self._or,
             "MM": self._mm,
             "ST": self._st,
-            "VA": self._va,
-            "AC": self._ac,
-            "SL": self._sl,
-            "SR": self._sr,
+            "VA": functools.partial(self._speed, "velocity_mm_s"),
+            "AC": functools.partial(self._speed, "acceleration_mm_s2"),
+            "SL": functools.partial(self._limit, "low_mm"),
+            "SR": functools.partial(self._limit, "high_mm"),
             "PW": self._pw,
             "RS": self._rs,
             "ID": lambda _u, _p: "SIM-TRA25CC",
@@ -324,52 +293,30 @@ class SimSMC100(WireController):
             unit.kept[other] = 0.0
         return None
 
-    def _va(self, unit: _Unit, parameter: str) -> str | None:
+    def _speed(self, name: str, unit: _Unit, parameter: str) -> str | None:
+        """Show or set ``velocity_mm_s`` or ``acceleration_mm_s2``; in configuration, the largest one too."""
         if parameter == "?":
-            return f"{unit.motor.velocity_mm_s:.4f}"
+            return f"{getattr(unit.motor, name):.4f}"
         self._check_settable(unit)
         value = float(parameter)
         if unit.state == _CONFIGURATION and 1e-6 < value < 1e12:
-            unit.max_velocity_mm_s = value
-        if not 0 < value <= unit.max_velocity_mm_s:
+            setattr(unit, f"max_{name}", value)
+        if not 0 < value <= getattr(unit, f"max_{name}"):
             raise _Refusal("C")
-        unit.motor.velocity_mm_s = value
+        setattr(unit.motor, name, value)
         return None
 
-    def _ac(self, unit: _Unit, parameter: str) -> str | None:
+    def _limit(self, name: str, unit: _Unit, parameter: str) -> str | None:
+        """Show or set ``low_mm`` or ``high_mm``; in configuration, the stored one too."""
         if parameter == "?":
-            return f"{unit.motor.acceleration_mm_s2:.4f}"
+            return f"{getattr(unit, name):.4f}"
         self._check_settable(unit)
         value = float(parameter)
-        if unit.state == _CONFIGURATION and 1e-6 < value < 1e12:
-            unit.max_acceleration_mm_s2 = value
-        if not 0 < value <= unit.max_acceleration_mm_s2:
+        if not 0 <= (value if name == "high_mm" else -value) < 1e12:
             raise _Refusal("C")
-        unit.motor.acceleration_mm_s2 = value
-        return None
-
-    def _sl(self, unit: _Unit, parameter: str) -> str | None:
-        if parameter == "?":
-            return f"{unit.low_mm:.4f}"
-        self._check_settable(unit)
-        value = float(parameter)
-        if not -1e12 < value <= 0:
-            raise _Refusal("C")
-        unit.low_mm = value
+        setattr(unit, name, value)
         if unit.state == _CONFIGURATION:
-            unit.stored_low_mm = value
-        return None
-
-    def _sr(self, unit: _Unit, parameter: str) -> str | None:
-        if parameter == "?":
-            return f"{unit.high_mm:.4f}"
-        self._check_settable(unit)
-        value = float(parameter)
-        if not 0 <= value < 1e12:
-            raise _Refusal("C")
-        unit.high_mm = value
-        if unit.state == _CONFIGURATION:
-            unit.stored_high_mm = value
+            setattr(unit, f"stored_{name}", value)
         return None
 
     def _pw(self, unit: _Unit, parameter: str) -> str | None:

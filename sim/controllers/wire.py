@@ -6,8 +6,9 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Self, TypedDict, Unpack
 
-from sim.controllers.axis import SimAxis
+from sim.controllers.axis import SimAxis, SimClock
 
 
 @dataclass
@@ -57,6 +58,49 @@ class LineFaults:
         return stray + reply
 
 
+class Motion(TypedDict, total=False):
+    """How the axes of a controller move.
+
+    Parameters
+    ----------
+    travel_mm
+        (low, high) software limits that it reports, measured from home; -50 to 50.
+    velocity_mm_s, acceleration_mm_s2
+        Power-on values, 10 and 40; up to four and ten times as much can be set.
+    time_scale
+        How many times faster than real the axes run; the speeds that it reports stay those of the stage.
+    start_mm
+        Where the axes stand at power-on, from home.
+    """
+
+    travel_mm: tuple[float, float]
+    velocity_mm_s: float
+    acceleration_mm_s2: float
+    time_scale: float
+    start_mm: float
+
+
+@dataclass
+class WireAxis:
+    """An axis with the limits that its controller keeps."""
+
+    motor: SimAxis
+    low_mm: float
+    high_mm: float
+    max_velocity_mm_s: float
+    max_acceleration_mm_s2: float
+
+    @classmethod
+    def make(cls, clock: SimClock, **motion: Unpack[Motion]) -> Self:
+        """Make one as it is at power-on."""
+        low_mm, high_mm = motion.get("travel_mm", (-50.0, 50.0))
+        velocity, acceleration = motion.get("velocity_mm_s", 10.0), motion.get("acceleration_mm_s2", 40.0)
+        motor = SimAxis(
+            clock, velocity_mm_s=velocity, acceleration_mm_s2=acceleration, start_mm=motion.get("start_mm", 0.0)
+        )
+        return cls(motor, low_mm, high_mm, 4 * velocity, 10 * acceleration)
+
+
 _MOST_RECEIVED = 200_000
 
 
@@ -73,7 +117,8 @@ class WireController(ABC):
 
     terminator: bytes
 
-    def __init__(self) -> None:
+    def __init__(self, time_scale: float = 1.0) -> None:
+        self.clock = SimClock(time_scale)
         self.line_faults = LineFaults()
         self.received: list[Received] = []
         self._lock = threading.RLock()

@@ -145,7 +145,7 @@ def test_costs_and_parts_split_a_point_s_time() -> None:
     assert sum(split.values()) == pytest.approx(30.0)
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 def test_parts_of_a_fit_are_timed() -> None:
     parts = measure_parts(make_kernel_scene(40), "cubic", 9)
     times = [v for v in asdict(parts).values() if isinstance(v, float)]

@@ -30,7 +30,6 @@ def test_a_sequence_is_rendered_once_and_runs_back_and_forth(tmp_path: Path) -> 
     assert len({data[0], data[1], data[2]}) == 3
 
 
-@pytest.mark.slow
 def test_stages_of_a_sequence_are_told_apart(tmp_path: Path, small: None) -> None:
     files = sequence_files(tmp_path, steps=3, pictures=2, size_px=(240, 200))
     out = tmp_path / "out"
@@ -54,7 +53,6 @@ def test_a_process_of_its_own_is_measured_from_its_start_to_its_end() -> None:
         bench.run_child(["-c", "raise SystemExit(3)"])
 
 
-@pytest.mark.slow
 def test_figures_become_rows_and_sections(tmp_path: Path, small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.bench.speed.page.DOCS", tmp_path)
     figures = Figures(

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from core.calibration import COVARIANCE_NAMES, calibrate
-from tests.support.calibration_truth import PAPER, Array, Grid, nodes, project
-from tests.unit.core.test_calibration import HELD, NOMINAL, make_views
+from tests.support.calibration_truth import HELD, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
 TEN = ("phd", "cx", "cy", "kappa", "alpha", "beta", "gamma", "x0", "y0", "z0")
 SCALE = np.array([1.0, 1.0, 1.0, 1e-9, 1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-1])
@@ -107,6 +106,7 @@ def through_lines(error: Array, degree: int) -> Array:
     return out
 
 
+@pytest.mark.normal_depth("0.0-2")
 @pytest.mark.parametrize(("tolerance", "degree"), [(0.0, None), (0.004, None), (0.0, 1), (0.0, 2)])
 def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float, degree: int | None) -> None:
     runs = 30

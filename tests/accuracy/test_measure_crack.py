@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from sim.render import RenderOptions, render
 from sim.rig import SimRig
 from sim.scene import Scene
 from sim.truth import truth_at
+from tests.support.requirements import ROOT
 
 SIZE = (288, 160)  # the whole crack and what lies above and below it
 CORNER = (112.0, 160.0)
@@ -26,7 +26,7 @@ CORNER = (112.0, 160.0)
 
 @pytest.fixture(scope="module")
 def rig() -> SimRig:
-    return SimRig.from_toml(Path(__file__).resolve().parents[2] / "config" / "sim_panel.toml")
+    return SimRig.from_toml(ROOT / "config" / "sim_panel.toml")
 
 
 def cut(camera: Camera) -> Camera:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -26,6 +24,7 @@ from sim.truth import truth_at
 from tests.accuracy import test_measure_crack as panel
 from tests.support import field_bench as bench
 from tests.support.cut_scenes import STILL, below, parted, reference, true_uvw
+from tests.support.requirements import ROOT
 
 OPTIONS = MeasureOptions(subset_px=21, patch="stretch")
 X = np.linspace(0.0, 263.0, 41)
@@ -78,7 +77,7 @@ def test_both_lips_stand_up_to_the_line(kind: str) -> None:
 
 @pytest.mark.fault(37)
 def test_a_crack_that_ends_inside_the_field() -> None:
-    rig = SimRig.from_toml(Path(__file__).resolve().parents[2] / "config" / "sim_panel.toml")
+    rig = SimRig.from_toml(ROOT / "config" / "sim_panel.toml")
     pair = StereoPair(panel.cut(rig.cam1.camera), panel.cut(rig.cam2.camera))
     before, after = make_scene(rig, "panel", load=0.0), make_scene(rig, "panel", load=35.6)
     model = CrackedPanel()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from core.status import PointStatus
 from sim.rig import SimRig
 from sim.truth import Truth
 from tests.support.field_bench import Images, grid, pair, scene, take, truth
+from tests.support.requirements import ROOT
 
 OPTIONS = MeasureOptions(subset_px=33)
 GRID = grid()
@@ -179,7 +179,7 @@ def test_seeds_given_by_the_user_are_enough(reference: ReferencePair, shape: Fie
 @pytest.mark.fault(17)
 @pytest.mark.parametrize("name", ["sim_paper", "sim_panel", "sim_modern"])
 def test_swapped_cameras_are_told_from_matches_and_right_ones_are_not(name: str) -> None:
-    rig = SimRig.from_toml(Path(__file__).resolve().parents[2] / "config" / f"{name}.toml")
+    rig = SimRig.from_toml(ROOT / "config" / f"{name}.toml")
     cameras = type(pair())(rig.cam1.camera, rig.cam2.camera)
     rng = np.random.default_rng(7)
     width, height = rig.cam1.size_px

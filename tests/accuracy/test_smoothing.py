@@ -97,6 +97,7 @@ def test_a_lone_line_of_points_keeps_its_values():
     np.testing.assert_allclose(got.covariance[7], field.covariance[7], rtol=1e-12)
 
 
+@pytest.mark.normal_depth("3-1")
 @pytest.mark.parametrize(("window", "order"), [(3, 1), (5, 2), (9, 2)])
 def test_told_is_the_scatter(window, order):
     """Points, differences, mean, extensometer and strain of smoothed fields against 600 fields of pixel noise."""

@@ -16,6 +16,7 @@ from tests.support.gauge_field import SUBSET, make_field, pixel_noise, surface
 TURN = Rotation.from_rotvec([0.1, -0.2, 0.4]).as_matrix()
 
 
+@pytest.mark.normal_depth("infinitesimal-3-1-0", "hencky-7-2-0")
 @pytest.mark.parametrize(
     ("tensor", "window", "order", "smooth"),
     [("green_lagrange", 5, 1, 0), ("hencky", 7, 2, 0), ("infinitesimal", 3, 1, 0), ("green_lagrange", 5, 1, 3)],

@@ -30,6 +30,7 @@ def _subset_means(rng, components):
     return means[half : rows - half : STEP, half : cols - half : STEP]
 
 
+@pytest.mark.normal_depth("green_lagrange-2-small", "hencky-1-large")
 @pytest.mark.parametrize("motion", list(MOTIONS))
 @pytest.mark.parametrize(
     ("tensor", "order"), [("green_lagrange", 1), ("green_lagrange", 2), ("infinitesimal", 1), ("hencky", 1)]

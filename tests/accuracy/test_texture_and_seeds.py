@@ -14,9 +14,9 @@ from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.field.seeding.seeds import Seed
 from server.compute.seeds import seeds_of
+from server.formats.results.settings import stored_settings
 from server.results.texture import errors_at, texture_verdict
-from tests.service.test_service_chain import SMALL
-from tests.support.service_rig import new_test, true_cameras
+from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(180)
 API = "/api/v1"
@@ -67,9 +67,13 @@ def test_no_texture_is_no_texture_and_lines_are_not_enough() -> None:
 
 
 def test_seeds_of_settings_old_and_new() -> None:
-    assert seeds_of({"seeds": None}) is None
-    assert seeds_of({"seeds": [[1.0, 2.0]]}) == [Seed((1.0, 2.0))]  # an analysis from before
-    assert seeds_of({"seeds": [[1.0, 2.0], [3.0, 4.0]], "seeds_cam2": [None, [5.0, 6.0]]}) == [
+    def seeds(**said: Any) -> Any:
+        region = {"rectangle": [0, 0, 9, 9]}
+        return seeds_of(stored_settings({"region": region, **said}))
+
+    assert seeds(seeds=None) is None
+    assert seeds(seeds=[[1.0, 2.0]]) == [Seed((1.0, 2.0))]  # an analysis from before
+    assert seeds(seeds=[[1.0, 2.0], [3.0, 4.0]], seeds_cam2=[None, [5.0, 6.0]]) == [
         Seed((1.0, 2.0)),
         Seed((3.0, 4.0), (5.0, 6.0)),
     ]

@@ -10,13 +10,16 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from server.workflows.service import Service
-from tests.browser.test_page_results import ENDS, LINE, Bench, bench, given, page, shown  # noqa: F401
+from tests.support import results_page
 from tests.support.page_bench import Watched, watched
+from tests.support.results_page import ENDS, LINE, Bench, given, shown
 from tests.support.service_rig import served, tiny_config, wait_for_rig
 
 if os.environ.get("CI", "").lower() != "true":
     pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python to test the page")
 from axe_playwright_python.base import AXE_SCRIPT
+
+bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(500)
 expect.set_options(timeout=30_000)  # the machine may be busy
@@ -37,7 +40,7 @@ Audit = Callable[[str], None]
 
 
 @pytest.fixture
-def audit(page: Watched) -> Audit:  # noqa: F811
+def audit(page: Watched) -> Audit:
     """Fail where axe finds anything on the page as it stands, in any of its looks, or it is wider than the screen."""
     return auditor(page.page)
 
@@ -66,7 +69,7 @@ def unfold(at: Page) -> None:
     at.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true })")
 
 
-def test_axe_finds_what_is_wrong(page: Watched, audit: Audit) -> None:  # noqa: F811
+def test_axe_finds_what_is_wrong(page: Watched, audit: Audit) -> None:
     """So that the others can fail."""
     page.open("#/jobs")
     page.page.evaluate("document.querySelector('main').insertAdjacentHTML('beforeend', '<a href=\"#/rig\"></a>')")
@@ -88,7 +91,7 @@ def test_with_nothing_yet(chromium: Browser, tmp_path: Path) -> None:
         service.close()
 
 
-def test_rig(page: Watched, audit: Audit) -> None:  # noqa: F811
+def test_rig(page: Watched, audit: Audit) -> None:
     at = page.open("#/rig")
     for cam in ("cam1", "cam2"):
         image = at.get_by_alt_text(f"Live view of {cam}", exact=True)
@@ -106,7 +109,7 @@ def test_rig(page: Watched, audit: Audit) -> None:  # noqa: F811
     page.sound(409, 422)
 
 
-def test_calibrate(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
+def test_calibrate(page: Watched, bench: Bench, audit: Audit) -> None:
     at = page.open("#/calibrate")
     expect(at.get_by_text("middle of the volume")).to_be_visible()
     expect(at.get_by_role("region", name="Views")).to_be_visible()
@@ -122,7 +125,7 @@ def test_calibrate(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: 
     page.sound(404)
 
 
-def test_tests(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
+def test_tests(page: Watched, bench: Bench, audit: Audit) -> None:
     at = page.open("#/test")
     at.get_by_role("button", name="Make the test").click()
     expect(at.get_by_role("alert")).to_be_visible()
@@ -143,7 +146,7 @@ def test_tests(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
     page.sound()
 
 
-def test_results(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
+def test_results(page: Watched, bench: Bench, audit: Audit) -> None:
     at = page.open("#/results")
     expect(at.get_by_role("heading", name="plate <b>&")).to_be_visible()
     audit("which results there are")
@@ -166,7 +169,7 @@ def test_results(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F8
     page.sound()
 
 
-def test_results_in_space_and_side_by_side(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
+def test_results_in_space_and_side_by_side(page: Watched, bench: Bench, audit: Audit) -> None:
     at = shown(page, bench)
     at.get_by_role("button", name="3-D surface").click()
     expect(at.locator(".space")).to_have_attribute("data-drawn", "2 w_mm")
@@ -182,7 +185,7 @@ def test_results_in_space_and_side_by_side(page: Watched, bench: Bench, audit: A
     page.sound()
 
 
-def test_jobs(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
+def test_jobs(page: Watched, bench: Bench, audit: Audit) -> None:
     at = page.open("#/jobs")
     at.locator("tr.pick button").first.click()
     expect(at.get_by_role("heading", name="Course")).to_be_visible()
@@ -191,7 +194,7 @@ def test_jobs(page: Watched, bench: Bench, audit: Audit) -> None:  # noqa: F811
     page.sound()
 
 
-def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:  # noqa: F811
+def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:
     at = page.open(f"#/test/{bench.test_id}")
     at.get_by_text("Facts for the report").click()
     at.get_by_label("Laboratory").fill("Room <7> & 8")
@@ -212,7 +215,7 @@ def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:  # noqa:
     page.sound()
 
 
-def test_pages_beside_the_page(page: Watched) -> None:  # noqa: F811
+def test_pages_beside_the_page(page: Watched) -> None:
     at = page.page
     at.goto(f"{page.origin}/problems")
     expect(at.get_by_role("heading", level=1)).to_be_visible()

@@ -16,9 +16,8 @@ from playwright.sync_api import Browser, Page, expect
 from core.names import CameraName
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.service.test_service_chain import SMALL
 from tests.support.page_bench import Watched, watched
-from tests.support.service_rig import wait_for_job, wait_for_rig
+from tests.support.service_rig import SMALL, wait_for_job, wait_for_rig
 
 pytestmark = pytest.mark.timeout(500)
 API = "/api/v1"

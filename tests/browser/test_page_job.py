@@ -24,8 +24,8 @@ from playwright.sync_api import Locator, Page, expect
 from core.cameras.camera import Camera
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.browser.test_page_test import Editor
 from tests.support.page_bench import Watched
+from tests.support.page_editor import Editor
 from tests.support.service_rig import SMALL, true_cameras
 
 pytestmark = pytest.mark.timeout(500)

@@ -12,10 +12,9 @@ from playwright.sync_api import Page, expect
 
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.browser.test_page_test import asked
-from tests.service.test_service_chain import SMALL
 from tests.support.page_bench import FOCUS, UNREACHED, Watched, tabbed
-from tests.support.service_rig import new_test, true_cameras
+from tests.support.page_editor import asked
+from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(300)
 expect.set_options(timeout=30_000)  # the machine may be busy

@@ -5,118 +5,27 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from core.cameras.camera import Camera
-from core.field.region.cuts import Cuts
-from server.config.rig_file import parse_config
 from server.formats.calibrations.recognise import load_calibration
-from server.formats.results.reading import read_field
-from server.formats.results.writing import Provenance, write_field
-from server.store.index import analysis_entry
-from server.workflows.service import Service
-from tests.service.test_service_chain import SMALL
+from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
-from tests.support.service_rig import served, wait_for_job, wait_for_rig
+from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown
+
+bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(600)
 expect.set_options(timeout=30_000)  # the machine may be busy
 
-API = "/api/v1"
-RECTANGLE = [60, 60, 180, 170]
 # matplotlib's own numbers at 0, 1/4, 1/2, 3/4 and 1, its documentation's viridis
 VIRIDIS = {0.0: (68, 1, 84), 0.25: (59, 82, 139), 0.5: (33, 145, 140), 0.75: (94, 201, 98), 1.0: (253, 231, 37)}
-
-
-@dataclass
-class Bench:
-    """A measured plate, and the same with points missing and a cut."""
-
-    service: Service
-    client: httpx.Client
-    test_id: str
-    analysis_id: str
-    cut_id: str
-
-    def path(self, analysis_id: str | None = None) -> str:
-        return f"{API}/tests/{self.test_id}/analyses/{analysis_id or self.analysis_id}"
-
-    def field(self, step: int, name: str, analysis_id: str | None = None) -> Any:
-        answer = self.client.get(f"{self.path(analysis_id)}/steps/{step}/fields/{name}")
-        assert answer.status_code == 200, answer.text
-        return np.array(answer.json()["values"], dtype=float)
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("results") / "data").start()
-    try:
-        with served(service) as client:
-            wait_for_rig(client)
-            accepted = client.post(
-                f"{API}/calibrations", json={"positions_mm": [0, 5], "held_out_mm": [2], "frames": 2}
-            )
-            assert wait_for_job(client, accepted.json()["job"])["state"] == "succeeded"
-            body = {"name": "plate <b>&", "calibration_id": accepted.json()["calibration_id"]}
-            test_id = str(client.post(f"{API}/tests", json=body).json()["id"])
-            for pressure in (0.0, 344.5, 689.0):
-                client.put(f"{API}/sim/scene", json={"scene": "plate", "load": pressure})
-                step = {"label": f"{pressure} kPa", "load_n": 2 * pressure, "channels": {"stroke_mm": pressure / 100}}
-                assert client.post(f"{API}/tests/{test_id}/steps", json=step).status_code == 201
-            asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, "strain": {"window": 5}}
-            made = client.post(f"{API}/tests/{test_id}/analyses", json=asked).json()
-            assert wait_for_job(client, made["job"])["state"] == "succeeded"
-            yield Bench(
-                service, client, test_id, made["analysis_id"], with_a_cut(service, test_id, made["analysis_id"])
-            )
-    finally:
-        service.close()
-
-
-def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
-    """The plate's results with three points missing, a cut between two columns, and 1 um more deflection."""
-    whole = service.tests.analysis_path(test_id, analysis_id)
-    told = service.tests.analysis(test_id, analysis_id)
-    kept = {k: told[k] for k in ("kind", "settings", "steps", "inputs", "software")}
-    document = service.tests.create_analysis(test_id, {**kept, "label": "with a cut"})
-    service.catalog.put_entry("analysis", test_id, document["id"], analysis_entry(document))
-    folder = service.tests.analysis_path(test_id, document["id"])
-    for n in told["steps"]:
-        field = read_field(whole / f"step_{n:04d}.nc")
-        field.status[4, 5] = field.status[4, 6] = field.status[8, 2] = 6
-        object.__setattr__(field, "cuts", Cuts([[(155.0, 50.0), (155.0, 120.0)]]))
-        if field.uvw_mm is not None:
-            field.uvw_mm[..., 2] += 1e-3
-        provenance = Provenance({"subset_px": 25, "step_px": 10}, {"a": "b"}, "0.1.0", step=n)
-        write_field(folder / f"step_{n:04d}.nc", field, provenance)
-    return str(document["id"])
-
-
-@pytest.fixture
-def page(chromium: Browser, bench: Bench) -> Iterator[Watched]:
-    with watched(chromium, str(bench.client.base_url).rstrip("/")) as made:
-        yield made
-
-
-def shown(page: Watched, bench: Bench, *, step: int = 2, name: str = "w_mm", analysis_id: str | None = None) -> Page:
-    """Open an analysis and wait until its field is drawn."""
-    page.open(f"#/results/{bench.test_id}/{analysis_id or bench.analysis_id}?step={step}&field={name}")
-    drawn(page.page, f"{step} {name} reference")
-    return page.page
-
-
-def drawn(at: Page, what: str) -> None:
-    at.wait_for_selector(f'canvas[data-role="map"][data-shown="{what}"]', state="attached")
-    at.wait_for_function("() => document.querySelector('canvas[data-role=map]').width === 256")
 
 
 def pixel(at: Page, x: int, y: int) -> list[int]:
@@ -306,15 +215,6 @@ def told_by(at: Page, role: str, condition: str, arg: Any = None) -> None:
     """Wait until what a chart shows fulfils a condition on ``a``, its answer, and ``arg``."""
     answer = f"const a = JSON.parse(document.querySelector('[data-role={role}]').dataset.answer)"
     at.wait_for_function(f"arg => {{ {answer}; return {condition} }}", arg=arg)
-
-
-def given(at: Page, names: tuple[str, ...], values: tuple[float, ...]) -> None:
-    for name, value in zip(names, values, strict=True):
-        at.get_by_label(name, exact=True).fill(str(value))
-
-
-LINE = ("Line from x", "Line from y", "Line to x", "Line to y")
-ENDS = ("Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y")
 
 
 def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:

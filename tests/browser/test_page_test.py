@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import httpx
 import numpy as np
 import pytest
-from playwright.sync_api import Locator, Page, Request, expect
+from playwright.sync_api import Locator, expect
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.service.test_service_chain import SMALL
 from tests.support.page_bench import Watched
-from tests.support.service_rig import new_test, true_cameras
+from tests.support.page_editor import HEIGHT, WIDTH, Editor, asked
+from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(500)
 API = "/api/v1"
 SLOW = 300_000
-WIDTH, HEIGHT = 256, 240
 # width of a drawing on the screen; its bounding box would count the stroke
 ON_SCREEN = "path => path.getBBox().width * path.getScreenCTM().a"
 
@@ -131,66 +129,6 @@ def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: h
     shown.get_by_role("button", name="Measure", exact=True).click()
     expect(shown.get_by_role("alert").filter(has_text="calibration")).to_be_visible()
     page.sound(409, 422)
-
-
-class Editor:
-    """Camera 1's picture, and where its pixels are by the transform that the browser drew it with."""
-
-    def __init__(self, shown: Page, camera: int = 1) -> None:
-        self.page = shown
-        self.view = shown.locator(".view").nth(camera - 1)
-        self.image = self.view.locator(".content > img").first
-        shown.wait_for_function("image => image.naturalWidth === 256", arg=self.image.element_handle())
-        self.show()
-
-    def show(self) -> None:
-        """Bring all of it into the window: what lies outside cannot be clicked."""
-        self.view.evaluate("view => view.scrollIntoView({block: 'end', behavior: 'instant'})")
-
-    def place(self, x: float, y: float) -> tuple[float, float]:
-        box = self.image.bounding_box()
-        assert box is not None
-        return box["x"] + (x + 0.5) / WIDTH * box["width"], box["y"] + (y + 0.5) / HEIGHT * box["height"]
-
-    def click(self, x: float, y: float) -> None:
-        self.page.mouse.click(*self.place(x, y))
-
-    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        self.page.mouse.move(*self.place(*start))
-        self.page.mouse.down()
-        middle = ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
-        self.page.mouse.move(*self.place(*middle))
-        self.page.mouse.move(*self.place(*end))
-        self.page.mouse.up()
-
-    def key(self, name: str, times: int = 1) -> None:
-        frame = self.view.locator(".frame")
-        frame.evaluate("frame => frame.focus({preventScroll: true})")
-        for _ in range(times):
-            self.page.keyboard.press(name)
-
-    def tool(self, name: str) -> None:
-        self.page.get_by_role("toolbar", name="Drawing").get_by_role("button", name=name, exact=True).click()
-        self.show()
-
-
-def asked(shown: Page, path: str, act: Callable[[], object], key: str = "", *like: Any) -> dict[str, Any]:
-    """Return the body that the page sends to an operation once this is done: the one with these numbers under a key.
-
-    What is drawn is judged a little later, so that a body from before may still be under way.
-    """
-
-    def right(request: Request) -> bool:
-        if request.method != "POST" or not request.url.endswith(path):
-            return False
-        if not key:
-            return True
-        found = np.array(json.loads(request.post_data or "{}")["region"].get(key))
-        return found.shape == np.shape(like[0]) and bool(np.abs(found - like[0]).max() <= like[1])
-
-    with shown.expect_request(right, timeout=60_000) as info:
-        act()
-    return dict(json.loads(info.value.post_data or "{}"))
 
 
 @pytest.mark.parametrize("presses", [0, 4])

@@ -28,6 +28,7 @@ from tests.support.camera_bench import (
     reading,
     seconds_until,
 )
+from tests.support.requirements import missing
 
 FAULT_S = 1.0  # a lost camera is shown within this time, at frame periods up to 100 ms
 RETURN_S = 3.0  # and works again this long after its return
@@ -55,9 +56,9 @@ def _make(name: str) -> CameraBench:
     if name == "aravis":
         from tests.support.fake_gige import what_is_missing
 
-        missing = what_is_missing()
-        if missing is not None:
-            missing(missing)
+        lacking = what_is_missing()
+        if lacking is not None:
+            missing(lacking)
         from tests.support.aravis_bench import AravisBench
 
         return AravisBench()

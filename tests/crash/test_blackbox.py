@@ -54,7 +54,7 @@ def calibration_file(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.normal_depth("profile")
 @pytest.mark.parametrize("localiser", ["profile", "paper"])
 def test_calibrate_finds_the_rig_from_pictures(tmp_path: Path, localiser: str) -> None:
     views = tmp_path / "views"
@@ -127,7 +127,6 @@ def test_calibrate_finds_the_rig_from_pictures(tmp_path: Path, localiser: str) -
     assert np.sqrt((error**2).mean(0)).max() < 1.5e-3
 
 
-@pytest.mark.slow
 def test_measure_finds_motion_from_pictures(tmp_path: Path) -> None:
     texture = Waves(0.25, seed=3)
     angle = deg(2.0)

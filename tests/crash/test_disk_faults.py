@@ -87,6 +87,7 @@ class Session:
             self._ask(lambda: self.tests.put_summary(test_id, analysis["id"], {"steps": []}))
 
 
+@pytest.mark.normal_depth("full", "write_error")
 @pytest.mark.fault(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_every_call_that_can_fail_fails_once(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

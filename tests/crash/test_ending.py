@@ -25,10 +25,9 @@ from server.cli.operation.serve import add_arguments
 from server.http.systemd import Notifier
 from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
-from tests.support.requirements import missing
+from tests.support.requirements import ROOT, missing
 from tests.support.stage_service import API, rig_text, wait_until
 
-ROOT = Path(__file__).resolve().parents[2]
 UNIT = ROOT / "deploy" / "stereorig.service"
 
 

@@ -1,42 +1,19 @@
 """Schema fuzzing of the whole API over a running simulated rig: nothing undocumented, nothing that breaks it.
 
-Two files share the cases, so that they run side by side; see test_fuzz_more.py. In CI they are 20,000 together,
-elsewhere fewer; ``make fuzz`` runs on for longer.
+Two files share the cases, so that they run side by side; see test_fuzz_more.py. In depth they are 20,000 together;
+``make fuzz`` runs on for longer.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 
-from tests.support.requirements import missing
-
-IN_CI = os.environ.get("CI") == "true"
+from tests.support.fuzz_verdict import judge
 
 
-def judge(folder: Path, *, phases: tuple[str, ...], each: int, seed: int, least: int) -> None:
-    """Run phases, and fail with everything that they found."""
-    try:
-        from tests.support.api_fuzz import fuzz, running_service
-    except ImportError:  # pragma: no cover - CI has it
-        missing("schemathesis (pip install '.[dev]')")
-        return
-    with running_service(folder) as service:
-        report = fuzz(service, cases_each=each, seed=seed, phases=phases)
-    print(f"{report.cases} cases in {report.seconds:.0f} s, {report.phases}, {dict(sorted(report.statuses.items()))}")
-    found = "\n\n".join(f"{name}\n{text}" for name, text in report.failures.items())
-    assert not report.failures, found
-    assert not report.errors, report.errors
-    undocumented = {status for status in report.statuses if status >= 500} - {503, 507}
-    assert not undocumented
-    assert report.cases >= least
-    # enough must get past the door, or nothing is tried; most values at and beyond bounds are wrong on purpose
-    assert sum(n for status, n in report.statuses.items() if status < 300) > 0.03 * report.cases
-
-
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.timeout(2400)
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.fault(52)

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.crash.test_fuzz import IN_CI, judge
+from tests.support.fuzz_verdict import judge
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(2400)
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.fault(51)
 @pytest.mark.fault(52)
-def test_generated_requests(tmp_path: Path) -> None:
-    each, least = (250, 12_500) if IN_CI else (20, 1_000)
+@pytest.mark.parametrize(("each", "least"), [(8, 400), pytest.param(250, 12_500, marks=pytest.mark.deep)])
+def test_generated_requests(tmp_path: Path, each: int, least: int) -> None:
     judge(tmp_path, phases=("fuzzing",), each=each, seed=20261123, least=least)

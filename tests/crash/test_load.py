@@ -12,12 +12,12 @@ import pytest
 
 from tests.bench.reliability.load import Load, lines, percentile
 from tests.bench.reliability.load_page import BEGIN, END, PAGE
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 24.0
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.fault(50)
 def test_captures_readers_slow_streams_an_analysis_and_stops_at_once(
     tmp_path: Path, record_property: pytest.RecordProperty

@@ -21,11 +21,9 @@ from core.errors import StateError, StorageError
 from server.jobs.job import Phase
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from tests.service.test_service_jobs import Bench
-from tests.support.requirements import missing
+from tests.support.job_bench import Bench
+from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import TINY
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
@@ -42,7 +40,7 @@ def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
         text=True,
         timeout=560,
         check=False,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-6000:]
     return dict(json.loads(done.stdout.splitlines()[-1]))
@@ -60,8 +58,8 @@ subprocess.run(["mount", "-t", "tmpfs", "-o", "size=5m", "tmpfs", str(data)], ch
 from server.config.rig_file import load_config
 from server.workflows.service import Service
 from server.store.verify import verify
-from service_rig import new_test, served, wait_for_job, wait_for_rig
-from tests.crash.test_service_kill import write_test_folder
+from tests.support.service_rig import new_test, served, wait_for_job, wait_for_rig
+from tests.support.copied_tests import write_test_folder
 
 write_test_folder(data / "tests" / "t000007-abcdef", 12)
 (data / "ballast").write_bytes(bytes(1_600_000))
@@ -111,7 +109,6 @@ print(json.dumps(out))
 
 
 @pytest.mark.fault(3)
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_disk_that_fills_up_while_it_captures_and_analyses(tmp_path: Path) -> None:
     out = run_with_mounts(FULL, tmp_path)

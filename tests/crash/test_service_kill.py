@@ -3,51 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import httpx
-import numpy as np
 import pytest
 
-from server.config.rig_file import parse_config
-from server.formats.images import encode_tiff
-from sim.rig import SimRig
-from sim.world import SimWorld
+from tests.support.copied_tests import CONFIG, write_test_folder
+from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY
-
-TIME = "2026-01-01T00:00:00Z"
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = TINY.replace("speckle_mm = 0.45", "speckle_mm = 0.4").replace("kernel_threads = 1", "kernel_threads = 2")
-
-
-def write_test_folder(folder: Path, steps: int, load_a_step: float = 0.0) -> None:
-    """Write a test as another service would have left it: a copied folder is a valid test."""
-    config = parse_config(CONFIG)
-    rig = SimRig.from_dict(config.model_dump(exclude_none=True))
-    world = SimWorld(rig, lambda _: 0.0)
-    rng = np.random.default_rng(5)
-    (folder / "analyses").mkdir(parents=True)
-    pair = world.true_pair()
-    calibration = {"cam1": pair.cam1.paper_parameters(), "cam2": pair.cam2.paper_parameters()}
-    (folder / "calibration.json").write_text(json.dumps(calibration))
-    for n in range(steps):
-        world.set_scene("plate", load=n * load_a_step)
-        step = folder / "steps" / f"{n:04d}"
-        step.mkdir(parents=True)
-        sha256 = {}
-        for cam in ("cam1", "cam2"):
-            content = encode_tiff(world.expose(cam, exposure_ms=10.0, gain_db=0.0, rng=rng))  # type: ignore[arg-type]
-            (step / f"{cam}.tif").write_bytes(content)
-            sha256[cam] = hashlib.sha256(content).hexdigest()
-        facts = {"label": "", "load_n": None, "source": "import", "captured_utc": TIME, "skew_ms": None, "quality": {}}
-        document = {"n": n, "test_id": folder.name, **facts, "sha256": sha256}
-        (step / "step.json").write_text(json.dumps(document))
-    document = {"id": folder.name, "name": "copied", "specimen": "", "notes": "", "calibration_id": None}
-    (folder / "test.json").write_text(json.dumps({**document, "created_utc": TIME}))
 
 
 def start(tmp_path: Path) -> tuple[subprocess.Popen[str], httpx.Client]:
@@ -152,6 +118,12 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
         assert client.post(f"/jobs/{rest.json()['job']['id']}/cancel").status_code == 202
         again = client.post(f"{test}/analyses", json={**body, "steps": [1]})
         assert again.status_code == 202
+        assert client.post(f"/jobs/{again.json()['job']['id']}/cancel").status_code == 202
+        deadline = time.monotonic() + 60
+        for ending in (rest, again):  # what still runs may be writing
+            while client.get(f"/jobs/{ending.json()['job']['id']}").json()["finished_utc"] is None:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
         assert not list((tmp_path / "data").rglob(".*.part"))
     finally:
         process.terminate()

@@ -19,15 +19,15 @@ import pytest
 from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
 from tests.bench.reliability.stage_stop import StopTimes
+from tests.support.requirements import ROOT
 from tests.support.stage_service import API, rig_text, wait_until
 
-ROOT = Path(__file__).resolve().parents[2]
 LIMIT_MS = 50.0
 STOPS = 200
 ROUNDS = 3
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.fault(26)
 def test_a_stop_under_full_load_is_on_the_wire_within_50_ms_at_p99(
     tmp_path: Path, record_property: pytest.RecordProperty

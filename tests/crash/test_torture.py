@@ -22,23 +22,24 @@ from tests.bench.reliability.torture_lab import Lab, Pictures
 
 #: the issue's demand
 READY_S = 5.0
-KILLS = int(os.environ.get("STEREORIG_KILLS", "200" if os.environ.get("CI") == "true" else "30"))
+KILLS = 12
+KILLS_IN_DEPTH = int(os.environ.get("STEREORIG_KILLS", "200"))
 
 
 @pytest.mark.fault(1)
 @pytest.mark.fault(2)
-@pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_killed_at_any_instant_it_loses_nothing_and_is_soon_ready(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [KILLS, pytest.param(KILLS_IN_DEPTH, marks=pytest.mark.deep)])
+def test_killed_at_any_instant_it_loses_nothing_and_is_soon_ready(tmp_path: Path, kills: int) -> None:
     seed = random.SystemRandom().randrange(10**6)
-    print(f"python -m tests.bench.reliability.torture --kills {KILLS} --seed {seed}")
-    outcome = torture(tmp_path, KILLS, seed, tell=print)
+    print(f"python -m tests.bench.reliability.torture --kills {kills} --seed {seed}")
+    outcome = torture(tmp_path, kills, seed, tell=print)
     print(summary(outcome))
     if (path := os.environ.get("STEREORIG_KILLS_JSON")) is not None:  # for the page, with others: torture --page
         Path(path).write_text(json.dumps(outcome.document()))
     assert not outcome.wrong, outcome.wrong
-    assert sum(outcome.kills.values()) == KILLS
-    assert outcome.counts["steps"] > KILLS
+    assert sum(outcome.kills.values()) == kills
+    assert outcome.counts["steps"] > kills
     # nothing of a killed service lives on beside the next one
     assert statistics.median(outcome.left_s) < 1.0
     # on a machine that has other things to do, what counts is the processor time that a start takes

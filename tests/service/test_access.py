@@ -27,11 +27,10 @@ from server.cli.main import main
 from server.cli.operation.serve import check_host, check_tls, tls_is_missing
 from server.http.access import KeyFile
 from server.workflows.service import Service
-from tests.support.requirements import missing
+from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import TINY, tiny_config
 
 API = "/api/v1"
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @contextlib.contextmanager

@@ -20,12 +20,11 @@ import pytest
 
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.crash.test_service_kill import CONFIG, write_test_folder
-from tests.service.test_continue_follow import API, BODY, begin, contents, folder_of, wait_for_steps
-from tests.support.requirements import missing
+from tests.support.copied_tests import CONFIG, write_test_folder
+from tests.support.requirements import ROOT, missing
+from tests.support.running_analyses import API, BODY, begin, contents, folder_of, wait_for_steps
 from tests.support.service_rig import a_second, served, wait_for_job
 
-ROOT = Path(__file__).resolve().parents[2]
 STEPS = 7
 INDEPENDENT = {"start_from": "reference"}
 
@@ -184,7 +183,6 @@ def test_a_killed_workers_steps_are_done_again(elsewhere: Place, here: Any, clus
 
 
 @pytest.mark.fault(43)
-@pytest.mark.flaky(reruns=2)  # the second is by the clock, and the machine may be busy
 def test_an_analysis_on_the_cluster_is_cancelled_within_a_second_and_goes_on(elsewhere: Place, here: Any) -> None:
     client = elsewhere.client
     url, job = begin(client, URL, **INDEPENDENT)

@@ -11,18 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import netCDF4
 import numpy as np
 import pytest
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
-from tests.crash.test_service_kill import CONFIG, write_test_folder
-from tests.support.service_rig import a_second, served, wait_for_job
+from tests.support.copied_tests import write_test_folder
+from tests.support.running_analyses import API, BODY, Place, begin, contents, folder_of, wait_for_steps
+from tests.support.service_rig import a_second, wait_for_job
 
-API = "/api/v1"
 STEPS = 5
-BODY: dict[str, Any] = {"region": {"rectangle": [30, 30, 120, 110]}, "subset_px": 21, "step_px": 8}
 
 
 @pytest.fixture(scope="module")
@@ -31,29 +27,6 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("taken") / "t000001-abcdef"
     write_test_folder(folder, STEPS, load_a_step=150.0)
     return folder
-
-
-class Place:
-    """A service on a data folder, begun anew when wanted."""
-
-    def __init__(self, data: Path) -> None:
-        self.data = data
-        self.service: Any = None
-        self.client: Any = None
-        self._context: Any = None
-
-    def start(self) -> httpx.Client:
-        self.stop()
-        self.service = Service(parse_config(CONFIG), self.data).start()
-        self._context = served(self.service)
-        self.client = self._context.__enter__()
-        return self.client
-
-    def stop(self) -> None:
-        if self.service is not None:
-            self._context.__exit__(None, None, None)
-            self.service.close()
-            self.service = None
 
 
 @pytest.fixture(scope="module")
@@ -70,25 +43,10 @@ def test_url(taken: Path) -> str:
     return f"{API}/tests/{taken.name}"
 
 
-def begin(client: httpx.Client, url: str, **changes: Any) -> tuple[str, dict[str, Any]]:
-    accepted = client.post(f"{url}/analyses", json={**BODY, **changes})
-    assert accepted.status_code == 202, accepted.text
-    return f"{url}/analyses/{accepted.json()['analysis_id']}", accepted.json()["job"]
-
-
 def succeed(client: httpx.Client, job: dict[str, Any]) -> dict[str, Any]:
     done = wait_for_job(client, job)
     assert done["state"] == "succeeded", done["problem"]
     return done
-
-
-def wait_for_steps(client: httpx.Client, url: str, count: int, seconds: float = 240.0) -> None:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if len(client.get(url).json()["steps_finished"]) >= count:
-            return
-        time.sleep(0.005)
-    raise AssertionError(client.get(url).text)
 
 
 @pytest.fixture(scope="module")
@@ -97,17 +55,6 @@ def plain(place: Place, test_url: str) -> str:
     url, job = begin(place.client, test_url)
     succeed(place.client, job)
     return url
-
-
-def folder_of(place: Place, url: str) -> Path:
-    parts = url.split("/")
-    return place.data / "tests" / parts[-3] / "analyses" / parts[-1]
-
-
-def contents(path: Path) -> dict[str, Any]:
-    with netCDF4.Dataset(path) as data:
-        data.set_auto_mask(False)
-        return {name: np.asarray(variable[...]) for name, variable in data.variables.items()}
 
 
 def assert_close(told: Any, expected: Any) -> None:
@@ -140,7 +87,6 @@ def assert_same_results(place: Place, one: str, two: str) -> None:
 
 
 @pytest.mark.fault(43)
-@pytest.mark.flaky(reruns=2)  # the second is by the clock, and the machine may be busy
 @pytest.mark.parametrize("update", ["auto", "always"])
 def test_a_cancelled_analysis_goes_on_as_if_nothing_had_been(
     place: Place, test_url: str, plain: str, update: str
@@ -300,7 +246,6 @@ def test_an_analysis_follows_its_test_and_leaves_the_lane_to_others(
 
 
 @pytest.mark.fault(43)
-@pytest.mark.flaky(reruns=2)
 def test_a_follower_that_waits_is_cancelled_at_once_and_goes_on_when_asked(
     place: Place, taken: Path, plain: str, growing: str
 ) -> None:

@@ -28,6 +28,7 @@ from server.cli import main
 from server.cli.operation.devices import report
 from server.rig.devices import DeviceFinder, DeviceListing, HeldDevice
 from server.workflows.service import Service
+from tests.support.requirements import ROOT
 from tests.support.service_rig import served, wait_for_rig
 
 API = "/api/v1"
@@ -281,7 +282,7 @@ def test_a_simulated_controller_can_be_run_apart(driver: str, pty_too: tuple[str
         [sys.executable, "-c", code, "simstage", "--driver", driver, "--port", "0", *pty_too],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=ROOT,
     ) as process:
         try:
             assert process.stdout is not None
@@ -293,7 +294,10 @@ def test_a_simulated_controller_can_be_run_apart(driver: str, pty_too: tuple[str
                 stage.close()
         finally:
             process.send_signal(signal.SIGINT)
-            assert process.wait(10) == 130
+            try:
+                assert process.wait(10) == 130
+            finally:
+                process.kill()
 
 
 @pytest.mark.parametrize("options", [["--axes", "4"], ["--travel", "1", "5"], ["--port", "70000"]])

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from server.workflows.service import Service
-from tests.crash.test_service_kill import write_test_folder
+from tests.support.copied_tests import write_test_folder
 from tests.support.service_rig import served, tiny_config, wait_for_job, wait_for_rig
 
 API = "/api/v1"

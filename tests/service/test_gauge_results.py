@@ -21,7 +21,7 @@ from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.strain import StrainOptions, surface_strain
 from server.cli.main import main
-from server.formats.results.reading import read_attributes, read_field
+from server.formats.results.reading import read_field, read_head
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.workflows.service import Service
@@ -415,11 +415,11 @@ def test_fields_are_written_in_the_frame_and_without_the_motion(
     moved, measured = (read_field(folder / "step_0002.nc") for folder in (out, results))
     np.testing.assert_array_equal(moved.status, measured.status)
     assert np.nanmean(np.abs(moved.uvw_mm)) < 0.05 < np.nanmean(np.abs(measured.uvw_mm))
-    told = read_attributes(out / "step_0002.nc")
-    transformation = json.loads(told["transformation"])
+    told = read_head(out / "step_0002.nc")
+    transformation = json.loads(str(told.attributes["transformation"]))
     assert transformation["align"]["kind"] == "plane"
     assert transformation["rigid_motion"]["values"]["rotation_z_rad"]["value"] is not None
-    assert told["inputs_sha256"] == INPUTS
+    assert told.inputs_sha256 == INPUTS
     for wrong in ((results, *options, "--field-out", results), (results, "--point", "60,80", "--field-out", out)):
         rc, _, err = gauge(capsys, *wrong)
         assert rc == 1

@@ -20,10 +20,11 @@ from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, i
 from server.jobs.hardware import HardwareGate
 from server.worker.embedded import ComputeWorker
 from server.workflows.service import Service
+from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY, new_test, wait_for_job, wait_for_rig
 
 API = "/api/v1"
-ROOT = Path(__file__).resolve().parents[2]
+
 _log = logging.getLogger("stereorig.of_a_test")
 
 

@@ -19,7 +19,7 @@ from server.formats.images import encode_tiff
 from server.store.folder import DataFolder
 from server.store.verify import verify
 from server.workflows.service import Service
-from tests.service.test_service_api import assert_problem
+from tests.support.problems import assert_problem
 from tests.support.service_rig import served, tiny_config, wait_for_job, wait_for_rig
 
 API = "/api/v1"

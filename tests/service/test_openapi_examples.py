@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import jsonschema
@@ -15,6 +14,7 @@ from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.bench.documents.openapi import current
 from tests.support.api_scenario import FILE, Session, operations_of, run, short
+from tests.support.requirements import ROOT
 from tests.support.service_rig import SMALL, served
 
 Json = dict[str, Any]
@@ -189,5 +189,5 @@ def test_examples_of_answers_have_the_keys_of_real_ones(session: Session, descri
 def test_the_description_holds_the_file_of_examples(described: Json) -> None:
     examples = json.loads(EXAMPLES.read_text(encoding="utf-8"))
     assert set(examples) == set(operations_of(described)), COMMAND
-    wheel = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    wheel = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     assert '"api/docs/examples.json"' in wheel  # the service of an installed wheel shows them too

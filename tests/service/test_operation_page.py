@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import httpx
 import pytest
@@ -13,9 +12,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from server.api.docs.problem_pages import known_problems
 from server.cli.main import main
 from server.config.rig_file import ServiceSection
+from tests.support.requirements import ROOT
 from tests.support.service_rig import wait_for_rig
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "operation.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 

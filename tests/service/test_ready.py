@@ -10,7 +10,7 @@ import pytest
 
 import server.store.folder
 from server.workflows.service import Service
-from tests.service.test_service_api import assert_problem
+from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, wait_for_job, wait_for_rig
 
 API = "/api/v1"

@@ -32,7 +32,7 @@ from sim.texture import speckle
 from tests.support.independent_rig import PlainCamera
 from tests.support.report_page import Page
 from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
-from tests.unit.core.test_pattern import two_point_width_mm
+from tests.support.texture_width import two_point_width_mm
 
 API = "/api/v1"
 NASTY = "Plate <script>alert(1)</script> & \"co\" 'x' \u2028 </style>"

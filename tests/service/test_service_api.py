@@ -15,20 +15,10 @@ from PIL import Image
 
 from server.formats.images import decode_image
 from server.workflows.service import Service
+from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, served, tiny_config, wait_for_job, wait_for_rig
 
 API = "/api/v1"
-
-
-def assert_problem(answer: object, status: int, code: str) -> dict[str, object]:
-    assert answer.status_code == status, answer.text  # type: ignore[attr-defined]
-    assert answer.headers["content-type"] == "application/problem+json"  # type: ignore[attr-defined]
-    body: dict[str, object] = answer.json()  # type: ignore[attr-defined]
-    assert body["code"] == code
-    assert body["status"] == status
-    assert body["detail"]
-    assert body["remedy"]
-    return body
 
 
 # system ---------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import encode_tiff
-from server.formats.results.reading import read_attributes
+from server.formats.results.reading import read_head
 from server.workflows.service import Service
 from tests.support.service_rig import served, tiny_config, wait_for_job
 
@@ -87,7 +87,7 @@ def test_specimen_is_measured_with_an_imported_calibration(
     assert np.sqrt(np.nanmean(epipolar**2)) < 0.1  # DICe's calibration is off by 0.08 px in this part of the face
     # an import's system frame is its camera 1, and results say so
     stored = folder / "tests" / test_id / "analyses" / accepted["analysis_id"] / "step_0001.nc"
-    assert read_attributes(stored)["frame"].startswith("sys = camera 1")
+    assert read_head(stored).frame.startswith("sys = camera 1")
     # the copy in the test's folder is the same pair to the last bit
     kept, original = (load_calibration(p) for p in (folder / "tests" / test_id / "calibration.json", xml))
     np.testing.assert_array_equal(kept.pair.cam2_from_cam1.translation_mm, original.pair.cam2_from_cam1.translation_mm)

@@ -19,43 +19,16 @@ import pytest
 
 from core.errors import Cancelled, FileFormatError, StateError, StorageError
 from server.base.errors import BusyError, QueueFullError
-from server.jobs.events import EventHub
 from server.jobs.hardware import HardwareGate
 from server.jobs.job import Job, Phase
-from server.jobs.manager import JobManager
 from server.store.catalog import Catalog
-from server.store.folder import DataFolder, IdMaker
+from server.store.folder import DataFolder
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
 from tests.support import worker_functions as work
+from tests.support.job_bench import Bench
+from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY, new_test, served, tiny_config, wait_for_job, wait_for_rig
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-class Bench:
-    """Jobs without a rig."""
-
-    def __init__(self, folder: Path, queue_limit: int = 2) -> None:
-        self.catalog = Catalog(folder / "catalog.sqlite").open()
-        self.gate = HardwareGate()
-        self.hub = EventHub()
-        self.jobs = JobManager(self.catalog, self.hub, self.gate, IdMaker(), queue_limit=queue_limit)
-        self.jobs.start()
-
-    def close(self) -> None:
-        self.jobs.close()
-        self.gate.close()
-        self.catalog.close()
-
-    def end_of(self, job: Job, seconds: float = 20.0) -> dict[str, Any]:
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            document = self.jobs.document(job.id)
-            if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
-                return document
-            time.sleep(0.005)
-        raise AssertionError(document)
 
 
 @pytest.fixture

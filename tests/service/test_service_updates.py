@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from core.errors import FileFormatError
 from server.api.models import AnalysisRequest
 from server.compute import measurement
 from server.formats.images import write_image
-from server.worker.tasks import EarlierStep, StepTask
+from server.worker.tasks import StepImages, StepTask
 from tests.support import sequence_bench as bench
 
 STEPS = (3, 4, 6, 7)  # as a test numbers them, one is missing
@@ -40,24 +41,20 @@ def tasks(inputs: Path, out: Path, **settings: Any) -> list[StepTask]:
     body = AnalysisRequest.model_validate(
         {"region": {"rectangle": [190, 180, 330, 300]}, "step_px": 14, "patch": "stretch", "strain": None, **settings}
     )
-    chosen = body.model_dump(exclude={"kind", "label", "steps", "noise_id"}) | {"noise": None}
-    paths = {n: (str(inputs / f"cam1_{n}.tif"), str(inputs / f"cam2_{n}.tif")) for n in STEPS}
-    sums = {n: [hashlib.sha256(Path(p).read_bytes()).hexdigest() for p in paths[n]] for n in STEPS}
-    first = STEPS[0]
+    steps = {}
+    for n in STEPS:
+        paths = inputs / f"cam1_{n}.tif", inputs / f"cam2_{n}.tif"
+        one, two = (hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+        steps[n] = StepImages(n=n, files=paths, sha256=(one, two))
     return [
         StepTask(
-            folder=str(out),
-            calibration=str(inputs / "calibration.json"),
-            kind="shape" if k == 0 else "motion",
-            n=n,
-            reference=first,
+            folder=out,
+            calibration=inputs / "calibration.json",
+            settings=body.stored(None),
+            reference=steps[STEPS[0]],
+            step=steps[n],
             previous=STEPS[k - 1] if k else None,
-            settings=chosen,
-            inputs={},
-            label="",
-            load_n=None,
-            images={"ref1": paths[first][0], "ref2": paths[first][1], "cur1": paths[n][0], "cur2": paths[n][1]},
-            earlier={m: EarlierStep(paths[m], (sums[m][0], sums[m][1])) for m in STEPS[1:k]},
+            earlier={m: steps[m] for m in STEPS[1:k]},
         )
         for k, n in enumerate(STEPS)
     ]
@@ -73,7 +70,7 @@ def test_a_fresh_worker_goes_on_from_the_files(inputs: Path, tmp_path: Path) -> 
             source = tmp_path / "one" / f"step_{STEPS[k]:04d}.nc"
             (tmp_path / "fresh" / source.name).write_bytes(source.read_bytes())
             continue
-        measurement._contexts.clear()
+        measurement._kept.clear()
         measurement.measure_step(task)
         with (
             xr.open_dataset(tmp_path / "one" / f"step_{STEPS[k]:04d}.nc") as a,
@@ -85,11 +82,11 @@ def test_a_fresh_worker_goes_on_from_the_files(inputs: Path, tmp_path: Path) -> 
             assert json.loads(a.attrs["settings"])["reference_update"] == "always"
             # a file written anew by somebody else is no reference any more
     document = fresh[3]
-    spoiled = {**document.__dict__, "earlier": {6: EarlierStep(document.earlier[6].images, ("0" * 64, "0" * 64))}}
-    measurement._contexts.clear()
+    spoiled = replace(document, earlier={6: replace(document.earlier[6], sha256=("0" * 64, "0" * 64))})
+    measurement._kept.clear()
     with pytest.raises(FileFormatError, match="checksum"):
-        measurement.measure_step(StepTask(**spoiled))
-    measurement._contexts.clear()
+        measurement.measure_step(spoiled)
+    measurement._kept.clear()
 
 
 def test_smoothed_files_still_tell_what_was_measured(inputs: Path, tmp_path: Path) -> None:
@@ -97,9 +94,9 @@ def test_smoothed_files_still_tell_what_was_measured(inputs: Path, tmp_path: Pat
     for task in made[:3]:
         measurement.measure_step(task)
     known = measurement.measure_step(made[3])["displacement_mm"]
-    measurement._contexts.clear()
+    measurement._kept.clear()
     again = measurement.measure_step(made[3])["displacement_mm"]
-    measurement._contexts.clear()
+    measurement._kept.clear()
     for name in "uvw":
         assert again[name]["mean"] == pytest.approx(known[name]["mean"], abs=1e-8)
 

@@ -26,7 +26,7 @@ from server.workflows.service import Service
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
 from sim.rig import SimRig
-from tests.service.cli.test_cli_measure import rig as rig
+from tests.support.measure_command import rig as rig
 from tests.support.service_rig import wait_for_job
 
 pytestmark = pytest.mark.fault(42)

@@ -25,8 +25,8 @@ from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.store.verify import verify
 from server.workflows.service import Service
-from tests.service.test_service_api import assert_problem
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
+from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, served, tiny_config
 
 API = "/api/v1"
@@ -185,6 +185,7 @@ def small_test(folder: DataFolder, steps: int = 2) -> str:
     return test_id
 
 
+@pytest.mark.normal_depth("full", "write_error")
 @pytest.mark.fault(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_disk_that_fails_while_something_is_deleted_keeps_all_of_it_somewhere(

@@ -23,8 +23,8 @@ from server.store.folder import DataFolder
 from server.store.repair import repair
 from server.store.verify import verify
 from server.workflows.service import Service
-from tests.service.test_service_chain import SMALL
-from tests.support.service_rig import new_test, served, wait_for_job, wait_for_rig
+from tests.support.requirements import ROOT
+from tests.support.service_rig import SMALL, new_test, served, wait_for_job, wait_for_rig
 
 API = "/api/v1"
 
@@ -178,7 +178,7 @@ def test_a_catalogue_that_is_gone_or_wrong_is_made_anew_and_every_difference_lis
 
 @pytest.mark.fault(5)
 def test_a_backup_as_the_operation_page_makes_it_is_whole(data: Path, tmp_path: Path) -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "operation.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "operation.md").read_text(encoding="utf-8")
     left_out = re.findall(r"--exclude='?([^' ]+)", page)
     assert "service.lock" in left_out
     (data / "tests" / ".test.json.12345678.part").write_text("{")  # written at that moment

@@ -31,8 +31,8 @@ from server.api.docs.problem_pages import known_problems
 from server.config.rig_file import parse_config
 from server.workflows.deletion import restore
 from server.workflows.service import Service
-from tests.bench.documents.tiny_rig import tiny_rig
 from tests.support.service_rig import TINY, served, true_cameras, wait_for_job, wait_for_rig
+from tests.support.tiny_rig import tiny_rig
 
 PHASES = ("examples", "coverage", "fuzzing", "stateful")
 _STREAM_S = 0.03  # a reader of a live view or of events leaves after so long

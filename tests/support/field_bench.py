@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from sim.render import RenderOptions, render
 from sim.rig import SimRig
 from sim.scene import Scene
 from sim.truth import Truth, truth_at
+from tests.support.requirements import ROOT
 
 SIZE = (264, 225)  # columns, rows; multiples of three
 _CORNER = (124.0, 128.0)
@@ -27,7 +27,7 @@ Images = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 @lru_cache(maxsize=1)
 def rig() -> SimRig:
-    return SimRig.from_toml(Path(__file__).resolve().parents[2] / "config" / "sim_paper.toml")
+    return SimRig.from_toml(ROOT / "config" / "sim_paper.toml")
 
 
 def _cut(camera: Camera) -> Camera:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-_MARKS = ("fault", "slow")
+_MARKS = ("fault",)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 from core.cameras.camera import RigidTransform
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
-from core.field.reference_update import ReferenceUpdate
 from core.field.region.region import PointGrid
 from core.measure import Earlier, MeasureOptions, ReferencePair
+from core.settings import ReferenceUpdate
 from server.formats.results.reading import read_field
 from server.formats.results.writing import Provenance, write_field
 from sim.scene import Scene

@@ -18,7 +18,7 @@ from core.cameras.camera import ELEVEN_PARAMETER_NAMES
 from server.api.app import create_app
 from server.config.rig_file import RigConfig, parse_config
 from server.workflows.service import Service
-from tests.bench.documents.tiny_rig import TINY, tiny_rig
+from tests.support.tiny_rig import TINY, tiny_rig
 
 # half of the paper rig's pixels: lines of the grid one pixel wide, speckles of four
 SMALL = (

@@ -26,8 +26,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.requirements import ROOT
+
 CACHE = ROOT / ".cache" / "guest"
+_PYTEST = (sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "tests.support.guest_report")
 #: the modules that are loaded, in this order, each after what it depends on
 _MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "vivid", "vhci_hcd", "uvcvideo")
 # Three devices: two webcams, of which the second has the multi-planar interface, and an HDMI input that can cut out
@@ -235,11 +237,21 @@ def run_in_guest(tests: Sequence[str], folder: Path, *, limit_s: float, argument
     first_root.write_bytes(_first_root(kernel))
     report = folder / "report"
     report.mkdir()
-    command = [sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "guest_report", "-p", "no:cacheprovider"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "pytest_timeout",
+        "-p",
+        "tests.support.guest_report",
+        "-p",
+        "no:cacheprovider",
+    ]
     environment = {
         "STEREORIG_V4L2_GUEST": "1",
         "GUEST_REPORT": "/run/report/outcomes",
-        "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}",
+        "PYTHONPATH": str(ROOT),
         "PYTHONDONTWRITEBYTECODE": "1",
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # fewer files to fetch through 9p
         "PATH": os.environ.get("PATH", "/usr/bin:/bin"),
@@ -326,12 +338,22 @@ def collect(tests: Sequence[str]) -> list[tuple[str, list[tuple[str, list[object
         **os.environ,
         "STEREORIG_V4L2_GUEST": "1",
         "GUEST_COLLECT": "1",
-        "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}",
+        "PYTHONPATH": str(ROOT),
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
     }
     for name in [name for name in environment if name.startswith(("PYTEST_XDIST", "PYTEST_CURRENT", "PYTEST_ADDOPTS"))]:
         del environment[name]
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "pytest_timeout", "-p", "guest_report"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "--collect-only",
+        "-q",
+        "-p",
+        "pytest_timeout",
+        "-p",
+        "tests.support.guest_report",
+    ]
     done = subprocess.run([*command, *tests], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
     for line in done.stdout.splitlines():
         if line.startswith("GUEST "):

@@ -14,8 +14,8 @@ from core.errors import ImageError
 from core.field.points.features import Box, Features, Picture, detect_all
 from core.matching.blur import Blur
 from core.matching.image import ImageData, prepare
-from core.matching.options import Interpolation
 from core.noise import NoiseModel
+from core.settings import Interpolation
 
 _TILE = 48
 _LEAST_STRUCTURE = 0.2

@@ -6,12 +6,10 @@ Apart from the choice itself, so that files can be read and written without load
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-PatchSetting = Literal["stretch", "rigid", "curved", "auto"]
-"""What can be asked for."""
-PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
-DEFAULT_PATCH: PatchSetting = "auto"
+from core.settings import PatchSetting
+
 UsedPatch = Literal["plane", "rigid", "stretch", "curved"]
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from core.arrays import Float
 from core.errors import InputError
 from core.field.region.window import fit_terms, window_offsets
+from core.settings import SMOOTHING_WINDOW
 
-WIDEST_SMOOTHING = 51
 Order = Literal[1, 2]
 
 
@@ -71,11 +71,11 @@ def check_smoothing(window: int, order: int = 2) -> None:
     InputError
         ``smoothing_window_invalid``, ``option_out_of_range``.
     """
-    if isinstance(window, bool) or int(window) != window or not 3 <= window <= WIDEST_SMOOTHING or window % 2 == 0:
+    if not SMOOTHING_WINDOW.holds(window):
         raise InputError(
-            f"the smoothing window is {window} points wide; it must be an odd whole number, 3 to {WIDEST_SMOOTHING}.",
+            f"the smoothing window is {window} points wide; it must be {SMOOTHING_WINDOW}.",
             code="smoothing_window_invalid",
-            remedy="Give 5, for example, or switch smoothing off.",
+            remedy=f"Give {SMOOTHING_WINDOW.default}, for example, or switch smoothing off.",
         )
     if order not in (1, 2):
         raise InputError(

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.region.cuts import Cuts
+from core.settings import SUBSET_PX
 
 if TYPE_CHECKING:
     from core.field.region.visibility import Sight
@@ -254,11 +255,11 @@ def check_region(
 
 def check_subset(subset_px: int) -> None:
     """Refuse an even or tiny subset, ``subset_invalid``."""
-    if isinstance(subset_px, bool) or int(subset_px) != subset_px or subset_px < 9 or subset_px % 2 == 0:
+    if not SUBSET_PX.holds(subset_px):
         raise RegionError(
-            f"the subset is {subset_px} px wide; it must be an odd whole number of 9 or more.",
+            f"the subset is {subset_px} px wide; it must be {SUBSET_PX}.",
             code="subset_invalid",
-            remedy="Give 33, for example; a subset should hold three speckles across or more.",
+            remedy=f"Give {SUBSET_PX.default}, for example; a subset should hold three speckles across or more.",
         )
 
 

@@ -20,7 +20,6 @@ from core.field.growth.seed import Seeds
 from core.field.growth.state import FieldInputs, prepare
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field, References
-from core.field.reference_update import ReferenceUpdate
 from core.field.region.find_visible import with_sight
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals
@@ -31,6 +30,7 @@ from core.field.settings import MeasureOptions
 from core.matching.fit import no_motion
 from core.matching.geometry import plane_from_angles
 from core.progress import CancelToken, Progress
+from core.settings import ReferenceUpdate
 from core.status import PointStatus
 
 Pair = tuple[MeasureImage, MeasureImage]

@@ -63,19 +63,7 @@ from server.api.models.tests import (
     WatchReply,
     WatchRequest,
 )
-from server.base.models import (
-    Channels,
-    JobState,
-    Label,
-    Number,
-    Pixel,
-    Real,
-    Reply,
-    Request,
-    Timestamp,
-    Whole,
-    utc_text,
-)
+from server.base.models import Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
 
 __all__ = [
     "Accepted",
@@ -117,12 +105,10 @@ __all__ = [
     "NoiseReply",
     "NoiseRequest",
     "Number",
-    "Pixel",
     "ProbeReply",
     "Progress",
     "ReadingReply",
     "ReadingRequest",
-    "Real",
     "Region",
     "Reply",
     "Request",
@@ -148,6 +134,5 @@ __all__ = [
     "ViewList",
     "WatchReply",
     "WatchRequest",
-    "Whole",
     "utc_text",
 ]

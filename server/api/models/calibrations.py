@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from core.settings import Real, Whole
 from server.api.models.jobs import Accepted, JobProblem
-from server.base.models import Label, Listing, Number, Real, Reply, Request, Whole
+from server.base.models import Label, Listing, Number, Reply, Request
 
 
 class CalibrationRequest(Request):

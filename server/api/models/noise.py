@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from core.settings import Whole
 from server.api.models.jobs import Accepted
-from server.base.models import Label, Listing, Reply, Request, Whole
+from server.base.models import Label, Listing, Reply, Request
 
 
 class NoiseRequest(Request):

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from core.names import CameraName
-from server.base.models import AxisValues, Number, Real, Reply, Request, Whole, any_of, one_of
+from core.settings import Real, Whole
+from server.base.models import AxisValues, Number, Reply, Request, any_of, one_of
 
 
 class SettingsPatch(Request):

@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
+from core.settings import Real, Whole
 from server.api.models.jobs import Accepted
-from server.base.models import Channels, Label, Listing, Number, Real, Reply, Request, Timestamp, Whole
+from server.base.models import Channels, Label, Listing, Number, Reply, Request, Timestamp
 
 
 class TestRequest(Request):

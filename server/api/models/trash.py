@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from server.base.models import Listing, Reply, Request, Whole
+from core.settings import Whole
+from server.base.models import Listing, Reply, Request
 
 
 class TrashEntry(Reply):

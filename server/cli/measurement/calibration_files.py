@@ -8,12 +8,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 from core.errors import InputError
-from server.exports.source import results_in
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
 from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
 from server.formats.images import read_file
+from server.formats.results.folder import first_results
 from server.results.epipolar_check import EpipolarComparison, check_against
 
 
@@ -69,13 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None) -> EpipolarComparison:
     places = [folder, folder / "exports" / "measure", *sorted((folder / "analyses").glob("*"))]
-    files = next((found for place in places if (found := results_in(place))), None)
-    if files is None:
-        raise InputError(
-            f"There is no step_0000.nc or another step's result in {folder}.",
-            code="results_missing",
-            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-        )
+    files = first_results(folder, places)
     if measured_with is None:
         measured_with = files[0].absolute().parent.parent.parent / "calibration.json"
         if not measured_with.is_file():

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     source = find_source(args.folder, args.analysis)
     if args.image is not None:
         source = replace(source, image=args.image)
-    for reason in source.about.get("stale_reasons", ()):
+    for reason in source.stale_reasons:
         print(f"STALE: {reason} since this was measured; measure again")
     make_folder(args.out)
     count = 0

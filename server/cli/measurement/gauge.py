@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -16,12 +14,12 @@ from server.formats.files import make_folder, write_bytes
 from server.formats.gauges.matlab import gauges_mat
 from server.formats.gauges.readings import GaugeReadings, LineReading, Number, StepReadings
 from server.formats.gauges.table import gauges_csv
+from server.formats.results.folder import first_results
 from server.formats.results.summary import to_json
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
 
-_RESULT = re.compile(r"step_\d{4,}\.nc")
 _FORMS = {".csv": gauges_csv, ".json": lambda readings: to_json(readings.document()), ".mat": gauges_mat}
 
 
@@ -29,27 +27,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
     add("folder", metavar="FOLDER", type=Path, help="results of stereorig measure, or of an analysis: step_0000.nc ...")
-    many: dict[str, Any] = {"action": "append", "default": []}
     add(
         "--point",
-        **many,
+        action="append",
+        default=[],
         metavar="X,Y",
         help="values at a place; repeatable, as all gauges; places are px of camera "
         "1's reference image; NAME= in front names a gauge",
     )
-    add("--extensometer", **many, metavar="X0,Y0,X1,Y1", help="length, elongation, engineering and true strain")
-    add("--point-mm", **many, metavar="X,Y", help="a place by X and Y of the reference, in the frame asked for")
-    add("--extensometer-mm", **many, metavar="X0,Y0,X1,Y1", help="an extensometer between two such places")
-    add("--line", **many, metavar="X0,Y0,X1,Y1[,N]", help="values at N places along a line (one a grid step)")
+    add(
+        "--extensometer",
+        action="append",
+        default=[],
+        metavar="X0,Y0,X1,Y1",
+        help="length, elongation, engineering and true strain",
+    )
+    add(
+        "--point-mm",
+        action="append",
+        default=[],
+        metavar="X,Y",
+        help="a place by X and Y of the reference, in the frame asked for",
+    )
+    add(
+        "--extensometer-mm",
+        action="append",
+        default=[],
+        metavar="X0,Y0,X1,Y1",
+        help="an extensometer between two such places",
+    )
+    add(
+        "--line",
+        action="append",
+        default=[],
+        metavar="X0,Y0,X1,Y1[,N]",
+        help="values at N places along a line (one a grid step)",
+    )
     add(
         "--area",
-        **many,
+        action="append",
+        default=[],
         metavar="X0,Y0,X1,Y1",
         help="statistics over a rectangle; six or more numbers: a polygon; all: the whole field",
     )
     add(
         "--variable",
-        **many,
+        action="append",
+        default=[],
         metavar="NAME",
         help="read this variable of the files at points, lines and areas (position and displacement)",
     )
@@ -68,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="take out the rigid motion of the whole field, or that of a rectangle or polygon",
     )
     add("--robust", action="store_true", help="let no outlier draw the rigid motion")
-    add("--step", **many, type=int, metavar="N", help="read this step only; repeatable (all)")
+    add("--step", action="append", default=[], type=int, metavar="N", help="read this step only; repeatable (all)")
     add(
         "--field-out",
         metavar="DIR",
@@ -92,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
             remedy="Give file.csv, file.json or file.mat.",
         )
     request = _request(args)
-    files = result_files(args.folder)
+    files = first_results(args.folder, (args.folder, args.folder / "exports" / "measure"))
     fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
     readings = read_gauges(files, request, fields)
     print("\n".join(report(readings)))
@@ -105,27 +129,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def result_files(folder: Path) -> list[Path]:
-    """Return the result files of a folder, or of a test's folder where ``stereorig measure`` put them.
-
-    Raises
-    ------
-    InputError
-        ``results_missing``.
-    """
-    for place in (folder, folder / "exports" / "measure"):
-        files = sorted(p for p in place.glob("step_*.nc") if _RESULT.fullmatch(p.name))
-        if files:
-            return files
-    raise InputError(
-        f"There is no step_0000.nc or another step's result in {folder}.",
-        code="results_missing",
-        remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
-    )
-
-
 def _request(args: argparse.Namespace) -> GaugeRequest:
-    body: dict[str, Any] = {
+    body: dict[str, object] = {
         "points": [
             *(_named("--point", t, lambda v: {"xy_px": v}, (2,)) for t in args.point),
             *(_named("--point-mm", t, lambda v: {"xy_mm": v}, (2,)) for t in args.point_mm),
@@ -158,7 +163,7 @@ def _request(args: argparse.Namespace) -> GaugeRequest:
         ) from error
 
 
-def _align(args: argparse.Namespace) -> dict[str, Any]:
+def _align(args: argparse.Namespace) -> dict[str, object]:
     if args.align == "plane":
         direction = (
             {} if args.x_direction is None else {"x_direction": _numbers("--x-direction", args.x_direction, (3,))}
@@ -174,20 +179,22 @@ def _align(args: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "3-2-1", "places_px": _pairs(_numbers("--align 3-2-1", places, (12,)))}
 
 
-def _named(option: str, text: str, make: Any, counts: tuple[int, ...] | None) -> dict[str, Any]:
+def _named(
+    option: str, text: str, make: Callable[[list[float]], dict[str, object]], counts: tuple[int, ...] | None
+) -> dict[str, object]:
     name, equals, rest = text.rpartition("=")
-    named = {"name": name} if equals else {}
+    named: dict[str, object] = {"name": name} if equals else {}
     if counts is None and rest == "all":
         return named
     return {**named, **make(_numbers(option, rest, counts))}
 
 
-def _line(v: list[float]) -> dict[str, Any]:
+def _line(v: list[float]) -> dict[str, object]:
     count = {} if len(v) == 4 else {"count": int(v[4]) if v[4].is_integer() else v[4]}
     return {"vertices_px": _pairs(v[:4]), **count}
 
 
-def _area(v: list[float]) -> dict[str, Any]:
+def _area(v: list[float]) -> dict[str, object]:
     return {"rectangle_px": v} if len(v) == 4 else {"polygon_px": _pairs(v)}
 
 

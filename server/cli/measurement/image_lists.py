@@ -11,6 +11,7 @@ from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
 from core.names import CAMERAS
+from server.worker.tasks import averages_of
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class ImagePair:
     number: int | None = None
     sha256_1: str | None = None
     sha256_2: str | None = None
+    averages: tuple[int, float] = (1, 1.0)
 
 
 def _natural(path: str) -> list[tuple[int, str]]:
@@ -116,11 +118,12 @@ def pairs_of_test_folder(folder: Path) -> list[ImagePair]:
     pairs = []
     for mark in sorted(folder.glob("steps/*/step.json")):
         try:
-            hashes = _hashes(json.loads(mark.read_text()))
+            record = json.loads(mark.read_text())
         except (ValueError, OSError) as error:
             raise FileFormatError(f"{mark} cannot be read as a step's record ({error}).") from error
         number = int(mark.parent.name) if mark.parent.name.isdigit() else None
-        pairs.append(ImagePair(mark.parent / "cam1.tif", mark.parent / "cam2.tif", number, *hashes))
+        averages = averages_of(record) if isinstance(record, dict) else (1, 1.0)
+        pairs.append(ImagePair(mark.parent / "cam1.tif", mark.parent / "cam2.tif", number, *_hashes(record), averages))
     if not pairs:
         raise InputError(
             f"{folder} holds no complete step (steps/<nnnn>/ with cam1.tif, cam2.tif and step.json).",

@@ -9,24 +9,32 @@ from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
 from core.field.points.images import check_calibrated_size
-from core.field.points.patch import DEFAULT_PATCH, PATCH_SETTINGS
-from core.field.points.smoothing_record import WIDEST_SMOOTHING
 from core.field.prefilter import check_prefilter
-from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, REFERENCE_UPDATES
-from core.strain.options import DEFAULT_WINDOW, STRAIN_TENSORS, WIDEST_WINDOW, StrainOptions
+from core.settings import (
+    DEFAULT_INTERPOLATION,
+    DEFAULT_PATCH,
+    DEFAULT_REFERENCE_UPDATE,
+    INTERPOLATIONS,
+    PATCH_SETTINGS,
+    REFERENCE_UPDATES,
+    SMOOTHING_WINDOW,
+    STEP_PX,
+    STRAIN_TENSORS,
+    STRAIN_WINDOW,
+    SUBSET_PX,
+    StoredSettings,
+)
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
-from server.cli.measurement.region import check_odd, check_region, parse_rectangle
-from server.cli.measurement.sequence import CheckedPair, MeasureJob, measure_sequence
+from server.cli.measurement.region import check_region, check_whole, parse_rectangle
+from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_places
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.images import decode_image, read_file
 from server.formats.noise_json import load_noise
 from server.store.durable import read_json
+from server.worker.tasks import StepImages
 from server.workflows.camera_identity import check_same_cameras
-
-SUBSET_RANGE_PX = (7, 301)
-STEP_RANGE_PX = (1, 1000)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,8 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X0,Y0,X1,Y1,X2,Y2[,...]",
         help="a polygon inside which nothing is measured",
     )
-    add("--subset", default="33", metavar="PX", help="subset width, odd (33)")
-    add("--step", default="10", metavar="PX", help="distance of the points (10)")
+    add("--subset", default=str(SUBSET_PX.default), metavar="PX", help=f"subset width, odd ({SUBSET_PX.default})")
+    add("--step", default=str(STEP_PX.default), metavar="PX", help=f"distance of the points ({STEP_PX.default})")
     add(
         "--patch",
         choices=PATCH_SETTINGS,
@@ -61,7 +69,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: "
         f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})",
     )
-    add("--interpolation", choices=("cubic", "quintic"), default="quintic", help="spline between the pixels (quintic)")
+    add(
+        "--interpolation",
+        choices=INTERPOLATIONS,
+        default=DEFAULT_INTERPOLATION,
+        help=f"spline between the pixels ({DEFAULT_INTERPOLATION})",
+    )
     add(
         "--prefilter",
         default="0",
@@ -78,9 +91,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
     add(
         "--strain",
-        default=str(DEFAULT_WINDOW),
+        default=str(STRAIN_WINDOW.default),
         metavar="WINDOW|off",
-        help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide ({DEFAULT_WINDOW})",
+        help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide "
+        f"({STRAIN_WINDOW.default})",
     )
     add("--strain-order", choices=("1", "2"), default="1", help="fit planes (1) or quadratics (2) over the gauge (1)")
     add(
@@ -120,15 +134,15 @@ def _missing(option: str) -> InputError:
     return InputError(f"{option} is missing.", code="option_missing", remedy="See stereorig measure --help.")
 
 
-def _strain_options(args: argparse.Namespace) -> StrainOptions | None:
+def _strain(args: argparse.Namespace) -> dict[str, object] | None:
     if args.strain == "off":
         return None
-    window = check_odd("--strain", args.strain, low=3, high=WIDEST_WINDOW, odd=True)
-    return StrainOptions(window=window, order=2 if args.strain_order == "2" else 1, tensor=args.strain_tensor)
+    window = check_whole("--strain", args.strain, STRAIN_WINDOW)
+    return {"window": window, "order": int(args.strain_order), "tensor": args.strain_tensor}
 
 
 def _smoothing_window(args: argparse.Namespace) -> int | None:
-    return None if args.smooth == "off" else check_odd("--smooth", args.smooth, low=3, high=WIDEST_SMOOTHING, odd=True)
+    return None if args.smooth == "off" else check_whole("--smooth", args.smooth, SMOOTHING_WINDOW)
 
 
 def _prefilter_px(args: argparse.Namespace, subset_px: int) -> float:
@@ -167,10 +181,10 @@ def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
 
 def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     """Check everything that can be checked before anything is computed or written."""
-    subset = check_odd("--subset", args.subset, low=SUBSET_RANGE_PX[0], high=SUBSET_RANGE_PX[1], odd=True)
-    step = check_odd("--step", args.step, low=STEP_RANGE_PX[0], high=STEP_RANGE_PX[1], odd=False)
+    subset = check_whole("--subset", args.subset, SUBSET_PX)
+    step = check_whole("--step", args.step, STEP_PX)
     rectangle = None if args.roi is None else parse_rectangle(args.roi)
-    strain, prefilter_px = _strain_options(args), _prefilter_px(args, subset)
+    strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
     calibration_file = Path(args.calibration) if args.calibration or folder is None else folder / "calibration.json"
@@ -187,7 +201,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         rectangle = (margin, margin, cols - 1 - margin, rows - 1 - margin)
     mask_file = None if args.mask is None else Path(args.mask)
     noise = None if args.noise is None else load_noise(args.noise)
-    region = check_region(
+    region, seeds = check_region(
         rectangle,
         image_shape=shapes[0],
         subset_px=subset,
@@ -197,24 +211,33 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         cracks=args.crack,
         holes=args.hole,
     )
-    check_places(calibration.pair, region.seeds or (), (shapes[1][1], shapes[1][0]))
-    pairs = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    check_places(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
+    steps = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    settings = StoredSettings.model_validate(
+        {
+            "region": region,
+            "subset_px": subset,
+            "step_px": step,
+            "patch": args.patch,
+            "interpolation": args.interpolation,
+            "prefilter_px": prefilter_px,
+            "seeds": None if seeds is None else [seed.xy_px for seed in seeds],
+            "seeds_cam2": None if seeds is None else [seed.xy2_px for seed in seeds],
+            "smoothing_window": _smoothing_window(args),
+            "reference_update": args.reference_update,
+            "strain": strain,
+            "reference": steps[0].n,
+            "noise": None if noise is None else noise.record(),
+        }
+    )
     return MeasureJob(
         calibration=calibration,
         calibration_file=calibration_file,
-        pairs=pairs,
-        region=region,
-        subset_px=subset,
-        step_px=step,
-        patch=args.patch,
-        interpolation=args.interpolation,
+        steps=steps,
+        settings=settings,
         mask_file=mask_file,
         out=out,
         noise=noise,
-        strain=strain,
-        prefilter_px=prefilter_px,
-        smoothing_window=_smoothing_window(args),
-        reference_update=args.reference_update,
     )
 
 
@@ -250,7 +273,7 @@ def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[t
     return shapes[0], shapes[1]
 
 
-def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> CheckedPair:
+def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
     """Read both images of a step once, so that a bad one is found before hours of work on the others."""
     hashes, images = [], []
     for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
@@ -283,4 +306,9 @@ def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple
             code="same_image",
             remedy="Give each camera its own images.",
         )
-    return CheckedPair(pair, (hashes[0], hashes[1]))
+    return StepImages(
+        n=step if pair.number is None else pair.number,
+        files=(pair.cam1, pair.cam2),
+        sha256=(hashes[0], hashes[1]),
+        averages=pair.averages,
+    )

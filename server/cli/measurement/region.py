@@ -4,43 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError, RegionError
-from core.field.region.region import PointGrid
 from core.field.region.region import check_region as check_points
 from core.field.seeding.seeds import Seed
+from core.settings import Range, StoredRegion
+from server.compute.region import lay_points
 from server.formats.images import read_mask
 
 Rectangle = tuple[float, float, float, float]
 Line = list[list[float]]
-
-
-@dataclass(frozen=True)
-class RegionRequest:
-    """What ``--roi``, ``--mask``, ``--crack``, ``--hole`` and ``--seed`` say, checked.
-
-    Attributes
-    ----------
-    rectangle_px
-        (X0, Y0, X1, Y1), points lie at X0 + i step and Y0 + j step up to X1, Y1.
-    grid
-        The points, those on the mask's black not allowed.
-    seeds
-        Places in camera 1's reference image, and in camera 2's where told; None = found by the program.
-    cracks_px, holes_px
-        Lines and polygons, as given; the grid knows them.
-    """
-
-    rectangle_px: Rectangle
-    grid: PointGrid
-    seeds: tuple[Seed, ...] | None
-    cracks_px: tuple[Line, ...] = ()
-    holes_px: tuple[Line, ...] = ()
 
 
 def _numbers(option: str, text: str, count: int, form: str | None = None) -> list[float]:
@@ -100,24 +77,23 @@ def parse_line(option: str, text: str, fewest: int) -> Line:
     return [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
 
 
-def check_odd(option: str, text: str, *, low: int, high: int, odd: bool) -> int:
-    """Read a whole number in a range, odd where it must be.
+def check_whole(option: str, text: str, allowed: Range) -> int:
+    """Read a whole number in a range.
 
     Raises
     ------
     InputError
         ``option_out_of_range``.
     """
-    kind = "an odd whole number" if odd else "a whole number"
     try:
         value = int(text)
     except ValueError:
-        value = low - 1
-    if not low <= value <= high or (odd and value % 2 == 0):
+        value = allowed.low - 1
+    if not allowed.holds(value):
         raise InputError(
-            f"{option} is {text}; it must be {kind} from {low} to {high}.",
+            f"{option} is {text}; it must be {allowed}.",
             code="option_out_of_range",
-            remedy=f"Give {option} {33 if odd else 10}, for example.",
+            remedy=f"Give {option} {allowed.default}, for example.",
         )
     return value
 
@@ -132,8 +108,8 @@ def check_region(
     seeds: Sequence[str],
     cracks: Sequence[str] = (),
     holes: Sequence[str] = (),
-) -> RegionRequest:
-    """Check region, mask, cracks, holes and seeds against camera 1's image, and lay the points.
+) -> tuple[StoredRegion, tuple[Seed, ...] | None]:
+    """Check region, mask, cracks, holes and seeds against camera 1's image; return the region, and the seeds if any.
 
     Raises
     ------
@@ -143,14 +119,19 @@ def check_region(
     ImageError
         If the mask cannot be read.
     """
-    grid = PointGrid.rectangle(*rectangle, step_px=step_px)
     mask = None if mask_path is None else read_mask(mask_path)
-    crack_lines = tuple(parse_line("--crack", text, 2) for text in cracks)
-    hole_lines = tuple(parse_line("--hole", text, 3) for text in holes)
-    checked = (grid if mask is None else grid.within_mask(mask)).without_holes(hole_lines).with_cracks(crack_lines)
+    region = StoredRegion.model_validate(
+        {
+            "rectangle": rectangle,
+            "cracks": [parse_line("--crack", text, 2) for text in cracks],
+            "holes": [parse_line("--hole", text, 3) for text in holes],
+            "mask": None if mask_path is None else str(mask_path),
+        }
+    )
     mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
-    check_points(checked, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
-    return RegionRequest(rectangle, checked, _seeds(seeds, rectangle, mask), crack_lines, hole_lines)
+    points = lay_points(region, step_px, mask)
+    check_points(points, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
+    return region, _seeds(seeds, rectangle, mask)
 
 
 def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> tuple[Seed, ...] | None:

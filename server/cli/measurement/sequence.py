@@ -12,36 +12,28 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from core.compiling import COMPILING, told_when_compiling
 from core.errors import MeasurementError
-from core.field.checks.extrapolated import mark_extrapolated
-from core.field.points.images import MeasureImage
-from core.field.points.patch import PatchSetting
 from core.field.points.result import Field
-from core.field.reference_update import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
-from core.strain import StrainOptions
-from server.cli.measurement.image_lists import ImagePair
-from server.cli.measurement.region import RegionRequest
+from core.settings import StoredSettings
 from server.cli.terminal import ProgressLine, duration
 from server.compute.compile_aside import CompileAside
 from server.compute.overlap import ReadAhead, WriteBehind
-from server.compute.strain import smoothed_step, smoothing_note, strain_of_step, strain_settings, summarise_strain
+from server.compute.strain import smoothing_note
 from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.volume import rbe_of, volume_of
 from server.formats.files import make_folder, sha256_of, write_bytes
-from server.formats.images import read_image
+from server.formats.images import read_mask
 from server.formats.noise_json import LoadedNoise
-from server.formats.results.reading import read_measured
-from server.formats.results.summary import summarise, to_json
-from server.formats.results.writing import Provenance, write_field
+from server.formats.results.summary import SequenceSummary, to_json
 from server.formats.version import software_version
+from server.worker.tasks import StepImages
 
 if TYPE_CHECKING:
-    from core import measure
+    from server.compute.sequence import Pair
 
 _LEAST_OF_STATED, _MOST_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
@@ -58,54 +50,17 @@ def _strain_noise(strain: dict[str, Any] | None) -> str:
     return f"strain noise {floor:.0f} microstrain over {strain['gauge_mm']:.3g} mm, "
 
 
-@dataclass(frozen=True)
-class CheckedPair:
-    """One step's files and the hashes of what was found in them."""
-
-    files: ImagePair
-    sha256: tuple[str, str]
-
-
 @dataclass(frozen=True, kw_only=True)
 class MeasureJob:
     """Everything that ``stereorig measure`` was asked to do, checked."""
 
     calibration: LoadedCalibration
     calibration_file: Path
-    pairs: list[CheckedPair]
-    region: RegionRequest
-    subset_px: int
-    step_px: int
-    patch: PatchSetting
-    interpolation: Literal["cubic", "quintic"]
+    steps: list[StepImages]
+    settings: StoredSettings
     mask_file: Path | None
     out: Path
     noise: LoadedNoise | None = None
-    strain: StrainOptions | None = None
-    prefilter_px: float = 0.0
-    reference_update: ReferenceUpdate = DEFAULT_REFERENCE_UPDATE
-    smoothing_window: int | None = None
-
-    def settings(self) -> dict[str, Any]:
-        """Return what the result depends on besides its inputs."""
-        seeds = self.region.seeds
-        return {
-            "roi": list(self.region.rectangle_px),
-            "subset_px": self.subset_px,
-            "step_px": self.step_px,
-            "patch": self.patch,
-            "interpolation": self.interpolation,
-            "seeds": None if seeds is None else [list(seed.xy_px) for seed in seeds],
-            "seeds_cam2": None if seeds is None else [None if s.xy2_px is None else list(s.xy2_px) for s in seeds],
-            "cracks": list(self.region.cracks_px),
-            "holes": list(self.region.holes_px),
-            "mask": None if self.mask_file is None else str(self.mask_file),
-            "noise": None if self.noise is None else self.noise.record(),
-            "prefilter_px": self.prefilter_px,
-            "smoothing_window": self.smoothing_window,
-            "reference_update": self.reference_update,
-            "strain": strain_settings(self.strain),
-        }
 
 
 def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
@@ -120,35 +75,36 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
 
     def on_compiling() -> None:
         progress.note(f"{COMPILING} ...")
-        if len(job.pairs) > 1:
+        if len(job.steps) > 1:
             aside.start()
 
     with (
         _output_folder(job.out),
-        CompileAside(job.patch) as aside,
+        CompileAside(job.settings.patch) as aside,
         told_when_compiling(on_compiling),
         WriteBehind[dict[str, Any]]() as written,
     ):
         runner = _Runner(job, progress, written)
-        with ReadAhead(runner.read, job.pairs[1:]) as pairs:
+        with ReadAhead(runner.sequence.read, job.steps[1:]) as pairs:
             runner.measure(None)
             aside.wait()
             for images in pairs:
                 runner.measure(images)
         steps = written.finish()
     seconds = round(time.monotonic() - started, 3)
-    summary = {
-        "software_version": software_version(),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "calibration": {
+    summary = SequenceSummary(
+        state="succeeded",
+        software_version=software_version(),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        calibration={
             "file": str(job.calibration_file),
             "sha256": job.calibration.sha256,
             "source": job.calibration.source,
         },
-        "settings": job.settings(),
-        "seconds": seconds,
-        "steps": steps,
-    }
+        settings=job.settings.model_dump(),
+        seconds=seconds,
+        steps=steps,
+    ).document()
     write_bytes(job.out / "summary.json", to_json(summary))
     progress.note(f"{len(steps)} steps in {duration(seconds)}: {job.out / 'summary.json'}")
     return summary
@@ -170,134 +126,79 @@ def _output_folder(out: Path) -> Iterator[None]:
 
 
 class _Runner:
-    """Measures the steps in order; keeps the reference, its shape and the last field, whatever the number of steps."""
+    """Measures the steps in order, and says on the terminal what a user should know of each."""
 
     def __init__(self, job: MeasureJob, progress: ProgressLine, written: WriteBehind[dict[str, Any]]) -> None:
         # the kernels' modules take seconds to load: after the input was checked is early enough
-        from core import measure
+        from server.compute.sequence import SequenceMeasurement
 
         self._job = job
         self._progress = progress
         self._written = written
-        self._options = measure.MeasureOptions(
-            subset_px=job.subset_px,
-            patch=job.patch,
-            interpolation=job.interpolation,
-            prefilter_px=job.prefilter_px,
-            noise=(None, None) if job.noise is None else job.noise.models,
+        self.sequence = SequenceMeasurement(
+            calibration=job.calibration,
+            settings=job.settings,
+            mask=None if job.mask_file is None else read_mask(job.mask_file),
+            reference=job.steps[0],
+            folder=job.out,
+            noise=job.noise,
+            inputs={} if job.mask_file is None else {"mask": sha256_of(job.mask_file)},
         )
-        self._reference = measure.ReferencePair(job.calibration.pair, *self.read(job.pairs[0]))
-        self._volume, self._rbe_px = volume_of(job.calibration), rbe_of(job.calibration)
-        self._n = 0
-        self._shape: Field | None = None
-        self._sequence: measure.Updating | None = None
-        self._last: measure.Earlier | None = None
-        self._last_images: tuple[MeasureImage, MeasureImage] | None = None
-        self._matched = 0
+        self._index = 0
+        self._matched = job.steps[0].n
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
         self._told_smoothing = False
         self._done = 0.0
 
-    def read(self, pair: CheckedPair) -> tuple[MeasureImage, MeasureImage]:
-        """Read both images of a step; what will be asked of them is found on this thread."""
-        one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.files.cam1, pair.files.cam2))
-        for image, noise in zip((one, two), self._options.noise, strict=True):
-            image.prepared(self._options.interpolation, noise, self._options.blur)
-            image.contrast()
-        return one, two
-
-    def measure(self, images: tuple[MeasureImage, MeasureImage] | None) -> None:
+    def measure(self, images: Pair | None) -> None:
         """Measure the next step, the reference's shape first (no images), and have its file written."""
-        started = time.monotonic()
-        n, region = self._n, self._job.region
-        if images is None:
-            result = self._shape = self._reference.shape(
-                region.grid, self._options, seeds=region.seeds, progress=self._shower(n)
-            )
-        else:
-            result = self._motion(n, images)
+        started, k, steps = time.monotonic(), self._index, self._job.steps
+        previous = steps[k - 1].n if k > 1 else None
+        result = self.sequence.measure(steps[k], images, previous=previous, progress=self._shower(k))
+        compute_s = round(time.monotonic() - started, 3)
         if not result.valid.any():
-            files = self._job.pairs[n].files
+            one, two = steps[k].files
             raise MeasurementError(
-                f"No point of step {n} ({files.cam1.name}, {files.cam2.name}) could be measured.",
+                f"No point of step {k} ({one.name}, {two.name}) could be measured.",
                 code="nothing_measured",
                 remedy="Check that both cameras see the same textured surface, in this order, and the region.",
             )
-        if n == 0:
+        if k == 0:
             self._remove_older()
             self._doubt_noise(result)
-        self._written.put(self._write, n, result, started)
-        self._n += 1
+        self._written.put(self._write, k, result, started, compute_s)
+        self._index += 1
 
-    def _motion(self, n: int, images: tuple[MeasureImage, MeasureImage]) -> Field:
-        """Measure a step's displacement; keep what the next one may be matched against."""
-        from core.measure import Earlier
-
-        region, update = self._job.region, self._job.reference_update
-        assert self._shape is not None
-        if self._sequence is None:
-            self._sequence = self._reference.sequence(
-                self._shape,
-                region.grid,
-                self._options,
-                reference_update=update,
-                images_of=self._images_of,
-                field_of=self._field_of,
-                first=self._number(0),
-            )
-        result = self._sequence.measure(images, self._last, seeds=region.seeds, progress=self._shower(n))
-        self._last = Earlier(self._number(n), result)
-        self._last_images = None if update == "never" else images
-        return result
-
-    def _index(self, number: int) -> int:
-        """Which of the pairs has a number."""
-        return next(k for k in range(len(self._job.pairs)) if self._number(k) == number)
-
-    def _images_of(self, number: int) -> tuple[MeasureImage, MeasureImage]:
-        if self._last is not None and self._last.step == number and self._last_images is not None:
-            return self._last_images
-        return self.read(self._job.pairs[self._index(number)])
-
-    def _field_of(self, number: int) -> Field:
-        """An earlier step's field as its file has it; the last one's may still be on its way to the disk."""
-        if self._last is not None and self._last.step == number:
-            return mark_extrapolated(self._last.field, self._volume)
-        return read_measured(self._job.out / f"step_{number:04d}.nc")
-
-    def _write(self, n: int, result: Field, started: float) -> dict[str, Any]:
+    def _write(self, k: int, result: Field, started: float, compute_s: float) -> dict[str, Any]:
         """Write the file of a step, say so, return its summary."""
-        pair, measured = self._job.pairs[n], result
-        result = smoothed_step(result, self._job.smoothing_window, subset_px=self._job.subset_px)
-        result = mark_extrapolated(result, self._volume)
-        number = self._number(n)
-        name = f"step_{number:04d}.nc"
-        strain = strain_of_step(result, self._job.strain, subset_px=self._job.subset_px)
-        write_field(self._job.out / name, result, self._provenance(n, result), strain, measured=measured)
+        step = self._job.steps[k]
+        one, two = step.files
+        about = {"cam1_file": str(one), "cam2_file": str(two)}
+        finished = self.sequence.finish(step, result, about=about, checksum=False, keep_starts=False)
+        seconds = round(time.monotonic() - started, 3)
         summary = {
-            "step": number,
-            "file": name,
-            "cam1": str(pair.files.cam1),
-            "cam2": str(pair.files.cam2),
-            "sha256": {"cam1": pair.sha256[0], "cam2": pair.sha256[1]},
-            **summarise(result, rbe_px=self._rbe_px, reference=self._number(0)).document(),
-            "strain": None if strain is None else summarise_strain(strain).document(),
-            "seconds": round(time.monotonic() - started, 3),
+            **finished.summary,
+            "cam1": str(one),
+            "cam2": str(two),
+            "sha256": dict(zip(("cam1", "cam2"), step.sha256, strict=True)),
+            "compute_s": compute_s,
+            "wall_s": seconds,
+            "seconds": seconds,
         }
         rms = summary["epipolar_residual_rms_px"]
         residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
-            f"step {n} of {len(self._job.pairs) - 1}: {summary['valid']} of {summary['points']} points, "
-            f"{residual}{_strain_noise(summary['strain'])}{duration(summary['seconds'])}"
+            f"step {k} of {len(self._job.steps) - 1}: {summary['valid']} of {summary['points']} points, "
+            f"{residual}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
-        self._say_choice(n, result)
-        self._say_reference(n, result)
-        self._say_smoothing(result, summary["strain"])
+        self._say_choice(k, finished.field)
+        self._say_reference(k, finished.field)
+        self._say_smoothing(finished.field, summary["strain"])
         check = summary["epipolar_check"]
         if check is not None and check["level"] != self._checked:
             self._checked = check["level"]
-            self._progress.note(f"{check['level']}: step {n}: {check['reason']}")
+            self._progress.note(f"{check['level']}: step {k}: {check['reason']}")
         return summary
 
     def _say_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
@@ -307,11 +208,6 @@ class _Runner:
         self._told_smoothing = True
         gauge = (None, None) if strain is None else (strain["gauge_px"], strain["window"])
         self._progress.note(f"note: {smoothing_note(result.smoothing, gauge[0], strain_window=gauge[1])}")
-
-    def _number(self, n: int) -> int:
-        """The n-th pair's number: in a test's folder, where an incomplete step is left out, its own."""
-        number = self._job.pairs[n].files.number
-        return n if number is None else number
 
     def _say_choice(self, n: int, result: Field) -> None:
         """Say what the patch was chosen for: of the shape, of the first step, and where it changes."""
@@ -326,13 +222,13 @@ class _Runner:
 
     def _say_reference(self, n: int, result: Field) -> None:
         """Say where another reference took over."""
-        matched = self._number(0) if result.references is None else result.references.step
-        if n > 1 and matched != self._matched and self._job.reference_update == "auto":
+        matched = self._job.steps[0].n if result.references is None else result.references.step
+        if n > 1 and matched != self._matched and self._job.settings.reference_update == "auto":
             self._progress.note(f"step {n}: step {self._matched} no longer serves as reference, step {matched} does")
         self._matched = matched
 
     def _shower(self, n: int) -> Any:
-        count = len(self._job.pairs)
+        count = len(self._job.steps)
 
         def show(stage: str, done: int, total: int) -> None:
             share = done / total if total > 0 else 0.0
@@ -342,36 +238,10 @@ class _Runner:
 
         return show
 
-    def _provenance(self, n: int, result: Field) -> Provenance:
-        job, first, now = self._job, self._job.pairs[0], self._job.pairs[n]
-        inputs = {
-            "calibration": job.calibration.sha256,
-            "reference_cam1": first.sha256[0],
-            "reference_cam2": first.sha256[1],
-            "cam1": now.sha256[0],
-            "cam2": now.sha256[1],
-        }
-        if result.references is not None:
-            matched = job.pairs[self._index(result.references.step)]
-            inputs["matched_cam1"], inputs["matched_cam2"] = matched.sha256
-        if job.mask_file is not None:
-            inputs["mask"] = sha256_of(job.mask_file)
-        if job.noise is not None:
-            inputs["noise"] = job.noise.sha256
-        return Provenance(
-            settings=job.settings(),
-            inputs=inputs,
-            software_version=software_version(),
-            step=self._number(n),
-            reference=self._number(0),
-            frame="target" if job.calibration.source == "calibration_json" else "camera1",
-            extra={"cam1_file": str(now.files.cam1), "cam2_file": str(now.files.cam2)},
-        )
-
     def _doubt_noise(self, shape: Field) -> None:
         """Say so where the residuals and the noise file tell different stories."""
-        model = self._options.noise[0]
-        image = self._reference.image1.prepared(self._options.interpolation, model, self._options.blur)
+        options = self.sequence.options
+        image = self.sequence.pair.image1.prepared(options.interpolation, None, options.blur)
         stated = image.noise_variance
         if stated is None:
             return

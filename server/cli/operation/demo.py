@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -69,19 +70,15 @@ def _experiment(session: Session, module: str) -> Outcome:
     from server.demo.drawing import fields
 
     session.say("calibrating: both stages move, the grid is imaged ...")
-    document = session.calibrate()
-    report = calibration.describe(session, document)
+    made = session.calibrate()
+    report = calibration.describe(session, made)
     for line in report.lines:
         session.say(line)
     session.say("")
-    outcome: Outcome = importlib.import_module(module).run(session, document["id"])
+    outcome: Outcome = importlib.import_module(module).run(session, made.id)
     outcome.checks = report.checks + outcome.checks
     outcome.pictures = fields.calibration(session.out, report.views) | outcome.pictures
-    outcome.data["calibration"] = {
-        "id": document["id"],
-        "checks": document.get("checks"),
-        "verdict": document.get("verdict"),
-    }
+    outcome.data["calibration"] = {"id": made.id, "checks": made.checks, "verdict": made.verdict}
     return outcome
 
 
@@ -119,17 +116,8 @@ def _finish(out: Path, experiment: str, title: str, outcome: Outcome, seconds: f
     return 1 if missed else 0
 
 
-def _as_dict(check: Check) -> dict[str, Any]:
-    return {
-        "name": check.name,
-        "unit": check.unit,
-        "found": check.found,
-        "true": check.true,
-        "error": check.error,
-        "limit": check.limit,
-        "error_unit": check.error_unit or check.unit,
-        "passed": check.passed,
-    }
+def _as_dict(check: Check) -> dict[str, object]:
+    return asdict(check) | {"error_unit": check.error_unit or check.unit, "passed": check.passed}
 
 
 class _Teller:

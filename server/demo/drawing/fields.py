@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.field.points.result import Field
+from server.demo.calibration import ViewResiduals
 from server.demo.compare import MotionComparison
 from server.exports.mesh import triangles_of
 from sim.plate import CircularPlate
@@ -31,7 +32,7 @@ STYLE: Any = {  # rc_context wants every key spelled out in its type
     "savefig.bbox": "tight",
     "image.interpolation": "nearest",
 }
-HEIGHT, DIFFERENCE = "viridis", "RdBu_r"
+HEIGHT = "viridis"
 
 
 def upright_mm(xyz_mm: Float) -> tuple[Float, Float]:
@@ -73,6 +74,12 @@ def draw_map(axis: Any, result: Field, values: Float, title: str, unit: str, **o
     bar.outline.set_visible(False)
 
 
+def draw_difference(axis: Any, result: Field, values: Float, title: str, unit: str, limit: float | None = None) -> None:
+    """Draw values about zero in two colours, up to ``limit``; without one, up to their own."""
+    limit = colour_limit(values) if limit is None else limit
+    draw_map(axis, result, values, title, unit, cmap="RdBu_r", vmin=-limit, vmax=limit)
+
+
 def _draw_cuts(axis: Any, result: Field, colour: str = "black") -> None:
     """Draw cracks and the borders of holes."""
     for line in result.cuts.lines_px if result.cuts else ():
@@ -97,7 +104,7 @@ def region(out: Path, image: NDArray[Any], roi_px: Sequence[float], result: Fiel
     return {"region.png": "camera 1's reference image with the region and its points"}
 
 
-def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
+def calibration(out: Path, views: Sequence[ViewResiduals]) -> dict[str, str]:
     """Draw the residuals of every view as arrows.
 
     Parameters
@@ -105,20 +112,20 @@ def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
     out
         Folder.
     views
-        Each with ``title``, ``held_out``, ``rbe_px``, ``xy_px`` (n, 2) and ``residual_px`` (n, 2).
+        What each found.
     """
     if not views:
         return {}
     columns = min(4, len(views))
     rows = -(-len(views) // columns)
-    scale = max(colour_limit(np.concatenate([np.ravel(v["residual_px"]) for v in views])), 1e-6)
+    scale = max(colour_limit(np.concatenate([np.ravel(v.residual_px) for v in views])), 1e-6)
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(rows, columns, figsize=(3.0 * columns, 3.1 * rows), squeeze=False)
         for axis in axes.flat[len(views) :]:
             axis.set_visible(False)
         for axis, view in zip(axes.flat, views, strict=False):
-            xy, residual = np.asarray(view["xy_px"]), np.asarray(view["residual_px"])
-            colour = "#c04020" if view["held_out"] else "#2060a0"
+            xy, residual = view.xy_px, view.residual_px
+            colour = "#c04020" if view.held_out else "#2060a0"
             arrows = axis.quiver(
                 xy[:, 0],
                 xy[:, 1],
@@ -132,7 +139,7 @@ def calibration(out: Path, views: Sequence[dict[str, Any]]) -> dict[str, str]:
             )
             axis.invert_yaxis()
             axis.set_aspect("equal")
-            axis.set_title(f"{view['title']}\nRBE {view['rbe_px']:.4f} px{', held out' if view['held_out'] else ''}")
+            axis.set_title(f"{view.title}\nRBE {view.rbe_px:.4f} px{', held out' if view.held_out else ''}")
             axis.tick_params(labelsize=7)
         figure.suptitle("Grid intersections: measured minus projected (blue fitted, red held out)", x=0.02, ha="left")
         figure.tight_layout()
@@ -182,16 +189,8 @@ def plate(
             values = 1e3 * last.uvw_mm[..., k]  # type: ignore[index]
             error = 1e3 * comparison.error_mm[..., k]
             draw_map(axes[0, k], last, values, f"{name} measured at {pressures_kpa[-1]:.0f} kPa", "um", cmap=HEIGHT)
-            limit = colour_limit(error)
-            draw_map(
-                axes[1, k],
-                last,
-                error,
-                f"{name} measured minus true, rms {np.sqrt(np.nanmean(error**2)):.2f} um",
-                "um",
-                cmap=DIFFERENCE,
-                vmin=-limit,
-                vmax=limit,
+            draw_difference(
+                axes[1, k], last, error, f"{name} measured minus true, rms {np.sqrt(np.nanmean(error**2)):.2f} um", "um"
             )
         figure.tight_layout()
         save(figure, out / "plate_maps.png")
@@ -226,10 +225,9 @@ def steel(
     limit = max(colour_limit(found_um), colour_limit(true_um))
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 3, figsize=(12.5, 3.4))
-        options = {"cmap": DIFFERENCE, "vmin": -limit, "vmax": limit}
-        draw_map(axes[0], result, found_um, "height over the best plane, one pair", "um", **options)
-        draw_map(axes[1], result, true_um, "true surface as the subset sees it", "um", **options)
-        draw_map(axes[2], result, found_um - true_um, "difference", "um", **options)
+        draw_difference(axes[0], result, found_um, "height over the best plane, one pair", "um", limit)
+        draw_difference(axes[1], result, true_um, "true surface as the subset sees it", "um", limit)
+        draw_difference(axes[2], result, found_um - true_um, "difference", "um", limit)
         figure.tight_layout()
         save(figure, out / "steel_heights.png")
 
@@ -283,16 +281,8 @@ def panel(
             opening = result.uvw_mm @ np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
             draw_map(axes[0, k], result, opening, f"along the load, {load:g} kN", "mm", cmap=HEIGHT)
             error = 1e3 * comparison.error_mm[..., 2]
-            limit = colour_limit(error)
-            draw_map(
-                axes[1, k],
-                result,
-                error,
-                f"w minus true, rms {np.sqrt(np.nanmean(error**2)):.1f} um",
-                "um",
-                cmap=DIFFERENCE,
-                vmin=-limit,
-                vmax=limit,
+            draw_difference(
+                axes[1, k], result, error, f"w minus true, rms {np.sqrt(np.nanmean(error**2)):.1f} um", "um"
             )
         figure.tight_layout()
         save(figure, out / "panel_maps.png")

@@ -12,11 +12,13 @@ from matplotlib import pyplot as plt
 from core.arrays import Float
 from core.field.points.result import Field
 from core.strain import StrainField
-from server.demo.drawing.fields import DIFFERENCE, HEIGHT, STYLE, colour_limit, draw_map, save
+from server.demo.drawing.fields import HEIGHT, STYLE, colour_limit, draw_difference, draw_map, save
 from server.demo.experiments.panel_gauges import ENDS_PX, Opening, Slice
 from server.demo.experiments.panel_strain import PanelStrain
 from server.demo.experiments.steel_motion import Moved
 from server.demo.strain import MICRO
+
+_DOTS: Any = {"fmt": ".", "markersize": 5, "elinewidth": 0.8}
 
 
 def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm: float) -> dict[str, str]:
@@ -27,12 +29,11 @@ def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm:
         x = found.place * half_crack_mm
         inner = np.linspace(-half_crack_mm, half_crack_mm, 201)
         for k, (load, colour) in enumerate(zip(loads_kn, colours, strict=True)):
-            bars: dict[str, Any] = {"fmt": ".", "color": colour, "markersize": 5, "elinewidth": 0.8}
-            axes[0].errorbar(x, 1e3 * found.found[k], 1e3 * found.sigma[k], label=f"{load:g} kN", **bars)
+            axes[0].errorbar(x, 1e3 * found.found[k], 1e3 * found.sigma[k], label=f"{load:g} kN", color=colour, **_DOTS)
             _true(axes[0], x, 1e3 * found.true[k], half_crack_mm)
             lens = np.max(found.lips[k]) * np.sqrt(1.0 - (inner / half_crack_mm) ** 2)  # one place is the middle
             axes[0].plot(inner, 1e3 * lens, "--", color="0.5", linewidth=0.7)
-            axes[2].errorbar(x, 1e3 * found.parting[k], 1e3 * found.parting_sigma[k], **bars)
+            axes[2].errorbar(x, 1e3 * found.parting[k], 1e3 * found.parting_sigma[k], color=colour, **_DOTS)
             _true(axes[2], x, 1e3 * found.parting_true[k], half_crack_mm)
         axes[0].set_ylabel("elongation over the crack, um")
         axes[0].set_title(
@@ -112,16 +113,12 @@ def strain(
         title = f"strain along the load at {load_kn:g} kN, gauge of {measured.gauge_mm:.0f} mm"
         draw_map(axes[0, 0], field, values, title, "microstrain", **scale)
         draw_map(axes[0, 1], field, read, "true, as this gauge reads it", "microstrain", **scale)
-        limit = colour_limit(values - read)
-        draw_map(
+        draw_difference(
             axes[1, 0],
             field,
             values - read,
             f"difference: rms {found.all_read.rms:.0f}, told {found.all_read.told:.0f}",
             "microstrain",
-            cmap=DIFFERENCE,
-            vmin=-limit,
-            vmax=limit,
         )
         axis = axes[1, 1]
         middle = 0.5 * (crack_px[0] + crack_px[-1])
@@ -172,15 +169,6 @@ def moved(out: Path, fields: Sequence[Field], strains: Sequence[StrainField], fo
             draw_map(axes[0, k], field, w, f"{one.name}: w", "mm", cmap=HEIGHT)
             for j, name in enumerate(("exx", "eyy")):
                 title = f"false {name}: mean {one.false_mean[j]:+.1f}, sd {one.false_sd[j]:.0f}, told {one.told[j]:.0f}"
-                draw_map(
-                    axes[1 + j, k],
-                    field,
-                    MICRO * strain.strain[..., j],
-                    title,
-                    "microstrain",
-                    cmap=DIFFERENCE,
-                    vmin=-limit,
-                    vmax=limit,
-                )
+                draw_difference(axes[1 + j, k], field, MICRO * strain.strain[..., j], title, "microstrain", limit)
         save(figure, out / "steel_motion.png")
     return {"steel_motion.png": "three rigid motions, and the strain that is not there"}

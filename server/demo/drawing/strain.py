@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from core.field.points.result import Field
 from core.strain import StrainField
-from server.demo.drawing.fields import DIFFERENCE, HEIGHT, STYLE, colour_limit, draw_map, save
+from server.demo.drawing.fields import HEIGHT, STYLE, draw_difference, draw_map, save
 from server.demo.experiments.plate_strain import PlateStrain
 from server.demo.strain import MICRO
 from sim.plate import CircularPlate
@@ -78,16 +78,8 @@ def plate(
                 axes[k, 0], last, measured, f"{name} strain at {pressures_kpa[-1]:.0f} kPa", "microstrain", **scale
             )
             draw_map(axes[k, 1], last, true, "plate theory at the points", "microstrain", **scale)
-            limit = colour_limit(measured - true)
-            draw_map(
-                axes[k, 2],
-                last,
-                measured - true,
-                "measured minus theory (windows are cut at the edges)",
-                "microstrain",
-                cmap=DIFFERENCE,
-                vmin=-limit,
-                vmax=limit,
+            draw_difference(
+                axes[k, 2], last, measured - true, "measured minus theory (windows are cut at the edges)", "microstrain"
             )
         save(figure, out / "plate_strain_maps.png")
     return {

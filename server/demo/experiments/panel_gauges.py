@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -92,15 +91,13 @@ def read_opening(
     ends = np.stack([on - reach, on + reach], axis=1)
     gauges = [{"a_px": a.tolist(), "b_px": b.tolist()} for a, b in ends]
     points = [{"xy_px": xy.tolist()} for xy in ends.reshape(-1, 2)]
-    steps = session.client.gauges(analysis, extensometers=gauges, points=points, variables=["w_mm"])["steps"][1:]
-    found, sigma = (
-        _numbers([[e["values"]["elongation_mm"][k] for e in s["extensometers"]] for s in steps])
-        for k in ("value", "sigma")
-    )
-    w, w_sigma = (
-        _numbers([[p["values"]["w_mm"][k] for p in s["points"]] for s in steps]).reshape(len(steps), -1, 2)
-        for k in ("value", "sigma")
-    )
+    steps = session.client.gauges(analysis, extensometers=gauges, points=points, variables=["w_mm"])[1:]
+    elongations = [[e.values["elongation_mm"] for e in s.extensometers] for s in steps]
+    found = _numbers([[e.value for e in of_step] for of_step in elongations])
+    sigma = _numbers([[e.sigma for e in of_step] for of_step in elongations])
+    depths = [[p.values["w_mm"] for p in s.points] for s in steps]
+    w = _numbers([[p.value for p in of_step] for of_step in depths]).reshape(len(steps), -1, 2)
+    w_sigma = _numbers([[p.sigma for p in of_step] for of_step in depths]).reshape(len(steps), -1, 2)
     truths = [true_panel(session.rig, ends, load) for load in loads_kn]
     s_mm = truths[0].st_mm[..., 0].mean(axis=1)
     lens = np.sqrt(np.clip(panel.half_crack_mm**2 - s_mm**2, 0.0, None))
@@ -122,10 +119,11 @@ def read_slice(
 ) -> Slice:
     """Read w along a line over HTTP; ``axis`` 0: told along the crack, 1: along the load."""
     line = {"vertices_px": np.asarray(ends_px).tolist()}
-    steps = session.client.gauges(analysis, lines=[line], variables=["w_mm"])["steps"][1:]
-    first = steps[0]["lines"][0]
-    xy = np.stack([first["x_px"], first["y_px"]], axis=-1)
-    found, sigma = (_numbers([s["lines"][0]["values"]["w_mm"][k] for s in steps]) for k in ("value", "sigma"))
+    steps = session.client.gauges(analysis, lines=[line], variables=["w_mm"])[1:]
+    first = steps[0].lines[0]
+    xy = np.stack([first.x_px, first.y_px], axis=-1)
+    depths = [s.lines[0].values["w_mm"] for s in steps]
+    found, sigma = _numbers([w.value for w in depths]), _numbers([w.sigma for w in depths])
     truths = [true_panel(session.rig, xy, load) for load in loads_kn]
     true = np.array([-t.uvw_mm[..., 2] for t in truths])
     return Slice(xy, truths[0].st_mm[:, axis], -found, sigma, true)
@@ -260,6 +258,6 @@ def _elongation(truth: Truth) -> Float:
     return np.asarray(length[1] - length[0])
 
 
-def _numbers(values: Any) -> Float:
+def _numbers(values: Sequence[Sequence[float | None]]) -> Float:
     """Lists of numbers, None where one is missing."""
     return np.array(values, dtype=np.float64)

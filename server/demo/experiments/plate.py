@@ -110,12 +110,15 @@ def run(session: Session, calibration_id: str) -> Outcome:
 def _strain_in_the_centre(session: Session, analysis: AnalysisHandle, fit: PlateFit) -> list[tuple[float, float]]:
     """Read the mean of both normal strains in the plate's centre in every step, with its standard deviation."""
     centre = {"name": "centre", "xy_mm": list(fit.centre_mm)}
-    steps = session.client.gauges(analysis, points=[centre], variables=["exx", "eyy"])["steps"][1:]
+    steps = session.client.gauges(analysis, points=[centre], variables=["exx", "eyy"])[1:]
     found = []
     for step in steps:
-        exx, eyy = (step["points"][0]["values"][name] for name in ("exx", "eyy"))
+        exx, eyy = (step.points[0].values[name] for name in ("exx", "eyy"))
+        sigmas = [np.nan if v.sigma is None else v.sigma for v in (exx, eyy)]
+        assert exx.value is not None
+        assert eyy.value is not None
         # their errors hardly go together: a whole window's slopes over column and row do not
-        found.append((0.5 * (exx["value"] + eyy["value"]), 0.5 * float(np.hypot(exx["sigma"], eyy["sigma"]))))
+        found.append((0.5 * (exx.value + eyy.value), 0.5 * float(np.linalg.norm(sigmas))))
     return found
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from server.demo.session import Check, Outcome, Session, table
 from server.demo.strain import MICRO, chi_limit, fetched_strain
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.volume import volume_of
+from server.formats.gauges.readings import AreaStatistics, StepReadings
 
 # name, translation (mm) and rotation (degrees about X_sys, Y_sys, Z_sys) of the plate, about the system's origin
 MOTIONS = (
@@ -70,7 +72,7 @@ class Moved:
     false_sd: Float
     told: Float
     chi: float
-    left: dict[str, Any]
+    left: Mapping[str, AreaStatistics]
 
 
 def capture(session: Session, test: str) -> None:
@@ -82,7 +84,7 @@ def capture(session: Session, test: str) -> None:
 
 
 def measure(
-    session: Session, test: str, first: int, region: dict[str, Any], folder: str, **settings: Any
+    session: Session, test: str, first: int, region: Mapping[str, Sequence[float]], folder: str, **settings: Any
 ) -> tuple[list[Moved], list[Field], list[StrainField]]:
     """Measure the motions of the steps from ``first`` on, and read the gauges over HTTP.
 
@@ -109,7 +111,7 @@ def measure(
         variables=["u_mm", "v_mm", "w_mm", *STRAINS],
         remove_rigid={},
         steps=steps,
-    )["steps"]
+    )
     volume = volume_of(load_calibration(session.out / "calibration.json"))
     moved = []
     for motion, step, field, strain in zip(MOTIONS, read, fields, strains, strict=True):
@@ -144,32 +146,32 @@ def calibration_covariance(volume: CalibratedVolume, points_mm: Float, motion: t
     return np.asarray(gain @ volume.covariance @ gain.T)
 
 
-def _moved(motion: tuple[str, Any, Any], step: dict[str, Any], strain: StrainField, calibration: Float) -> Moved:
+def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField, calibration: Float) -> Moved:
     name, shift, degrees = motion
-    rigid = step["rigid_motion"]
+    rigid = step.rigid_motion
+    assert rigid is not None
     turn = Rotation.from_rotvec(degrees, degrees=True)
-    middle = np.array(rigid["centre_mm"])
+    middle = np.array(rigid.centre_mm)
     true = np.concatenate([turn.as_rotvec(), turn.apply(middle) + np.array(shift) - middle])
     values = [
-        rigid["values"][f"{what}_{axis}_{unit}"]
+        rigid.values[f"{what}_{axis}_{unit}"]
         for what, unit in (("rotation", "rad"), ("translation", "mm"))
         for axis in "xyz"
     ]
-    elongation = [e["values"]["elongation_mm"] for e in step["extensometers"]]
-    area = step["areas"][0]["values"]
-    mean, mean_sigma = (
-        MICRO * np.array([area[name][k] for name in STRAINS], dtype=np.float64) for k in ("mean", "mean_sigma")
-    )
+    elongation = [e.values["elongation_mm"] for e in step.extensometers]
+    area = step.areas[0].values
+    mean = MICRO * np.array([area[name].mean for name in STRAINS], dtype=np.float64)
+    mean_sigma = MICRO * np.array([area[name].mean_sigma for name in STRAINS], dtype=np.float64)
     e, sigma = strain.strain[strain.valid], strain.sigma[strain.valid]
     return Moved(
         name=name,
-        found=np.array([v["value"] for v in values]),
-        sigma=np.array([v["sigma"] for v in values]),
+        found=np.array([v.value for v in values]),
+        sigma=np.array([v.sigma for v in values]),
         sigma_calibration=np.sqrt(np.diag(calibration))[:6],
         true=true,
-        noise_ratio=float(rigid["noise_ratio"]),
-        elongation_mm=np.array([v["value"] for v in elongation]),
-        elongation_sigma_mm=np.array([v["sigma"] for v in elongation]),
+        noise_ratio=rigid.noise_ratio,
+        elongation_mm=np.array([v.value for v in elongation]),
+        elongation_sigma_mm=np.array([v.sigma for v in elongation]),
         false_mean=mean,
         false_mean_sigma=mean_sigma,
         false_mean_calibration=MICRO * np.sqrt(np.diag(calibration))[6:],
@@ -205,7 +207,7 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
             ]
         )
         elongations = " ".join(f"{1e3 * e:+.2f}" for e in one.elongation_mm)
-        u, v, w = (1e3 * one.left[f"{c}_mm"]["sd"] for c in "uvw")
+        u, v, w = (np.nan if (sd := one.left[f"{c}_mm"].sd) is None else 1e3 * sd for c in "uvw")
         false_rows.append(
             [
                 one.name,
@@ -253,7 +255,7 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
             "noise_ratio": one.noise_ratio,
             "elongation_mm": one.elongation_mm.tolist(),
             "elongation_sigma_mm": one.elongation_sigma_mm.tolist(),
-            "left": one.left,
+            "left": {name: asdict(values) for name, values in one.left.items()},
             "false_strain_microstrain": {
                 "mean": one.false_mean.tolist(),
                 "mean_sigma": one.false_mean_sigma.tolist(),

@@ -24,7 +24,7 @@ FORMAT_VERSION = 1
 
 
 def calibration_content(
-    result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, Any] | None = None
+    result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, object] | None = None
 ) -> dict[str, Any]:
     """Return the content of calibration.json as plain numbers, lists and texts.
 
@@ -86,9 +86,9 @@ def calibration_content(
 
 
 def write_calibration(
-    path: str | Path, result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Write calibration.json aside, sync it and rename it; return its content.
+    path: str | Path, result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, object] | None = None
+) -> None:
+    """Write calibration.json aside, sync it and rename it.
 
     Raises
     ------
@@ -98,10 +98,9 @@ def write_calibration(
     content = calibration_content(result, target, provenance=provenance)
     # a number that is not finite has no place in JSON, and none in a calibration
     write_bytes(Path(path), (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
-    return content
 
 
-def covariance_in(content: Mapping[str, Any], *, name: str) -> NDArray[np.float64] | None:
+def covariance_in(content: Mapping[str, object], *, name: str) -> NDArray[np.float64] | None:
     """Return the (20, 20) covariance of a calibration.json's content in the order of COVARIANCE_NAMES, None without.
 
     Raises
@@ -139,15 +138,15 @@ def _unusable(name: str, why: str) -> FileFormatError:
     )
 
 
-def _by_camera(values: NDArray[np.float64]) -> dict[str, Any]:
+def _by_camera(values: NDArray[np.float64]) -> dict[str, list[float] | float]:
     return {f"cam{c + 1}": v.tolist() if np.ndim(v) else float(v) for c, v in enumerate(values)}
 
 
-def _three(measures: Measures) -> dict[str, Any]:
+def _three(measures: Measures) -> dict[str, float]:
     return {"rbe_px": measures.rbe_px, "raz_mm": measures.raz_mm, "nsce": measures.nsce, "points": measures.count}
 
 
-def _measures(check: CheckMeasures) -> dict[str, Any]:
+def _measures(check: CheckMeasures) -> dict[str, object]:
     return {
         **_three(check.mean),
         "per_camera": {f"cam{c + 1}": _three(m) for c, m in enumerate(check.per_camera)},

@@ -43,7 +43,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix)
 
 
-def _load(name: str, text: str) -> dict[str, Any]:
+def _load(name: str, text: str) -> dict[str, object]:
     """Read YAML, JSON or XML text to plain lists, mappings and numbers."""
     try:
         if text.lstrip().startswith("<"):
@@ -58,7 +58,7 @@ def _load(name: str, text: str) -> dict[str, Any]:
     return content
 
 
-def _load_xml(text: str) -> dict[str, Any]:
+def _load_xml(text: str) -> dict[str, object]:
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     try:
         nodes = {key: storage.getNode(key) for key in (*KEYS, "imageSize")}
@@ -91,7 +91,7 @@ def _flat(value: Any, depth: int = 0) -> list[float]:
     return [number for part in value for number in _flat(part, depth + 1)]
 
 
-def _array(name: str, content: dict[str, Any], key: str) -> NDArray[np.float64]:
+def _array(name: str, content: dict[str, object], key: str) -> NDArray[np.float64]:
     if content.get(key) is None:
         raise unreadable(name, f"{key} is missing")
     value = content[key]
@@ -110,7 +110,7 @@ def _array(name: str, content: dict[str, Any], key: str) -> NDArray[np.float64]:
     return array
 
 
-def _lens(name: str, content: dict[str, Any], which: int) -> OpenCVLens:
+def _lens(name: str, content: dict[str, object], which: int) -> OpenCVLens:
     K = _array(name, content, f"cameraMatrix{which}")
     if K.shape != (3, 3):
         raise unreadable(name, f"cameraMatrix{which} has the shape {K.shape}, not (3, 3)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -61,7 +62,7 @@ IMPORTED = "imported"
 _DEEPEST = 30  # levels of nesting; our own files have six
 
 
-def imported_content(data: bytes, *, name: str) -> dict[str, Any]:
+def imported_content(data: bytes, *, name: str) -> dict[str, object]:
     """Return the content of a ``calibration.json`` that carries the bytes of any calibration file.
 
     A calibration of this program is carried over as it is. Another program's text is wrapped whole, so that no digit
@@ -118,7 +119,7 @@ def _camera(name: str, which: str, content: Any) -> Camera:
     return Camera.from_paper(**values)
 
 
-def _size(content: dict[str, Any], which: str) -> tuple[int, int] | None:
+def _size(content: Mapping[str, object], which: str) -> tuple[int, int] | None:
     sizes = content.get("image_size_px", content[which])  # our own files keep it beside the cameras
     size = sizes.get(which, sizes.get("image_size_px")) if isinstance(sizes, dict) else None
     if isinstance(size, list) and len(size) == 2 and all(isinstance(v, int) and v > 0 for v in size):

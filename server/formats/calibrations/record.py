@@ -62,7 +62,7 @@ class ViewRecord(Measures):
 class TargetRecord(Record):
     """The grid that was looked at."""
 
-    lines: list[int]
+    lines: tuple[int, int]
     pitch_mm: float
     line_width_mm: float
     node_tolerance_mm: float = 0.0
@@ -100,8 +100,8 @@ class CalibrationRecord(Record):
     checks: ChecksRecord | None = None
     verdict: VerdictRecord = VerdictRecord()
     uncertainty: UncertaintyRecord = UncertaintyRecord()
-    sigma: dict[str, float] = Field(default={})
-    views: list[ViewRecord] = Field(default=[])
+    sigma: dict[str, float | None] = Field(default={})
+    views: list[ViewRecord] | None = None
     target: TargetRecord | None = None
     provenance: OriginRecord = OriginRecord()
     settings: SettingsRecord = SettingsRecord()

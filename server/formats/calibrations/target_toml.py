@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
 
 from core.calibration import NominalCamera
 from core.errors import FileFormatError, InputError
@@ -35,7 +34,7 @@ class NominalRig:
     axis_tilt_sigma_rad: float = 0.0
 
 
-def load_toml(path: Path, *, what: str) -> dict[str, Any]:
+def load_toml(path: Path, *, what: str) -> dict[str, object]:
     """Read a TOML file.
 
     Raises
@@ -70,11 +69,6 @@ def read_target(path: Path) -> GridTarget:
     where = f"{path}, [target]" if "target" in content else str(path)
     if not isinstance(table, Mapping):
         raise _field(where, "target", "is not a table")
-    return parse_target(table, where=where)
-
-
-def parse_target(table: Mapping[str, Any], *, where: str) -> GridTarget:
-    """Make the target of a table's fields; ``where`` names the table in messages."""
     pitch = _number(table, "pitch_mm", where, positive=True)
     width = _number(table, "line_width_mm", where, positive=True)
     tolerance = _number(table, "node_tolerance_mm", where, default=0.0)
@@ -120,7 +114,7 @@ def read_rig(path: Path) -> NominalRig:
     return NominalRig(cameras[0], cameras[1], tilt)
 
 
-def _camera(table: Mapping[str, Any], where: str) -> NominalCamera:
+def _camera(table: Mapping[str, object], where: str) -> NominalCamera:
     size = table.get("image_size_px")
     if size is None:
         raise _field(where, "image_size_px", "is missing")
@@ -139,7 +133,7 @@ def _camera(table: Mapping[str, Any], where: str) -> NominalCamera:
 
 
 def _number(
-    table: Mapping[str, Any], key: str, where: str, *, positive: bool = False, default: float | None = None
+    table: Mapping[str, object], key: str, where: str, *, positive: bool = False, default: float | None = None
 ) -> float:
     value = table.get(key, default)
     if value is None:

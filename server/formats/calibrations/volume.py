@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from core.calibration.volume import CalibratedVolume, calibrated_volume
 from core.errors import TargetError
@@ -11,6 +10,7 @@ from core.names import CAMERAS
 from core.target import GridTarget
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
+from server.formats.calibrations.record import ChecksRecord
 
 
 def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
@@ -21,17 +21,17 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
     FileFormatError
         ``calibration_unreadable`` if the file's covariance is not usable.
     """
-    content = calibration.details
+    record = calibration.record
     sizes = (calibration.image_size1_px, calibration.image_size2_px)
-    target, views = content.get("target"), content.get("views")
-    if sizes[0] is None or sizes[1] is None or not isinstance(target, dict) or not isinstance(views, list):
+    if sizes[0] is None or sizes[1] is None or record.target is None or record.views is None:
         return None
-    positions = [_positions(views, camera) for camera in CAMERAS]
+    # those that the fit used
+    fitted = [view for view in record.views if not view.held_out]
+    positions = [[view.dz_mm for view in fitted if view.camera == cam] for cam in CAMERAS]
+    told = record.target
     try:
-        grid = GridTarget(
-            pitch_mm=target["pitch_mm"], lines=tuple(target["lines"]), line_width_mm=target["line_width_mm"]
-        )
-    except (KeyError, TypeError, TargetError):
+        grid = GridTarget(pitch_mm=told.pitch_mm, lines=told.lines, line_width_mm=told.line_width_mm)
+    except TargetError:
         return None
     return calibrated_volume(
         calibration.pair,
@@ -39,30 +39,15 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
         (sizes[0], sizes[1]),
         positions,
         pitch_mm=grid.pitch_mm,
-        covariance=covariance_in(content, name="calibration.json"),
+        covariance=covariance_in(calibration.details, name="calibration.json"),
     )
 
 
 def rbe_of(calibration: LoadedCalibration) -> float | None:
     """Return the calibration's reprojection error, of held-out positions where there are any; None if not told."""
-    checks = calibration.details.get("checks")
-    if not isinstance(checks, dict):
-        return None
-    for name in ("held_out", "fitted"):
-        measures = checks.get(name)
-        value = measures.get("rbe_px") if isinstance(measures, dict) else None
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0.0:
-            return float(value)
+    checks = calibration.record.checks or ChecksRecord()
+    for measures in (checks.held_out, checks.fitted):
+        value = None if measures is None else measures.rbe_px
+        if value is not None and math.isfinite(value) and value >= 0.0:
+            return value
     return None
-
-
-def _positions(views: list[Any], camera: str) -> list[float]:
-    """Travels of a camera's views that the fit used."""
-    return [
-        float(view["dz_mm"])
-        for view in views
-        if isinstance(view, dict)
-        and view.get("camera") == camera
-        and not view.get("held_out", False)
-        and isinstance(view.get("dz_mm"), int | float)
-    ]

@@ -165,7 +165,7 @@ class GaugeReadings:
     """
 
     software_version: str
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     inputs_sha256: Mapping[str, str]
     stale: bool
     stale_reasons: Sequence[str]
@@ -180,7 +180,7 @@ class GaugeReadings:
         """The steps that could be read."""
         return [step for step in self.steps if step.problem is None]
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> dict[str, object]:
         """Return what stands above a table of readings."""
         return {
             "software_version": self.software_version,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from core.field.points.result import Field
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 COMPARISONS = ("cam1_t0__cam2_t0", "cam1_t0__cam1_t", "cam1_t0__cam2_t")
 COVARIANCE_NAMES = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
 #: What steps that are matched against this one inherit: name in variables and in `References` -> its cause

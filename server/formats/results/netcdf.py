@@ -6,7 +6,7 @@ import contextlib
 import errno
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +43,13 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def written_dataset(path: Path, *, checksum: bool = False) -> Iterator[Any]:
+def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False) -> Iterator[Any]:
     """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_aside`.
+
+    Parameters
+    ----------
+    classic
+        Keep to the classic model, which every reader knows; without it there are texts and unlimited dimensions.
 
     Raises
     ------
@@ -53,8 +58,19 @@ def written_dataset(path: Path, *, checksum: bool = False) -> Iterator[Any]:
     """
     with written_aside(path, checksum=checksum) as aside:
         try:
-            with library, netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC") as dataset:
+            with (
+                library,
+                netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC" if classic else "NETCDF4") as dataset,
+            ):
                 yield dataset
         except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
             full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
+
+
+def dataset_bytes(fill: Callable[[Any], None]) -> bytes:
+    """Return the bytes of a NetCDF-4 file that ``fill`` puts into an empty data set."""
+    with library:
+        dataset = netCDF4.Dataset("field.nc", "w", memory=1 << 16, format="NETCDF4_CLASSIC")
+        fill(dataset)
+        return bytes(dataset.close())

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,11 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field, References
 from core.field.points.smoothing_record import Smoothing
 from core.field.region.cuts import Cuts, from_arrays
+from core.names import CameraName
+from core.status import PointStatus
 from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, HANDED_ON, MOTION, SHAPE
 from server.formats.results.netcdf import opened
+from server.formats.results.settings import current_inputs, current_settings
 
 
 @contextlib.contextmanager
@@ -75,7 +78,7 @@ def read_field(path: str | Path) -> Field:
 
 
 def read_measured(path: str | Path) -> Field:
-    """Read a result file back as it was measured: with its displacement before smoothing.
+    """Read a result file back as it was measured: before smoothing, and before points outside the volume were marked.
 
     Raises
     ------
@@ -83,34 +86,89 @@ def read_measured(path: str | Path) -> Field:
         As :func:`read_field`.
     """
     field = read_field(path)
-    if field.smoothing is None:
-        return field
     with _opened(Path(path)) as dataset:
-        if "measured_covariance" not in dataset.variables:
-            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
         read = {
             name: np.asarray(v[...], dtype=np.float64)
             for name, v in dataset.variables.items()
             if name.startswith("measured_")
         }
-    uvw = np.stack([read[f"measured_{name}_mm"] for name in ("u", "v", "w")], axis=-1)
-    return replace(field, uvw_mm=uvw, covariance=read["measured_covariance"], smoothing=None)
+    if field.smoothing is not None:
+        if "measured_u_mm" not in read:
+            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
+        uvw = np.stack([read[f"measured_{name}_mm"] for name in ("u", "v", "w")], axis=-1)
+        field = replace(field, uvw_mm=uvw, smoothing=None)
+    # files of format 1 have it only beside a smoothed displacement: there, marked points keep the calibration's part
+    covariance = read.get("measured_covariance", field.covariance)
+    status = np.where(field.status == PointStatus.EXTRAPOLATED, PointStatus.OK, field.status).astype(np.int8)
+    return replace(field, covariance=covariance, status=status)
 
 
-def read_attributes(path: str | Path) -> dict[str, Any]:
-    """Read a result file's global attributes; those that hold JSON (``settings`` ...) come back as objects.
+@dataclass(frozen=True)
+class ResultHead:
+    """What a result file says of itself.
+
+    Attributes
+    ----------
+    step, kind, label, load_n
+        Of the step; ``shape`` or ``displacement``.
+    frame, created, software_version
+        As written.
+    reference_step
+        What it was matched against; None for a shape.
+    settings, inputs_sha256
+        In today's form, see :mod:`server.formats.results.settings`.
+    attributes
+        All global attributes, as they are stored.
+    """
+
+    step: int
+    kind: str
+    label: str
+    load_n: float | None
+    frame: str
+    created: str
+    software_version: str
+    reference_step: int | None
+    settings: dict[str, Any]
+    inputs_sha256: dict[str, str]
+    attributes: Mapping[str, object]
+
+    def image_file(self, cam: CameraName) -> str:
+        """Where the step's image lay; empty where the file does not say."""
+        return str(self.attributes.get(f"{cam}_file", ""))
+
+
+def read_head(path: str | Path) -> ResultHead:
+    """Read what a result file says of itself.
 
     Raises
     ------
     FileFormatError
         As :func:`read_field`.
     """
-    with _opened(Path(path)) as dataset:
-        attributes = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
-    for name in ("settings", "inputs_sha256", "patch_choice", "smoothing"):
-        if name in attributes:
-            attributes[name] = json.loads(attributes[name])
-    return attributes
+    path = Path(path)
+    with _opened(path) as dataset:
+        said: dict[str, Any] = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
+    return ResultHead(
+        step=int(said.get("step", 0)),
+        kind=str(said.get("kind", "")),
+        label=str(said.get("label", "")),
+        load_n=_number(said.get("load_n")),
+        frame=str(said.get("frame", "")),
+        created=str(said.get("created", "")),
+        software_version=str(said.get("software_version", "")),
+        reference_step=int(said["reference_step"]) if "reference_step" in said else None,
+        settings=current_settings(json.loads(said.get("settings", "{}"))),
+        inputs_sha256=current_inputs(json.loads(said.get("inputs_sha256", "{}"))),
+        attributes=said,
+    )
+
+
+def _number(text: object) -> float | None:
+    try:
+        return float(str(text))
+    except ValueError:
+        return None
 
 
 def _references_of(dataset: Any) -> References | None:

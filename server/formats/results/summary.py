@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
-from server.formats.results.layout import COMPARISONS
+from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
 
 
 def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -150,6 +151,41 @@ def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0)
             for name, a in zip(("u", "v", "w"), uvw.T, strict=True)
         },
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceSummary:
+    """``summary.json``: what a measurement found in its steps, whatever became of it.
+
+    Attributes
+    ----------
+    state
+        ``succeeded``, or how the analysis' job ended.
+    calibration
+        ``sha256``; ``file`` and ``source`` where it was named by its file.
+    settings
+        As :class:`core.settings.StoredSettings`.
+    seconds
+        That the measurement took.
+    steps
+        An entry a finished step, in their order.
+    steps_failed
+        The problem of each step that could not be measured, by its number.
+    """
+
+    state: str
+    software_version: str
+    created: str
+    calibration: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    seconds: float
+    steps: Sequence[Mapping[str, Any]]
+    steps_failed: Mapping[str, Any] = field(default_factory=dict)
+    format_version: int = FORMAT_VERSION
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return asdict(self)
 
 
 def to_json(document: Any) -> bytes:

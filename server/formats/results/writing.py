@@ -236,18 +236,21 @@ def _put_references(dataset: Any, references: References) -> None:
             )
 
 
-def _put_measured(dataset: Any, measured: Field) -> None:
-    assert measured.uvw_mm is not None
-    for k, name in enumerate(("u", "v", "w")):
-        _put(
-            dataset,
-            f"measured_{name}_mm",
-            measured.uvw_mm[..., k],
-            ("row", "col"),
-            units="mm",
-            dtype="f8",
-            long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
-        )
+def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
+    """Write what later steps go on from, where the field that is shown has something else."""
+    if result.smoothing is not None and measured.uvw_mm is not None:
+        for k, name in enumerate(("u", "v", "w")):
+            _put(
+                dataset,
+                f"measured_{name}_mm",
+                measured.uvw_mm[..., k],
+                ("row", "col"),
+                units="mm",
+                dtype="f8",
+                long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
+            )
+    if result.covariance is measured.covariance:
+        return
     _put(
         dataset,
         "measured_covariance",
@@ -255,11 +258,11 @@ def _put_measured(dataset: Any, measured: Field) -> None:
         ("row", "col", "i", "j"),
         units="mm2",
         dtype="f4",
-        long_name="covariance of x_mm, y_mm, z_mm and the displacement as measured",
+        long_name="covariance of x_mm, y_mm, z_mm and the displacement as measured, by image noise alone",
     )
 
 
-def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, Any]:
+def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, object]:
     return {
         "Conventions": "CF-1.11",
         "title": "displacement from the reference step" if moved else "shape of the reference step",
@@ -298,7 +301,7 @@ def write_field(
     strain
         Of the same points, if it was computed; :func:`server.formats.results.strain.read_strain` reads it back.
     measured
-        The field before its displacement was smoothed; later steps may go on from it.
+        The field before its displacement was smoothed and points were marked; later steps go on from it.
     checksum
         Put the file's SHA-256 beside it.
 
@@ -309,5 +312,5 @@ def write_field(
     """
     with written_dataset(Path(path), checksum=checksum) as dataset:
         _fill(dataset, result, provenance, strain)
-        if result.smoothing is not None and measured is not None:
-            _put_measured(dataset, measured)
+        if measured is not None:
+            _put_measured(dataset, result, measured)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from core.errors import InputError
 from core.field.points.result import Field
 from core.strain import surface_strain
 from server.formats.files import make_folder
 from server.formats.gauges.readings import FrameReading, RigidMotionReading
+from server.formats.results.reading import ResultHead
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
@@ -58,7 +57,7 @@ class FieldWriter:
         self,
         path: Path,
         sha256: str,
-        attributes: Mapping[str, Any],
+        head: ResultHead,
         field: Field,
         frame: FrameReading | None,
         motion: RigidMotionReading | None,
@@ -67,7 +66,7 @@ class FieldWriter:
         strain = read_strain(path)
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)
-        extra = {name: str(attributes[name]) for name in _CARRIED if name in attributes}
+        extra = {name: str(head.attributes[name]) for name in _CARRIED if name in head.attributes}
         extra["made_from"] = f"{path.name}, SHA-256 {sha256}"
         extra["transformation"] = json.dumps(
             {
@@ -80,15 +79,15 @@ class FieldWriter:
             },
             sort_keys=True,
         )
-        told = str(attributes["frame"])
+        told = head.frame
         if self._request.align is not None:
             told = f"aligned by {self._request.align.kind}; before: {told}"
         provenance = Provenance(
-            settings=attributes["settings"],
-            inputs=attributes["inputs_sha256"],
+            settings=head.settings,
+            inputs=head.inputs_sha256,
             software_version=software_version(),
             frame=told,
-            step=int(attributes["step"]),
+            step=head.step,
             extra=extra,
         )
         to = self._folder / path.name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,8 +36,9 @@ from server.formats.gauges.readings import (
     RigidMotionReading,
     StepReadings,
 )
+from server.formats.results.folder import number_of
 from server.formats.results.layout import COVARIANCE_NAMES
-from server.formats.results.reading import read_attributes, read_field
+from server.formats.results.reading import ResultHead, read_field, read_head
 from server.formats.version import software_version
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
@@ -47,7 +48,6 @@ from server.results.staleness import stale_results
 
 _Placed = dict[str | None, list[tuple[float, float]]]
 MOST_NUMBERS = 3_000_000
-_CALIBRATION = ("calibration", "calibration.json")
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
 
@@ -57,19 +57,13 @@ class _Step:
 
     path: Path
     sha256: str
-    attributes: Mapping[str, Any]
+    head: ResultHead
     field: Field
     shared: SharedPixels
 
     def reading(self, **found: Any) -> StepReadings:
-        load = self.attributes.get("load_n")
-        return StepReadings(
-            n=int(self.attributes["step"]),
-            kind=str(self.attributes["kind"]),
-            label=str(self.attributes.get("label", "")),
-            load_n=None if load is None else float(load),
-            **found,
-        )
+        head = self.head
+        return StepReadings(n=head.step, kind=head.kind, label=head.label, load_n=head.load_n, **found)
 
 
 def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> GaugeReadings:
@@ -97,7 +91,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     """
     chosen = _chosen(files, request.steps)
     alignment: Alignment | None = None
-    first: Mapping[str, Any] | None = None
+    first: ResultHead | None = None
     grid: tuple[Float, Float] | None = None
     hashes, steps, heads = {}, [], []
     moved_by: set[str] = set()
@@ -106,13 +100,13 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     numbers = 0
     for path in chosen:
         step = _read(path)
-        first = step.attributes if first is None else first
+        first = step.head if first is None else first
         grid = (step.field.x_px, step.field.y_px) if grid is None else grid
         _check_same(step, first, grid, path, moved_by)
         hashes[path.name] = step.sha256
         if request.align is not None and alignment is None:
             alignment = _alignment(step, request)
-        if first is step.attributes:
+        if first is step.head:
             placed = _placed(step.field if alignment is None else aligned(step.field, alignment), request)
         numbers += _count(step.field, request.lines, len(request.variables or COVARIANCE_NAMES))
         if numbers > MOST_NUMBERS:
@@ -121,14 +115,14 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
                 code="gauge_too_large",
                 remedy="Ask for fewer places, variables or steps.",
             )
-        heads.append(step.attributes)
+        heads.append(step.head)
         steps.append(_read_step(step, alignment, request, placed, found, fields))
     for name in request.variables or ():
         if name not in found and any(s.problem is None for s in steps):
             read_variable(chosen[-1], name)  # says which there are
     assert first is not None
     stale = stale_results(chosen, heads)
-    frame = str(first["frame"])
+    frame = first.frame
     if request.align is not None:
         frame = f"aligned by {request.align.kind}; before: {frame}"
     return GaugeReadings(
@@ -138,8 +132,8 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         stale=bool(stale),
         stale_reasons=stale,
         frame=frame,
-        subset_px=first["settings"]["subset_px"],
-        smoothing_window=first["settings"].get("smoothing_window"),
+        subset_px=first.settings["subset_px"],
+        smoothing_window=first.settings.get("smoothing_window"),
         alignment=None if alignment is None else _frame_reading(alignment),
         steps=steps,
     )
@@ -152,7 +146,7 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
             code="no_results",
             remedy="Measure first; a step's result can be read once the step is finished.",
         )
-    there = {_number_of(path): path for path in files}
+    there = {number_of(path): path for path in files}
     numbers = sorted(there) if wanted is None else sorted(set(wanted))
     missing = [n for n in numbers if n not in there]
     if missing:
@@ -164,27 +158,23 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
     return [there[n] for n in numbers]
 
 
-def _number_of(path: Path) -> int:
-    return int(path.stem.removeprefix("step_"))
-
-
 def _listed(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers)) if len(numbers) <= 8 else f"{numbers[0]} ... {numbers[-1]}"
 
 
 def _read(path: Path) -> _Step:
-    attributes, field = read_attributes(path), read_field(path)
-    subset = attributes.get("settings", {}).get("subset_px")
+    head, field = read_head(path), read_field(path)
+    subset = head.settings.get("subset_px")
     if not isinstance(subset, int | float):
         raise InputError(
             f"{path.name} does not say its subset.", code="settings_missing", remedy="Measure again with this program."
         )
-    return _Step(path, sha256_of(path), attributes, field, SharedPixels.of(field, float(subset)))
+    return _Step(path, sha256_of(path), head, field, SharedPixels.of(field, float(subset)))
 
 
-def _check_same(step: _Step, first: Mapping[str, Any], grid: tuple[Float, Float], path: Path, refs: set[str]) -> None:
+def _check_same(step: _Step, first: ResultHead, grid: tuple[Float, Float], path: Path, refs: set[str]) -> None:
     """Refuse files that are no one measurement: other points, calibration, subset or reference."""
-    inputs, others = step.attributes["inputs_sha256"], first["inputs_sha256"]
+    inputs, others = step.head.inputs_sha256, first.inputs_sha256
     field = step.field
     if step.field.has_motion:
         refs.add(str(inputs.get("reference_cam1")))
@@ -192,12 +182,11 @@ def _check_same(step: _Step, first: Mapping[str, Any], grid: tuple[Float, Float]
         "points"
         if field.shape != grid[0].shape or (field.x_px != grid[0]).any() or (field.y_px != grid[1]).any()
         else "calibration"
-        if any(inputs.get(k) != others.get(k) for k in _CALIBRATION)
+        if inputs.get("calibration") != others.get("calibration")
         else "subset"
-        if step.attributes["settings"].get("subset_px") != first["settings"].get("subset_px")
+        if step.head.settings.get("subset_px") != first.settings.get("subset_px")
         else "smoothing"
-        if field.has_motion
-        and first["settings"].get("smoothing_window") != step.attributes["settings"].get("smoothing_window")
+        if field.has_motion and first.settings.get("smoothing_window") != step.head.settings.get("smoothing_window")
         else "reference"
         if len(refs) > 1 or (refs and str(others.get("reference_cam1")) not in refs)
         else ""
@@ -255,7 +244,7 @@ def _read_step(
         taken_out = _motion_reading(motion)
     if fields is not None:
         frame = None if alignment is None else _frame_reading(alignment)
-        fields(step.path, step.sha256, step.attributes, field, frame, taken_out)
+        fields(step.path, step.sha256, step.head, field, frame, taken_out)
     variables = Variables(step.path, field, step.shared, measured=step.field)
     names = variables.known(request.variables or COVARIANCE_NAMES)
     found.update(names)

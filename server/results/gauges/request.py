@@ -7,19 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
-from server.base.models import (
-    Number,
-    Pixel,
-    Request,
-    StepNumber,
-    Switch,
-    Whole,
-    any_of,
-    disagreement,
-    given,
-    not_both,
-    one_of,
-)
+from core.settings import Pixel, Whole, disagreement
+from server.base.models import Number, Request, StepNumber, Switch, any_of, given, not_both, one_of
 
 Place = tuple[Pixel, Pixel]
 PlaceMm = tuple[Number, Number]

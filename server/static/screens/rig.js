@@ -185,8 +185,8 @@ function camera(cam, first, ends) {
       stats = await api.get(`/cameras/${cam}/stats`);
       regain();
     } catch (error) {
-      if (!(error instanceof api.Problem)) throw error;
-      if (error.status >= 500) lose(error.message);
+      if (!(error instanceof Error)) throw error;
+      if (error instanceof api.Problem && error.status >= 500) lose(error.message);
       replace(figures, [...facts([["not known", error.message]]).children]);
       return null;
     }

@@ -11,10 +11,10 @@ import numpy as np
 
 from core.arrays import Float
 from core.cameras.camera import RigidTransform
-from core.field.points.patch import PatchSetting
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair
+from core.settings import PatchSetting
 from sim.catalog import make_scene
 from sim.rig import SimRig
 from sim.scene import UPRIGHT, Scene

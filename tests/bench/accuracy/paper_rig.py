@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +15,8 @@ from sim.render import RenderOptions, material_points, render
 from sim.scene import UPRIGHT, Scene
 from sim.surface import flat
 from sim.texture import Texture, speckle
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255
 
 

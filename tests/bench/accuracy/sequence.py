@@ -13,9 +13,9 @@ from core.arrays import Float
 from core.errors import MeasurementError
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
-from core.field.reference_update import REFERENCE_UPDATES, ReferenceUpdate
 from core.field.region.region import PointGrid
 from core.measure import Earlier, MeasureOptions, ReferencePair
+from core.settings import REFERENCE_UPDATES, ReferenceUpdate
 from sim.scene import Scene
 from tests.bench.accuracy.paper_rig import BRIGHT, DARK, Rig, plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section

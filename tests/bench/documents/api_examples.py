@@ -12,15 +12,16 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[3]
+from tests.support.requirements import ROOT
+
 sys.path.insert(0, str(ROOT / "tests"))
 
-from server.api.app import bare_app  # noqa: E402
-from server.api.docs.openapi import EXAMPLES  # noqa: E402
-from server.config.rig_file import parse_config  # noqa: E402
-from server.workflows.service import Service  # noqa: E402
-from tests.support.api_scenario import Session, run, short  # noqa: E402
-from tests.support.service_rig import SMALL, served  # noqa: E402
+from server.api.app import bare_app
+from server.api.docs.openapi import EXAMPLES
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from tests.support.api_scenario import Session, run, short
+from tests.support.service_rig import SMALL, served
 
 
 def examples_of(session: Session) -> dict[str, dict[str, object]]:

@@ -20,8 +20,8 @@ from typing import Any
 import core.errors
 import server.base.errors
 from server.api.protocol.problems import status_of_class
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 LIST = ROOT / "server" / "static" / "problems.json"
 PACKAGES = ("core", "drivers", "server", "sim")
 _WORD = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")

@@ -32,8 +32,8 @@ import numpy as np
 
 from sim.controllers.esp301 import SimESP301
 from tests.bench.reliability.stage_stop import TEST_ID, analysed, busy_s, homed_bench, set_priority
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 API = "/api/v1"
 PER_MINUTE = 200
 READERS = 50

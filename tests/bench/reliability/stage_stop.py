@@ -35,8 +35,8 @@ from sim.controllers.esp301 import SimESP301
 from sim.controllers.server import ControllerServer
 from sim.rig import SimRig
 from sim.world import SimWorld
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 API = "/api/v1"
 TEST_ID = "t000007-abcdef"
 TIME = "2026-01-01T00:00:00Z"

@@ -32,8 +32,8 @@ import httpx
 
 from server.formats.version import software_version
 from tests.bench.reliability.torture_lab import RIG, Lab, Pictures
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 KILLS_IN_A_FOLDER = 25
 COLD_EVERY = 25
 _WAIT_S = 120.0

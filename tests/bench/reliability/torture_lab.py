@@ -26,7 +26,7 @@ from server.formats.images import encode_tiff
 from server.store.verify import verify
 from sim.rig import SimRig
 from sim.world import SimWorld
-from tests.bench.documents.tiny_rig import tiny_rig
+from tests.support.tiny_rig import tiny_rig
 
 FINAL = ("succeeded", "failed", "cancelled", "interrupted")
 REGION = {"rectangle": [25, 25, 130, 115]}

@@ -14,10 +14,10 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[3]
+from tests.support.requirements import ROOT
+
 # numba takes this machine's features unless it is told others; the processor's name implies the rest
 TARGETS = {
     "haswell": "+avx2,+fma",

@@ -21,7 +21,8 @@ from core.cameras.stereo import StereoPair
 from core.field.region.region import PointGrid
 from core.matching.fit import fit_motion, fit_shape
 from core.matching.image import ImageData, prepare
-from core.matching.options import Interpolation, MatchOptions
+from core.matching.options import MatchOptions
+from core.settings import Interpolation
 from core.threads import set_threads
 from tests.bench.accuracy.paper_rig import load_rig, plane_scene
 

@@ -20,7 +20,8 @@ from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.loops import LANES, compare_cubic, compare_quintic, sum_reference
 from core.matching.kernels.point import make_point
 from core.matching.kernels.warp import lens_jacobian, set_up_warp
-from core.matching.options import SPLINE_ORDER, Interpolation
+from core.matching.options import SPLINE_ORDER
+from core.settings import Interpolation
 from tests.bench.speed.kernel import KernelScene
 
 DEGREE = 1  # plane patches

@@ -15,8 +15,8 @@ import numpy as np
 
 from core.cameras.lens import OpenCVLens
 from tests.bench.speed.pairs import BenchScene, Errors, judge
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 PEER_PYTHON = ROOT / ".venv-bench" / "bin" / "python"
 LONGEST_S = 1800.0
 

@@ -33,8 +33,8 @@ from server.demo.process import running_service
 from server.formats.images import encode_tiff
 from sim.rig import SimRig
 from sim.world import SimWorld
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 PAGE = ROOT / "docs" / "scaling.md"
 RIG = ROOT / "config" / "sim_paper.toml"
 STEPS = 17  # the reference and sixteen more

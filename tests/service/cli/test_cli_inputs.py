@@ -12,9 +12,10 @@ from PIL import Image
 
 from core.errors import FileFormatError, ImageError, InputError, RegionError
 from core.field.seeding.seeds import Seed
+from core.settings import STEP_PX, SUBSET_PX
 from server.cli import main
 from server.cli.measurement.image_lists import expand, pair_up, pairs_of_test_folder
-from server.cli.measurement.region import check_odd, check_region, parse_rectangle
+from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.terminal import ProgressLine, duration
 
 SHAPE = (480, 512)
@@ -164,7 +165,7 @@ def test_seeds_must_lie_in_the_region_and_on_white(tmp_path: Path, seed: str, co
 
 
 def test_seeds_come_as_points() -> None:
-    region = check_region(
+    _, seeds = check_region(
         (100.0, 100.0, 300.0, 300.0),
         image_shape=SHAPE,
         subset_px=33,
@@ -172,11 +173,11 @@ def test_seeds_come_as_points() -> None:
         mask_path=None,
         seeds=["150,160.5", "200,210"],
     )
-    assert region.seeds == (Seed((150.0, 160.5)), Seed((200.0, 210.0)))
+    assert seeds == (Seed((150.0, 160.5)), Seed((200.0, 210.0)))
 
 
 def test_a_seed_may_say_where_camera_2_sees_it() -> None:
-    region = check_region(
+    _, seeds = check_region(
         (100.0, 100.0, 300.0, 250.0),
         image_shape=SHAPE,
         subset_px=33,
@@ -184,7 +185,7 @@ def test_a_seed_may_say_where_camera_2_sees_it() -> None:
         mask_path=None,
         seeds=["150,160.5,151.25,158", "200,210"],
     )
-    assert region.seeds == (Seed((150.0, 160.5), (151.25, 158.0)), Seed((200.0, 210.0)))
+    assert seeds == (Seed((150.0, 160.5), (151.25, 158.0)), Seed((200.0, 210.0)))
     with pytest.raises(RegionError, match="has 3 numbers") as refused:
         check_region(
             (100.0, 100.0, 300.0, 250.0),
@@ -200,10 +201,10 @@ def test_a_seed_may_say_where_camera_2_sees_it() -> None:
 @pytest.mark.parametrize("text", ["32", "0", "-33", "5", "999", "33.0", "many", ""])
 def test_subsets_are_odd_and_sensible(text: str) -> None:
     with pytest.raises(InputError) as caught:
-        check_odd("--subset", text, low=7, high=301, odd=True)
+        check_whole("--subset", text, SUBSET_PX)
     assert caught.value.code == "option_out_of_range"
-    assert check_odd("--subset", "33", low=7, high=301, odd=True) == 33
-    assert check_odd("--step", "10", low=1, high=1000, odd=False) == 10
+    assert check_whole("--subset", "33", SUBSET_PX) == 33
+    assert check_whole("--step", "10", STEP_PX) == 10
 
 
 @pytest.mark.parametrize("arguments", [[], ["frobnicate"], ["--version"]])

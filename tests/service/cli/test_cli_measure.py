@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -25,25 +24,10 @@ from sim.catalog import make_scene
 from sim.render import RenderOptions, render
 from sim.rig import SimRig
 from sim.truth import truth_at
+from tests.support.measure_command import SIZE, command
+from tests.support.measure_command import rig as rig
 
-ROOT = Path(__file__).resolve().parents[3]
-SIZE = (230, 200)
 LOADS = (0.0, 0.5, 1.0)
-ROI = "50,45,180,155"
-
-
-def small_rig() -> SimRig:
-    """The paper's rig with smaller sensors: the same rays, fewer pixels."""
-    tables = tomllib.loads((ROOT / "config" / "sim_paper.toml").read_text())
-    for name in CAMERAS:
-        tables[name]["image_size_px"] = list(SIZE)
-        tables["sim"][name] |= {"cx_px": SIZE[0] / 2 + 3.0, "cy_px": SIZE[1] / 2 - 2.0}
-    return SimRig.from_dict(tables)
-
-
-@pytest.fixture(scope="module")
-def rig() -> SimRig:
-    return small_rig()
 
 
 @pytest.fixture(scope="module")
@@ -67,23 +51,6 @@ def folder(originals: Path, tmp_path: Path) -> Path:
     """A copy to spoil."""
     shutil.copytree(originals, tmp_path / "in")
     return tmp_path / "in"
-
-
-def command(folder: Path, results: Path, **changes: str | list[str] | None) -> list[str]:
-    options: dict[str, Any] = {
-        "cam1": str(folder / "cam1_*.tif"),
-        "cam2": str(folder / "cam2_*.tif"),
-        "calibration": str(folder / "calibration.json"),
-        "roi": ROI,
-        "subset": "21",
-        "out": str(results),
-    }
-    options.update(changes)
-    arguments = ["measure"]
-    for name, value in options.items():
-        if value is not None:
-            arguments += [f"--{name}", *([value] if isinstance(value, str) else value)]
-    return arguments
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +87,7 @@ def test_shape_and_displacement_agree_with_the_truth(measured: Path, rig: SimRig
 def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> None:
     summary = json.loads((measured / "summary.json").read_text())
     assert [step["step"] for step in summary["steps"]] == [0, 1, 2]
-    assert summary["settings"]["roi"] == [50.0, 45.0, 180.0, 155.0]
+    assert summary["settings"]["region"]["rectangle"] == [50.0, 45.0, 180.0, 155.0]
     assert summary["calibration"]["source"] == "calibration_json"
     for step in summary["steps"]:
         assert step["points"] == 14 * 12
@@ -137,8 +104,8 @@ def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) 
     assert main([*arguments, "--crack", crack, "--hole", hole]) == 0
     with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
         settings = json.loads(data.attrs["settings"])
-        assert settings["cracks"] == [[[50.0, 100.2], [90.5, 101.7], [130.0, 96.4]]]
-        assert settings["holes"] == [[[140.0, 60.0], [165.0, 60.0], [165.0, 85.0], [140.0, 85.0]]]
+        assert settings["region"]["cracks"] == [[[50.0, 100.2], [90.5, 101.7], [130.0, 96.4]]]
+        assert settings["region"]["holes"] == [[[140.0, 60.0], [165.0, 60.0], [165.0, 85.0], [140.0, 85.0]]]
         inside = (data["x_px"] >= 140) & (data["x_px"] <= 165) & (data["y_px"] >= 60) & (data["y_px"] <= 85)
         assert (data["status"].values[inside.values] == 2).all()
         assert (data["status"].values[~inside.values] == 0).mean() > 0.97
@@ -146,7 +113,7 @@ def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) 
         assert data["cut_y_px"].values[5:].tolist() == [100.2, 101.7, 96.4]
     cuts = read_field(tmp_path / "out" / "step_0000.nc").cuts
     assert cuts is not None
-    assert cuts.lines_px[1].tolist() == settings["cracks"][0]
+    assert cuts.lines_px[1].tolist() == settings["region"]["cracks"][0]
 
 
 @pytest.mark.parametrize(

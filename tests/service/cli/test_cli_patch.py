@@ -20,7 +20,7 @@ from sim.rig import SimRig
 from sim.scene import UPRIGHT, Scene
 from sim.surface import sphere
 from sim.truth import truth_at
-from tests.service.cli.test_cli_measure import command, small_rig
+from tests.support.measure_command import command, small_rig
 
 # a sphere of 30 mm; it moves as a block; then its skin straightens to 90 mm and goes back
 STATES = ("still", "moved", "bent", "moved")

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 from core.errors import MeasurementError, StateError
-from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from server.cli import main
 from server.cli.operation import demo
+from server.demo.calibration import ViewResiduals
 from server.demo.client import ServiceClient
 from server.demo.compare import compare_motion, compare_shape, heights_mm, pixel_mm
 from server.demo.drawing import fields as pictures
@@ -33,35 +33,10 @@ from server.exports.mesh import triangles_of
 from server.formats.images import read_image
 from sim.plate import CircularPlate
 from sim.rig import SimRig
+from tests.support.demo_field import field_of
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 PRESSURES = [200.0, 400.0, 689.0]
-
-
-def field_of(w_of: Callable[[np.ndarray, np.ndarray], np.ndarray], *, noise_mm: float = 0.0, seed: int = 0) -> Field:
-    """A displacement field on a flat face whose w is a given function of X_sys, Y_sys."""
-    rng = np.random.default_rng(seed)
-    x, y = np.meshgrid(np.linspace(-7.0, 7.0, 29), np.linspace(-7.0, 7.0, 29))
-    zero, shape = np.zeros_like(x), x.shape
-    uvw = np.stack([zero, zero, w_of(x, y)], axis=-1) + rng.normal(0.0, noise_mm, (*shape, 3))
-    return Field(
-        x_px=256 + 30 * x,
-        y_px=240 + 30 * y,
-        status=np.zeros(shape, np.int8),
-        xyz_mm=np.stack([x, y, zero], axis=-1),
-        normal_sys=np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3)),
-        theta_rad=zero,
-        phi_rad=zero,
-        zp_mm=zero,
-        zncc=np.ones((*shape, 3)),
-        epipolar_px=zero,
-        iterations=np.zeros(shape, np.int32),
-        noise_grey=zero,
-        covariance=np.broadcast_to(np.eye(6) * max(noise_mm, 1e-9) ** 2, (*shape, 6, 6)),
-        uvw_mm=uvw,
-        rotation_rad=np.zeros((*shape, 3)),
-        stretch=np.zeros((*shape, 3)),
-    )
 
 
 def clamped(pressure_kpa: float, radius_mm: float, centre: tuple[float, float]) -> Callable[..., np.ndarray]:
@@ -134,7 +109,7 @@ def test_pictures_are_drawn_for_fields_with_holes(tmp_path: Path) -> None:
     found |= pictures.panel(tmp_path, image, (46, 30, 466, 450), [one], [comparison], [1.0])
     heights = heights_mm(one.xyz_mm, one.valid)
     found |= pictures.steel(tmp_path, image, (46, 30, 466, 450), one, heights, heights)
-    view = {"title": "cam1", "held_out": True, "rbe_px": 0.1, "xy_px": np.ones((3, 2)), "residual_px": np.ones((3, 2))}
+    view = ViewResiduals("cam1", True, np.ones((3, 2)), np.ones((3, 2)))
     found |= pictures.calibration(tmp_path, [view])
     assert len(found) == 9
     for name in found:
@@ -223,7 +198,6 @@ def answers(port: int) -> bool:
         return False
 
 
-@pytest.mark.slow
 def test_the_service_ends_with_the_block_whatever_ends_it(tmp_path: Path) -> None:
     config = demo.find_config("sim_paper.toml")
     with contextlib.suppress(ZeroDivisionError), running_service(config, tmp_path / "data", tmp_path / "log") as url:
@@ -233,7 +207,6 @@ def test_the_service_ends_with_the_block_whatever_ends_it(tmp_path: Path) -> Non
     assert not answers(port)
 
 
-@pytest.mark.slow
 def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "server.cli", "demo", "--out", str(out)]
@@ -282,7 +255,7 @@ def test_no_triangle_of_a_picture_reaches_over_a_crack() -> None:
     assert gone == {2 * cols + c for c in range(5)} | {3 * cols + c for c in range(4)}
 
 
-@pytest.mark.slow
+@pytest.mark.normal_depth("plate")
 @pytest.mark.parametrize("experiment", ["plate", "steel", "panel"])
 def test_every_experiment_keeps_its_limits(tmp_path: Path, experiment: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--experiment", experiment, "--out", str(tmp_path)]) == 0

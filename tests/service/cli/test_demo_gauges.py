@@ -25,11 +25,21 @@ from server.demo.experiments.panel_gauges import Opening, Slice, crests, plane_p
 from server.demo.experiments.panel_strain import panel_strain
 from server.demo.session import Outcome
 from server.demo.strain import MICRO, along, as_read, chi_limit, difference, whole_gauges
+from server.formats.gauges.readings import (
+    AreaReading,
+    AreaStatistics,
+    ExtensometerReading,
+    Number,
+    PointReading,
+    RigidMotionReading,
+    StepReadings,
+)
 from sim.panel import CrackedPanel
 from sim.plate import CircularPlate
 from sim.rig import SimRig
 from sim.truth import Truth
-from tests.service.cli.test_demo import ROOT, field_of
+from tests.support.demo_field import field_of
+from tests.support.requirements import ROOT
 
 PANEL = SimRig.from_toml(ROOT / "config" / "sim_panel.toml")
 SUBSET = 21
@@ -133,26 +143,23 @@ def test_the_cracks_opening_is_read_over_it_and_missing_readings_stay_missing(tm
     crack = np.asarray(PANEL.cam1.camera.project(np.column_stack([ends, [-panel.bow_mm] * 2])).xy)
 
     class Client:
-        def gauges(self, _analysis: AnalysisHandle, **request: Any) -> dict[str, Any]:
+        def gauges(self, _analysis: AnalysisHandle, **request: Any) -> list[StepReadings]:
             xy = ends_of(request)
-            steps: list[dict[str, Any]] = [{}]  # the reference
+            steps = [StepReadings(0, "shape", "", None)]  # the reference
             for load in loads:
                 truth = true_panel(PANEL, xy, load)
                 before, after = truth.xyz_mm, truth.xyz_mm + truth.uvw_mm
                 long = [np.linalg.norm(p[:, 1] - p[:, 0], axis=-1) for p in (before, after)]
-                value = [{"value": float(v), "sigma": 0.002} for v in long[1] - long[0] + 0.001]
-                value[3] = {"value": None, "sigma": None}
+                value = [Number(float(v), 0.002, "mm") for v in long[1] - long[0] + 0.001]
+                value[3] = Number(None, None, "mm")
                 w = truth.uvw_mm[..., 2].ravel()
-                steps.append(
-                    {
-                        "extensometers": [{"values": {"elongation_mm": v}} for v in value],
-                        "points": [{"values": {"w_mm": {"value": float(v), "sigma": 0.003}}} for v in w],
-                    }
-                )
-            return {"steps": steps}
+                over = [ExtensometerReading("e", (0, 0), (0, 0), "", {"elongation_mm": v}) for v in value]
+                at = [PointReading("p", (0, 0), "", {"w_mm": Number(float(v), 0.003, "mm")}) for v in w]
+                steps.append(StepReadings(1, "displacement", "", load, extensometers=over, points=at))
+            return steps
 
     session: Any = SimpleNamespace(client=Client(), rig=PANEL, out=tmp_path)
-    found = read_opening(session, AnalysisHandle("t", "a", {}), crack, panel, loads)
+    found = read_opening(session, AnalysisHandle("t", "a"), crack, panel, loads)
     assert np.isnan(found.found[:, 3]).all()
     kept = np.delete(found.found - found.true, 3, axis=1)
     np.testing.assert_allclose(kept, 0.001, atol=1e-12)
@@ -207,15 +214,20 @@ def test_a_rigid_motions_truth_is_told_about_the_points_middle() -> None:
     centre = np.array([1.0, -2.0, 0.1])
     d = R @ centre + np.array(shift) - centre
     vector = np.radians(degrees)
-    values = {f"rotation_{a}_rad": {"value": vector[k] + 1e-6, "sigma": 1e-6} for k, a in enumerate("xyz")}
-    values |= {f"translation_{a}_mm": {"value": d[k] - 1e-4, "sigma": 1e-4} for k, a in enumerate("xyz")}
-    area = {f"{c}_mm": {"mean": 0.0, "mean_sigma": 0.0, "sd": 1e-4} for c in "uvw"}
-    area |= {name: {"mean": 2e-6, "mean_sigma": 1e-6, "sd": 1e-5} for name in ("exx", "eyy", "exy")}
-    step = {
-        "rigid_motion": {"values": values, "centre_mm": centre.tolist(), "noise_ratio": 1.0},
-        "extensometers": [{"values": {"elongation_mm": {"value": 2e-4, "sigma": 1e-4}}}],
-        "areas": [{"values": area}],
-    }
+    values = {f"rotation_{a}_rad": Number(vector[k] + 1e-6, 1e-6, "rad") for k, a in enumerate("xyz")}
+    values |= {f"translation_{a}_mm": Number(d[k] - 1e-4, 1e-4, "mm") for k, a in enumerate("xyz")}
+    area = {f"{c}_mm": AreaStatistics("mm", 9, 0.0, 0.0, 1e-4, 1e-4, None, None) for c in "uvw"}
+    area |= {name: AreaStatistics("1", 9, 2e-6, 1e-6, 1e-5, 1e-5, None, None) for name in ("exx", "eyy", "exy")}
+    long = Number(2e-4, 1e-4, "mm")
+    step = StepReadings(
+        1,
+        "displacement",
+        "",
+        None,
+        rigid_motion=RigidMotionReading(values, centre.tolist(), [], 9, 0.0, 1.0),
+        extensometers=[ExtensometerReading("e", (0, 0), (0, 0), "", {"elongation_mm": long})],
+        areas=[AreaReading("all", 9, 9, "", area)],
+    )
     one = steel_motion._moved((name, shift, degrees), step, strain, np.zeros((9, 9)))
     np.testing.assert_allclose(one.found - one.true, [1e-6] * 3 + [-1e-4] * 3, rtol=1e-9)
     np.testing.assert_allclose(one.false_mean, 2.0)

@@ -3,51 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from core.calibration import (
-    CalibrationOptions,
-    CalibrationResult,
-    CalibrationView,
-    NominalCamera,
-    calibrate,
-    check_known_distance,
-)
+from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, calibrate, check_known_distance
 from core.errors import CalibrationError, CalibrationInputError
-from tests.support.calibration_truth import PAPER, Array, Grid, nodes, project
-
-NOISE_PX = 0.0022
-NOMINAL = (
-    NominalCamera((512, 480), 12000.0, 400.0, -30.0, 0.9617),
-    NominalCamera((512, 480), 12000.0, 400.0, 30.0, 0.9617),
-)
-HELD = CalibrationOptions(held_out_mm=(2.0, 4.0))
-
-
-def make_views(
-    positions: Sequence[float] = (0.0, 2.0, 4.0, 5.0),
-    *,
-    grid: Grid | None = None,
-    noise: float = NOISE_PX,
-    seed: int = 0,
-    error_mm: Array | None = None,
-    tilt: tuple[float, float] = (0.0, 0.0),
-    declared: Callable[[float], float] = lambda dz: dz,
-    cameras: Sequence[dict[str, float]] = PAPER,
-) -> list[CalibrationView]:
-    rng = np.random.default_rng(seed)
-    X, Y = nodes(grid or Grid())
-    if error_mm is not None:
-        X, Y = X + error_mm[..., 0], Y + error_mm[..., 1]
-    views = []
-    for name, camera in zip(("cam1", "cam2"), cameras, strict=True):
-        for dz in positions:
-            xy = project(camera, X, Y, dz, tilt=tilt)
-            views.append(CalibrationView(name, declared(dz), xy + noise * rng.standard_normal(xy.shape)))  # type: ignore[arg-type]
-    return views
+from tests.support.calibration_truth import HELD, NOISE_PX, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
 
 def shape_error_um(result: CalibrationResult) -> float:

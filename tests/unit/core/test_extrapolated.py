@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.calibration import COVARIANCE_NAMES
 from core.calibration.volume import CalibratedVolume, calibrated_volume
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
@@ -23,18 +22,8 @@ from server.cli import main
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.volume import volume_of
 from server.formats.images import write_image
+from tests.support.calibrated_volume import POSITIONS, TARGET, content, covariance
 from tests.support.field_bench import SIZE, pair, take
-
-TARGET = GridTarget(pitch_mm=0.5, lines=(7, 7), line_width_mm=0.02)
-POSITIONS = (0.0, 2.0, 5.0)
-
-
-def covariance() -> np.ndarray:
-    """A made-up covariance with the correlation of distance and principal distance that real ones have."""
-    sigma = np.array([2.0, 0.5, 0.5, 1e-10, 2e-5, 2e-5, 2e-5, 2e-3, 2e-3, 0.06])
-    one = np.diag(sigma**2)
-    one[0, 9] = one[9, 0] = 0.999 * sigma[0] * sigma[9]
-    return np.kron(np.eye(2), one)
 
 
 def volume(size: tuple[int, int] = SIZE, **more: Any) -> CalibratedVolume:
@@ -43,22 +32,6 @@ def volume(size: tuple[int, int] = SIZE, **more: Any) -> CalibratedVolume:
     )
     assert found is not None
     return found
-
-
-def content() -> dict[str, Any]:
-    """A calibration.json as ``stereorig calibrate`` writes it, as far as the volume needs it."""
-    cameras = {"cam1": pair().cam1, "cam2": pair().cam2}
-    return {
-        **{name: camera.paper_parameters() for name, camera in cameras.items()},
-        "image_size_px": {name: list(SIZE) for name in cameras},
-        "target": {"pitch_mm": 0.5, "lines": [7, 7], "line_width_mm": 0.02, "node_tolerance_mm": 0.0},
-        "views": [
-            {"camera": name, "dz_mm": dz, "held_out": held_out, "name": f"{name}_{dz:g}"}
-            for name in cameras
-            for dz, held_out in ((0.0, False), (2.0, False), (5.0, False), (40.0, True))
-        ],
-        "covariance": {"names": list(COVARIANCE_NAMES), "matrix": covariance().tolist()},
-    }
 
 
 def test_the_volume_is_what_both_cameras_saw_and_a_little_more() -> None:

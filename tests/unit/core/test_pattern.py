@@ -9,24 +9,9 @@ from numpy.typing import NDArray
 
 from core.pattern import pattern_size
 from sim.texture import Texture, speckle
+from tests.support.texture_width import two_point_width_mm
 
 _PIXEL_WIDTH = 2.355 / np.sqrt(6.0)  # of the autocorrelation of a pixel's square, as a Gaussian's
-
-
-def two_point_width_mm(texture: Texture, *, pairs: int = 200_000, seed: int = 5) -> float:
-    """Full width at half height of the texture's covariance, from random pairs of points of the formula itself."""
-    rng = np.random.default_rng(seed)
-    start = rng.uniform(-500.0, 500.0, (pairs, 2))
-    angle = rng.uniform(0.0, 2.0 * np.pi, pairs)
-    way = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    here = texture.value(start)
-    variance = here.var()
-    distances = np.linspace(0.0, 1.0, 101)
-    shares = np.array([np.cov(here, texture.value(start + d * way))[0, 1] for d in distances]) / variance
-    k = int(np.argmax(shares < 0.5))
-    assert k > 0
-    a, b = shares[k - 1], shares[k]
-    return 2.0 * float(distances[k - 1] + (a - 0.5) / (a - b) * (distances[1] - distances[0]))
 
 
 def painted(texture: Texture, px_mm: float, size: tuple[int, int], fine: int = 4) -> NDArray[np.float64]:

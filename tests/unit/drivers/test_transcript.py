@@ -20,6 +20,7 @@ from drivers.stages.protocol import AxisOptions
 from drivers.stages.transcript import Transcript
 from sim.controllers.esp301 import SimESP301
 from sim.controllers.server import ControllerServer
+from tests.support.requirements import ROOT
 from tests.support.stage_bench import CONTROLLERS, bench
 
 LINE = re.compile(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6})Z +(\d+\.\d{6}) ([<>!#]) (.*)")
@@ -121,9 +122,7 @@ def test_what_went_out_before_a_kill_stands_in_the_file(tmp_path: Path) -> None:
     )
     with ControllerServer(SimESP301()) as server:
         child = subprocess.Popen(
-            [sys.executable, "-c", program, server.url, str(record)],
-            stdout=subprocess.PIPE,
-            cwd=Path(__file__).resolve().parents[3],
+            [sys.executable, "-c", program, server.url, str(record)], stdout=subprocess.PIPE, cwd=ROOT
         )
         assert child.stdout is not None
         assert child.stdout.readline() == b"asked\n"
@@ -152,7 +151,7 @@ def test_serve_refuses_a_transcript_that_cannot_be_written(tmp_path: Path) -> No
         text=True,
         timeout=60,
         check=False,
-        cwd=Path(__file__).resolve().parents[3],
+        cwd=ROOT,
     )
     assert done.returncode == 1
     assert "record_unusable" in done.stderr

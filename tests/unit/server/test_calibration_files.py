@@ -15,7 +15,8 @@ from server.formats.calibrations.native import covariance_in, write_calibration
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.target_toml import read_rig, read_target
 from server.formats.views import find_views
-from tests.unit.core.test_calibration import HELD, NOMINAL, make_views
+from tests.support.calibration_truth import HELD, NOMINAL, make_views
+from tests.support.requirements import ROOT
 
 TARGET = "pitch_mm = 1.0\nlines = [11, 11]\nline_width_mm = 0.03\nnode_tolerance_mm = 0.004\ndark_lines = true\n"
 CAMERA = "image_size_px = [512, 480]\nphd_px = 12000\nstandoff_mm = 400.0\nangle_deg = -30\naspect = 0.9617\n"
@@ -80,7 +81,7 @@ def test_a_rig_file_of_the_service_serves_as_well(tmp_path: Path) -> None:
     rig = read_rig(put(tmp_path, "rig.toml", RIG + "[calibration]\naxis_tilt_sigma_rad = 0.001\n"))
     assert rig.cam1.image_size_px == (512, 480)
     assert rig.axis_tilt_sigma_rad == 0.001
-    assert read_rig(Path(__file__).parents[3] / "config" / "sim_paper.toml").cam2.angle_deg == 30.0
+    assert read_rig(ROOT / "config" / "sim_paper.toml").cam2.angle_deg == 30.0
     with pytest.raises(FileFormatError) as caught:
         read_rig(tmp_path / "none.toml")
     assert caught.value.code == "file_missing"

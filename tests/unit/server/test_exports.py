@@ -461,7 +461,7 @@ def test_a_tests_folder_and_its_analyses(tmp_path: Path) -> None:
     assert found.title == "Panel 7"
     assert found.image == test / "steps" / "0000" / "cam1.tif"
     assert (found.about["calibration_id"], found.about["analysis_id"]) == ("c000002-1", "a000001-000001")
-    assert found.about["stale_reasons"]  # its images are not those that the result was made from
+    assert found.stale_reasons  # its images are not those that the result was made from
     write_results(test / "analyses" / "a000002-000002", 1)
     with pytest.raises(InputError) as caught:
         find_source(test)

@@ -16,13 +16,13 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
-from server.formats.results.reading import read_attributes, read_field
+from server.formats.results.reading import read_field, read_head
 from server.formats.results.summary import summarise, to_json
 from server.formats.results.writing import Provenance, write_field
 
 ROWS, COLS = 4, 6
 PROVENANCE = Provenance(
-    settings={"subset_px": 33, "roi": [1.0, 2.0, 3.0, 4.0]},
+    settings={"subset_px": 33, "region": {"rectangle": [1.0, 2.0, 3.0, 4.0]}},
     inputs={"ref1": "ab" * 32, "µ.tif": "cd" * 32},
     software_version="1.2.3",
     step=7,
@@ -91,12 +91,12 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool)
         else:
             np.testing.assert_array_equal(b, a)
             assert b.dtype == a.dtype
-    attributes = read_attributes(tmp_path / "step_0007.nc")
-    assert attributes["settings"] == PROVENANCE.settings
-    assert attributes["inputs_sha256"] == PROVENANCE.inputs
-    assert attributes["label"] == "Größe 1"
-    assert attributes["step"] == 7
-    assert attributes.get("patch_reason") == ("curved: Gründe" if curved else None)
+    head = read_head(tmp_path / "step_0007.nc")
+    assert head.settings == PROVENANCE.settings
+    assert head.inputs_sha256 == PROVENANCE.inputs
+    assert head.label == "Größe 1"
+    assert head.step == 7
+    assert head.attributes.get("patch_reason") == ("curved: Gründe" if curved else None)
     assert summarise(field).document()["patch"] == (field.patch.document() if field.patch else None)
 
 

@@ -15,8 +15,8 @@ from server.config.reference import json_schema, markdown
 from server.config.rig_file import RigConfig, load_config, parse_config
 from server.rig.build import check_config
 from tests.bench.documents.rig_file import PAGE
+from tests.support.requirements import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 FILES = sorted((ROOT / "config").glob("*.toml"))
 
 

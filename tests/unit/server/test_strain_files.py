@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from core.errors import FileFormatError, InputError
+from core.settings import StrainSettings
 from core.strain import StrainOptions, StrainStatus, surface_strain
-from server.compute.strain import strain_of_step, strain_options, strain_settings, summarise_strain
+from server.compute.strain import strain_of_step, summarise_strain
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
@@ -100,9 +101,13 @@ def test_summary_of_nothing():
 
 def test_settings_and_back():
     options = StrainOptions(window=5, order=2, tensor="infinitesimal")
-    assert strain_options(strain_settings(options)) == options
-    assert strain_options(strain_settings(None)) is None
+    settings = StrainSettings(window=5, order=2, tensor="infinitesimal")
+    assert StrainOptions.of(settings) == options
+    assert StrainOptions.of(StrainSettings.model_validate(settings.model_dump(mode="json"))) == options
+    assert StrainOptions.of(None) is None
+    with pytest.raises(ValueError, match="odd"):
+        StrainSettings.model_validate({"window": 6})
     with pytest.raises(InputError):
-        strain_options({"window": 6})
+        StrainOptions(window=6)
     field = make_field(plane, lambda p: p)
     assert strain_of_step(field, None, subset_px=21) is None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from drivers.cameras.protocol import CameraSettings
@@ -14,8 +12,9 @@ from sim.controllers.server import ControllerServer
 from sim.grabber import SimFrameGrabber
 from sim.rig import SimRig
 from sim.world import SimWorld
+from tests.support.requirements import ROOT
 
-CONFIG = Path(__file__).resolve().parents[3] / "config" / "sim_paper.toml"
+CONFIG = ROOT / "config" / "sim_paper.toml"
 
 
 def test_a_move_over_the_wire_changes_the_image_and_the_way_back_restores_it() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import fsolve
@@ -18,8 +16,9 @@ from sim.scene import Scene
 from sim.steel import average_roughness_mm, ground_steel
 from sim.texture import line_grid, speckle
 from sim.truth import subset_planes, truth_at
+from tests.support.requirements import ROOT
 
-CONFIG = Path(__file__).resolve().parents[3] / "config"
+CONFIG = ROOT / "config"
 PAPER = SimRig.from_toml(CONFIG / "sim_paper.toml")
 PANEL = SimRig.from_toml(CONFIG / "sim_panel.toml")
 LOADS = {"plate": 689.0, "panel": 48.95, "block": 1.0, "strip": 5.0, "sphere": 1.0}

@@ -13,8 +13,9 @@ from core.errors import InputError
 from sim.rig import SimCamera, SimRig
 from sim.sensor import Sensor
 from sim.world import SimWorld
+from tests.support.requirements import ROOT
 
-CONFIG = Path(__file__).resolve().parents[3] / "config"
+CONFIG = ROOT / "config"
 
 
 def small(rig: SimRig) -> SimRig:

@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import APIRouter
 
 from core.errors import RegionError
+from core.settings import NoiseRecord
 from server.api.models import AnalysisAccepted, AnalysisList, AnalysisReply, AnalysisRequest, ContinueRequest, Region
 from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.paging import PageDep
@@ -50,10 +51,11 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
     for n in steps:
         check_same_cameras(calibration, service.tests.step(test_id, n).document.get("cameras"), f"Step {n}")
     mask = mask_of(body.region)
-    settings = body.model_dump(exclude={"kind", "label", "steps", "noise_id", "follow"})
     noise = None if body.noise_id is None else service.noise.file(body.noise_id)
-    settings["noise"] = None if noise is None else {"noise_id": body.noise_id, **load_noise(noise).record()}
-    settings["region"].pop("mask_png_base64")
+    record = (
+        None if noise is None else NoiseRecord.model_validate({"noise_id": body.noise_id, **load_noise(noise).record()})
+    )
+    settings = body.stored(record)
     analysis_start.check_region(service, test_id, steps[0], settings, mask)
     if body.seeds_cam2 is not None:
         rows, cols = read_image(service.tests.step(test_id, steps[0]).cam2).shape
@@ -62,7 +64,7 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
     document = {
         "kind": body.kind,
         "label": body.label,
-        "settings": settings,
+        "settings": settings.model_dump(),
         "steps": steps,
         "follow": body.follow,
         "software": software_version(),

@@ -9,6 +9,7 @@ from fastapi.responses import Response
 from pydantic import Field
 
 from core.errors import InputError
+from core.settings import SUBSET_PX
 from server.api.protocol.dependencies import CalibrationId, Camera, ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.base.models import Reply
@@ -19,7 +20,10 @@ from server.workflows.service import Service
 router = APIRouter(tags=["looks"])
 Kind = Annotated[MapKind, Path(description="What the map shows.")]
 Index = Annotated[int, Path(ge=0, le=9999, description="Number of the position.")]
-Subset = Annotated[int, Query(ge=5, le=255, description="Width of the subset that the texture is judged for, px.")]
+Subset = Annotated[
+    int,
+    Query(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Width of the subset that the texture is judged for, px."),
+]
 Width = Annotated[int | None, Query(ge=16, le=8192, description="Width in px; the image's own if left out.")]
 _KEPT = "private, max-age=86400"  # what a step or a view shows never changes
 _JPEG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}, "description": "8-bit JPEG."}}
@@ -79,7 +83,7 @@ def get_pixel(
     response_class=Response,
     responses=errors(409, 422, 503) | _PNG,
 )
-def get_live_map(service: ServiceDep, cam: Camera, kind: Kind, subset_px: Subset = 33) -> Response:
+def get_live_map(service: ServiceDep, cam: Camera, kind: Kind, subset_px: Subset = SUBSET_PX.default) -> Response:
     """Return a picture of any size that covers the whole image; what its colours mean is in `X-Legend`."""
     frame = service.rig.pair.live(cam, max_age_s=0.2)
     return _overlay(kind, frame.pixels, float(2**frame.bit_depth - 1), subset_px)
@@ -136,7 +140,7 @@ def get_step_pixels(
     responses=errors(404, 409, 422) | _PNG,
 )
 def get_step_map(
-    service: ServiceDep, test_id: TestId, n: StepNumber, cam: Camera, kind: Kind, subset_px: Subset = 33
+    service: ServiceDep, test_id: TestId, n: StepNumber, cam: Camera, kind: Kind, subset_px: Subset = SUBSET_PX.default
 ) -> Response:
     """Return a picture of any size that covers the whole image; what its colours mean is in `X-Legend`."""
     pixels, full_scale = step_image(service, test_id, n, cam)

@@ -11,7 +11,8 @@ from pydantic import Field, StringConstraints
 
 from core.errors import InputError
 from core.field.seeding.seeds import Seed
-from server.api.models import Pixel, Real, Region, Reply, Request, Whole
+from core.settings import STEP_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, StepPx, SubsetPx, Whole
+from server.api.models import Region, Reply, Request
 from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
@@ -30,8 +31,8 @@ class TextureRequest(Request):
     """A region of camera 1's image, and the subsets that are to lie in it."""
 
     region: Region = Field(description="Where points may lie.")
-    subset_px: Annotated[Whole, Field(ge=9, le=255)] = Field(33, description="Subset size, odd.")
-    step_px: Annotated[Whole, Field(ge=1, le=1000)] = Field(10, description="Distance of neighbouring points.")
+    subset_px: SubsetPx = SUBSET_PX.default
+    step_px: StepPx = STEP_PX.default
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None, description="Noise measurement that tells camera 1's noise; 1 % of full scale is assumed without it."
     )
@@ -101,11 +102,15 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
     """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""
     if body.subset_px % 2 == 0:
         raise InputError(
-            f"subset_px must be odd, got {body.subset_px}.", code="subset_invalid", remedy="Give 33, for example."
+            f"subset_px must be odd, got {body.subset_px}.",
+            code="subset_invalid",
+            remedy=f"Give {SUBSET_PX.default}, for example.",
         )
     pixels, full_scale = step_image(service, test_id, n, "cam1")
     mask = mask_of(body.region)
-    settings = {"region": body.region.model_dump(), "step_px": body.step_px, "subset_px": body.subset_px, "seeds": None}
+    settings = AnalysisSettings.model_validate(
+        {"region": body.region, "step_px": body.step_px, "subset_px": body.subset_px}
+    )
     grid = make_grid(settings, None if mask is None else decode_mask(mask), (pixels.shape[0], pixels.shape[1]))
     noise = body.noise_grey
     if noise is None and body.noise_id is not None:

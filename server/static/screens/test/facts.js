@@ -41,7 +41,7 @@ export function factsPanel(id) {
     /** @type {((out: Read) => void)[]} */
     const readers = [];
     const input = (/** @type {object | null | undefined} */ of, /** @type {Row} */ [name, label, unit]) => {
-      const known = /** @type {Record<string, any>} */ (of ?? {})[name];
+      const known = /** @type {Record<string, any> | null | undefined} */ (of)?.[name];
       const control = unit ? number(known) : h("input", { type: "text", maxlength: 500, value: known ?? "" });
       readers.push((out) => { if (control.value.trim() !== "") out[name] = unit ? Number(control.value) : control.value.trim(); });
       return field(label, control, unit === "1" ? "" : unit);

@@ -22,12 +22,10 @@ import pytest
 
 from server.config.rig_file import parse_config
 from sim.rig import SimRig
-from tests.service.test_service_chain import SMALL
 from tests.support.namespace import Namespace, NamespaceTransport, namespaces_missing
-from tests.support.requirements import missing
-from tests.support.service_rig import TINY, new_test, wait_for_job
+from tests.support.requirements import ROOT, missing
+from tests.support.service_rig import SMALL, TINY, new_test, wait_for_job
 
-ROOT = Path(__file__).resolve().parents[2]
 API = "/api/v1"
 ADDRESSES = ("127.0.0.1", "127.0.0.2")
 
@@ -195,7 +193,7 @@ def test_simulated_pictures_behind_the_same_drivers_end_in_a_calibration(network
     sim_file.write_text(SMALL)
     truth = SimRig.from_dict(parse_config(SMALL).model_dump(exclude_none=True))
     world = subprocess.Popen(
-        network.command(sys.executable, str(ROOT / "tests" / "gige_sim.py"), str(sim_file), *ADDRESSES),
+        network.command(sys.executable, "-m", "tests.support.gige_sim", str(sim_file), *ADDRESSES),
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdin=subprocess.PIPE,

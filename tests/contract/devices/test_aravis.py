@@ -16,6 +16,7 @@ from core.errors import CameraError
 from drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, FrameGrabber, FrameStatus
 from drivers.registry import discover_cameras, make_camera
 from tests.support.fake_gige import FakeCamera, small_sensor_xml, strict_xml, what_is_missing
+from tests.support.requirements import missing
 
 RETURN_S = 3.0
 
@@ -23,9 +24,9 @@ RETURN_S = 3.0
 @pytest.fixture(scope="module")
 def cameras(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FakeCamera, FakeCamera]]:
     """An ordinary fake camera and a strict one."""
-    missing = what_is_missing()
-    if missing is not None:
-        missing(missing)
+    lacking = what_is_missing()
+    if lacking is not None:
+        missing(lacking)
     folder = tmp_path_factory.mktemp("gige")
     made: list[FakeCamera] = []
     try:

@@ -32,6 +32,7 @@ def two_processors(monkeypatch):
     monkeypatch.setattr("core.threads.available_threads", lambda: 2)
 
 
+@pytest.mark.deep
 def test_what_it_compiled_nobody_compiles_again(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     with CompileAside("auto") as aside:

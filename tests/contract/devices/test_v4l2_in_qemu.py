@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import pytest
 
+from tests.support.requirements import missing
 from tests.support.v4l2_guest import Missing, Outcome, Report, collect, run_in_guest
 
 _TESTS = (
-    "tests/support/v4l2_vivid_guest.py",
-    "tests/support/v4l2_usb_guest.py",
+    "tests/contract/devices/v4l2_vivid_guest.py",
+    "tests/contract/devices/v4l2_usb_guest.py",
     "tests/contract/test_camera_contract.py",
 )
 # A boot without KVM takes half a minute, the tests a minute and a half; a machine with other work takes its time
@@ -32,9 +33,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     try:
         return run_in_guest(_TESTS, tmp_path_factory.mktemp("guest"), limit_s=_LIMIT_S)
-    except Missing as missing:
-        missing(str(missing))
-        raise AssertionError from missing
+    except Missing as error:
+        missing(str(error))
+        raise AssertionError from error
 
 
 @pytest.mark.timeout(_LIMIT_S + 120)

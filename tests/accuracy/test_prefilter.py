@@ -35,6 +35,7 @@ def scene():
     return pair, clean, xy, true_w(pair.cam1, before, xy), true_g(pair.cam1, before, after, xy)
 
 
+@pytest.mark.normal_depth("1.0-2.0-True")
 @pytest.mark.parametrize(
     ("sd", "noise", "known"), [(0.5, 2.0, True), (1.0, 6.0, False), (1.0, 2.0, True), (2.0, 6.0, True)]
 )

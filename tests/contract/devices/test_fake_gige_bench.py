@@ -19,9 +19,8 @@ import pytest
 from server.cli import main
 from server.doctor import Check, Report
 from server.rig.devices import DeviceListing
-from tests.support.requirements import missing
+from tests.support.requirements import ROOT, missing
 
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config" / "bench_fake_gige.toml"
 # root needs no user namespace, which containers often forbid
 NETWORK = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--user", "--map-root-user", "--net"]
@@ -36,7 +35,7 @@ setpriv --pdeathsig KILL arv-fake-gv-camera-0.8 -i 127.0.0.1 -s BENCH1 &
 CAM1=$!
 setpriv --pdeathsig KILL arv-fake-gv-camera-0.8 -i 127.0.0.2 -s BENCH2 &
 setpriv --pdeathsig KILL "$PYTHON" -c 'from server.cli import main; main(["simstage", "--port", "5301"])' &
-"$PYTHON" tests/contract/test_fake_gige_bench.py $CAM1
+"$PYTHON" -m tests.contract.devices.test_fake_gige_bench $CAM1
 """
 
 

@@ -20,6 +20,7 @@ from drivers.acquisition.reader import CameraReader
 from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber, FrameStatus
 from drivers.cameras.v4l2 import discover, make
 from tests.support.camera_bench import frames_of, seconds_until
+from tests.support.requirements import ROOT
 from tests.support.usb_camera import UsbCamera
 
 
@@ -248,7 +249,7 @@ def test_a_webcam_that_falls_silent_is_lost_by_the_watchdog_and_closes_quickly(w
 @pytest.mark.fault(11)
 def test_the_rig_s_camera_comes_back_with_its_settings_within_three_seconds(tmp_path: Path) -> None:
     # the file alone: the package around it brings the whole service, which takes minutes to load in the guest
-    spec = importlib.util.spec_from_file_location("rig_unit", Path(__file__).parents[2] / "server" / "rig" / "unit.py")
+    spec = importlib.util.spec_from_file_location("rig_unit", ROOT / "server" / "rig" / "unit.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from tests.support.requirements import ROOT
 
-TINY = (Path(__file__).resolve().parents[3] / "config" / "sim_tiny.toml").read_text(encoding="utf-8")
+TINY = (ROOT / "config" / "sim_tiny.toml").read_text(encoding="utf-8")
 
 
 def tiny_rig(**replacements: str) -> str:

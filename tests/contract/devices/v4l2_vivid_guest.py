@@ -25,7 +25,7 @@ from drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, Frame
 from drivers.cameras.v4l2 import discover, make
 from tests.support.camera_bench import frames_of
 from tests.support.v4l2_bench import calm, controls_of, put
-from tests.unit.drivers.test_v4l2_formats import BYTES, packed
+from tests.support.v4l2_pixels import BYTES, packed
 
 WEBCAM, PLANAR, HDMI = "/dev/video0", "/dev/video1", "/dev/video2"
 SMALL = (0, 0, 320, 180)

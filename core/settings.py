@@ -1,0 +1,230 @@
+"""The settings of a measurement: each parameter with its bounds, default, unit and meaning, stated once.
+
+Requests, the command line's options, the worker's tasks, result files, reports and reference pages derive from these
+models; the functions of `core` take their bounds and defaults from here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.config import JsonDict
+from pydantic_core import PydanticCustomError
+
+PatchSetting = Literal["stretch", "rigid", "curved", "auto"]
+PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
+Interpolation = Literal["cubic", "quintic"]
+INTERPOLATIONS: tuple[Interpolation, ...] = get_args(Interpolation)
+ReferenceUpdate = Literal["never", "auto", "always"]
+REFERENCE_UPDATES: tuple[ReferenceUpdate, ...] = get_args(ReferenceUpdate)
+StrainTensor = Literal["green_lagrange", "infinitesimal", "hencky"]
+STRAIN_TENSORS: tuple[StrainTensor, ...] = get_args(StrainTensor)
+StartFrom = Literal["previous", "reference"]
+DEFAULT_PATCH: PatchSetting = "auto"
+DEFAULT_INTERPOLATION: Interpolation = "quintic"
+DEFAULT_REFERENCE_UPDATE: ReferenceUpdate = "auto"
+
+
+class Range(NamedTuple):
+    """The whole numbers that a parameter can have, ends included."""
+
+    low: int
+    high: int
+    odd: bool
+    default: int
+
+    def holds(self, value: Any) -> bool:
+        """Return True for a whole number of the range."""
+        whole = not isinstance(value, bool) and int(value) == value
+        return whole and self.low <= value <= self.high and (not self.odd or value % 2 == 1)
+
+    def __str__(self) -> str:
+        return f"{'an odd' if self.odd else 'a'} whole number from {self.low} to {self.high}"
+
+
+#: below 9 px a subset holds too few pixels for its twelve unknowns; above 401 px the kernels' sums lose digits
+SUBSET_PX = Range(9, 401, True, 33)
+STEP_PX = Range(1, 1000, False, 10)
+STRAIN_WINDOW = Range(3, 101, True, 9)
+#: no default window: displacements are smoothed only where that is asked for
+SMOOTHING_WINDOW = Range(3, 51, True, 5)
+#: a wider Gaussian would leave a handful of independent pixels in the subset
+PREFILTER_OF_SUBSET = 0.25
+MAX_SEEDS = MAX_CUTS = 100
+MAX_CORNERS = 1000
+
+
+def _a_number(value: Any) -> Any:
+    if isinstance(value, str):
+        raise ValueError("must be a number, not text")
+    # true would be taken for 1
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+ODD: JsonDict = {"not": {"multipleOf": 2}}
+Real = Annotated[float, BeforeValidator(_a_number)]
+Whole = Annotated[int, BeforeValidator(_a_number)]
+Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
+SubsetPx = Annotated[
+    Whole, Field(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Subset size, odd.", json_schema_extra=ODD)
+]
+StepPx = Annotated[Whole, Field(ge=STEP_PX.low, le=STEP_PX.high, description="Distance of neighbouring points.")]
+Place = tuple[Pixel, Pixel]
+Rectangle = tuple[Pixel, Pixel, Pixel, Pixel]
+
+
+def disagreement(text: str) -> PydanticCustomError:
+    """Return the error for values that are right each by itself and cannot be together."""
+    return PydanticCustomError("values_disagree", "{text}", {"text": text})
+
+
+def require_odd(**values: int | None) -> None:
+    """Raise ValueError for an even number, by its name."""
+    for name, value in values.items():
+        if value is not None and value % 2 == 0:
+            raise ValueError(f"{name} must be odd, got {value}")
+
+
+class Settings(BaseModel):
+    """A closed group of parameters."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Region(Settings):
+    """Where points may lie: a rectangle or a polygon, or a mask alone; cracks and holes.
+
+    No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
+    """
+
+    rectangle: Rectangle | None = Field(
+        None, description="x0, y0, x1, y1 in camera 1's reference image, inclusive.", examples=[[120, 100, 400, 380]]
+    )
+    polygon: list[Place] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
+    cracks: list[Annotated[list[Place], Field(min_length=2, max_length=MAX_CORNERS)]] = Field(
+        [],
+        description="Lines in camera 1's reference image, each the points that it goes through.",
+        max_length=MAX_CUTS,
+        examples=[[[[150, 240], [260, 238.5], [362, 241]]]],
+    )
+    holes: list[Annotated[list[Place], Field(min_length=3, max_length=MAX_CORNERS)]] = Field(
+        [],
+        description="Corners of polygons in camera 1's reference image inside which nothing is measured.",
+        max_length=MAX_CUTS,
+        examples=[[[[200, 180], [240, 180], [240, 220], [200, 220]]]],
+    )
+
+
+class StrainSettings(Settings):
+    """Strain over a virtual gauge, (window - 1) step_px + subset_px wide."""
+
+    window: Annotated[Whole, Field(ge=STRAIN_WINDOW.low, le=STRAIN_WINDOW.high)] = Field(
+        STRAIN_WINDOW.default, description="Points across the gauge, odd.", json_schema_extra=ODD
+    )
+    order: Literal[1, 2] = Field(
+        1, description="Fit planes or quadratics; they differ only where an edge, a hole or a cut takes points away."
+    )
+    tensor: StrainTensor = Field("green_lagrange", description="Which strain is told.")
+
+    @model_validator(mode="after")
+    def _odd(self) -> Self:
+        require_odd(window=self.window)
+        return self
+
+
+class AnalysisSettings(Settings):
+    """What a measurement depends on besides its images and its calibration."""
+
+    region: Region = Field(description="Where points may lie.")
+    subset_px: SubsetPx = SUBSET_PX.default
+    step_px: StepPx = STEP_PX.default
+    patch: PatchSetting = Field(
+        DEFAULT_PATCH,
+        description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about "
+        "twice the noise; auto takes stretch or curved, whichever errs less on the field in all, shape and motion "
+        "apart; each step's summary has the choice and its reason under patch.",
+    )
+    interpolation: Interpolation = Field(DEFAULT_INTERPOLATION, description="B-spline order.")
+    prefilter_px: Annotated[Real, Field(ge=0.0, le=PREFILTER_OF_SUBSET * SUBSET_PX.high)] = Field(
+        0.0,
+        description="Sd of a Gaussian that all images are blurred with, px, at most a quarter of subset_px; 0: none.",
+    )
+    seeds: Annotated[list[Place], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
+        None, description="Start points in camera 1's reference image; found automatically if left out."
+    )
+    seeds_cam2: Annotated[list[Place | None], Field(max_length=MAX_SEEDS)] | None = Field(
+        None,
+        description="The same points in camera 2's reference image, where known: as many as `seeds`, null where not. "
+        "They start the search there; one further than 8 px from its epipolar line is refused.",
+    )
+    reference_update: ReferenceUpdate = Field(
+        DEFAULT_REFERENCE_UPDATE,
+        description="never: match every step against the reference (total); always: against the step before "
+        "(incremental); auto: against the reference, or a later one where that fails. Displacements are totals in any "
+        "case; each step's summary has what it was matched against under reference_step.",
+    )
+    start_from: StartFrom = Field(
+        "previous",
+        description="Where a step's start values come from. previous: the step before, and steps are measured one "
+        "after another. reference: the reference alone; steps need one another for nothing, and a cluster measures as "
+        "many at once as it has workers. It needs reference_update = never, which is then the default.",
+    )
+    strain: StrainSettings | None = Field(
+        default_factory=lambda: StrainSettings.model_validate({}), description="Strain of a displacement; null: none."
+    )
+    smoothing_window: Annotated[Whole, Field(ge=SMOOTHING_WINDOW.low, le=SMOOTHING_WINDOW.high)] | None = Field(
+        None,
+        description="Points across the square window over which a quadratic smooths the displacement, odd; strain and "
+        "gauges then take its value. null: as measured.",
+        json_schema_extra=ODD,
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _starts_alone(cls, given: Any) -> Any:
+        if isinstance(given, dict) and given.get("start_from") == "reference":
+            if given.get("reference_update", "never") != "never":
+                raise disagreement("start_from = 'reference' needs reference_update = 'never'")
+            return {**given, "reference_update": "never"}
+        return given
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        require_odd(subset_px=self.subset_px, smoothing_window=self.smoothing_window)
+        if self.seeds_cam2 is not None and len(self.seeds_cam2) != len(self.seeds or []):
+            raise disagreement(f"seeds_cam2 has {len(self.seeds_cam2)} places for {len(self.seeds or [])} seeds")
+        if self.prefilter_px > PREFILTER_OF_SUBSET * self.subset_px:
+            raise disagreement(f"prefilter_px must be at most a quarter of subset_px, {self.subset_px}")
+        return self
+
+
+class NoiseRecord(BaseModel):
+    """The noise models that weighed the pixels: the numbers that were used, and where they come from."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    sha256: str
+    noise_id: str | None = None
+
+
+class StoredRegion(Region):
+    """A region as results keep it; checked against its image when it was made."""
+
+    rectangle: tuple[float, float, float, float] | None = None
+    polygon: list[tuple[float, float]] | None = None
+    cracks: list[list[tuple[float, float]]] = []
+    holes: list[list[tuple[float, float]]] = []
+    mask: str | None = None
+
+
+class StoredSettings(AnalysisSettings):
+    """Settings as results keep them: with what stands for the files beside them."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    region: StoredRegion
+    reference: int = 0
+    noise: NoiseRecord | None = None

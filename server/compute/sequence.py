@@ -1,0 +1,281 @@
+"""The measurement of a sequence, a step at a time: read, measure, smooth, mark, strain, write, summarise.
+
+The worker and the command line both measure with it, so a folder measured through either gives the same files. A step
+depends on the files alone: what is kept from the step before is what its file holds.
+"""
+
+from __future__ import annotations
+
+import time
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import FileFormatError
+from core.field.checks.extrapolated import mark_extrapolated
+from core.field.points.images import MeasureImage, check_calibrated_size
+from core.field.points.result import Field
+from core.field.settings import MeasureOptions
+from core.measure import Earlier, ReferencePair, Updating
+from core.progress import CancelToken, Progress
+from core.settings import StoredSettings
+from core.strain import StrainOptions
+from server.compute.region import make_grid
+from server.compute.seeds import seeds_of
+from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
+from server.formats.calibrations.recognise import LoadedCalibration
+from server.formats.calibrations.volume import rbe_of, volume_of
+from server.formats.files import sha256_of
+from server.formats.images import read_image
+from server.formats.noise_json import LoadedNoise
+from server.formats.results.reading import read_measured
+from server.formats.results.starts import read_starts, starts_file, write_starts
+from server.formats.results.summary import summarise
+from server.formats.results.writing import Provenance, write_field
+from server.formats.version import software_version
+from server.worker.tasks import StepImages
+
+Pair = tuple[MeasureImage, MeasureImage]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishedStep:
+    """A step whose file is written.
+
+    Attributes
+    ----------
+    field
+        As the file has it: smoothed where that was asked for, points outside the calibrated volume marked.
+    summary
+        The step's entry of ``summary.json``, without the time that its measurement took.
+    """
+
+    n: int
+    field: Field
+    summary: dict[str, Any]
+
+
+@dataclass(eq=False)
+class SequenceMeasurement:
+    """What the steps of one measurement share, and how each is measured and finished.
+
+    Parameters
+    ----------
+    calibration, settings
+        What is measured with, and how.
+    mask
+        (rows, cols) True where points may lie, or None.
+    reference
+        Step that the first comparison is made with.
+    folder
+        Result files go there, and are read from there.
+    noise
+        Models of both cameras.
+    inputs
+        Name and SHA-256 of further files that the result depends on.
+
+    Raises
+    ------
+    ImageError, FileFormatError
+        The reference's images cannot be used, or do not have the calibration's size.
+    RegionError
+        As :func:`make_grid`.
+    """
+
+    calibration: LoadedCalibration
+    settings: StoredSettings
+    mask: NDArray[np.bool_] | None
+    reference: StepImages
+    folder: Path
+    noise: LoadedNoise | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.options = MeasureOptions.of(self.settings)
+        self.steps: dict[int, StepImages] = {}
+        self._models = (None, None) if self.noise is None else self.noise.models
+        self._volume = volume_of(self.calibration)
+        self._rbe_px = rbe_of(self.calibration)
+        self._fields: dict[int, Field] = {}
+        self._last_images: tuple[int, Pair] | None = None
+        self._sequence: Updating | None = None
+        images = self.read(self.reference)
+        sizes = (self.calibration.image_size1_px, self.calibration.image_size2_px)
+        for cam, image, size in zip(("cam1", "cam2"), images, sizes, strict=True):
+            check_calibrated_size(f"The image of {cam}", image.shape, size)
+        self.grid = make_grid(self.settings, self.mask, images[0].shape)
+        self.pair = ReferencePair(self.calibration.pair, *images)
+
+    def read(self, step: StepImages) -> Pair:
+        """Read both images of a step; what will be asked of them is found on the calling thread."""
+        one, two = (
+            MeasureImage(read_image(path), str(path), noise=None if model is None else model.averaged(*step.averages))
+            for path, model in zip(step.files, self._models, strict=True)
+        )
+        for image in (one, two):
+            image.prepared(self.options.interpolation, None, self.options.blur)
+            image.contrast()
+        return one, two
+
+    def measure(
+        self,
+        step: StepImages,
+        images: Pair | None = None,
+        *,
+        previous: int | None = None,
+        progress: Progress | None = None,
+        cancel: CancelToken | None = None,
+    ) -> Field:
+        """Measure a step: the reference's shape, or another step's displacement.
+
+        Parameters
+        ----------
+        images
+            The step's, if they were read already.
+        previous
+            The step measured before, whose field gives start values.
+
+        Raises
+        ------
+        SeedError
+            No start was found.
+        FileFormatError
+            An earlier step's file is missing, or its images were replaced.
+        Cancelled
+            If the token said so.
+        """
+        more: dict[str, Any] = {"progress": progress, "cancel": cancel}
+        seeds = seeds_of(self.settings)
+        if seeds is not None:
+            more["seeds"] = seeds
+        self.steps[step.n] = step
+        if step.n == self.reference.n:
+            result = self.pair.shape(self.grid, self.options, **more)
+        else:
+            shape = self._field(self.reference.n)
+            earlier = None
+            if previous is not None and previous != self.reference.n:
+                earlier = Earlier(previous, self._field(previous))
+            images = images or self.read(step)
+            result = self._updating(shape).measure(images, earlier, **more)
+            self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
+        self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
+        return result
+
+    def finish(
+        self, step: StepImages, result: Field, *, about: Mapping[str, str], checksum: bool, keep_starts: bool
+    ) -> FinishedStep:
+        """Smooth, mark and strain a measured step, write its file, and summarise it.
+
+        Parameters
+        ----------
+        result
+            As :meth:`measure` gave it.
+        about
+            Further text attributes of the file.
+        checksum
+            Put the file's SHA-256 beside it.
+        keep_starts
+            Keep the matcher's own unknowns beside the file, for a process that goes on from there.
+
+        Raises
+        ------
+        StorageError
+            ``storage_full`` or ``storage_failed``.
+        """
+        began = time.perf_counter()
+        subset_px = self.settings.subset_px
+        shown = smoothed_step(result, self.settings.smoothing_window, subset_px=subset_px)
+        shown = mark_extrapolated(shown, self._volume)
+        strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
+        path = self.file_of(step.n)
+        if result.starts is not None and keep_starts:
+            write_starts(starts_file(path), result.starts)  # first: where the result is, they are
+        write_field(path, shown, self._provenance(step, result, about), strain, measured=result, checksum=checksum)
+        summary = summarise(shown, rbe_px=self._rbe_px, reference=self.reference.n).document()
+        return FinishedStep(
+            n=step.n,
+            field=shown,
+            summary={
+                "n": step.n,
+                "step": step.n,
+                "file": path.name,
+                **summary,
+                "strain": None if strain is None else summarise_strain(strain).document(),
+                "write_s": round(time.perf_counter() - began, 3),
+            },
+        )
+
+    def file_of(self, n: int) -> Path:
+        """Return the path of a step's result."""
+        return self.folder / f"step_{n:04d}.nc"
+
+    def _updating(self, shape: Field) -> Updating:
+        if self._sequence is None:
+            own = weakref.proxy(self)  # no circle: what is dropped, images above all, is to go at once
+            self._sequence = self.pair.sequence(
+                shape,
+                self.grid,
+                self.options,
+                reference_update=self.settings.reference_update,
+                first=self.reference.n,
+                images_of=lambda n: own._earlier_images(n),
+                field_of=lambda n: own._field(n),
+            )
+        return self._sequence
+
+    def _earlier_images(self, n: int) -> Pair:
+        """Images of an earlier step: those of the last one are still here, others are read and checked again."""
+        if self._last_images is not None and self._last_images[0] == n:
+            return self._last_images[1]
+        step = self.steps[n]
+        for path, recorded in zip(step.files, step.sha256, strict=True):
+            if sha256_of(path) != recorded:
+                raise FileFormatError(
+                    f"{path} does not match the checksum in its step.json.",
+                    code="checksum_mismatch",
+                    remedy="Restore the file, or start the analysis again.",
+                )
+        return self.read(step)
+
+    def _field(self, n: int) -> Field:
+        """Field of an earlier step as it was measured: before smoothing, and without the calibration's own error.
+
+        What later steps inherit of it is the images' noise; the calibration's error is told once, of the total.
+        """
+        if n not in self._fields:
+            path = self.file_of(n)
+            if not path.exists():
+                raise FileFormatError(
+                    f"The result of step {n} is missing.", code="file_missing", remedy="Start the analysis again."
+                )
+            measured = replace(read_measured(path), starts=read_starts(starts_file(path)))
+            if n != self.reference.n:
+                return measured
+            self._fields[n] = measured
+        return self._fields[n]
+
+    def _provenance(self, step: StepImages, result: Field, about: Mapping[str, str]) -> Provenance:
+        inputs = {"calibration": self.calibration.sha256, **self.inputs}
+        if self.noise is not None:
+            inputs["noise"] = self.noise.sha256
+        shown = {"reference": self.reference, "": step}
+        if result.references is not None:
+            shown["matched"] = self.steps[result.references.step]
+        for name, images in shown.items():
+            for cam, sha256 in zip(("cam1", "cam2"), images.sha256, strict=True):
+                inputs[f"{name}_{cam}" if name else cam] = sha256
+        return Provenance(
+            settings=self.settings.model_dump(),
+            inputs=inputs,
+            software_version=software_version(),
+            step=step.n,
+            reference=self.reference.n,
+            frame="target" if self.calibration.source == "calibration_json" else "camera1",
+            extra=about,
+        )

@@ -1,0 +1,46 @@
+"""A folder of result files: ``step_<nnnn>.nc``, one a step."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from core.errors import InputError
+
+_RESULT = re.compile(r"step_\d{4,}\.nc")
+
+
+def results_in(folder: Path) -> list[Path]:
+    """Return a folder's result files, by step."""
+    return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))
+
+
+def number_of(path: Path) -> int:
+    """Return the step's number in the name of a result file."""
+    return int(path.stem.removeprefix("step_"))
+
+
+def first_results(folder: Path, places: Iterable[Path]) -> list[Path]:
+    """Return the result files of the first place that has any.
+
+    Parameters
+    ----------
+    folder
+        What the user named.
+    places
+        Where its results may lie.
+
+    Raises
+    ------
+    InputError
+        ``results_missing``.
+    """
+    files = next((found for place in places if (found := results_in(place))), None)
+    if files is None:
+        raise InputError(
+            f"There is no step_0000.nc or another step's result in {folder}.",
+            code="results_missing",
+            remedy="Give the folder that stereorig measure --out wrote, or an analysis' folder.",
+        )
+    return files

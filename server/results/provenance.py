@@ -1,0 +1,83 @@
+"""Where a step's numbers come from, as every export says it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from server.formats.files import sha256_of
+from server.formats.version import software_version
+from server.results.steps import Source, StepResult
+
+
+def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, object]:
+    """Return what every export says: software, frame, settings, calibration, inputs; values are plain.
+
+    Parameters
+    ----------
+    path
+        The result file, to say its checksum.
+    """
+    said = step.attributes
+    document: dict[str, object] = {
+        "software": f"stereorig {software_version()}",
+        "measured_with": said.get("source", ""),
+        "measured": said.get("created", ""),
+        "kind": said.get("kind", ""),
+        "frame": said.get("frame", ""),
+        "length_unit": "mm",
+        "settings": _json(step, "settings"),
+        "calibration_sha256": calibration_of(step),
+        "inputs_sha256": _json(step, "inputs_sha256"),
+        **({"stale_reasons": list(source.stale_reasons)} if source.stale_reasons else {}),
+        **source.about,
+    }
+    for name in ("strain", "smoothing", "patch_choice", "transformation"):
+        if name in said:
+            document[name] = _json(step, name)
+    for name in ("strain_axes", "strain_note", "patch", "patch_reason", "made_from"):
+        if name in said:
+            document[name] = said[name]
+    document["step"] = step.n
+    document["label"], document["load_n"] = step.label, step.load_n
+    if path is not None:
+        document["result_file"] = path.name
+        document["result_sha256"] = sha256_of(path)
+    return document
+
+
+def calibration_of(step: StepResult) -> str | None:
+    """Return the SHA-256 of the calibration that a step was measured with; None where the file does not say."""
+    inputs = _json(step, "inputs_sha256")
+    return inputs.get("calibration")
+
+
+def notes_of(step: StepResult, source: Source) -> list[str]:
+    """Return the few lines that a picture says of its provenance."""
+    settings, strain = _json(step, "settings"), _json(step, "strain")
+    said = [
+        f"{name} {settings[key]}{unit}"
+        for name, key, unit in (
+            ("subset", "subset_px", " px"),
+            ("step", "step_px", " px"),
+            ("patch", "patch", ""),
+            ("interpolation", "interpolation", ""),
+            ("prefilter", "prefilter_px", " px"),
+            ("smoothing window", "smoothing_window", " points"),
+        )
+        if settings.get(key)
+    ]
+    if strain:
+        mm = strain.get("gauge_mm")
+        said.append(f"gauge {strain['gauge_px']:g} px{'' if mm is None else f' = {mm:.3g} mm'}, {strain['tensor']}")
+    calibration = source.about.get("calibration_id"), (calibration_of(step) or "")[:12]
+    known = " ".join(str(part) for part in calibration if part) or "not known"
+    frame, measured_with = (step.attributes.get(name, "") for name in ("frame", "source"))
+    return [f"frame: {frame}", f"{', '.join(said)}; calibration {known}; {measured_with}"]
+
+
+def _json(step: StepResult, name: str) -> dict[str, Any]:
+    """An attribute that holds JSON; empty where there is none."""
+    read: dict[str, Any] = json.loads(str(step.attributes.get(name, "{}")))
+    return read

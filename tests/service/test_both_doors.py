@@ -1,0 +1,115 @@
+"""One folder measured by the service and by the command line: the same files to the last bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+
+from core.status import PointStatus
+from server.cli import main
+from server.config.rig_file import parse_config
+from server.formats.images import encode_tiff
+from server.formats.results.settings import current_summary
+from server.workflows.service import Service
+from tests.support.calibrated_volume import content
+from tests.support.copied_tests import CONFIG, TIME
+from tests.support.field_bench import take
+from tests.support.service_rig import served, wait_for_job
+
+API = "/api/v1"
+STEPS = 5
+ROI = [40.0, 40.0, 224.0, 184.0]
+TIMES = {"created", "cam1_file", "cam2_file", "label", "test_step"}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with a test: a plate that turns, half of it outside the calibrated volume."""
+    folder = tmp_path_factory.mktemp("doors") / "data"
+    test = folder / "tests" / "t000001-abcdef"
+    (test / "analyses").mkdir(parents=True)
+    (folder / "format.json").write_text('{"format": 1}')
+    (test / "calibration.json").write_text(json.dumps(content()))
+    for n in range(STEPS):
+        step = test / "steps" / f"{n:04d}"
+        step.mkdir(parents=True)
+        sha256 = {}
+        for cam, image in zip(
+            ("cam1", "cam2"), take("block", motion=(0.1 * n, 0, 0, 0, 0, 0.12 * n), seed=n), strict=True
+        ):
+            (step / f"{cam}.tif").write_bytes(encode_tiff(image))
+            sha256[cam] = hashlib.sha256((step / f"{cam}.tif").read_bytes()).hexdigest()
+        record = {
+            "label": "",
+            "load_n": None,
+            "source": "import",
+            "captured_utc": "2026-03-01T12:00:00Z",
+            "quality": {},
+        }
+        (step / "step.json").write_text(json.dumps({"n": n, "test_id": test.name, "sha256": sha256, **record}))
+    document = {"id": test.name, "name": "copied", "calibration_id": None, "created_utc": TIME}
+    (test / "test.json").write_text(json.dumps(document))
+    return folder
+
+
+def by_the_service(data: Path, body: dict[str, Any]) -> Path:
+    service = Service(parse_config(CONFIG), data).start()
+    try:
+        with served(service) as client:
+            made = client.post(f"{API}/tests/t000001-abcdef/analyses", json=body)
+            assert made.status_code == 202, made.text
+            ended = wait_for_job(client, made.json()["job"])
+            assert ended["state"] == "succeeded", ended["problem"]
+            return data / "tests" / "t000001-abcdef" / "analyses" / str(made.json()["analysis_id"])
+    finally:
+        service.close()
+
+
+@pytest.mark.parametrize("update", ["never", "always"])
+def test_a_folder_measured_through_both_doors_is_the_same_to_the_last_bit(
+    data: Path, tmp_path: Path, update: str
+) -> None:
+    settings = {"subset_px": 25, "step_px": 12, "patch": "stretch", "reference_update": update, "smoothing_window": 3}
+    region = {"rectangle": ROI, "cracks": [[[60, 60], [100, 60]]]}
+    one = by_the_service(data, {**settings, "region": region, "strain": {"window": 5}})
+    command = [
+        "measure",
+        str(data / "tests" / "t000001-abcdef"),
+        "--out",
+        str(tmp_path),
+        "--strain",
+        "5",
+        "--smooth",
+        "3",
+    ]
+    command += ["--roi", ",".join(map(str, ROI)), "--crack", "60,60,100,60", "--subset", "25", "--step", "12"]
+    assert main([*command, "--patch", "stretch", "--reference-update", update]) == 0
+    outside, later = 0, set()
+    for n in range(STEPS):
+        with netCDF4.Dataset(one / f"step_{n:04d}.nc") as a, netCDF4.Dataset(tmp_path / f"step_{n:04d}.nc") as b:
+            assert list(a.variables) == list(b.variables)
+            for name in a.variables:
+                a[name].set_auto_mask(False)
+                b[name].set_auto_mask(False)
+                assert np.asarray(a[name][...]).tobytes() == np.asarray(b[name][...]).tobytes(), (n, name)
+                assert a[name].__dict__.keys() == b[name].__dict__.keys(), (n, name)
+            assert set(a.ncattrs()) ^ set(b.ncattrs()) <= TIMES
+            for name in set(a.ncattrs()) & set(b.ncattrs()) - TIMES:
+                assert np.array_equal(a.getncattr(name), b.getncattr(name)), (n, name)
+            outside += int((a["status"][...] == PointStatus.EXTRAPOLATED).sum())
+            later |= set() if n == 0 else {int(a.reference_step)}
+    assert outside > 20
+    # with always, each step is matched against the one before, whose covariance it inherits
+    assert later == ({0} if update == "never" else set(range(STEPS - 1)))
+    summaries = [json.loads((folder / "summary.json").read_text()) for folder in (one, tmp_path)]
+    assert summaries[0]["settings"] == summaries[1]["settings"]
+    assert summaries[0].keys() - summaries[1].keys() == {"analysis_id", "job_id", "problem"}
+    timed = {"compute_s", "write_s", "wall_s", "seconds", "cam1", "cam2", "sha256"}
+    for x, y in zip(*(current_summary(s)["steps"] for s in summaries), strict=True):
+        assert {k: v for k, v in x.items() if k not in timed} == {k: v for k, v in y.items() if k not in timed}

@@ -1,0 +1,39 @@
+"""Jobs without a rig."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from server.jobs.events import EventHub
+from server.jobs.hardware import HardwareGate
+from server.jobs.job import Job
+from server.jobs.manager import JobManager
+from server.store.catalog import Catalog
+from server.store.folder import IdMaker
+
+
+class Bench:
+    """Jobs without a rig."""
+
+    def __init__(self, folder: Path, queue_limit: int = 2) -> None:
+        self.catalog = Catalog(folder / "catalog.sqlite").open()
+        self.gate = HardwareGate()
+        self.hub = EventHub()
+        self.jobs = JobManager(self.catalog, self.hub, self.gate, IdMaker(), queue_limit=queue_limit)
+        self.jobs.start()
+
+    def close(self) -> None:
+        self.jobs.close()
+        self.gate.close()
+        self.catalog.close()
+
+    def end_of(self, job: Job, seconds: float = 20.0) -> dict[str, Any]:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            document = self.jobs.document(job.id)
+            if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
+                return document
+            time.sleep(0.005)
+        raise AssertionError(document)
