@@ -12,9 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.arrays import Float
 from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
 from core.errors import InputError
 from core.matching.image import PAD, ImageData
+from core.matching.kernels.given import ComparedImage, Given, ReferenceImage, Setting
 from core.matching.options import SPLINE_ORDER, MatchOptions
+from core.threads import run_ranges
 
 Int = NDArray[np.int32]
 
@@ -75,7 +78,52 @@ def starts_of(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) 
     return array
 
 
-def setting_of(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...]:
+def given_to_kernels(
+    pair: StereoPair,
+    images: list[ImageData],
+    xy: Float,
+    w: Float,
+    options: MatchOptions,
+    visible: VisiblePixels | None,
+    *,
+    G: Float | None = None,
+    epipolar_px: Float | None = None,
+) -> Given:
+    """Return what the kernels are called with, for n points with unknowns ``w`` and, for a motion, ``G``."""
+    n, pose = len(xy), pair.cam2_from_cam1
+    patches, which = visible_of(visible, n, options.subset_px)
+    return Given(
+        reference=reference_of(images[0]),
+        patches=patches,
+        which=which,
+        images=tuple(flat(image) for image in images[1:]),
+        lens1=lens_of(pair.cam1),
+        lens2=lens_of(pair.cam2),
+        R=own(pose.rotation),
+        t=own(pose.translation_mm),
+        xy=xy,
+        w=w,
+        G=np.zeros((n, 3, w.shape[1])) if G is None else G,
+        e=np.zeros(n) if epipolar_px is None else epipolar_px,
+        setting=setting_of(options, images),
+    )
+
+
+def run_kernel(kernel: Any, make_space: Callable[[int], Any], given: Given, out: Float) -> tuple[NDArray[np.int8], Int]:
+    """Run a kernel over all points, on all threads, ``out`` (n, ...) in place; returns status and iterations (n,)."""
+    n = len(given.xy)
+    status, iterations = np.ones(n, np.int8), np.zeros(n, np.int32)
+    space = one_a_thread(make_space, given.setting.subset)
+    run_ranges(
+        lambda first, last: kernel(first, last, given, space(), out, status, iterations),
+        n,
+        POINTS_AT_ONCE,
+        FEWEST_AT_ONCE,
+    )
+    return status, iterations
+
+
+def setting_of(options: MatchOptions, images: list[ImageData]) -> Setting:
     """Options and what is known of the noise: the images' variances, or all one where any is unknown."""
     given = [image.noise_variance for image in images]
     variances = [v for v in given if v is not None and v > 0.0]
@@ -85,16 +133,18 @@ def setting_of(options: MatchOptions, images: list[ImageData]) -> tuple[Any, ...
         max_sigma_px /= float(np.sqrt(np.median(spread[::4, ::4])))
         variances = variances if known else [assumed_variance(images[0])] * len(images)
         known = True
-    return (
-        options.subset_px,
-        SPLINE_ORDER[options.interpolation],
-        options.max_iterations,
-        options.tolerance_px,
-        max_sigma_px,
-        options.max_step_px,
-        (images[0].slope_noise, images[0].slope_share),
-        tuple(variances) if known else (1.0,) * len(images),
-        known,
+    return Setting(
+        subset=options.subset_px,
+        order=SPLINE_ORDER[options.interpolation],
+        max_iterations=options.max_iterations,
+        tolerance=options.tolerance_px,
+        max_sigma=max_sigma_px,
+        max_step=options.max_step_px,
+        slope_noise=images[0].slope_noise,
+        slope_share=images[0].slope_share,
+        variances=tuple(variances) if known else (1.0,) * len(images),
+        known_noise=known,
+        rigid=options.patch == "rigid",
     )
 
 
@@ -119,16 +169,16 @@ def visible_of(visible: VisiblePixels | None, n: int, subset: int) -> tuple[NDAr
     return patches, of_point
 
 
-def reference_of(image: ImageData) -> tuple[Any, ...]:
+def reference_of(image: ImageData) -> ReferenceImage:
     """Return the reference's pixels, gradients and weights; empty where all pixels weigh alike."""
     weights = np.empty((0, 0), np.float32) if image.weights is None else image.weights
-    return (image.pixels, *image.gradients, weights)
+    return ReferenceImage(image.pixels, *image.gradients, weights)
 
 
-def flat(image: ImageData) -> tuple[Any, ...]:
+def flat(image: ImageData) -> ComparedImage:
     """Return the padded coefficients as one row, the image's rows and columns, and the padded row's length."""
     rows, cols = image.shape
-    return image.coefficients.ravel(), rows, cols, cols + 2 * PAD
+    return ComparedImage(image.coefficients.ravel(), rows, cols, cols + 2 * PAD)
 
 
 def lens_of(camera: Camera) -> Float:

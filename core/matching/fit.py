@@ -13,29 +13,21 @@ from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.errors import ImageError, InputError
 from core.matching.arguments import (
-    FEWEST_AT_ONCE,
-    POINTS_AT_ONCE,
     Int,
     VisiblePixels,
     assumed_variance,
     degree_of,
-    flat,
-    lens_of,
-    one_a_thread,
-    own,
+    given_to_kernels,
     points_of,
-    reference_of,
-    setting_of,
+    run_kernel,
     starts_of,
-    visible_of,
 )
 from core.matching.image import ImageData, prepare
-from core.matching.kernels.drivers import motion_points, motion_space, shape_points, shape_space
+from core.matching.kernels.drivers import run_points, work_space
 from core.matching.kernels.motion import n_motion_out
 from core.matching.kernels.shape import n_shape_out
 from core.matching.options import MatchOptions
 from core.status import PointStatus
-from core.threads import run_ranges
 
 Status = NDArray[np.int8]
 
@@ -159,24 +151,8 @@ def fit_shape(
     degree, terms = degree_of(options)
     w = starts_of("start", start, (n,), terms)
     out = np.full((n, n_shape_out(terms)), np.nan)
-    status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
-    results = (out, status, iterations)
-    pose = pair.cam2_from_cam1
-    setting = setting_of(options, images)
-    fixed = (
-        reference_of(images[0]),
-        visible_of(visible, n, options.subset_px),
-        flat(images[1]),
-        lens_of(pair.cam1),
-        lens_of(pair.cam2),
-        own(pose.rotation),
-        own(pose.translation_mm),
-        xy,
-        w,
-        setting,
-    )
-    kernel, space = shape_points[degree], one_a_thread(shape_space[degree], options.subset_px)
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
+    given = given_to_kernels(pair, images, xy, w, options, visible)
+    status, iterations = run_kernel(run_points["shape"][degree], work_space["shape"][degree], given, out)
     failed = status != 0
     out[failed, : terms + 1] = np.nan
     out[failed, terms + 3 :] = np.nan
@@ -258,27 +234,8 @@ def fit_motion(
     w = starts_of("start_w", start_w, (n,), terms)
     G = starts_of("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
     out = np.full((n, n_motion_out(terms)), np.nan)
-    status, iterations = np.zeros(n, np.int8), np.zeros(n, np.int32)
-    results = (out, status, iterations)
-    pose = pair.cam2_from_cam1
-    setting = (*setting_of(options, images), options.patch == "rigid")
-    fixed = (
-        reference_of(images[0]),
-        visible_of(visible, n, options.subset_px),
-        flat(images[1]),
-        flat(images[2]),
-        flat(images[3]),
-        lens_of(pair.cam1),
-        lens_of(pair.cam2),
-        own(pose.rotation),
-        own(pose.translation_mm),
-        xy,
-        w,
-        G,
-        setting,
-    )
-    kernel, space = motion_points[degree], one_a_thread(motion_space[degree], options.subset_px)
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), *results), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
+    given = given_to_kernels(pair, images, xy, w, options, visible, G=G)
+    status, iterations = run_kernel(run_points["motion"][degree], work_space["motion"][degree], given, out)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan
     out[failed, at + 5 : at + 30] = np.nan

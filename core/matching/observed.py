@@ -10,25 +10,10 @@ from numpy.typing import ArrayLike
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
-from core.matching.arguments import (
-    FEWEST_AT_ONCE,
-    POINTS_AT_ONCE,
-    VisiblePixels,
-    degree_of,
-    flat,
-    lens_of,
-    one_a_thread,
-    own,
-    points_of,
-    reference_of,
-    setting_of,
-    starts_of,
-    visible_of,
-)
+from core.matching.arguments import VisiblePixels, degree_of, given_to_kernels, own, points_of, run_kernel, starts_of
 from core.matching.image import ImageData, prepare
-from core.matching.kernels.drivers import observe_motion, observe_shape, observed_motion_space, observed_shape_space
+from core.matching.kernels.drivers import observe_points, observed_space
 from core.matching.options import MatchOptions
-from core.threads import run_ranges
 
 
 def observed_covariance(
@@ -80,32 +65,13 @@ def observed_covariance(
         raise InputError(f"{len(prepared)} images do not fit to the unknowns.", code="shape_mismatch")
     xy, n = points_of(xy_px)
     degree, terms = degree_of(options)
-    motion = G is not None
     unknown_w = starts_of("w", w, (n,), terms)
-    unknown_g = np.zeros((n, 3, terms)) if G is None else starts_of("G", G, (n, 3), terms)
+    unknown_g = None if G is None else starts_of("G", G, (n, 3), terms)
     offsets = own(np.broadcast_to(np.asarray(epipolar_px, dtype=np.float64), (n,)))
-    q = 5 if motion else 2
-    out, status = np.full((n, q * q), np.nan), np.ones(n, np.int8)
-    seen = [flat(image) for image in prepared[1:]]
-    pose = pair.cam2_from_cam1
-    fixed = (
-        reference_of(prepared[0]),
-        visible_of(visible, n, options.subset_px),
-        *(seen if motion else 3 * seen),
-        lens_of(pair.cam1),
-        lens_of(pair.cam2),
-        own(pose.rotation),
-        own(pose.translation_mm),
-        xy,
-        unknown_w,
-        unknown_g,
-        offsets,
-        setting_of(options, prepared),
-        options.patch == "rigid",
-    )
-    kernels, spaces = (observe_motion, observed_motion_space) if motion else (observe_shape, observed_shape_space)
-    kernel, space = kernels[degree], one_a_thread(spaces[degree], options.subset_px)
-    run_ranges(lambda first, last: kernel(first, last, *fixed, space(), out, status), n, POINTS_AT_ONCE, FEWEST_AT_ONCE)
+    given = given_to_kernels(pair, prepared, xy, unknown_w, options, visible, G=unknown_g, epipolar_px=offsets)
+    what, q = ("shape", 2) if G is None else ("motion", 5)
+    out = np.full((n, q * q), np.nan)
+    status, _ = run_kernel(observe_points[what][degree], observed_space[what][degree], given, out)
     known: Bool = status == 0
     out[~known] = np.nan
     return out.reshape(n, q, q), known

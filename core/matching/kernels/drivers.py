@@ -12,9 +12,12 @@ differs from process to process.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
+from core.matching.kernels.given import FitKernels
 from core.matching.kernels.motion import make_motion
 from core.matching.kernels.naming import entry
 from core.matching.kernels.shape import make_shape
@@ -27,331 +30,54 @@ def _stamp() -> int:
     return int.from_bytes(digest[:7], "big")
 
 
-_plane_shape, _shape_space, _observed_plane_shape, _observed_shape_space = make_shape(1)
-_plane_motion, _motion_space, _observed_plane_motion, _observed_motion_space = make_motion(1)
-_curved_shape, _curved_shape_space, _observed_curved_shape, _observed_curved_shape_space = make_shape(2)
-_curved_motion, _curved_motion_space, _observed_curved_motion, _observed_curved_motion_space = make_motion(2)
+def _entry(name: str, kernel: Any, stamp: int) -> Any:
+    """Compile the loop over a range of points for a kernel, under a name of its own."""
 
-
-def _wrappers(stamp: int) -> tuple[dict[int, Any], ...]:
-    @entry
-    def run_plane_shape(
-        first, last, reference, visible, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
-    ):
+    def run(first, last, given, space, out, status, iterations):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        patches, which = visible
+        # taken apart before the loop: in it numba would count references at each attribute
+        reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting = given
         for i in range(first, last):
-            status[i], iterations[i] = _plane_shape(
-                reference, patches, which[i], image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
-            )
-
-    @entry
-    def run_plane_motion(
-        first,
-        last,
-        reference,
-        visible,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        start_w,
-        start_g,
-        setting,
-        space,
-        out,
-        status,
-        iterations,
-    ):
-        if stamp < 0:
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i], iterations[i] = _plane_motion(
+            status[i], iterations[i] = _point(
                 reference,
                 patches,
                 which[i],
-                image2,
-                image1t,
-                image2t,
-                lens1,
-                lens2,
-                R,
-                t,
-                xy[i],
-                start_w[i],
-                start_g[i],
-                setting,
-                space,
-                out[i],
-            )
-
-    @entry
-    def run_curved_shape(
-        first, last, reference, visible, image2, lens1, lens2, R, t, xy, start, setting, space, out, status, iterations
-    ):
-        if stamp < 0:  # never; it makes the stamp part of the function
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i], iterations[i] = _curved_shape(
-                reference, patches, which[i], image2, lens1, lens2, R, t, xy[i], start[i], setting, space, out[i]
-            )
-
-    @entry
-    def run_curved_motion(
-        first,
-        last,
-        reference,
-        visible,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        start_w,
-        start_g,
-        setting,
-        space,
-        out,
-        status,
-        iterations,
-    ):
-        if stamp < 0:
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i], iterations[i] = _curved_motion(
-                reference,
-                patches,
-                which[i],
-                image2,
-                image1t,
-                image2t,
-                lens1,
-                lens2,
-                R,
-                t,
-                xy[i],
-                start_w[i],
-                start_g[i],
-                setting,
-                space,
-                out[i],
-            )
-
-    @entry
-    def observe_plane_shape(
-        first,
-        last,
-        reference,
-        visible,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        w,
-        g,
-        e,
-        setting,
-        rigid,
-        space,
-        out,
-        status,
-    ):
-        if stamp < 0:
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i] = _observed_plane_shape(
-                reference,
-                patches,
-                which[i],
-                image2,
-                image1t,
-                image2t,
+                images,
                 lens1,
                 lens2,
                 R,
                 t,
                 xy[i],
                 w[i],
-                g[i],
+                G[i],
                 e[i],
                 setting,
-                rigid,
                 space,
                 out[i],
             )
 
-    @entry
-    def observe_plane_motion(
-        first,
-        last,
-        reference,
-        visible,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        w,
-        g,
-        e,
-        setting,
-        rigid,
-        space,
-        out,
-        status,
-    ):
-        if stamp < 0:
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i] = _observed_plane_motion(
-                reference,
-                patches,
-                which[i],
-                image2,
-                image1t,
-                image2t,
-                lens1,
-                lens2,
-                R,
-                t,
-                xy[i],
-                w[i],
-                g[i],
-                e[i],
-                setting,
-                rigid,
-                space,
-                out[i],
-            )
-
-    @entry
-    def observe_curved_shape(
-        first,
-        last,
-        reference,
-        visible,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        w,
-        g,
-        e,
-        setting,
-        rigid,
-        space,
-        out,
-        status,
-    ):
-        if stamp < 0:
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i] = _observed_curved_shape(
-                reference,
-                patches,
-                which[i],
-                image2,
-                image1t,
-                image2t,
-                lens1,
-                lens2,
-                R,
-                t,
-                xy[i],
-                w[i],
-                g[i],
-                e[i],
-                setting,
-                rigid,
-                space,
-                out[i],
-            )
-
-    @entry
-    def observe_curved_motion(
-        first,
-        last,
-        reference,
-        visible,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        w,
-        g,
-        e,
-        setting,
-        rigid,
-        space,
-        out,
-        status,
-    ):
-        if stamp < 0:
-            return
-        patches, which = visible
-        for i in range(first, last):
-            status[i] = _observed_curved_motion(
-                reference,
-                patches,
-                which[i],
-                image2,
-                image1t,
-                image2t,
-                lens1,
-                lens2,
-                R,
-                t,
-                xy[i],
-                w[i],
-                g[i],
-                e[i],
-                setting,
-                rigid,
-                space,
-                out[i],
-            )
-
-    return (
-        {1: run_plane_shape, 2: run_curved_shape},
-        {1: run_plane_motion, 2: run_curved_motion},
-        {1: observe_plane_shape, 2: observe_curved_shape},
-        {1: observe_plane_motion, 2: observe_curved_motion},
-    )
+    looped = FunctionType(run.__code__, {**globals(), "_point": kernel}, name, None, run.__closure__)
+    looped.__qualname__ = name
+    return entry(looped)
 
 
-shape_points, motion_points, observe_shape, observe_motion = _wrappers(_stamp())
-"""The compiled fits and observed covariances, by the patch's degree: 1 plane, 2 curved."""
-shape_space = {1: _shape_space, 2: _curved_shape_space}
-motion_space = {1: _motion_space, 2: _curved_motion_space}
-observed_shape_space = {1: _observed_shape_space, 2: _observed_curved_shape_space}
-observed_motion_space = {1: _observed_motion_space, 2: _observed_curved_motion_space}
+def _point(*given: Any) -> tuple[int, int]:
+    """Stand for an entry point's kernel, which is found under this name in globals of the entry point's own."""
+    raise NotImplementedError
+
+
+_STAMP = _stamp()
+_FITS = {"shape": {1: make_shape(1), 2: make_shape(2)}, "motion": {1: make_motion(1), 2: make_motion(2)}}
+
+
+def _by_fit(of: Callable[[str, FitKernels], Any]) -> dict[str, dict[int, Any]]:
+    return {what: {d: of(f"{what}_{d}", kernels) for d, kernels in fits.items()} for what, fits in _FITS.items()}
+
+
+run_points = _by_fit(lambda name, kernels: _entry(f"run_{name}", kernels.point, _STAMP))
+observe_points = _by_fit(lambda name, kernels: _entry(f"observe_{name}", kernels.observed, _STAMP))
+"""The compiled fits and observed covariances: of a shape or a motion, by the patch's degree (1 plane, 2 curved)."""
+work_space = _by_fit(lambda _, kernels: kernels.space)
+observed_space = _by_fit(lambda _, kernels: kernels.observed_space)
 """What makes their work space for a subset's width; one call at a time may use it."""

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
+from core.matching.kernels.given import FitKernels
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
@@ -51,23 +51,13 @@ def n_motion_out(terms: int) -> int:
     return 4 * terms + 31
 
 
-def make_motion(degree: int) -> Any:
+def make_motion(degree: int) -> FitKernels:
     """Compile the fit for plane (degree 1, stretch or rigid) or curved (2) patches."""
     parts = make_point(degree, 3)
-    (
-        set_up_reference,
-        work_space,
-        compare,
-        image_matrices,
-        jacobian,
-        assemble,
-        factor,
-        gradient,
-        moves_of,
-        predict,
-        texture,
-        few,
-    ) = parts
+    set_up_reference, compare, image_matrices = parts.set_up_reference, parts.compare, parts.image_matrices
+    jacobian, assemble, factor = parts.jacobian, parts.assemble, parts.factor
+    gradient, moves_of, predict = parts.gradient, parts.moves_of, parts.predict
+    texture, few = parts.texture, parts.few
     unknowns = 4 * few + 1
 
     @kernel(f"{degree}")
@@ -102,56 +92,29 @@ def make_motion(degree: int) -> Any:
                         free[i] = s
                     for i in range(unknowns):
                         columns[k, r, i] = free[i] if i < n else 0.0
-        assemble(equations, of_reference[7])
+        assemble(equations, of_reference.gram)
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
     def motion_point(
-        reference,
-        patches,
-        which,
-        image2,
-        image1t,
-        image2t,
-        lens1,
-        lens2,
-        R,
-        t,
-        xy,
-        start_w,
-        start_g,
-        setting,
-        space,
-        out,
+        reference, patches, which, images, lens1, lens2, R, t, xy, start_w, start_g, _e, setting, space, out
     ):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
-        subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise, rigid = setting
-        (
-            ref,
-            of_reference,
-            warp_space,
-            rhs,
-            levels,
-            M,
-            equations,
-            moves,
-            vectors,
-            inverse,
-            G,
-            rotation,
-            chain,
-            work,
-        ) = space
-        gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2, white, count = set_up_reference(
-            reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
+        order, tolerance, variances = setting.order, setting.tolerance, setting.variances
+        ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain, work = (
+            space
         )
-        if not inside:
+        gram, columns, normal = of_reference.gram, equations.columns, equations.normal
+        subset = setting.subset
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
+        xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
+        if not seen.inside:
             return OUTSIDE_IMAGE, 0
+        rigid = setting.rigid
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
         gradients, weakest = texture(gram)
-        if not (white < WHITE and gradients > 1e-6 * f2):
+        if not (seen.white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
         w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
@@ -172,7 +135,7 @@ def make_motion(degree: int) -> Any:
             if not nearest_rotation(xc, yc, w, G, rotation):
                 return SINGULAR, 0
             rigid_columns(xc, yc, w, rotation, G)
-        images, lenses = (image2, image1t, image2t), (lens1, lens2)
+        lenses = (lens1, lens2)
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
@@ -182,7 +145,7 @@ def make_motion(degree: int) -> Any:
         moved, previous, last = np.inf, 0.0, np.inf
         status = NOT_CONVERGED
         iterations = 0
-        while iterations < max_iterations:
+        while iterations < setting.max_iterations:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
             result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
             if result != OK:
@@ -200,7 +163,7 @@ def make_motion(degree: int) -> Any:
             gradient(equations, rhs, small)
             solve(normal, small, n)
             motion = moves_of(columns, small, moves)
-            cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
+            cut = min(1.0, setting.max_step / motion) if motion > 0.0 else 1.0
             if few == 3 and rigid:
                 for r in range(unknowns):
                     s = 0.0
@@ -244,22 +207,22 @@ def make_motion(degree: int) -> Any:
         for k in range(3):
             out[at + 1 + k] = levels[k, ZNCC]
             worst = min(worst, levels[k, ZNCC])
-        variance = noise_from_residuals(levels, 3, count, float(n))
+        variance = noise_from_residuals(levels, 3, seen.n_pixels, float(n))
         out[at + 4] = math.sqrt(variance)
-        above = unlike_noise(levels, 3, count, float(n))
+        above = unlike_noise(levels, 3, seen.n_pixels, float(n))
         out[at + 30] = variance + above
-        if known_noise:
+        if setting.known_noise:
             variance = variances[0]
         covariance = out[at + 5 : at + 30]
         covariance_of_last(normal, n, 5, work, covariance)
-        factor_on = share_correction(gradients, variance, p, slope[0], slope[1])
-        factor_on *= 1.0 if known_noise else variance + above
+        factor_on = share_correction(gradients, variance, p, setting.slope_noise, setting.slope_share)
+        factor_on *= 1.0 if setting.known_noise else variance + above
         for i in range(25):
             covariance[i] *= factor_on
         # px: along and across camera 2's epipolar line, and both ways in camera 1 at t
         sigma = max(math.sqrt(covariance[0]) * along, math.sqrt(covariance[24]))
         sigma = max(sigma, math.sqrt(max(covariance[6], covariance[12])) * lens1[1] / G[2, 0])
-        share = slope[0] * variance * p / weakest
-        return texture_status(status, share, sigma, max_sigma, worst), iterations
+        share = setting.slope_noise * variance * p / weakest
+        return texture_status(status, share, sigma, setting.max_sigma, worst), iterations
 
-    return motion_point, work_space, *make_observed(degree, 3, parts, freeze, work_space)
+    return FitKernels(motion_point, parts.work_space, *make_observed(degree, 3, parts, freeze))

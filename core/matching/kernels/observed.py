@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from core.matching.kernels.given import ObservedSpace
 from core.matching.kernels.linear import solve
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
 from core.matching.kernels.naming import kernel
@@ -27,7 +28,15 @@ from core.matching.kernels.noise import (
     noise_from_residuals,
     share_correction,
 )
-from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR, epipolar_shift, make_sum_pixels
+from core.matching.kernels.point import (
+    LOW_TEXTURE,
+    OK,
+    OUTSIDE_IMAGE,
+    SINGULAR,
+    PointKernels,
+    epipolar_shift,
+    make_sum_pixels,
+)
 from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
 from core.matching.kernels.vectors import LANES
 from core.matching.kernels.warp import lens_jacobian, set_up_warp
@@ -41,7 +50,7 @@ def blocks_across(subset_px: int) -> int:
     return int(min(max(round(subset_px / BLOCK_PX), FEWEST_BLOCKS), MOST_BLOCKS))
 
 
-def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space: Any) -> tuple[Any, Any]:
+def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) -> tuple[Any, Any]:
     """Compile the observed covariance for the fit that ``parts`` and ``freeze`` belong to.
 
     Parameters
@@ -52,28 +61,26 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
         What :func:`core.matching.kernels.point.make_point` returned.
     freeze
         The fit's set-up of the normal equations.
-    make_space
-        The fit's own work space for a subset's width.
     """
-    set_up_reference, _, compare, image_matrices, *_, gradients_of, few = parts
+    set_up_reference, make_space, few = parts.set_up_reference, parts.work_space, parts.few
+    compare, image_matrices, gradients_of = parts.compare, parts.image_matrices, parts.texture
     n_columns = 2 * few
     last = 5 if images == 3 else 2
     unknowns = (4 if images == 3 else 1) * few + 1
     sum_pixels = make_sum_pixels(degree)
 
-    def work_space(subset: int) -> tuple[Any, ...]:
-        """The fit's space and, besides, one block's pixels, the blocks' sums, and what they do to the unknowns."""
+    def work_space(subset: int) -> ObservedSpace:
         across = blocks_across(subset)
         widest = -(-subset // across) + 1
         width = (widest * widest + LANES - 1) // LANES * LANES + LANES
-        own = (
-            np.zeros((N_ROWS, width), np.float32),
-            np.empty((images, across * across, n_columns)),
-            np.empty((last, images, n_columns)),
-            np.empty(last),
-            np.empty(3 + n_columns),
+        return ObservedSpace(
+            fit=make_space(subset),
+            part=np.zeros((N_ROWS, width), np.float32),
+            scores=np.empty((images, across * across, n_columns)),
+            pull=np.empty((last, images, n_columns)),
+            z=np.empty(last),
+            sums=np.empty(3 + n_columns),
         )
-        return make_space(subset), own
 
     @kernel(f"{degree}_{images}")
     def cut_out(ref, subset, top, bottom, left, right, part):
@@ -116,30 +123,24 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
-    def observed_point(
-        reference, patches, which, image2, image1t, image2t, lens1, lens2, R, t, xy, w, g, e, setting, rigid, space, out
-    ):
-        """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status."""
-        subset, order, _, _, _, _, slope, variances, known_noise = setting
-        fit_space, (part, scores, pull, z, sums) = space
-        (ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _) = (
-            fit_space
-        )
-        inside, xc, yc, p, offset, f2, _, count = set_up_reference(
-            reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
-        )
-        if not inside:
-            return OUTSIDE_IMAGE
+    def observed_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
+        """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status, and 0."""
+        subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
+        fit_space, part, scores, pull, z, sums = space
+        ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _ = fit_space
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
+        xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
+        if not seen.inside:
+            return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
-            return LOW_TEXTURE
-        gradients, _ = gradients_of(of_reference[7])
+            return LOW_TEXTURE, 0
+        gradients, _ = gradients_of(of_reference.gram)
         nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, w[0])
         if not along > 0.0:
-            return SINGULAR
+            return SINGULAR, 0
         slopes = lens_jacobian(lens1, xc, yc)
-        shown = (image2, image1t, image2t)
         known = (np.int64((subset * subset + LANES - 1) // LANES), p, offset, f2)
-        warp = warp_space[0]
+        warp = warp_space.warp
         if images == 3:
             for j in range(few):
                 for i in range(3):
@@ -150,16 +151,16 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
             lens = lens1 if k == 1 else lens2
             levels[k, GAIN], levels[k, SHIFT] = 1.0, 0.0
             if not compare(shown[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
-                return OUTSIDE_IMAGE
+                return OUTSIDE_IMAGE, 0
             if levels[k, CONTRAST] == 0.0 or not levels[k, ZNCC] > 0.0:
-                return LOW_TEXTURE
+                return LOW_TEXTURE, 0
             # residuals that hold nothing of the reference itself: its mean and its contrast are taken out
             correlation = levels[k, ZNCC]
             warp[20] = levels[k, GAIN] / correlation
             warp[21] = (levels[k, SHIFT] + offset) / correlation - offset
             coefficients, rows, cols, stride = shown[k]
             base = set_up_warp(
-                lens, M[k], of_reference[2], rows, cols, stride, 1 if order == 3 else 2, warp_space[1], warp
+                lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.places, warp
             )
             worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores[k])
         # the contrast of all is taken for the best one's: what another lacks of its correlation is noise of its own
@@ -168,13 +169,13 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
         if images == 3 and few == 3 and rigid:
             n = N_RIGID
             if not nearest_rotation(xc, yc, w, G, rotation):
-                return SINGULAR
+                return SINGULAR, 0
             rigid_chain(xc, yc, w, rotation, G, chain)
         result = freeze(
             R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid
         )
         if result != OK:
-            return result
+            return result, 0
         weights, _, columns, _, _, normal = equations
         unit = vectors[0]
         for i in range(last):
@@ -205,10 +206,12 @@ def make_observed(degree: int, images: int, parts: Any, freeze: Any, make_space:
                     out[last * i + j] += z[i] * z[j]
         # the fit took the mean and slopes of the residuals' pull away from the blocks
         factor_on = 1.0 / max(1.0 - few / worth, 0.2)
-        variance = variances[0] if known_noise else noise_from_residuals(levels, images, count, float(n))
-        factor_on *= share_correction(gradients, variance, p, slope[0], slope[1])
+        variance = (
+            variances[0] if setting.known_noise else noise_from_residuals(levels, images, seen.n_pixels, float(n))
+        )
+        factor_on *= share_correction(gradients, variance, p, setting.slope_noise, setting.slope_share)
         for i in range(last * last):
             out[i] *= factor_on
-        return OK
+        return OK, 0
 
     return observed_point, work_space

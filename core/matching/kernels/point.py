@@ -17,11 +17,13 @@ what the patch does in its own coordinates then is ``d = M_k^-1 dM_k m``, from w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from core.matching.kernels.given import Equations, ReferenceSpace, WarpSpace, WorkSpace
 from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
 from core.matching.kernels.loops import N_WARP, compare_cubic, compare_quintic, monomials
 from core.matching.kernels.naming import inner, kernel
@@ -135,9 +137,9 @@ def make_compare(degree: int) -> Any:
         """
         coefficients, rows, cols, stride = image
         blocks, p, offset, f2 = known
-        _, _, powers, _, _, sum_g, sum_fg, _ = of_reference
+        sum_g, sum_fg = of_reference.sum_g, of_reference.sum_fg
         warp, places, sums = space
-        base = set_up_warp(lens, m, powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
+        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
         if base < 0:
             return False
         warp[20] = levels[GAIN]
@@ -160,7 +162,7 @@ def make_compare(degree: int) -> Any:
         levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
         levels[CONTRAST] = c / gain
         levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
-        half = of_reference[4][2]
+        half = of_reference.place[2]
         levels[SMOOTHED] = interpolated_noise(warp, half, order)
         levels[DENSITY] = min(max(abs(warp[1] * warp[12] - warp[2] * warp[11]) / (half * half), 0.01), 100.0)
         return True
@@ -168,7 +170,24 @@ def make_compare(degree: int) -> Any:
     return compare
 
 
-def make_point(degree: int, images: int) -> Any:
+class PointKernels(NamedTuple):
+    """The compiled parts of a fit, what makes its work space, and how many monomials its patch has."""
+
+    set_up_reference: Any
+    work_space: Callable[[int], WorkSpace]
+    compare: Any
+    image_matrices: Any
+    jacobian: Any
+    assemble: Any
+    factor: Any
+    gradient: Any
+    moves_of: Any
+    predict: Any
+    texture: Any
+    few: int
+
+
+def make_point(degree: int, images: int) -> PointKernels:
     """Compile what the fits share, for patches of this degree (1 plane, 2 curved) and one or three comparisons."""
     few = len(monomials(degree))
     each = 4 if images == 3 else 1  # unknowns a monomial: w_j, and G_0j, G_1j, G_2j
@@ -179,45 +198,43 @@ def make_point(degree: int, images: int) -> Any:
     product, factor = make_product(row), make_factor(row)
     made_for = f"{degree}_{images}"
 
-    def work_space(subset: int) -> tuple[Any, ...]:
-        """Everything one thread needs, so that no point allocates."""
+    def work_space(subset: int) -> WorkSpace:
         ref = subset_array(subset)
         basis = np.zeros((few, few))
         basis[0, 0] = 1.0
-        reference = (
-            np.empty(n_raw),
-            np.empty(22),
-            np.empty((few, N_NODES)),
-            basis,
-            np.empty(3),
-            np.empty(n_columns),
-            np.empty(n_columns),
-            np.empty((n_columns, n_columns)),
+        reference = ReferenceSpace(
+            raw=np.empty(n_raw),
+            node_work=np.empty(22),
+            powers=np.empty((few, N_NODES)),
+            basis=basis,
+            place=np.empty(3),
+            sum_g=np.empty(n_columns),
+            sum_fg=np.empty(n_columns),
+            gram=np.empty((n_columns, n_columns)),
         )
-        # four of what there is one of for each image: the products work on pairs
-        equations = (
-            np.zeros((4, 4)),  # weights
-            np.zeros((3, 5)),  # what an image's matrix makes of a unit of each unknown
-            np.zeros((4, n_columns, row)),  # columns
-            np.zeros((4, n_columns, row)),  # Gram matrix times columns
-            np.zeros((4, n_columns, row)),  # the same, weighted
-            np.zeros((row, row)),  # normal equations, then their factor
+        equations = Equations(
+            weights=np.zeros((4, 4)),
+            block=np.zeros((3, 5)),
+            columns=np.zeros((4, n_columns, row)),
+            half=np.zeros((4, n_columns, row)),
+            weighted=np.zeros((4, n_columns, row)),
+            normal=np.zeros((row, row)),
         )
-        return (
-            ref,
-            reference,
-            (np.zeros(N_WARP, np.float32), np.empty(26), np.empty(3 + n_columns)),  # warp, places, sums
-            np.empty((images, n_columns)),  # rhs
-            np.empty((images, N_LEVELS)),  # levels
-            np.empty((images, 3, few)),  # M
-            equations,
-            np.empty((images, n_columns)),  # moves
-            np.zeros((4, row)),  # vectors
-            np.empty((3, 3)),  # inverse
-            np.empty((3, few)),  # G
-            np.empty((3, 3)),  # rotation
-            np.zeros((unknowns, unknowns)),  # chain
-            np.empty((5, 5)),  # work
+        return WorkSpace(
+            ref=ref,
+            of_reference=reference,
+            warp=WarpSpace(np.zeros(N_WARP, np.float32), np.empty(26), np.empty(3 + n_columns)),
+            rhs=np.empty((images, n_columns)),
+            levels=np.empty((images, N_LEVELS)),
+            M=np.empty((images, 3, few)),
+            equations=equations,
+            moves=np.empty((images, n_columns)),
+            vectors=np.zeros((4, row)),
+            inverse=np.empty((3, 3)),
+            G=np.empty((3, few)),
+            rotation=np.empty((3, 3)),
+            chain=np.zeros((unknowns, unknowns)),
+            work=np.empty((5, 5)),
         )
 
     @kernel(made_for)
@@ -244,7 +261,7 @@ def make_point(degree: int, images: int) -> Any:
 
         ``slopes`` are d(px) / d(ray) of camera 1 at the point.
         """
-        _, _, _, basis, place, _, _, _ = of_reference
+        basis, place = of_reference.basis, of_reference.place
         last = each * few
         j11, j12, j21, j22 = slopes
         for k in range(images):
@@ -314,7 +331,7 @@ def make_point(degree: int, images: int) -> Any:
     @kernel(made_for)
     def gradient(equations, rhs, out):
         """Right-hand side in the unknowns from each image's sums ``rhs``, with the sign of a step downhill."""
-        weights, columns = equations[0], equations[2]
+        weights, columns = equations.weights, equations.columns
         for c in range(row):
             out[c] = 0.0
         for k in range(images):
@@ -365,17 +382,17 @@ def make_point(degree: int, images: int) -> Any:
         mean = 0.5 * (xx + yy)
         return mean, mean - math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
 
-    return (
-        set_up_reference,
-        work_space,
-        compare,
-        image_matrices,
-        jacobian,
-        assemble,
-        factor,
-        gradient,
-        moves_of,
-        predict,
-        texture,
-        few,
+    return PointKernels(
+        set_up_reference=set_up_reference,
+        work_space=work_space,
+        compare=compare,
+        image_matrices=image_matrices,
+        jacobian=jacobian,
+        assemble=assemble,
+        factor=factor,
+        gradient=gradient,
+        moves_of=moves_of,
+        predict=predict,
+        texture=texture,
+        few=few,
     )

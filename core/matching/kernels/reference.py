@@ -21,6 +21,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from core.matching.kernels.given import Subset
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
 from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
@@ -112,34 +113,22 @@ def make_reference(degree: int) -> Any:
 
     @kernel(f"{degree}")
     def set_up_reference(reference, patches, which, lens, x_px, y_px, subset, ref, space):
-        """Copy the subset nearest to (x_px, y_px) and sum it.
+        """Copy the subset nearest to (x_px, y_px) and sum it; returns a :class:`Subset`.
 
         Parameters
         ----------
-        reference
-            Tuple of pixels, gradients along x and y, and weights, (rows, cols) float32 each; weights may be empty.
-        patches, which
-            (k, subset, subset) uint8, zero where a pixel does not count, and which of them is the point's; -1 = none.
+        reference, patches, which
+            As in :class:`core.matching.kernels.given.Given`, of one point.
         lens
             Camera 1's.
         ref
             The subset's array, see ``loops``.
         space
-            Work space: raw sums, a vector for the nodes; and results: node monomials (M, 16), the change of basis
-            (M, M) from monomials of a pixel's place to those of its ray, the middle of the subset's pixels from the
-            point and half its width (3,) px, sum of each column (2 M,), of f times it (2 M,), and the Gram matrix
-            (2 M, 2 M); gain and offset are projected out of the last two.
-
-        Returns
-        -------
-        tuple
-            ``inside`` (bool), the point's ray ``xc, yc``, the weights' sum, the mean of f that is left, the sum of
-            squares of f about it, the differences of neighbours against it (1 for white noise), and how many pixels
-            count.
+            A :class:`ReferenceSpace`.
         """
         pixels, grad_x, grad_y, weights = reference
         raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
-        nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
         left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
@@ -189,7 +178,7 @@ def make_reference(degree: int) -> Any:
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])
-        return True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count)
+        return Subset(True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count))
 
     return set_up_reference, n_columns, first_gg + 3 * many
 

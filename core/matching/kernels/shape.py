@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
+from core.matching.kernels.given import FitKernels
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
@@ -43,23 +43,13 @@ def n_shape_out(terms: int) -> int:
     return terms + 6
 
 
-def make_shape(degree: int) -> Any:
+def make_shape(degree: int) -> FitKernels:
     """Compile the fit for plane (degree 1) or curved (2) patches."""
     parts = make_point(degree, 1)
-    (
-        set_up_reference,
-        work_space,
-        compare,
-        image_matrices,
-        jacobian,
-        assemble,
-        factor,
-        gradient,
-        moves_of,
-        predict,
-        texture,
-        few,
-    ) = parts
+    set_up_reference, compare, image_matrices = parts.set_up_reference, parts.compare, parts.image_matrices
+    jacobian, assemble, factor = parts.jacobian, parts.assemble, parts.factor
+    gradient, moves_of, predict = parts.gradient, parts.moves_of, parts.predict
+    texture, few = parts.texture, parts.few
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @kernel(f"{degree}")
@@ -69,29 +59,28 @@ def make_shape(degree: int) -> Any:
         joint_weights(levels, variances, 1, weights)
         if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
-        assemble(equations, of_reference[7])
+        assemble(equations, of_reference.gram)
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def shape_point(reference, patches, which, image2, lens1, lens2, R, t, xy, start, setting, space, out):
+    def shape_point(reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, _e, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
-        subset, order, max_iterations, tolerance, max_sigma, max_step, slope, variances, known_noise = setting
-        (ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work) = (
-            space
-        )
-        gram, columns, normal = of_reference[7], equations[2], equations[5]
-        inside, xc, yc, p, offset, f2, white, count = set_up_reference(
-            reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference
-        )
-        if not inside:
+        order, tolerance, variances = setting.order, setting.tolerance, setting.variances
+        ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work = space
+        gram, columns, normal = of_reference.gram, equations.columns, equations.normal
+        subset = setting.subset
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
+        xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
+        if not seen.inside:
             return OUTSIDE_IMAGE, 0
         if not (f2 > 0.0 and p > 0.0):
             return LOW_TEXTURE, 0
         gradients, weakest = texture(gram)
-        if not (white < WHITE and gradients > 1e-6 * f2):
+        if not (seen.white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
         w, step, small = vectors[0], vectors[1], vectors[2]
         total = 0.0
+        image2 = images[0]
         for i in range(few):
             w[i] = start[i]
             total += w[i]
@@ -108,7 +97,7 @@ def make_shape(degree: int) -> Any:
         moved, previous, last = np.inf, 0.0, np.inf
         status = NOT_CONVERGED
         iterations = 0
-        while iterations < max_iterations:
+        while iterations < setting.max_iterations:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
             if not compare(image2, lens2, M[0], order, ref, known, of_reference, warp_space, levels[0], rhs[0]):
                 return OUTSIDE_IMAGE, iterations
@@ -125,7 +114,7 @@ def make_shape(degree: int) -> Any:
             gradient(equations, rhs, step)
             solve(normal, step, n)
             motion = moves_of(columns, step, moves)
-            cut = min(1.0, max_step / motion) if motion > 0.0 else 1.0
+            cut = min(1.0, setting.max_step / motion) if motion > 0.0 else 1.0
             for j in range(1, few):
                 w[j] += cut * step[j - 1]
             w[0] += cut * step[few - 1]
@@ -147,15 +136,16 @@ def make_shape(degree: int) -> Any:
         for j in range(few):
             out[j] = w[j]
         out[few], out[few + 1] = e, levels[0, ZNCC]
-        variance = noise_from_residuals(levels, 1, count, float(n))
+        variance = noise_from_residuals(levels, 1, seen.n_pixels, float(n))
         out[few + 2] = math.sqrt(variance)
-        if known_noise:
+        if setting.known_noise:
             variance = variances[0]
         covariance_of_last(normal, n, 2, work, small)
-        factor_on = share_correction(gradients, variance, p, slope[0], slope[1]) * (1.0 if known_noise else variance)
+        factor_on = share_correction(gradients, variance, p, setting.slope_noise, setting.slope_share)
+        factor_on *= 1.0 if setting.known_noise else variance
         out[few + 3], out[few + 4], out[few + 5] = factor_on * small[0], factor_on * small[1], factor_on * small[3]
         sigma = max(math.sqrt(out[few + 3]) * along, math.sqrt(out[few + 5]))
-        share = slope[0] * variance * p / weakest
-        return texture_status(status, share, sigma, max_sigma, levels[0, ZNCC]), iterations
+        share = setting.slope_noise * variance * p / weakest
+        return texture_status(status, share, sigma, setting.max_sigma, levels[0, ZNCC]), iterations
 
-    return shape_point, work_space, *make_observed(degree, 1, parts, freeze, work_space)
+    return FitKernels(shape_point, parts.work_space, *make_observed(degree, 1, parts, freeze))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from core.matching.arguments import reference_of
 from core.matching.image import PAD
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.loops import LANES, compare_cubic, compare_quintic, sum_reference
@@ -85,7 +86,9 @@ class Parts:
 @cache
 def _timers(order: int) -> dict[str, Any]:
     """Compiled loops around the parts."""
-    set_up_reference, work_space, _, _, jacobian, assemble, factor, gradient, moves_of, *_ = make_point(DEGREE, 3)
+    parts = make_point(DEGREE, 3)
+    set_up_reference, jacobian, assemble = parts.set_up_reference, parts.jacobian, parts.assemble
+    factor, gradient, moves_of = parts.factor, parts.gradient, parts.moves_of
     sums_of, compare = sum_reference[DEGREE], (compare_cubic if order == 3 else compare_quintic)[DEGREE]
     lead = order // 2
 
@@ -95,7 +98,7 @@ def _timers(order: int) -> dict[str, Any]:
     def reference(n, images, lens, x, y, subset, ref, space):
         total = 0.0
         for _ in range(n):
-            total += set_up_reference(images, everything, -1, lens, x, y, subset, ref, space)[5]
+            total += set_up_reference(images, everything, -1, lens, x, y, subset, ref, space).f2
         return total
 
     @njit(nogil=True, error_model="numpy")
@@ -121,21 +124,21 @@ def _timers(order: int) -> dict[str, Any]:
     def jacobians(n, R, t, M, slopes, of_reference, inverse, equations):
         ok = True
         for _ in range(n):
-            ok &= jacobian(R, t, 0.0, 1e-5, 1e-5, M, slopes, of_reference, inverse, equations[1], equations[2])
+            ok &= jacobian(R, t, 0.0, 1e-5, 1e-5, M, slopes, of_reference, inverse, equations.block, equations.columns)
         return ok
 
     @njit(nogil=True, error_model="numpy")
     def assembles(n, equations, gram):
         for _ in range(n):
             assemble(equations, gram)
-        return equations[5][0, 0]
+        return equations.normal[0, 0]
 
     @njit(nogil=True, error_model="numpy")
     def steps(n, equations, rhs, small, moves):
         total = 0.0
         for _ in range(n):
             gradient(equations, rhs, small)
-            total += moves_of(equations[2], small, moves)
+            total += moves_of(equations.columns, small, moves)
         return total
 
     @njit(nogil=True, error_model="numpy")
@@ -159,7 +162,7 @@ def _timers(order: int) -> dict[str, Any]:
         return out[0]
 
     return {
-        "work_space": work_space,
+        "work_space": parts.work_space,
         "jacobian": jacobians,
         "assemble": assembles,
         "step": steps,
@@ -198,10 +201,11 @@ def measure_parts(scene: KernelScene, interpolation: Interpolation, subset_px: i
     middle = len(scene.xy_px) // 2
     x, y = scene.xy_px[middle]
     lens1, lens2 = (np.array(c.lens.kernel_parameters()) for c in (scene.pair.cam1, scene.pair.cam2))
-    weights = np.empty((0, 0), np.float32) if images[0].weights is None else images[0].weights
-    pictures = (images[0].pixels, *images[0].gradients, weights)
-    ref, of_reference, warp_space, rhs, _, M, equations, moves, vectors, inverse, *_ = run["work_space"](subset_px)
-    raw, powers, gram = of_reference[0], of_reference[2], of_reference[7]
+    pictures = reference_of(images[0])
+    space = run["work_space"](subset_px)
+    ref, of_reference, rhs, M, equations = space.ref, space.of_reference, space.rhs, space.M, space.equations
+    moves, vectors, inverse = space.moves, space.vectors, space.inverse
+    raw, powers, gram = of_reference.raw, of_reference.powers, of_reference.gram
     reference_us = _us(lambda n: run["reference"](n, pictures, lens1, x, y, subset_px, ref, of_reference))
     blocks = (subset_px**2 + LANES - 1) // LANES
     gram_us = _us(lambda n: run["gram"](n, ref, blocks, raw))
@@ -212,7 +216,7 @@ def measure_parts(scene: KernelScene, interpolation: Interpolation, subset_px: i
     M[0] = M[2] = R @ M[1] + np.outer(t, [scene.w0[middle], 0.0, 0.0])
     rows, cols = images[1].shape
     stride = cols + 2 * PAD
-    p, work, sums = warp_space
+    p, work, sums = space.warp
     p[20] = 1.0
     base = run["warp"](1, lens2, M[0], powers, rows, cols, stride, work, p)
     if base < 0:
@@ -222,15 +226,17 @@ def measure_parts(scene: KernelScene, interpolation: Interpolation, subset_px: i
     loop_us = _us(lambda n: run["loop"](n, flat, base, stride, p, ref, blocks, sums))
     slopes = lens_jacobian(lens1, xc, yc)
     jacobian_us = _us(lambda n: run["jacobian"](n, R, t, M, slopes, of_reference, inverse, equations))
-    equations[0][:3, :3] = 1.5 * np.eye(3) - 0.4  # inverse covariance of comparisons that share the reference's noise
+    equations.weights[:3, :3] = (
+        1.5 * np.eye(3) - 0.4
+    )  # inverse covariance of comparisons that share the reference's noise
     assemble_us = _us(lambda n: run["assemble"](n, equations, gram))
-    normal = equations[5].copy()
-    factor_us = _us(lambda n: run["factor"](n, normal, equations[5]))
+    normal = equations.normal.copy()
+    factor_us = _us(lambda n: run["factor"](n, normal, equations.normal))
     rhs[:] = 1.0
     step_us = _us(lambda n: run["step"](n, equations, rhs, vectors[2], moves))
-    solve_us = _us(lambda n: run["solve"](n, equations[5], vectors[2], vectors[3]))
+    solve_us = _us(lambda n: run["solve"](n, equations.normal, vectors[2], vectors[3]))
     few, out = np.empty((5, 5)), np.empty(25)
-    covariance_us = _us(lambda n: run["covariance"](n, equations[5], few, out))
+    covariance_us = _us(lambda n: run["covariance"](n, equations.normal, few, out))
     if not np.isfinite(out).all():
         raise RuntimeError("the bench's normal equations cannot be solved")
     return Parts(

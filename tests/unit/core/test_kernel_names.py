@@ -14,7 +14,7 @@ from core.matching.kernels.shape import make_shape
 def test_every_kernel_has_a_name_of_its_own() -> None:
     made = [*(make_point(degree, images) for degree in (1, 2) for images in (1, 3))]
     made += [(make_compare(degree), *make_reference(degree)) for degree in (1, 2)]
-    made += [(make_shape(degree)[0], make_motion(degree)[0]) for degree in (1, 2)]
+    made += [(make_shape(degree).point, make_motion(degree).point) for degree in (1, 2)]
     made += [(make_factor(row),) for row in (4, 8, 16, 28)]
     kernels = {id(part): part.py_func for parts in made for part in parts if hasattr(part, "py_func")}
     # the same code for the same row length may share a name

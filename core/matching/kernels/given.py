@@ -1,0 +1,164 @@
+"""What the kernels are called with, what they work in and what they return: named tuples, which numba knows."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+
+class ReferenceImage(NamedTuple):
+    """(rows, cols) float32 each: pixels, gradients along x and y, and weights, which may be empty."""
+
+    pixels: Any
+    grad_x: Any
+    grad_y: Any
+    weights: Any
+
+
+class ComparedImage(NamedTuple):
+    """Padded coefficients as one row, the image's rows and columns, and the padded row's length."""
+
+    coefficients: Any
+    rows: int
+    cols: int
+    stride: int
+
+
+class Setting(NamedTuple):
+    """Options, and what is known of the noise: the images' variances, or all one where any is unknown."""
+
+    subset: int
+    order: int
+    max_iterations: int
+    tolerance: float
+    max_sigma: float
+    max_step: float
+    slope_noise: float
+    slope_share: float
+    variances: tuple[float, ...]
+    known_noise: bool
+    rigid: bool
+
+
+class Given(NamedTuple):
+    """Images, cameras, n points and settings.
+
+    ``patches`` (k, subset, subset) uint8 are zero where a pixel does not count, ``which`` (n,) says which of them is a
+    point's, -1 = none. Images compared with the reference: camera 2 at t0 and, for a motion, both cameras at t.
+    ``xy`` (n, 2) px; ``w`` (n, M), ``G`` (n, 3, M) starts, or with ``e`` (n,) px the results whose covariance is asked.
+    """
+
+    reference: ReferenceImage
+    patches: Any
+    which: Any
+    images: tuple[ComparedImage, ...]
+    lens1: Any
+    lens2: Any
+    R: Any
+    t: Any
+    xy: Any
+    w: Any
+    G: Any
+    e: Any
+    setting: Setting
+
+
+class ReferenceSpace(NamedTuple):
+    """Of the reference subset: work space, and what :func:`set_up_reference` finds.
+
+    Raw sums, a vector for the nodes; then node monomials (M, 16), the change of basis (M, M) from monomials of a
+    pixel's place to those of its ray, the middle of the subset's pixels from the point and half its width (3,) px, the
+    sum of each column (2 M,), of f times it (2 M,), and the Gram matrix (2 M, 2 M); gain and offset are projected out
+    of the last two.
+    """
+
+    raw: Any
+    node_work: Any
+    powers: Any
+    basis: Any
+    place: Any
+    sum_g: Any
+    sum_fg: Any
+    gram: Any
+
+
+class Subset(NamedTuple):
+    """A point's subset in the reference.
+
+    Whether it lies in the image and the lens model's domain, the point's ray ``xc, yc``, the weights' sum ``p``, the
+    mean of f that is left, the sum of squares of f about it, the differences of neighbours against it (1 for white
+    noise), and how many pixels count.
+    """
+
+    inside: bool
+    xc: float
+    yc: float
+    p: float
+    offset: float
+    f2: float
+    white: float
+    n_pixels: float
+
+
+class WarpSpace(NamedTuple):
+    """Of one comparison: the warp, places for its nodes, and sums over the pixels."""
+
+    warp: Any
+    places: Any
+    sums: Any
+
+
+class Equations(NamedTuple):
+    """Normal equations and what they are made of; four of what there is one of for each image, products take pairs.
+
+    Weights (4, 4); what an image's matrix makes of a unit of each unknown; columns; the Gram matrix times them; the
+    same, weighted; the normal equations, then their factor.
+    """
+
+    weights: Any
+    block: Any
+    columns: Any
+    half: Any
+    weighted: Any
+    normal: Any
+
+
+class WorkSpace(NamedTuple):
+    """Everything that a thread needs for one point after another, so that no point allocates.
+
+    Kernels take it apart at once: numba counts references at each attribute.
+    """
+
+    ref: Any
+    of_reference: ReferenceSpace
+    warp: WarpSpace
+    rhs: Any
+    levels: Any
+    M: Any
+    equations: Equations
+    moves: Any
+    vectors: Any
+    inverse: Any
+    G: Any
+    rotation: Any
+    chain: Any
+    work: Any
+
+
+class ObservedSpace(NamedTuple):
+    """The fit's space and, besides, one block's pixels, the blocks' sums, and what they do to the unknowns."""
+
+    fit: WorkSpace
+    part: Any
+    scores: Any
+    pull: Any
+    z: Any
+    sums: Any
+
+
+class FitKernels(NamedTuple):
+    """A compiled fit and its observed covariance, of one point each, and what makes their work spaces."""
+
+    point: Any
+    space: Any
+    observed: Any
+    observed_space: Any
