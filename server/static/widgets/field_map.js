@@ -4,6 +4,12 @@ import { View } from "./view.js";
 import { num, quantity } from "../lib/dom.js";
 import { greyOf } from "./grey.js";
 import { statistics } from "../lib/point_grid.js";
+/** @import { Result, Shown } from "../screens/results/analysis.js" */
+/** @import { Grid, Raster } from "../lib/point_grid.js" */
+/** @import { Scale } from "./scale.js" */
+/** @typedef {"reference" | "cam1" | "cam2"} Over the image that a field is laid over */
+/** @typedef {{ result: Result, n: number, info: Shown, image: Over, grid: Grid, values: ArrayLike<number>, sigma: ArrayLike<number> | null,
+ *   places: ArrayLike<number> | null, statistics: ReturnType<typeof statistics>, withSigma: Promise<unknown> }} Now what is shown */
 
 /**
  * Values of the points that were measured.
@@ -16,13 +22,6 @@ export function measured(grid, values) {
   for (let i = 0; i < values.length; i += 1) if (grid.valid[i] && Number.isFinite(values[i])) out[count++] = values[i];
   return out.subarray(0, count);
 }
-
-/** @import { Result, Shown } from "../screens/results/analysis.js" */
-/** @import { Grid, Raster } from "../lib/point_grid.js" */
-/** @import { Scale } from "./scale.js" */
-/** @typedef {"reference" | "cam1" | "cam2"} Over the image that a field is laid over */
-/** @typedef {{ result: Result, n: number, info: Shown, image: Over, grid: Grid, values: ArrayLike<number>, sigma: ArrayLike<number> | null,
- *   places: ArrayLike<number> | null, statistics: ReturnType<typeof statistics>, withSigma: Promise<unknown> }} Now what is shown */
 
 export class FieldMap {
   /**

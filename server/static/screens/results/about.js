@@ -60,11 +60,11 @@ export function about(screen) {
 
 /** @typedef {any} Schema of a parameter, as JSON Schema has it: a border */
 /** @typedef {{ name: string, in: string, required?: boolean, description?: string, schema: Schema }} Parameter */
-/** @type {Promise<any> | null} */
+/** @type {any} */
 let description = null;
 /** The API's own description: which forms a result can be had in. */
 async function operations() {
-  description ??= api.raw("/openapi.json").then((answer) => answer.json());
+  description ??= await (await api.raw("/openapi.json")).json();
   return description;
 }
 
