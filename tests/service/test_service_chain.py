@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -452,7 +453,9 @@ def test_noise_is_measured_on_the_rig_and_used(client: httpx.Client, plate_test:
         np.testing.assert_allclose(c0 + c1 * grey + c2 * grey**2, true, rtol=0.06)
         assert document[cam]["frames"] == 12
     (tmp_path / "noise.json").write_bytes(client.get(f"{API}/noise/{noise_id}/file").content)
-    assert load_noise(tmp_path / "noise.json").content["settings"]["cam1"]["exposure_ms"] == pytest.approx(10.0)
+    content = json.loads((tmp_path / "noise.json").read_bytes())
+    assert content["settings"]["cam1"]["exposure_ms"] == pytest.approx(10.0)
+    load_noise(tmp_path / "noise.json")
 
     body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 30, "steps": [1], "noise_id": noise_id}
     accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body)
