@@ -14,7 +14,7 @@ ARGS ?=
 # test files side by side, a process each; more than four only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 4 ? 4 : n)))
 
-.PHONY: help demo quick test test-deep serve check bench format accuracy fuzz load openapi torture pagespeed pagepictures clean
+.PHONY: help demo quick test test-deep serve check check-page bench format accuracy fuzz load openapi torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -22,7 +22,7 @@ help:
 	@echo "make test    the whole behaviour at normal depth (WORKERS=1: one file at a time)"
 	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
-	@echo "make check   lint, format check, types, import walls"
+	@echo "make check   lint, format check, types, import walls; lint and types of the page's scripts"
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a few minutes)"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/reliability.md (ARGS='--kills N')"
@@ -75,6 +75,18 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The page runs as it lies in server/static; Node is for its check alone. Without Node that is said, and fails in CI only.
+PAGE := tests/page/node_modules/.installed
+$(PAGE): tests/page/package.json
+	@echo "Setting up tests/page/node_modules (once) ..."
+	@npm install --prefix tests/page --no-package-lock --no-audit --no-fund --loglevel=error
+	@touch $@
+
+check: check-page
+check-page: $(if $(shell command -v npm),$(PAGE))
+	@command -v npm >/dev/null || { echo "The page's scripts are not checked: Node is missing. Install it: apt-get install nodejs npm"; [ "$$CI" != true ]; exit $$?; }; \
+		npm run --prefix tests/page --silent check
+
 # The peer has its own environment, since its pins clash with ours. Without it the rest is measured all the same.
 $(PEER_STAMP): pyproject.toml | $(STAMP)
 	@rm -rf $(PEER)
@@ -114,5 +126,5 @@ pagepictures: $(STAMP)
 	$(BIN)/python -m tests.bench.page.pictures $(ARGS)
 
 clean:
-	rm -rf $(VENV) $(PEER) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
+	rm -rf $(VENV) $(PEER) tests/page/node_modules build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

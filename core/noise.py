@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -173,10 +173,11 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
     if shift > LARGEST_SHIFT_PX:
         raise _not_static(f"they move by {shift:.2f} px from one frame to the next")
     square: Float32 = np.float32(0.5) * np.stack(differences) ** 2
-    levels, variances, sds, excess, excess_sd = _binned(mean, square, free, steep)
-    if excess > LARGEST_EXCESS and excess > _SURE * excess_sd:
+    bins = _binned(mean, square, free, steep)
+    excess, levels = bins.excess, bins.levels
+    if excess > LARGEST_EXCESS and excess > _SURE * bins.excess_sd:
         raise _not_static(f"steep places vary by {100 * excess:.0f} % more than flat ones of the same grey level")
-    c, sd, misfit = _fit(levels, variances, sds)
+    c, sd, misfit = _fit(levels, bins.variances, bins.sds)
     low, high = float(levels[0]), float(levels[-1])
     if c[2] == 0.0:  # a line holds beyond what was seen, as far as it stays clear of zero
         low = 0.0 if low > 0.0 and c[0] > _CLEAR * (c[0] + c[1] * low) else low
@@ -187,8 +188,8 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
         range_grey=(low, high),
         frames=len(images),
         levels=tuple(map(float, levels)),
-        variances=tuple(map(float, variances)),
-        variances_sd=tuple(map(float, sds)),
+        variances=tuple(map(float, bins.variances)),
+        variances_sd=tuple(map(float, bins.sds)),
         misfit=misfit,
         drift=drift,
         shift_px=shift,
@@ -287,8 +288,17 @@ def _still(difference: Float, basis: Float, free: Bool) -> tuple[Float, float, f
     return difference - basis @ x, float(gain), float(np.hypot(x[2], x[3]))
 
 
-def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> tuple[Float, Float, Float, float, float]:
-    """Mean grey levels, variances and their sd by bins; excess of the steep places and its sd."""
+class _Bins(NamedTuple):
+    """Mean grey levels, variances and their standard deviations by bins; excess of the steep places and its own."""
+
+    levels: Float
+    variances: Float
+    sds: Float
+    excess: float
+    excess_sd: float
+
+
+def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> _Bins:
     g, v, s = mean[free], square[:, free], steep[free]
     order = np.argsort(g, kind="stable")
     count = int(np.clip(len(g) // _FEWEST_PIXELS, 1, _BINS))
@@ -324,7 +334,7 @@ def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> tuple[Flo
         inside = v_bin > 0.0
     excess_sd = np.sqrt(8.0 * repeat / max(v.size, 1))
     g_bin, v_bin, sd_bin = g_bin[inside], v_bin[inside], sd_bin[inside]
-    return g_bin, v_bin, sd_bin, ratio / max(weight, 1.0), float(excess_sd)
+    return _Bins(g_bin, v_bin, sd_bin, ratio / max(weight, 1.0), float(excess_sd))
 
 
 def _fit(g: Float, v: Float, sd: Float) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:

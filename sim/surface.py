@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Float
-from sim import surface_kernels as kernels
+from sim import formulas as kernels
 
 FLAT: Final = 0
 HEIGHT: Final = 1
@@ -46,7 +46,7 @@ class Surface:
     kind
         ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL`` or ``SPHERE``.
     parameters
-        Numbers of that kind, see `sim.surface_kernels`.
+        Numbers of that kind, see `sim.formulas`.
     coarse, fine
         Coefficient tables of a height field.
     """

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.grid.pieces import Pieces
+from core.grid.directions import Pieces
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens
 _MOST_ROUNDS = 40

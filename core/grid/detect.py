@@ -12,10 +12,10 @@ from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
 from core.grid.checks import blame_glare, check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
+from core.grid.directions import directions
 from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
 from core.grid.lines import LineFit, fit_lines
 from core.grid.piece_table import PieceTable, line_points, piece_table
-from core.grid.pieces import directions
 from core.grid.profile import OUT, fit_pieces
 from core.grid.threshold import checked_image, coarse_factors, line_picture
 from core.grid.view import GridOptions, GridView, LineModel, Localiser

@@ -15,8 +15,8 @@ import numpy as np
 from core.arrays import Float
 from core.errors import TargetError
 from core.grid.chains import Chain, CoarseLine, link, order
+from core.grid.directions import Directions, family_pieces
 from core.grid.lines import meet_parabolas
-from core.grid.pieces import Directions, family_pieces
 from core.grid.threshold import LinePicture
 
 _COARSE = ("centre_px", "direction", "bend")

@@ -14,6 +14,7 @@ lines to straight lines cannot be seen and are not needed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,6 +182,22 @@ def _line_index(points: LinePoints, counts: tuple[int, int]) -> NDArray[np.intp]
     return points.line + np.where(points.family == 0, 0, counts[0])
 
 
+class _Adjusted(NamedTuple):
+    """Straight lines and terms of distortion, adjusted together.
+
+    The offsets and slopes of the lines across ``direction``, then the terms; residuals, px; the normal equations, and
+    the weighted design; of each line the point, direction and normal that it is told from.
+    """
+
+    solution: Float
+    residual_px: Float
+    N: Float
+    JW: Float
+    origin: Float
+    direction: Float
+    normal: Float
+
+
 def _fit_straight(
     points: LinePoints, counts: tuple[int, int], size: tuple[int, int], node_sigma_px: float, used: Bool
 ) -> tuple[LineFit, _Distortion, Float]:
@@ -192,7 +209,7 @@ def _fit_straight(
     variance = points.sigma_px**2 + node_sigma_px**2
     weight = np.where(used, 1.0 / variance, 0.0)
 
-    def solve(n_terms: int) -> tuple[Float, Float, Float, Float, Float, Float, Float]:
+    def solve(n_terms: int) -> _Adjusted:
         D = np.zeros(n_terms)
         origin, direction, normal = _frames(points, u, counts)
         for _ in range(3):  # the distance along the line depends on D; three rounds settle it far below 1e-6 px
@@ -213,21 +230,21 @@ def _fit_straight(
             solution = np.linalg.solve(N, JW.T @ y)
             D = solution[2 * n_line :]
         residual = (y - J @ solution) * scale
-        return solution, residual, N, JW, origin, direction, normal
+        return _Adjusted(solution, residual, N, JW, origin, direction, normal)
 
     result = solve(_BASE_TERMS)
-    chi2 = float(np.sum(weight * result[1] ** 2))
+    chi2 = float(np.sum(weight * result.residual_px**2))
     dof = max(int(used.sum()) - 2 * n_line - _BASE_TERMS, 1)
     if chi2 > _MISFIT * dof:
         richer = solve(_ALL_TERMS)
-        chi2_richer = float(np.sum(weight * richer[1] ** 2))
+        chi2_richer = float(np.sum(weight * richer.residual_px**2))
         if (chi2 - chi2_richer) / max(1.0, chi2_richer / dof) > _MORE_TERMS_GAIN:
             result = richer
-    solution, residual, N, JW, origin, direction, normal = result
+    solution, origin, direction, normal = result.solution, result.origin, result.direction, result.normal
     D = solution[2 * n_line :]
     distortion = _Distortion(centre, scale, D)
     # noise of the solution from the points' own noise alone
-    A = np.linalg.solve(N, JW.T)
+    A = np.linalg.solve(result.N, result.JW.T)
     covariance = np.einsum("in,jn->ij", A * (points.sigma_px / scale) ** 2, A)
     alpha, beta = solution[0 : 2 * n_line : 2], solution[1 : 2 * n_line : 2]
     point = origin + alpha[:, None] * normal
@@ -235,7 +252,7 @@ def _fit_straight(
     straight = _meet_straight(point, along, counts)
     nodes = distortion.distort(straight)
     cov = _straight_covariance(straight, origin, direction, normal, covariance, distortion, nodes, counts)
-    return LineFit(nodes, cov, residual, variance, straight), distortion, normal
+    return LineFit(nodes, cov, result.residual_px, variance, straight), distortion, normal
 
 
 def _meet_straight(point: Float, along: Float, counts: tuple[int, int]) -> Float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,18 +61,26 @@ def piece_table(nodes_px: Float, target: GridTarget, *, blur_px: float | None) -
         Known blur; None searches across the line first.
     """
     tables = [_family(nodes_px, 0), _family(np.swapaxes(nodes_px, 0, 1), 1)]
-    rows = np.concatenate([t[0] for t in tables])
-    spacing = np.concatenate([t[1] for t in tables])
+    rows, spacing, family, line, place = (np.concatenate(columns) for columns in zip(*tables, strict=True))
     rows[:, IN["width"]] = np.maximum(spacing * target.line_width_mm / target.pitch_mm, 0.05)
     rows[:, IN["blur"]] = _FIRST_BLUR_PX if blur_px is None else blur_px
     rows[:, IN["search"]] = _SEARCH_SHARE * spacing if blur_px is None else 0.0
     rows[:, IN["room"]] = _STRIP_SHARE * spacing
-    family, line, place = (np.concatenate([t[k] for t in tables]) for k in (2, 3, 4))
     return PieceTable(rows, family, line, place, (nodes_px.shape[0], nodes_px.shape[1]))
 
 
-def _family(nodes: Float, family: int) -> tuple[Float, Float, NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Pieces of the lines along axis 1 of ``nodes`` (lines, crossings, 2); their table, spacing and numbers."""
+class _Family(NamedTuple):
+    """Pieces of one family's lines: rows of the table, the lines' spacing there, and the pieces' numbers."""
+
+    rows: Float
+    spacing: Float
+    family: NDArray[np.intp]
+    line: NDArray[np.intp]
+    place: NDArray[np.intp]
+
+
+def _family(nodes: Float, family: int) -> _Family:
+    """Pieces of the lines along axis 1 of ``nodes`` (lines, crossings, 2)."""
     n_line, n_cross = nodes.shape[:2]
     start, end = nodes[:, :-1], nodes[:, 1:]
     chord = end - start
@@ -101,7 +110,7 @@ def _family(nodes: Float, family: int) -> tuple[Float, Float, NDArray[np.intp], 
     rows[..., IN["bend"]] = bend
     number = np.broadcast_to(np.arange(n_line)[:, None], length.shape).ravel()
     place = np.broadcast_to(np.arange(n_cross - 1)[None], length.shape).ravel()
-    return rows.reshape(-1, len(INPUTS)), spacing.ravel(), np.full(number.size, family), number, place
+    return _Family(rows.reshape(-1, len(INPUTS)), spacing.ravel(), np.full(number.size, family), number, place)
 
 
 def _bends(nodes: Float) -> Float:

@@ -1,16 +1,19 @@
 // Shows the API with Swagger UI, from files of this service alone. Where a key is asked for, the page asks for it first.
-"use strict";
+/** @import { SwaggerUI } from "#swagger" */
 
+const swagger = /** @type {{ SwaggerUIBundle: SwaggerUI }} */ (/** @type {unknown} */ (window)).SwaggerUIBundle;
+/** @param {string} id */
+const part = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const DESCRIPTION = "/api/v1/openapi.json";
 
 async function show() {
   const answer = await fetch(DESCRIPTION, { credentials: "same-origin" });
   if (answer.status === 401 || answer.status === 403) {
-    document.getElementById("log-in").hidden = false;
+    part("log-in").hidden = false;
     return;
   }
-  document.getElementById("log-in").hidden = true;
-  SwaggerUIBundle({
+  part("log-in").hidden = true;
+  swagger({
     spec: await answer.json(),
     dom_id: "#api",
     deepLinking: true,
@@ -18,16 +21,16 @@ async function show() {
     docExpansion: "list",
     filter: true,
     validatorUrl: null, // nothing is sent elsewhere
-    presets: [SwaggerUIBundle.presets.apis],
+    presets: [swagger.presets.apis],
     layout: "BaseLayout",
   });
 }
 
-document.getElementById("log-in").addEventListener("submit", async (event) => {
+part("log-in").addEventListener("submit", async (event) => {
   event.preventDefault();
-  const key = new FormData(event.target).get("key");
+  const key = new FormData(/** @type {HTMLFormElement} */ (event.target)).get("key");
   const answer = await fetch("/api/v1/session", { method: "POST", headers: { Authorization: `Bearer ${key}` } });
-  document.getElementById("refused").hidden = answer.ok;
+  part("refused").hidden = answer.ok;
   if (answer.ok) show();
 });
 

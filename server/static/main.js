@@ -1,8 +1,13 @@
 // The shell: bar with the stop button, screens by address, what is said about connection and key.
 import * as api from "./lib/api.js";
 import * as events from "./lib/events.js";
-import { h, replace, notify, badge, num, field, problemText, ask, modal } from "./lib/dom.js";
+import { h, replace, notify, badge, num, field, part, problemText, ask, modal } from "./lib/dom.js";
 
+/** @typedef {() => void} Leave */
+/** @typedef {{ screen: string, path: string[], query: URLSearchParams }} Here what the address says */
+/** @typedef {{ open: (root: HTMLElement, here: Here) => Promise<Leave> }} Screen */
+
+/** @type {Record<string, [text: string, load: () => Promise<Screen>]>} */
 const SCREENS = {
   rig: ["Rig", () => import("./screens/rig.js")],
   calibrate: ["Calibrate", () => import("./screens/calibrate.js")],
@@ -11,8 +16,9 @@ const SCREENS = {
   jobs: ["Jobs & system", () => import("./screens/jobs.js")],
 };
 
-const main = document.getElementById("main");
-const bar = document.getElementById("bar");
+const main = part("main");
+const bar = part("bar");
+/** @type {Leave | null} */
 let leave = null;
 let visit = 0;
 
@@ -27,7 +33,7 @@ async function open() {
   const here = place();
   visit += 1;
   const mine = visit;
-  for (const link of bar.querySelectorAll("nav a")) {
+  for (const link of /** @type {NodeListOf<HTMLElement>} */ (bar.querySelectorAll("nav a"))) {
     if (link.dataset.screen === here.screen) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
@@ -128,6 +134,7 @@ function showKeys() {
 }
 const keysButton = h("button.plain", { type: "button", onclick: showKeys, "aria-label": "Keys", title: "Keys" }, "⌨");
 
+/** @type {Map<string, import("#routes").Model<"JobReply">>} */
 const active = new Map();
 function showJobs() {
   const jobs = [...active.values()];
@@ -194,13 +201,14 @@ api.onConnection((state) => {
   if (state === "down") lost.textContent = "The service does not answer. What is shown may be old; the page goes on by itself once it is back.";
 });
 
-let ticking = null;
+/** @type {number | undefined} */
+let ticking;
 async function begin() {
   let who;
   try {
     who = await api.get("/session");
   } catch (error) {
-    if (error.status !== 401) {
+    if (!(error instanceof api.Problem && error.status === 401)) {
       lost.hidden = false;
       setTimeout(begin, 2000);
     }
@@ -220,7 +228,7 @@ if (kept) document.documentElement.dataset.theme = kept;
 drawBar();
 SCREENS[place().screen][1]().catch(() => {}); // its script comes while the service says who is there
 window.addEventListener("hashchange", open);
-document.querySelector(".skip").addEventListener("click", (event) => {
+document.querySelector(".skip")?.addEventListener("click", (event) => {
   event.preventDefault(); // the address names the screen
   main.focus();
 });

@@ -7,7 +7,7 @@ A lens is the flat array of ``LensModel.kernel_parameters``.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -24,13 +24,28 @@ from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, s
 _NEWTON_STEPS = 20
 
 
+class LensExpansion(NamedTuple):
+    """A lens about a normalised point.
+
+    ``x, y`` (px), the radial factor's coefficients ``l1, l2, l3`` in powers of rho = r^2 - r0^2, and the matrix
+    ``h11, h12, h22`` that acts on the offset besides: radial factor at the centre plus the tangential terms' slopes.
+    """
+
+    x: float
+    y: float
+    l1: float
+    l2: float
+    l3: float
+    h11: float
+    h12: float
+    h22: float
+
+
 @inner
 def lens_expansion(lens, u, v):
     """Expand a lens about the normalised point (u, v).
 
-    Returns ``x, y`` (px), the radial factor's coefficients ``l1, l2, l3`` in powers of rho = r^2 - r0^2, and the
-    matrix ``h11, h12, h22`` that acts on the offset besides: radial factor at the centre plus the tangential terms'
-    slopes. Exact for OpenCV's polynomial; the Seidel term 1 / (1 + k r^2) leaves (k rho)^4, below 1e-12 here.
+    Exact for OpenCV's polynomial; the Seidel term 1 / (1 + k r^2) leaves (k rho)^4, below 1e-12 here.
     """
     r2 = u * u + v * v
     if lens[0] == SEIDEL:
@@ -55,13 +70,14 @@ def lens_expansion(lens, u, v):
     h11 = l0 + 2.0 * p1 * v + 6.0 * p2 * u
     h12 = 2.0 * p1 * u + 2.0 * p2 * v
     h22 = l0 + 6.0 * p1 * v + 2.0 * p2 * u
-    return x, y, l1, l2, l3, h11, h12, h22
+    return LensExpansion(x, y, l1, l2, l3, h11, h12, h22)
 
 
 @njit(nogil=True, error_model="numpy")
 def lens_jacobian(lens, u, v):
     """d(image px) / d(normalised) at (u, v): the four entries row by row."""
-    _, _, l1, _, _, h11, h12, h22 = lens_expansion(lens, u, v)
+    near = lens_expansion(lens, u, v)
+    l1, h11, h12, h22 = near.l1, near.h11, near.h12, near.h22
     a11 = h11 + 2.0 * l1 * u * u
     a12 = h12 + 2.0 * l1 * u * v
     a22 = h22 + 2.0 * l1 * v * v
@@ -84,9 +100,9 @@ def undistort(lens, x, y):
             shrink = 0.999 * math.sqrt(lens[11] / (u * u + v * v))
             u *= shrink
             v *= shrink
-        xn, yn, _, _, _, _, _, _ = lens_expansion(lens, u, v)
+        near = lens_expansion(lens, u, v)
         j11, j12, j21, j22 = lens_jacobian(lens, u, v)
-        ex, ey = xn - x, yn - y
+        ex, ey = near.x - x, near.y - y
         error = max(abs(ex), abs(ey))
         det = j11 * j22 - j12 * j21
         du = (j22 * ex - j12 * ey) / det

@@ -1,10 +1,17 @@
 // The public HTTP API as the page uses it: nothing else is ever asked.
+/** @import { Address, Body, Model, Query, Reply, Trouble } from "#routes" */
+/** @typedef {{ [name: string]: string | number | boolean | readonly (string | number)[] | null | undefined }} Asked what is asked of an address */
 
 export const BASE = "/api/v1";
 
 /** What the API answers when it refuses: code, cause and remedy. */
 export class Problem extends Error {
-  constructor(status, document_, requestId) {
+  /**
+   * @param {number} status of HTTP; 0 where no answer refused
+   * @param {Trouble} document_
+   * @param {string | null} [requestId]
+   */
+  constructor(status, document_, requestId = null) {
     super(document_.detail || document_.cause || document_.title || `The service answered ${status}.`);
     this.name = "Problem";
     this.status = status;
@@ -12,42 +19,80 @@ export class Problem extends Error {
     this.remedy = document_.remedy;
     this.requestId = requestId;
     this.document = document_;
-    this.fields = (document_.errors ?? []).map((one) =>
-      typeof one === "string" ? one : `${(one.loc ?? [one.field ?? ""]).filter((p) => p !== "body").join(".")}: ${one.msg ?? one.detail ?? one.cause ?? ""}`,
+    this.fields = (document_.errors ?? []).map((/** @type {any} */ one) =>
+      typeof one === "string" ? one : `${(one.loc ?? [one.field ?? ""]).filter((/** @type {unknown} */ p) => p !== "body").join(".")}: ${one.msg ?? one.detail ?? one.cause ?? ""}`,
     );
   }
 }
 
+/**
+ * A problem as a document or an event tells it, or one of what was typed in here, to be shown as any other.
+ * @param {Trouble} trouble
+ */
+export const problemOf = (trouble) => new Problem(0, trouble);
+
+/**
+ * Whether something was given up because nobody waits for it any more.
+ * @param {unknown} error
+ */
+export const aborted = (error) => error instanceof Error && error.name === "AbortError";
+
+/** @typedef {"up" | "down" | "login"} Connection */
+/** @type {Set<(state: Connection) => void>} */
 const listeners = new Set();
-/** Hear whether the service can be reached ("up", "down") and when a key is needed ("login"). */
+/**
+ * Hear whether the service can be reached ("up", "down") and when a key is needed ("login").
+ * @param {(state: Connection) => void} listener
+ */
 export function onConnection(listener) {
   listeners.add(listener);
   return () => listeners.delete(listener);
 }
-const tell = (state) => listeners.forEach((listener) => listener(state));
+/** @param {Connection} state */
+function tell(state) {
+  for (const listener of listeners) listener(state);
+}
 
 function newKey() {
   // crypto.randomUUID is missing where the page came over plain http from another machine
   return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 }
 
-async function send(method, path, { body, query, headers = {}, signal, making = false } = {}) {
+/**
+ * @param {string} path below BASE, or a whole address
+ * @param {Asked} [query]
+ */
+function located(path, query = {}) {
   const url = new URL(path.startsWith("/") ? BASE + path : path, location.origin);
-  for (const [name, value] of Object.entries(query ?? {})) if (value !== undefined && value !== null) url.searchParams.append(name, value);
+  for (const [name, value] of Object.entries(query)) {
+    if (value !== undefined && value !== null) url.searchParams.append(name, String(value));
+  }
+  return url;
+}
+
+/**
+ * @param {"GET" | "POST" | "PUT" | "PATCH" | "DELETE"} method
+ * @param {string} path
+ * @param {{ body?: unknown, query?: Asked, headers?: Record<string, string>, signal?: AbortSignal, making?: boolean }} [options] `making`: it makes something
+ */
+async function send(method, path, { body, query, headers = {}, signal, making = false } = {}) {
+  const url = located(path, query);
   const sent = { ...headers };
   if (making) sent["Idempotency-Key"] = newKey();
-  if (body !== undefined && !(body instanceof FormData)) {
+  let content;
+  if (body instanceof FormData) content = body;
+  else if (body !== undefined) {
     sent["Content-Type"] = "application/json";
-    body = JSON.stringify(body);
+    content = JSON.stringify(body);
   }
   // what makes something carries its key, so it may be sent once more when the line broke
   for (let attempt = 0; ; attempt += 1) {
     try {
-      const response = await fetch(url, { method, headers: sent, body, signal, credentials: "same-origin" });
+      const response = await fetch(url, { method, headers: sent, body: content, signal, credentials: "same-origin" });
       tell("up");
       return response;
     } catch (error) {
-      if (error.name === "AbortError") throw error;
+      if (aborted(error)) throw error;
       if (attempt >= 1 || !(method === "GET" || making)) {
         tell("down");
         throw new Problem(0, { detail: "The service does not answer.", remedy: "Is it running? The page goes on by itself once it is back.", code: "no_answer" });
@@ -57,6 +102,10 @@ async function send(method, path, { body, query, headers = {}, signal, making = 
   }
 }
 
+/**
+ * @param {Response} response
+ * @returns {Promise<never>}
+ */
 async function refuse(response) {
   let document_ = {};
   try {
@@ -68,56 +117,125 @@ async function refuse(response) {
   throw new Problem(response.status, document_, response.headers.get("X-Request-Id"));
 }
 
+/** @param {Response} response */
 async function ok(response) {
   if (!response.ok) await refuse(response);
   return response;
 }
 
+/** @param {Response} response */
 const json = async (response) => (response.status === 204 ? null : (await ok(response)).json());
 
-export const get = async (path, query, signal) => json(await send("GET", path, { query, signal }));
-export const post = async (path, body, query) => json(await ok(await send("POST", path, { body: body ?? undefined, query, making: true })));
-export const put = async (path, body, headers) => json(await ok(await send("PUT", path, { body, headers })));
-export const patch = async (path, body, headers) => json(await ok(await send("PATCH", path, { body, headers })));
-export const remove = async (path, headers) => json(await ok(await send("DELETE", path, { headers })));
-export const upload = async (path, form) => json(await ok(await send("POST", path, { body: form, making: true })));
-export const raw = async (path, query, signal) => ok(await send("GET", path, { query, signal }));
+/**
+ * @template {string} const P
+ * @param {P & Address<"get", P>} path
+ * @param {Query<"get", P>} [query]
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<Reply<"get", P>>}
+ */
+export const get = async (path, query, signal) => json(await send("GET", path, { query: /** @type {Asked | undefined} */ (query), signal }));
 
-/** Read something together with its ETag, for a change that must not overwrite somebody else's. */
+/**
+ * @template {string} const P
+ * @param {P & Address<"post", P>} path
+ * @param {Body<"post", P>} [body]
+ * @returns {Promise<Reply<"post", P>>}
+ */
+export const post = async (path, body) => json(await send("POST", path, { body, making: true }));
+
+/**
+ * @template {string} const P
+ * @param {P & Address<"put", P>} path
+ * @param {Body<"put", P>} body
+ * @param {Record<string, string>} [headers]
+ * @returns {Promise<Reply<"put", P>>}
+ */
+export const put = async (path, body, headers) => json(await send("PUT", path, { body, headers }));
+
+/**
+ * @template {string} const P
+ * @param {P & Address<"patch", P>} path
+ * @param {Body<"patch", P>} body
+ * @returns {Promise<Reply<"patch", P>>}
+ */
+export const patch = async (path, body) => json(await send("PATCH", path, { body }));
+
+/**
+ * @template {string} const P
+ * @param {P & Address<"delete", P>} path
+ * @returns {Promise<Reply<"delete", P>>}
+ */
+export const remove = async (path) => json(await send("DELETE", path));
+
+/**
+ * @template {string} const P
+ * @param {P & Address<"post", P>} path
+ * @param {FormData} form
+ * @returns {Promise<Reply<"post", P>>}
+ */
+export const upload = async (path, form) => json(await send("POST", path, { body: form, making: true }));
+
+/**
+ * Something else than JSON.
+ * @param {string} path
+ * @param {Asked} [query]
+ */
+export const raw = async (path, query) => ok(await send("GET", path, { query }));
+
+/**
+ * Read something together with its ETag, for a change that must not overwrite somebody else's.
+ * @template {string} const P
+ * @param {P & Address<"get", P>} path
+ * @returns {Promise<{ value: Reply<"get", P>, etag: string | null }>}
+ */
 export async function getTagged(path) {
   const response = await ok(await send("GET", path));
   return { value: await response.json(), etag: response.headers.get("ETag") };
 }
 
-/** Log in with a key; the service answers with a cookie that pictures and event streams can use. */
+/**
+ * Log in with a key; the service answers with a cookie that pictures and event streams can use.
+ * @param {string} key
+ */
 export async function login(key) {
-  return json(await ok(await send("POST", "/session", { headers: { Authorization: `Bearer ${key}` } })));
+  return json(await send("POST", "/session", { headers: { Authorization: `Bearer ${key}` } }));
 }
 
-/** An address for <img> and links. */
-export function address(path, query = {}) {
-  const url = new URL(BASE + path, location.origin);
-  for (const [name, value] of Object.entries(query)) if (value !== undefined && value !== null) url.searchParams.append(name, value);
+/**
+ * An address for <img> and links.
+ * @param {string} path
+ * @param {Asked} [query]
+ */
+export function address(path, query) {
+  const url = located(path, query);
   return url.pathname + url.search;
 }
 
-/** Read a .npy answer: {data, shape}. Little-endian floats, ints and bytes, C order, as numpy writes them. */
-export async function npy(path, query, signal) {
-  const buffer = await (await raw(path, query, signal)).arrayBuffer();
+/**
+ * Read a .npy answer. Little-endian floats, ints and bytes, C order, as numpy writes them.
+ * @param {string} path
+ * @param {Asked} [query]
+ */
+export async function npy(path, query) {
+  const buffer = await (await raw(path, query)).arrayBuffer();
   const view = new DataView(buffer);
   const wide = view.getUint8(6) >= 2;
   const length = wide ? view.getUint32(8, true) : view.getUint16(8, true);
   const start = (wide ? 12 : 10) + length;
   const header = new TextDecoder("latin1").decode(new Uint8Array(buffer, wide ? 12 : 10, length));
-  const descr = /'descr':\s*'([^']+)'/.exec(header)[1];
-  const shape = /'shape':\s*\(([^)]*)\)/.exec(header)[1].split(",").map((s) => s.trim()).filter(Boolean).map(Number);
+  const descr = /'descr':\s*'([^']+)'/.exec(header)?.[1] ?? "";
+  const shape = (/'shape':\s*\(([^)]*)\)/.exec(header)?.[1] ?? "").split(",").map((s) => s.trim()).filter(Boolean).map(Number);
   const kinds = { f8: Float64Array, f4: Float32Array, i4: Int32Array, u4: Uint32Array, i2: Int16Array, u2: Uint16Array, i1: Int8Array, u1: Uint8Array, b1: Uint8Array };
-  const Kind = kinds[descr.slice(1)];
+  const Kind = kinds[/** @type {keyof typeof kinds} */ (descr.slice(1))];
   if (!Kind || descr[0] === ">") throw new Error(`An array of ${descr} cannot be shown.`);
   return { data: new Kind(buffer.slice(start)), shape };
 }
 
-/** Follow a job to its end by polling; events make the page quick, this makes it certain. */
+/**
+ * Follow a job to its end by polling; events make the page quick, this makes it certain.
+ * @param {string} jobId
+ * @param {{ onprogress?: (job: Model<"JobReply">) => void, signal?: AbortSignal }} [options]
+ */
 export async function finished(jobId, { onprogress, signal } = {}) {
   for (;;) {
     const job = await get(`/jobs/${jobId}`, undefined, signal);
@@ -127,7 +245,8 @@ export async function finished(jobId, { onprogress, signal } = {}) {
   }
 }
 
-/** The error of a job that did not succeed, to be shown as any other. */
-export function jobProblem(job) {
-  return new Problem(0, job.problem ?? { detail: `The job ended ${job.state}.`, code: job.state }, null);
-}
+/**
+ * The error of a job that did not succeed, to be shown as any other.
+ * @param {Model<"JobReply">} job
+ */
+export const jobProblem = (job) => problemOf(job.problem ?? { detail: `The job ended ${job.state}.`, code: job.state });

@@ -1,77 +1,130 @@
 // Elements, numbers with units, and what the screens share of looks.
+/** @import { Attributes, Column, Control, Drawn, Made, Part } from "#dom" */
 
 /**
  * Make an element: h("button.primary", {onclick, title}, "Text", child, ...).
  * Attributes named on... become listeners; true/false/null set or leave out an attribute.
+ * @template {string} Spec
+ * @param {Spec} spec tag and classes
+ * @param {Part[]} rest
+ * @returns {Made<Spec>}
  */
 export function h(spec, ...rest) {
   const [tag, ...classes] = spec.split(".");
-  const node = document.createElement(tag || "div");
+  const node = document.createElement(tag);
   if (classes.length) node.className = classes.join(" ");
   fill(node, rest);
-  return node;
+  return /** @type {Made<Spec>} */ (node);
 }
 
-const SVG = "http://www.w3.org/2000/svg";
+/**
+ * The same for drawings.
+ * @template {keyof SVGElementTagNameMap} Tag
+ * @param {Tag} tag
+ * @param {Part[]} rest
+ */
 export function svg(tag, ...rest) {
-  const node = document.createElementNS(SVG, tag);
+  const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
   fill(node, rest);
   return node;
 }
 
-function fill(node, rest) {
-  for (const part of rest.flat(Infinity)) {
+/**
+ * @param {Drawn} node
+ * @param {readonly Part[]} parts
+ */
+function fill(node, parts) {
+  for (const part of parts) {
     if (part === null || part === undefined || part === false) continue;
-    if (part instanceof Node) node.append(part);
-    else if (typeof part === "object") attributes(node, part);
+    if (Array.isArray(part)) fill(node, part);
+    else if (part instanceof Node) node.append(part);
+    else if (typeof part === "object") attributes(node, /** @type {Attributes} */ (part));
     else node.append(String(part));
   }
 }
 
+/**
+ * @param {Drawn} node
+ * @param {Attributes} values
+ */
 function attributes(node, values) {
   for (const [name, value] of Object.entries(values)) {
     if (value === null || value === undefined || value === false) continue;
-    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
-    else if (name === "value" || name === "checked" || name === "disabled" || name === "selected") node[name] = value;
-    else if (name === "style" && typeof value === "object") Object.assign(node.style, value);
-    else node.setAttribute(name, value === true ? "" : value);
+    if (typeof value === "function") node.addEventListener(name.slice(2), /** @type {EventListener} */ (value));
+    else if (name === "value" || name === "checked" || name === "disabled" || name === "selected") Object.assign(node, { [name]: value });
+    else if (typeof value === "object") Object.assign(node.style, value);
+    else node.setAttribute(name, value === true ? "" : String(value));
   }
 }
 
-/** Put other children into a node. Where the focus was in it, it stays at what stands in the same place now. */
+/**
+ * What a canvas is drawn with.
+ * @param {HTMLCanvasElement} canvas
+ */
+export function pen(canvas) {
+  const context = canvas.getContext("2d");
+  if (!context) throw new Error("This browser cannot draw in a canvas.");
+  return context;
+}
+
+/**
+ * Put other children into a node. Where the focus was in it, it stays at what stands in the same place now.
+ * @param {Drawn} node
+ * @param {Part[]} children
+ */
 export function replace(node, ...children) {
-  const active = document.activeElement;
-  const held = active !== node && node.contains(active) ? place(node, active) : null;
+  const active = /** @type {Control | null} */ (document.activeElement);
+  const held = active && active !== node && node.contains(active) ? place(node, active) : null;
   node.replaceChildren();
   fill(node, children);
-  if (held && !(active.isConnected && document.activeElement === active)) refocus(node, active, held);
+  if (held && !(held.control.isConnected && document.activeElement === held.control)) refocus(node, held);
   return node;
 }
 
-/** What tells a control from the others of its kind, as far as it survives being drawn again. */
+/**
+ * What tells a control from the others of its kind, as far as it survives being drawn again.
+ * @param {Control} control
+ */
 function sign(control) {
   const own = control.dataset.handle ?? control.getAttribute("aria-label") ?? control.getAttribute("href") ?? control.labels?.[0]?.textContent;
   return `${control.tagName} ${own ?? control.textContent}`;
 }
 
-/** A control's sign, and which of those with the same one it is. */
-function place(node, control) {
-  const mine = sign(control);
-  return { mine, index: [...node.querySelectorAll(control.tagName)].filter((one) => sign(one) === mine).indexOf(control) };
+/**
+ * @param {Drawn} node
+ * @param {Control} control
+ * @returns {Control[]} those of its kind with the same sign
+ */
+function alike(node, control, mine = sign(control)) {
+  return [.../** @type {NodeListOf<Control>} */ (node.querySelectorAll(control.tagName))].filter((one) => sign(one) === mine);
 }
 
-function refocus(node, before, { mine, index }) {
+/**
+ * A control's sign, and which of those with the same one it is.
+ * @param {Drawn} node
+ * @param {Control} control
+ */
+const place = (node, control) => ({ control, mine: sign(control), index: alike(node, control).indexOf(control) });
+
+/**
+ * @param {Drawn} node
+ * @param {ReturnType<typeof place>} held
+ */
+function refocus(node, { control: before, mine, index }) {
   if (before.isConnected) return before.focus({ preventScroll: true }); // it was only moved
-  const same = [...node.querySelectorAll(before.tagName)].filter((one) => sign(one) === mine && !one.disabled);
+  const same = alike(node, before, mine).filter((one) => !one.disabled);
   const next = same[index] ?? same.at(-1);
   if (next) return next.focus({ preventScroll: true });
   // it is gone: the next Tab goes on from where it was
-  if (!(node instanceof HTMLElement)) return node.closest("[tabindex]")?.focus({ preventScroll: true });
+  if (!(node instanceof HTMLElement)) return /** @type {HTMLElement | null} */ (node.closest("[tabindex]"))?.focus({ preventScroll: true });
   if (!node.hasAttribute("tabindex")) node.tabIndex = -1;
   return node.focus({ preventScroll: true });
 }
 
-/** A number with `digits` significant digits; an unknown one is said to be unknown, never zero. */
+/**
+ * A number with `digits` significant digits; an unknown one is said to be unknown, never zero.
+ * @param {number | null | undefined} value
+ */
 export function num(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
@@ -81,12 +134,18 @@ export function num(value, digits = 4) {
   return value.toFixed(Math.min(decimals, 6)).replace("-", "−");
 }
 
-/** A whole number with narrow spaces, that no line breaks at, between thousands. */
+/**
+ * A whole number with narrow spaces, that no line breaks at, between thousands.
+ * @param {number | null | undefined} value
+ */
 export function count(value) {
   return value === null || value === undefined ? "–" : Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, "\u202f");
 }
 
-/** A number for an axis: as short as it can be. */
+/**
+ * A number for an axis: as short as it can be.
+ * @param {number} value
+ */
 export function tick(value) {
   if (value === 0) return "0";
   const size = Math.abs(value);
@@ -94,17 +153,17 @@ export function tick(value) {
   return text.replaceAll("-", "−");
 }
 
-const UNITS = { px: "px", mm: "mm", m: "m", deg: "°", rad: "rad", ms: "ms", s: "s", hz: "Hz", n: "N", 1: "" };
-export function unit(name) {
-  return name === undefined || name === null ? "" : (UNITS[name] ?? name);
-}
-
-/** A number and its unit, kept on one line. */
-export function quantity(value, name, digits = 4) {
+/**
+ * A number and its unit, kept on one line.
+ * @param {number | null | undefined} value
+ * @param {string} unit
+ */
+export function quantity(value, unit, digits = 4) {
   const text = num(value, digits);
-  return text === "–" || !unit(name) ? text : `${text}\u00a0${unit(name)}`;
+  return text === "–" || !unit ? text : `${text}\u00a0${unit}`;
 }
 
+/** @param {string | null | undefined} utc */
 export function when(utc) {
   if (!utc) return "–";
   const date = new Date(utc);
@@ -112,7 +171,11 @@ export function when(utc) {
 }
 
 let fields = 0;
-/** A labelled control: field("Exposure", input, "ms", "what it means"). */
+/**
+ * A labelled control: field("Exposure", input, "ms", "what it means").
+ * @param {string} label
+ * @param {HTMLElement} control
+ */
 export function field(label, control, unitName = "", hint = "") {
   fields += 1;
   control.id ||= `field${fields}`;
@@ -125,20 +188,29 @@ export function field(label, control, unitName = "", hint = "") {
   return h("div.field", parts);
 }
 
+/**
+ * @param {number | null | undefined} value
+ * @param {Attributes} [attributes_]
+ */
 export function number(value, attributes_ = {}) {
   return h("input", { type: "number", step: "any", value: value ?? "", ...attributes_ });
 }
 
+/**
+ * @param {readonly (readonly (string | number)[])[]} options value and text of each
+ * @param {unknown} chosen
+ * @param {Attributes} [attributes_]
+ */
 export function select(options, chosen, attributes_ = {}) {
-  const node = h(
-    "select",
-    attributes_,
-    options.map(([value, text]) => h("option", { value, selected: String(value) === String(chosen) }, text)),
-  );
-  return node;
+  return h("select", attributes_, options.map(([value, text]) => h("option", { value, selected: String(value) === String(chosen) }, text)));
 }
 
-/** A button that cannot be pressed again while what it began is under way. */
+/**
+ * A button that cannot be pressed again while what it began is under way.
+ * @param {string} text
+ * @param {() => unknown} run
+ * @param {Attributes & { kind?: string }} [attributes_]
+ */
 export function action(text, run, attributes_ = {}) {
   const { kind = "", ...others } = attributes_;
   const node = h(kind ? `button.${kind}` : "button", { type: "button", ...others }, text);
@@ -150,7 +222,7 @@ export function action(text, run, attributes_ = {}) {
     try {
       await run();
     } catch (error) {
-      if (error.name !== "AbortError") notify(error);
+      if (!(error instanceof Error && error.name === "AbortError")) notify(error);
     } finally {
       node.removeAttribute("aria-disabled");
       node.removeAttribute("aria-busy");
@@ -159,7 +231,22 @@ export function action(text, run, attributes_ = {}) {
   return node;
 }
 
-/** A table: columns [[heading, row => cell, {numeric, unseen}]...]; an unseen heading is read out, not shown. */
+/**
+ * A column of numbers.
+ * @template Row
+ * @param {string} heading
+ * @param {(row: Row) => Part} cell
+ * @returns {Column<Row>}
+ */
+export const numeric = (heading, cell) => [heading, cell, { numeric: true }];
+
+/**
+ * A table of columns [heading, row => cell, {numeric, unseen}]; an unseen heading is read out, not shown.
+ * @template Row
+ * @param {readonly Column<Row>[]} columns
+ * @param {readonly Row[]} rows
+ * @param {{ caption?: string, onrow?: (row: Row) => unknown, empty?: string }} [options]
+ */
 export function table(columns, rows, { caption, onrow, empty = "Nothing here yet." } = {}) {
   if (!rows.length) return h("p.quiet", empty);
   return h(
@@ -174,7 +261,7 @@ export function table(columns, rows, { caption, onrow, empty = "Nothing here yet
         rows.map((row) =>
           h(
             onrow ? "tr.pick" : "tr",
-            onrow ? { onclick: (event) => event.target.closest("button, a, input") || onrow(row) } : {},
+            onrow ? { onclick: (/** @type {MouseEvent} */ event) => /** @type {Element} */ (event.target).closest("button, a, input") || onrow(row) } : {},
             columns.map(([, cell, options]) => h("td", { class: options?.numeric ? "numeric" : null }, cell(row))),
           ),
         ),
@@ -183,62 +270,89 @@ export function table(columns, rows, { caption, onrow, empty = "Nothing here yet
   );
 }
 
-/** Facts as a definition list: [[name, value]...]; values that are not known are said to be so. */
+/**
+ * Facts as a definition list; values that are not known are said to be so.
+ * @param {readonly (readonly [string, Part])[]} pairs name and value of each
+ */
 export function facts(pairs) {
-  return h("dl.facts", pairs.filter(Boolean).map(([name, value]) => [h("dt", name), h("dd", value ?? "–")]));
+  return h("dl.facts", pairs.map(([name, value]) => [h("dt", name), h("dd", value ?? "–")]));
 }
 
+/** @param {string | undefined} text */
 export function badge(text, kind = "") {
   return h(`span.badge${kind ? `.${kind}` : ""}`, text);
 }
 
+/** @type {Record<string, string>} */
 export const STATE_KIND = {
   succeeded: "good", complete: "good", accepted: "good", ok: "good", pass: "good", passed: "good", ready: "good",
   running: "busy", queued: "busy", cancelling: "busy", starting: "busy", unfinished: "busy",
   failed: "bad", fault: "bad", refused: "bad", interrupted: "warn", cancelled: "warn", warning: "warn",
 };
 
-/** Say something at the foot of the page; a problem shows cause and remedy as the API gave them. */
+/**
+ * A part of the page that index.html has.
+ * @param {string} id
+ */
+export function part(id) {
+  const found = document.getElementById(id);
+  if (!found) throw new Error(`The page has no #${id}.`);
+  return found;
+}
+
+/**
+ * Say something at the foot of the page; a problem shows cause and remedy as the API gave them.
+ * @param {unknown} what an error, or a text
+ */
 export function notify(what, kind = "") {
-  const place = document.getElementById("notices");
+  const place = part("notices");
   const problem = what instanceof Error;
   const box = h(
     `div.notice${problem ? ".bad" : kind ? `.${kind}` : ""}`,
     { role: problem ? "alert" : "status" },
-    problem ? problemText(what) : h("p", what),
+    problem ? problemText(what) : h("p", String(what)),
     h("button.plain", { type: "button", "aria-label": "Dismiss this message", onclick: () => {
       const next = box.nextElementSibling ?? box.previousElementSibling;
       box.remove();
-      (next?.querySelector("button") ?? document.getElementById("main")).focus({ preventScroll: true });
+      (next?.querySelector("button") ?? part("main")).focus({ preventScroll: true });
     } }, "×"),
   );
-  const same = [...place.children].find((node) => node.firstChild.textContent === box.firstChild.textContent);
+  const same = [...place.children].find((node) => node.firstChild?.textContent === box.firstChild?.textContent);
   if (same) same.remove();
   place.append(box);
-  while (place.children.length > 4) place.firstChild.remove();
+  while (place.children.length > 4) place.firstElementChild?.remove();
+  /** @returns {unknown} */
   const fade = () => (box.contains(document.activeElement) ? setTimeout(fade, 2000) : box.remove());
   if (!problem) setTimeout(fade, 6000);
   return box;
 }
 
-/** Cause, remedy and code of a problem. */
-export function problemText(error) {
+/**
+ * Cause, remedy and code of a problem.
+ * @param {unknown} problem
+ */
+export function problemText(problem) {
+  const error = /** @type {Partial<import("./api.js").Problem>} */ (problem ?? {});
   return h(
     "div.problem",
-    h("p", h("strong", error.message || String(error))),
+    h("p", h("strong", error.message || String(problem))),
     error.remedy ? h("p", error.remedy) : null,
     error.code ? h("p.quiet", h("code", error.code), error.requestId ? ` · request ${error.requestId}` : "") : null,
-    (error.fields ?? []).length ? h("ul", error.fields.map((text) => h("li", text))) : null,
+    error.fields?.length ? h("ul", error.fields.map((text) => h("li", text))) : null,
   );
 }
 
-/** Open a dialog: Tab goes round in it, and the focus goes back to where it was once it is closed. */
+/**
+ * Open a dialog: Tab goes round in it, and the focus goes back to where it was once it is closed.
+ * @param {HTMLDialogElement} node
+ * @param {HTMLElement} [first] what has the focus at first
+ */
 export function modal(node, first) {
-  const before = document.activeElement;
+  const before = /** @type {HTMLElement | null} */ (document.activeElement);
   node.addEventListener("keydown", (event) => {
     if (event.key !== "Tab") return;
-    const stops = [...node.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex='0']")].filter((one) => !one.disabled && one.checkVisibility());
-    const at = stops.indexOf(document.activeElement);
+    const stops = [.../** @type {NodeListOf<Control>} */ (node.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex='0']"))].filter((one) => !one.disabled && one.checkVisibility());
+    const at = stops.indexOf(/** @type {Control} */ (document.activeElement));
     const next = event.shiftKey ? (at <= 0 ? stops.at(-1) : null) : at === stops.length - 1 ? stops[0] : null;
     if (!next) return;
     event.preventDefault();
@@ -247,23 +361,29 @@ export function modal(node, first) {
   node.addEventListener("close", () => {
     node.remove();
     if (before?.isConnected && before !== document.body) before.focus();
-    else document.getElementById("main").focus();
+    else part("main").focus();
   });
   document.body.append(node);
   node.showModal();
   first?.focus();
 }
 
-/** A dialog with a heading, a body and buttons; resolves to what was pressed. What moves can be stopped from it. */
-export function ask(heading, body, buttons = [["Cancel", null], ["OK", "ok"]]) {
+/**
+ * A dialog with a heading, a body and buttons; resolves to what was pressed. What moves can be stopped from it.
+ * @param {string} heading
+ * @param {HTMLElement} body
+ * @param {(readonly [string, string | null])[]} buttons text and meaning of each; the last one is the first choice
+ * @returns {Promise<string | null>}
+ */
+export function ask(heading, body, buttons) {
   return new Promise((resolve) => {
     const stop = h("button.stop", { type: "button", title: "Stop every axis at once (Esc, twice)", onclick: () => window.dispatchEvent(new Event("stopstage")) }, "STOP");
     const node = h("dialog", { "aria-label": heading }, h("div.spread", h("h2", heading), stop), body);
-    const close = (value) => { node.close(); resolve(value); };
+    const close = (/** @type {string | null} */ value) => { node.close(); resolve(value); };
     const choices = buttons.map(([text, value], index) =>
       h(index === buttons.length - 1 ? "button.primary" : "button", { type: "button", onclick: () => close(value) }, text));
     node.append(h("div.row.end", choices));
     node.addEventListener("cancel", (event) => { event.preventDefault(); close(null); });
-    modal(node, body.querySelector?.("input, select, textarea") ?? choices[0]);
+    modal(node, /** @type {HTMLElement | null} */ (body.querySelector("input, select, textarea")) ?? choices[0]);
   });
 }

@@ -1,29 +1,42 @@
 // One stream of events for the whole page; the browser resumes it with Last-Event-ID by itself.
 import { BASE } from "./api.js";
+/** @import { Events } from "#routes" */
 
 const NAMES = ["job", "step", "result", "stage", "camera", "scene", "test", "calibration", "noise"];
+/** @type {Map<string, Set<(data: any) => void>>} what was said is as its name says: a border */
 const listeners = new Map();
+/** @type {EventSource | null} */
 let source = null;
 
-/** Hear events of one name, or of all ("*"); returns the function that ends it. */
+/**
+ * Hear events of one name; returns the function that ends it.
+ * @template {keyof Events} Name
+ * @param {Name} name
+ * @param {(data: Events[Name]) => void} listener
+ */
 export function on(name, listener) {
-  if (!listeners.has(name)) listeners.set(name, new Set());
-  listeners.get(name).add(listener);
-  return () => listeners.get(name).delete(listener);
+  const heard = listeners.get(name) ?? new Set();
+  listeners.set(name, heard.add(listener));
+  return () => heard.delete(listener);
 }
 
+/**
+ * @param {string} name
+ * @param {unknown} data
+ */
 function pass(name, data) {
-  for (const key of [name, "*"]) for (const listener of listeners.get(key) ?? []) listener(data, name);
+  for (const listener of listeners.get(name) ?? []) listener(data);
 }
 
 export function start() {
   source?.close();
-  source = new EventSource(`${BASE}/events`);
-  for (const name of NAMES) source.addEventListener(name, (event) => pass(name, JSON.parse(event.data)));
-  source.addEventListener("open", () => pass("open", {}));
-  source.addEventListener("error", () => {
+  const stream = new EventSource(`${BASE}/events`);
+  source = stream;
+  for (const name of NAMES) stream.addEventListener(name, (event) => pass(name, JSON.parse(event.data)));
+  stream.addEventListener("open", () => pass("open", {}));
+  stream.addEventListener("error", () => {
     pass("lost", {});
     // a refused stream (no key yet, service restarting) is not tried again by the browser
-    if (source.readyState === EventSource.CLOSED) setTimeout(start, 2000);
+    if (stream.readyState === EventSource.CLOSED) setTimeout(start, 2000);
   });
 }

@@ -3,32 +3,53 @@
 
 const NEAR = 1e-6;
 
-/** Whether the straight lines a-b and c-d meet. */
+/**
+ * Whether the straight lines a-b and c-d meet.
+ * @param {number} ax
+ * @param {number} ay
+ * @param {number} bx
+ * @param {number} by
+ * @param {number} cx
+ * @param {number} cy
+ * @param {number} dx
+ * @param {number} dy
+ */
 function meet(ax, ay, bx, by, cx, cy, dx, dy) {
+  /** @type {(px: number, py: number, qx: number, qy: number, rx: number, ry: number) => number} */
   const side = (px, py, qx, qy, rx, ry) => (qx - px) * (ry - py) - (qy - py) * (rx - px);
   const s1 = side(ax, ay, bx, by, cx, cy);
   const s2 = side(ax, ay, bx, by, dx, dy);
   const s3 = side(cx, cy, dx, dy, ax, ay);
   const s4 = side(cx, cy, dx, dy, bx, by);
   if (s1 === 0 && s2 === 0 && s3 === 0 && s4 === 0) {
+    /** @type {(a: number, b: number, c: number, d: number) => boolean} */
     const over = (a, b, c, d) => Math.max(Math.min(a, b), Math.min(c, d)) <= Math.min(Math.max(a, b), Math.max(c, d));
     return over(ax, bx, cx, dx) && over(ay, by, cy, dy);
   }
   return s1 * s2 <= 0 && s3 * s4 <= 0;
 }
 
+/** @typedef {[x0: number, y0: number, x1: number, y1: number]} Piece of a cut */
+/** @typedef {ReturnType<typeof statistics>} Statistics */
+/** @typedef {{ x: number, y: number, width: number, height: number, values: Float32Array }} Raster a part of an image */
+
 export class Grid {
   /**
    * @param {object} of
    * @param {number} of.rows
    * @param {number} of.cols
-   * @param {Float64Array} of.x columns of the points in camera 1's reference image, row by row
-   * @param {Float64Array} of.y their rows
-   * @param {Int8Array} of.status
-   * @param {number[][]} [of.cuts] pieces [x0, y0, x1, y1] of the cuts
+   * @param {ArrayLike<number>} of.x columns of the points in camera 1's reference image, row by row
+   * @param {ArrayLike<number>} of.y their rows
+   * @param {ArrayLike<number>} of.status
+   * @param {Piece[]} [of.cuts] pieces of the cuts
    */
   constructor({ rows, cols, x, y, status, cuts = [] }) {
-    Object.assign(this, { rows, cols, x, y, status, cuts });
+    this.rows = rows;
+    this.cols = cols;
+    this.x = x;
+    this.y = y;
+    this.status = status;
+    this.cuts = cuts;
     this.x0 = x[0];
     this.y0 = y[0];
     this.dx = cols > 1 ? x[1] - x[0] : rows > 1 ? y[cols] - y[0] : 1;
@@ -40,30 +61,39 @@ export class Grid {
 
   /** Cell number -> the pieces of cuts that touch it. */
   #cutCells() {
+    /** @type {Map<number, Piece[]>} */
     const cells = new Map();
     for (const piece of this.cuts) {
       const [x0, y0, x1, y1] = piece;
-      const column = (x) => Math.floor((x - this.x0) / this.dx);
-      const row = (y) => Math.floor((y - this.y0) / this.dy);
+      const column = (/** @type {number} */ x) => Math.floor((x - this.x0) / this.dx);
+      const row = (/** @type {number} */ y) => Math.floor((y - this.y0) / this.dy);
       for (let r = Math.max(row(Math.min(y0, y1) - NEAR), 0); r <= Math.min(row(Math.max(y0, y1) + NEAR), this.rows - 2); r += 1) {
         for (let c = Math.max(column(Math.min(x0, x1) - NEAR), 0); c <= Math.min(column(Math.max(x0, x1) + NEAR), this.cols - 2); c += 1) {
           const cell = r * this.cols + c;
-          if (!cells.has(cell)) cells.set(cell, []);
-          cells.get(cell).push(piece);
+          cells.set(cell, [...(cells.get(cell) ?? []), piece]);
         }
       }
     }
     return cells;
   }
 
-  /** Nearest point of the grid to a place in the reference image. */
+  /**
+   * Nearest point of the grid to a place in the reference image.
+   * @param {number} x
+   * @param {number} y
+   */
   nearest(x, y) {
     const c = Math.min(Math.max(Math.round((x - this.x0) / this.dx), 0), this.cols - 1);
     const r = Math.min(Math.max(Math.round((y - this.y0) / this.dy), 0), this.rows - 1);
     return r * this.cols + c;
   }
 
-  /** Nearest point where the points lie at `places`; -1 where none has a place. */
+  /**
+   * Nearest point where the points lie at `places`; -1 where none has a place.
+   * @param {ArrayLike<number>} places
+   * @param {number} x
+   * @param {number} y
+   */
   nearestOf(places, x, y) {
     let best = -1;
     let least = Infinity;
@@ -74,11 +104,16 @@ export class Grid {
     return best;
   }
 
+  /** @param {number} cell */
   corners(cell) {
     return [cell, cell + 1, cell + this.cols, cell + this.cols + 1];
   }
 
-  /** Which of a cell's corners (bits) have a value. */
+  /**
+   * Which of a cell's corners (bits) have a value.
+   * @param {ArrayLike<number>} values
+   * @param {number} cell
+   */
   good(values, cell) {
     const below = cell + this.cols;
     let bits = 0;
@@ -89,7 +124,13 @@ export class Grid {
     return bits;
   }
 
-  /** Value in a cell at shares s, t of its width and height; NaN where it has none. */
+  /**
+   * Value in a cell at shares s, t of its width and height; NaN where it has none.
+   * @param {ArrayLike<number>} values
+   * @param {number} cell
+   * @param {number} s
+   * @param {number} t
+   */
   inside(values, cell, s, t, bits = this.good(values, cell)) {
     const pieces = this.cutCells.get(cell);
     const corners = this.corners(cell);
@@ -117,7 +158,12 @@ export class Grid {
     return (1 - a - b) * values[corners[o]] + a * values[corners[o ^ 1]] + b * values[corners[o ^ 2]];
   }
 
-  /** Value at a place of the reference image; NaN where it has none. */
+  /**
+   * Value at a place of the reference image; NaN where it has none.
+   * @param {ArrayLike<number>} values
+   * @param {number} x
+   * @param {number} y
+   */
   at(values, x, y) {
     const fx = (x - this.x0) / this.dx;
     const fy = (y - this.y0) / this.dy;
@@ -133,9 +179,9 @@ export class Grid {
    * @param {ArrayLike<number>} values of the points
    * @param {number} width of the image, px
    * @param {number} height of the image, px
-   * @param {?Float64Array} places where the points lie in it (x, y, x, y ...); null: the reference image
+   * @param {ArrayLike<number> | null} places where the points lie in it (x, y, x, y ...); null: the reference image
    * @param {boolean} steps each pixel takes its nearest point's value, failed or not (for a status)
-   * @returns {{x: number, y: number, width: number, height: number, values: Float32Array}} a part of the image
+   * @returns {Raster} the part of the image where points lie
    */
   raster(values, width, height, places = null, steps = false) {
     let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
@@ -153,13 +199,16 @@ export class Grid {
     right = Math.min(Math.ceil(right) + margin, width - 1);
     bottom = Math.min(Math.ceil(bottom) + margin, height - 1);
     if (!(right >= left && bottom >= top)) return { x: 0, y: 0, width: 0, height: 0, values: new Float32Array(0) };
-    const out = { x: left, y: top, width: right - left + 1, height: bottom - top + 1, values: null };
-    out.values = new Float32Array(out.width * out.height).fill(NaN);
+    const out = { x: left, y: top, width: right - left + 1, height: bottom - top + 1, values: new Float32Array((right - left + 1) * (bottom - top + 1)).fill(NaN) };
     if (steps && !places) this.#nearestEach(values, out);
     else this.#cells(values, out, places);
     return out;
   }
 
+  /**
+   * @param {ArrayLike<number>} values
+   * @param {Raster} out
+   */
   #nearestEach(values, out) {
     const half = [Math.abs(this.dx) / 2, Math.abs(this.dy) / 2];
     for (let y = 0; y < out.height; y += 1) {
@@ -173,6 +222,11 @@ export class Grid {
     }
   }
 
+  /**
+   * @param {ArrayLike<number>} values
+   * @param {Raster} out
+   * @param {ArrayLike<number> | null} places
+   */
   #cells(values, out, places) {
     const used = new Uint8Array(this.x.length);
     for (let r = 0; r < this.rows - 1; r += 1) {
@@ -201,6 +255,12 @@ export class Grid {
     }
   }
 
+  /**
+   * @param {ArrayLike<number>} values
+   * @param {Raster} out
+   * @param {number} cell
+   * @param {number} bits
+   */
   #rectangle(values, out, cell, bits) {
     const x0 = this.x[cell];
     const y0 = this.y[cell];
@@ -225,9 +285,17 @@ export class Grid {
     }
   }
 
-  /** The half of a cell at its corner `o`, where its corners lie at `places`. */
+  /**
+   * The half of a cell at its corner `o`, where its corners lie at `places`.
+   * @param {ArrayLike<number>} values
+   * @param {Raster} out
+   * @param {ArrayLike<number>} places
+   * @param {number} cell
+   * @param {number} o
+   * @param {number} bits
+   */
   #triangle(values, out, places, cell, o, bits) {
-    const corner = (k) => cell + (k & 1) + (k & 2 ? this.cols : 0);
+    const corner = (/** @type {number} */ k) => cell + (k & 1) + (k & 2 ? this.cols : 0);
     const [io, ia, ib, id] = [corner(o), corner(o ^ 1), corner(o ^ 2), corner(o ^ 3)];
     const px = places[2 * io];
     const py = places[2 * io + 1];
@@ -261,20 +329,27 @@ export class Grid {
           out.values[(y - out.y) * out.width + x - out.x] = vo + a * (va - vo) + b * (vb - vo) + a * b * twist;
           continue;
         }
-        const clip = (share) => Math.min(Math.max(share, 0), 1);
+        const clip = (/** @type {number} */ share) => Math.min(Math.max(share, 0), 1);
         const value = this.inside(values, cell, clip(o & 1 ? 1 - a : a), clip(o & 2 ? 1 - b : b), bits);
         if (!Number.isNaN(value)) out.values[(y - out.y) * out.width + x - out.x] = value;
       }
     }
   }
 
-  /** Whether another grid has the same points. */
+  /**
+   * Whether another grid has the same points.
+   * @param {Grid} other
+   */
   same(other) {
-    return this.rows === other.rows && this.cols === other.cols && ["x0", "y0", "dx", "dy"].every((name) => Math.abs(this[name] - other[name]) < 1e-3);
+    return this.rows === other.rows && this.cols === other.cols && /** @type {const} */ (["x0", "y0", "dx", "dy"]).every((name) => Math.abs(this[name] - other[name]) < 1e-3);
   }
 }
 
-/** Least, largest, mean, sd and number of the values of measured points, and how many there could be. */
+/**
+ * Least, largest, mean, sd and number of the values of measured points, and how many there could be.
+ * @param {Grid} grid
+ * @param {ArrayLike<number>} values
+ */
 export function statistics(grid, values) {
   let [count, sum, squares, min, max, within] = [0, 0, 0, Infinity, -Infinity, 0];
   for (let i = 0; i < values.length; i += 1) {

@@ -2,23 +2,57 @@
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { calibrationViews } from "./calibrate/views.js";
-import { h, replace, field, number, select, action, table, facts, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
+import { h, numeric, pen, replace, field, number, select, action, table, facts, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
 
+/** @import { Here } from "../main.js" */
+/** @import { Ends, Part } from "#dom" */
+/** @import { Model, Reply } from "#routes" */
+/** @typedef {Model<"CalibrationReply">} Calibration */
+/** @typedef {Reply<"get", "/calibrations">["calibrations"]} Entries */
+/** @typedef {Model<"ExpectReply">} Expected */
+/** @typedef {{ nodes: Part, close: () => void }} Panels */
+
+/** @type {Record<string, string>} */
 const LEVEL = { good: "good", warning: "warn", failed: "bad" };
+/** @type {Record<string, string>} */
 const DECISION = { accepted: "good", discarded: "bad" };
 const NAMES = ["phd_px", "cx_px", "cy_px", "kappa_per_px2", "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm"];
+/** @type {Record<string, string>} */
+const PHASES = { views: "taking views", grid: "finding the grid", calibration: "adjusting" };
+const CAMERAS = /** @type {const} */ (["cam1", "cam2"]);
+/** @type {Record<string, string>} */
 const UNIT = { phd_px: "px", cx_px: "px", cy_px: "px", kappa_per_px2: "px⁻²", alpha_rad: "rad", beta_rad: "rad", gamma_rad: "rad", x0_mm: "mm", y0_mm: "mm", z0_mm: "mm" };
-const symbol = (name) => name.replace(/_(px|rad|mm|per_px2)$/, "");
-const um = (mm, digits = 3) => quantity(mm === null || mm === undefined ? null : 1000 * mm, "µm", digits);
+const symbol = (/** @type {string} */ name) => name.replace(/_(px|rad|mm|per_px2)$/, "");
+const um = (/** @type {number | null | undefined} */ mm, digits = 3) => quantity(mm === null || mm === undefined ? null : 1000 * mm, "µm", digits);
 
+/** @param {Model<"JobReply">} job of a calibration */
+function verdictOf(job) {
+  const verdict = /** @type {Calibration["verdict"]} */ (job.result?.verdict);
+  return verdict ? `Verdict: ${verdict.level}.` : "";
+}
+
+/**
+ * Identifiers of the calibrations that are ticked.
+ * @param {HTMLElement} list
+ */
+const ticked = (list) => [.../** @type {NodeListOf<HTMLInputElement>} */ (list.querySelectorAll("input:checked"))].map((input) => input.value);
+
+/**
+ * @param {HTMLElement} root
+ * @param {Here} here
+ */
 export async function open(root, { path }) {
+  /** @type {Ends} */
   const ends = [];
   const rig = await api.get("/rig");
   const shown = h("div", { "aria-live": "polite" });
   const list = h("div");
-  let chosen = path[0] ?? null;
+  /** @type {string | undefined} */
+  let chosen = path[0];
+  /** @type {Entries} */
   let entries = [];
-  let drawn = null; // which calibration, in which state, is shown
+  let drawn = ""; // which calibration, in which state, is shown
+  /** @type {(() => void) | null} */
   let closeShown = null;
 
   async function refresh() {
@@ -26,13 +60,19 @@ export async function open(root, { path }) {
     drawList();
   }
 
+  /** @param {Entries[number]} one */
+  function levelBadge(one) {
+    const level = /** @type {string | undefined} */ (one.verdict?.level);
+    return badge(level ?? one.state, LEVEL[level ?? ""] ?? STATE_KIND[one.state] ?? "");
+  }
+
   function drawList() {
-    const compared = new Set([...list.querySelectorAll("input:checked")].map((input) => input.value));
+    const compared = new Set(ticked(list));
     replace(list, table([
       ["Compare", (one) => h("input", { type: "checkbox", value: one.id, checked: compared.has(one.id), disabled: one.state !== "complete", "aria-label": `Compare ${one.id}` }), { unseen: true }],
       ["Calibration", (one) => h("a", { href: `#/calibrate/${one.id}`, "aria-current": one.id === chosen ? "true" : null }, one.label || one.id)],
       ["Made", (one) => when(one.created_utc)],
-      ["Verdict", (one) => [badge(one.verdict?.level ?? one.state, LEVEL[one.verdict?.level] ?? STATE_KIND[one.state] ?? ""), " ", one.decision ? badge(one.decision, DECISION[one.decision]) : null]],
+      ["Verdict", (one) => [levelBadge(one), " ", one.decision ? badge(one.decision, DECISION[one.decision]) : null]],
     ], entries, { caption: "Calibrations, newest first", empty: "No calibration yet: run one, or import one." }));
   }
 
@@ -53,17 +93,21 @@ export async function open(root, { path }) {
       closeShown = parts.close;
       replace(shown, parts.nodes);
     } catch (error) {
-      drawn = null;
+      drawn = "";
       replace(shown, h("section.panel", h("h2", id), problemText(error)));
     }
   }
 
+  /**
+   * @param {Calibration} document_
+   * @returns {Promise<Panels>}
+   */
   async function one(document_) {
     const { id, plan } = document_;
     const heading = h("div.spread", h("h2", plan.label || "Calibration", " ", h("code", id)),
       h("span.row", badge(document_.state, STATE_KIND[document_.state]), document_.judgement ? badge(document_.judgement.decision, DECISION[document_.judgement.decision]) : null));
     const decide = h("div.row", decisions(document_, async () => { await refresh(); await show(true); }, async () => {
-      chosen = null;
+      chosen = undefined;
       await refresh();
       if (location.hash === "#/calibrate") await show(true);
       else location.hash = "#/calibrate";
@@ -72,16 +116,17 @@ export async function open(root, { path }) {
     // one that its verdict refused is shown like any other: what was wrong is in its residuals
     if (document_.state !== "complete" && !document_.verdict) {
       return { nodes: h("section.panel", heading,
-        problem ? problemText(Object.assign(new Error(problem.cause ?? problem.detail), problem)) : h("p.quiet", "It is not complete yet; the job's course is above, or under Jobs."),
-        document_.state === "unfinished" ? null : decide, await viewsOf(document_, null)), close: () => {} };
+        problem ? problemText(api.problemOf(problem)) : h("p.quiet", "It is not complete yet; the job's course is above, or under Jobs."),
+        document_.state === "unfinished" ? null : decide, viewsOf(document_)), close: () => {} };
     }
+    /** @type {Reply<"get", "/calibrations/{calibration_id}/residuals">["views"] | null} */
     let residuals = null;
     try {
       if (document_.taken) residuals = (await api.get(`/calibrations/${id}/residuals`)).views;
     } catch (error) {
-      if (error.status !== 404) notify(error);
+      if (!(error instanceof api.Problem && error.status === 404)) notify(error);
     }
-    const made = await calibrationViews(document_, residuals);
+    const made = calibrationViews(document_, /** @type {import("./calibrate/views.js").Found[] | null} */ (residuals));
     return {
       nodes: [
         h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), decide),
@@ -94,9 +139,10 @@ export async function open(root, { path }) {
     };
   }
 
-  async function viewsOf(document_) {
-    if (!document_.taken?.length) return null;
-    const made = await calibrationViews(document_, null);
+  /** @param {Calibration} document_ */
+  function viewsOf(document_) {
+    const made = calibrationViews(document_, null);
+    if (!made) return null;
     ends.push(made.close);
     return h("div", h("h3", "Views that were taken"), made.root);
   }
@@ -112,10 +158,15 @@ export async function open(root, { path }) {
   return () => { closeShown?.(); ends.forEach((end) => end()); };
 }
 
-/** The plan, what it may be expected to leave uncertain, and its run. */
+/**
+ * The plan, what it may be expected to leave uncertain, and its run.
+ * @param {Model<"RigReply">} rig
+ * @param {Ends} ends
+ * @param {(id: string) => Promise<unknown>} done
+ */
 function run(rig, ends, done) {
   const usual = rig.calibration_plan ?? {};
-  const list_ = (values) => (values ?? []).map((value) => String(value)).join(", ");
+  const list_ = (/** @type {number[] | null | undefined} */ values) => (values ?? []).map((value) => String(value)).join(", ");
   const positions = h("input", { type: "text", value: list_(usual.positions_mm), inputmode: "decimal", autocomplete: "off" });
   const held = h("input", { type: "text", value: list_(usual.held_out_mm), inputmode: "decimal", autocomplete: "off" });
   const frames = number(usual.frames ?? 4, { min: 1, max: 256, step: 1 });
@@ -127,13 +178,17 @@ function run(rig, ends, done) {
   const progress = h("div", { role: "status", "data-role": "progress" });
   const start = action("Calibrate", begin, { kind: "primary" });
 
+  /**
+   * @param {HTMLInputElement} input
+   * @param {string} name
+   */
   function numbers(input, name) {
     const parts = input.value.split(/[\s;,]+/).filter(Boolean);
     const values = parts.map(Number);
-    if (values.some((value) => !Number.isFinite(value))) throw Object.assign(new Error(`${name}: “${input.value}” is no list of numbers.`), { remedy: "Write millimetres with a point, between commas: 0, 2.5, 5." });
+    if (values.some((value) => !Number.isFinite(value))) throw api.problemOf({ cause: `${name}: “${input.value}” is no list of numbers.`, remedy: "Write millimetres with a point, between commas: 0, 2.5, 5." });
     return values;
   }
-  const plan = () => ({ positions_mm: numbers(positions, "Fitted positions"), held_out_mm: numbers(held, "Held-out positions"), localiser: localiser.value });
+  const plan = () => ({ positions_mm: numbers(positions, "Fitted positions"), held_out_mm: numbers(held, "Held-out positions"), localiser: /** @type {"profile" | "paper"} */ (localiser.value) });
 
   let asked = 0;
   async function foresee() {
@@ -146,7 +201,8 @@ function run(rig, ends, done) {
       if (mine === asked) replace(expected, problemText(error));
     }
   }
-  let timer = null;
+  /** @type {number | undefined} */
+  let timer;
   for (const input of [positions, held, localiser, roll, noise]) input.addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(foresee, 350); });
   ends.push(() => clearTimeout(timer));
   foresee();
@@ -158,6 +214,10 @@ function run(rig, ends, done) {
 
   const stopped = new AbortController();
   ends.push(() => stopped.abort());
+  /**
+   * @param {Model<"JobReply">} job
+   * @param {string | undefined} id
+   */
   async function follow(job, id) {
     start.setAttribute("aria-disabled", "true");
     const bar = h("progress", { max: 1, "aria-label": "Progress of the calibration" });
@@ -167,14 +227,14 @@ function run(rig, ends, done) {
       const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
         const { stage, done: ready, total } = now.progress ?? {};
         if (total) bar.value = ready / total;
-        text.textContent = now.state === "queued" ? "waiting" : `${{ views: "taking views", grid: "finding the grid", calibration: "adjusting" }[stage] ?? stage ?? ""} ${total ? `${ready} of ${total}` : ""}`;
+        text.textContent = now.state === "queued" ? "waiting" : `${PHASES[stage ?? ""] ?? stage ?? ""} ${total ? `${ready} of ${total}` : ""}`;
       } });
       replace(progress, ended.state === "succeeded"
-        ? h("p", badge("succeeded", "good"), " ", ended.result?.verdict ? `Verdict: ${ended.result.verdict.level}.` : "")
+        ? h("p", badge("succeeded", "good"), " ", verdictOf(ended))
         : ended.state === "cancelled" ? h("p", badge("cancelled", "warn"), " The axes were stopped; nothing was made of the views.") : problemText(api.jobProblem(ended)));
       if (id) await done(id);
     } catch (error) {
-      if (error.name !== "AbortError") throw error;
+      if (!api.aborted(error)) throw error;
     } finally {
       start.removeAttribute("aria-disabled");
     }
@@ -182,10 +242,10 @@ function run(rig, ends, done) {
   // one that runs already is followed, whoever began it
   api.get("/jobs", { limit: 20 }).then(({ jobs }) => {
     const job = jobs.find((one) => one.kind === "calibration" && ["queued", "running", "cancelling"].includes(one.state));
-    if (job) return follow(job, job.subject?.calibration_id);
-  }).catch((error) => { if (error.name !== "AbortError") notify(error); });
+    return job && follow(job, /** @type {string | undefined} */ (job.subject.calibration_id));
+  }).catch((error) => { if (!api.aborted(error)) notify(error); });
 
-  const target = rig.target ?? {};
+  const { target } = rig;
   return h("section.panel", { "aria-label": "New calibration" }, h("h2", "New calibration"),
     h("p.quiet", `Target of the rig file: ${target.lines?.join(" × ")} lines, ${target.dark_lines ? "dark" : "bright"}, ${quantity(target.pitch_mm, "mm")} apart, ${quantity(target.line_width_mm, "mm")} wide, known to ±${um(target.node_tolerance_mm)}.`),
     h("div.fields",
@@ -196,22 +256,24 @@ function run(rig, ends, done) {
     h("div.row", start), progress);
 }
 
+/** @param {Expected} told */
 function foreseen(told) {
   const middle = told.points[0];
   const corners = told.points.slice(1);
   const worst = [0, 1, 2].map((axis) => Math.max(...corners.map((point) => point.sigma_mm[axis])));
-  const sigma = (cam, name) => told.parameters[`${cam}.${name}`].sigma;
+  const sigma = (/** @type {string} */ cam, /** @type {string} */ name) => told.parameters[`${cam}.${name}`].sigma;
   return [
     told.refused ? h("div.problem", h("p", h("strong", "Such views would be refused.")), h("ul", told.reasons.map((text) => h("li", text))), h("p", "Let the positions lie further apart.")) : null,
-    table([["Point", (row) => row[0]], ...["X", "Y", "Z"].map((axis, k) => [`σ ${axis}`, (row) => um(row[1][k]), { numeric: true }])],
-      [["middle of the volume", middle.sigma_mm], ["worst corner", worst]], { caption: `What the parameters' uncertainty does to a point; the corners lie at ±${num(Math.abs(corners[0].xyz_mm[0]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[1]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[2]), 3)} mm` }),
+    table([["Point", (row) => row[0]], ...["X", "Y", "Z"].map((axis, k) => numeric(`σ ${axis}`, (/** @type {[string, number[]]} */ row) => um(row[1][k])))],
+      /** @type {[string, number[]][]} */ ([["middle of the volume", middle.sigma_mm], ["worst corner", worst]]), { caption: `What the parameters' uncertainty does to a point; the corners lie at ±${num(Math.abs(corners[0].xyz_mm[0]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[1]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[2]), 3)} mm` }),
     h("details", h("summary", "Parameters and assumptions"),
-      table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]], ...["cam1", "cam2"].map((cam) => [`σ ${cam}`, (name) => num(sigma(cam, name), 3), { numeric: true }])], NAMES, { caption: "Expected standard deviations" }),
+      table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]], ...CAMERAS.map((cam) => numeric(`σ ${cam}`, (/** @type {string} */ name) => num(sigma(cam, name), 3)))], NAMES, { caption: "Expected standard deviations" }),
       facts([["shape", `${um(told.shape_rms_mm)} rms over the volume`], ["scale", quantity(100 * told.scale, "%", 2)], ["intersections seen", `cam1 ${num(100 * told.seen_share.cam1, 3)} %, cam2 ${num(100 * told.seen_share.cam2, 3)} %`]]),
-      h("p.quiet", told.assumed.text)),
+      h("p.quiet", String(told.assumed.text))),
   ];
 }
 
+/** @param {Calibration} document_ */
 function verdict(document_) {
   const { verdict: v, uncertainty: u, checks } = document_;
   if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it brings no verdict.`);
@@ -224,10 +286,15 @@ function verdict(document_) {
   ];
 }
 
+/**
+ * @param {Calibration} document_
+ * @param {() => Promise<unknown>} changed
+ * @param {() => Promise<unknown>} gone
+ */
 function decisions(document_, changed, gone) {
   const { id, state } = document_;
   const now = document_.judgement?.decision;
-  const put = (decision, note = "") => api.put(`/calibrations/${id}/judgement`, { decision, note }).then(changed);
+  const put = (/** @type {"accepted" | "discarded" | null} */ decision, note = "") => api.put(`/calibrations/${id}/judgement`, { decision, note }).then(changed);
   return [
     state === "complete" && now !== "accepted" ? action("Accept", () => put("accepted"), { kind: "primary", title: "New tests measure with the newest accepted calibration" }) : null,
     now !== "discarded" ? action("Discard", async () => {
@@ -245,15 +312,20 @@ function decisions(document_, changed, gone) {
   ];
 }
 
+/** @param {Calibration} document_ */
 function measures(document_) {
   const { checks } = document_;
   if (!checks) return h("p.quiet", "It brings no checks.");
+  /** @type {[text: string, camera: string, check: import("#routes").PositionsCheck, positions: { [cam: string]: number[] } | null][]} */
   const rows = [];
-  for (const [name, text] of [["fitted", "fitted"], ["held_out", "held out"]]) {
+  for (const [name, text] of /** @type {const} */ ([["fitted", "fitted"], ["held_out", "held out"]])) {
     const check = checks[name];
     if (!check) continue;
-    rows.push([text, "both", check, check.positions_mm]);
-    for (const cam of ["cam1", "cam2"]) if (check.per_camera?.[cam]) rows.push([text, cam, check.per_camera[cam], null]);
+    rows.push([text, "both", check, check.positions_mm ?? null]);
+    for (const cam of CAMERAS) {
+      const own = check.per_camera?.[cam];
+      if (own) rows.push([text, cam, own, null]);
+    }
   }
   return [
     table([["Positions", (row) => [row[0], row[3] ? h("small.quiet", ` ${[...new Set(Object.values(row[3]).flat())].map((mm) => num(mm, 3)).join(", ")} mm`) : null]], ["Camera", (row) => row[1]],
@@ -263,51 +335,65 @@ function measures(document_) {
   ];
 }
 
+/** @param {Calibration} document_ */
 function viewTable(document_) {
   if (!Array.isArray(document_.views)) return null;
   return h("details", h("summary", "Each view"), table([["View", (v) => v.name], ["dZ", (v) => quantity(v.dz_mm, "mm", 4), { numeric: true }], ["Role", (v) => (v.held_out ? "held out" : "fitted")],
     ["RBE", (v) => quantity(v.rbe_px, "px", 3), { numeric: true }], ["RAZ", (v) => um(v.raz_mm), { numeric: true }], ["NSCE", (v) => num(v.nsce, 3), { numeric: true }]], document_.views, { caption: "Measures of each view" }));
 }
 
+/**
+ * @param {number | null | undefined} value
+ * @param {number | null | undefined} sigma
+ */
 function withSigma(value, sigma) {
   if (value === undefined || value === null) return "–";
-  if (!(sigma > 0)) return num(value, 6);
+  if (!sigma || !(sigma > 0)) return num(value, 6);
   const decimals = Math.min(Math.max(1 - Math.floor(Math.log10(sigma)), 0), 12);
   return Math.abs(value) < 1e-4 ? `${num(value, 4)} ± ${num(sigma, 2)}` : `${value.toFixed(Math.min(decimals, 8)).replace("-", "−")} ± ${num(sigma, 2)}`;
 }
 
+/** @param {Calibration} document_ */
 function parameters(document_) {
   const sigma = document_.sigma ?? {};
   return table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]],
-    ...["cam1", "cam2"].map((cam) => [`${cam} ± σ`, (name) => withSigma(document_[cam]?.[name], sigma[`${cam}.${name}`]), { numeric: true }]),
+    ...CAMERAS.map((cam) => numeric(`${cam} ± σ`, (/** @type {string} */ name) => withSigma(document_[cam]?.[name], sigma[`${cam}.${name}`]))),
     ["nominal", (name) => nominal(document_, name), { numeric: true }]], NAMES, { caption: "Ten parameters of each camera, with their standard deviations" });
 }
 
+/**
+ * @param {Calibration} document_
+ * @param {string} name
+ */
 function nominal(document_, name) {
-  const of = (cam) => {
+  const of = (/** @type {string} */ cam) => {
     const n = document_.nominal?.[cam];
     if (!n) return null;
-    return { phd_px: n.phd_px, z0_mm: n.standoff_mm, gamma_rad: (n.angle_deg * Math.PI) / 180, cx_px: (n.image_size_px[0] - 1) / 2, cy_px: (n.image_size_px[1] - 1) / 2 }[name] ?? null;
+    /** @type {Record<string, number>} */
+    const known = { phd_px: n.phd_px, z0_mm: n.standoff_mm, gamma_rad: (n.angle_deg * Math.PI) / 180, cx_px: (n.image_size_px[0] - 1) / 2, cy_px: (n.image_size_px[1] - 1) / 2 };
+    return known[name] ?? null;
   };
   const [a, b] = [of("cam1"), of("cam2")];
   if (a === null && b === null) return "";
   return a === b ? num(a, 5) : `${num(a, 4)}; ${num(b, 4)}`;
 }
 
+/** @param {Calibration} document_ */
 function correlations(document_) {
-  const covariance = document_.covariance;
-  if (!Array.isArray(covariance?.matrix)) return null;
+  const { covariance } = document_;
+  if (!covariance?.matrix) return null;
   const { names, matrix } = covariance;
   const r = matrix.map((row, i) => row.map((value, k) => value / Math.sqrt(matrix[i][i] * matrix[k][k])));
+  /** @type {[one: string, other: string, correlation: number][]} */
   const strongest = [];
   names.forEach((a, i) => names.forEach((b, k) => { if (k > i && Math.abs(r[i][k]) > 0.9) strongest.push([a, b, r[i][k]]); }));
   strongest.sort((a, b) => Math.abs(b[2]) - Math.abs(a[2]));
   const SIZE = 14;
   const canvas = h("canvas", { width: names.length * SIZE, height: names.length * SIZE, role: "img", "aria-label": "Correlation of all parameters: blue negative, orange positive", style: { maxWidth: "100%", display: "block" } });
-  const pen = canvas.getContext("2d");
+  const context = pen(canvas);
   r.forEach((row, i) => row.forEach((value, k) => {
-    pen.fillStyle = value < 0 ? `rgba(40, 120, 220, ${Math.abs(value)})` : `rgba(230, 120, 0, ${Math.abs(value)})`;
-    pen.fillRect(k * SIZE, i * SIZE, SIZE - 1, SIZE - 1);
+    context.fillStyle = value < 0 ? `rgba(40, 120, 220, ${Math.abs(value)})` : `rgba(230, 120, 0, ${Math.abs(value)})`;
+    context.fillRect(k * SIZE, i * SIZE, SIZE - 1, SIZE - 1);
   }));
   const under = h("p.quiet", { role: "status" }, "Point at a square to read it.");
   canvas.addEventListener("pointermove", (event) => {
@@ -320,19 +406,21 @@ function correlations(document_) {
     table([["One", (row) => row[0]], ["Other", (row) => row[1]], ["Correlation", (row) => row[2].toFixed(5).replace("-", "−"), { numeric: true }]], strongest.slice(0, 12), { caption: "Strongest, above 0.9", empty: "None above 0.9." }));
 }
 
+/** @param {HTMLElement} list */
 async function comparison(list) {
-  const ids = [...list.querySelectorAll("input:checked")].map((input) => input.value);
-  if (ids.length !== 2) throw Object.assign(new Error(`${ids.length} calibrations are chosen.`), { remedy: "Tick two complete calibrations in the list." });
+  const ids = ticked(list);
+  if (ids.length !== 2) throw api.problemOf({ cause: `${ids.length} calibrations are chosen.`, remedy: "Tick two complete calibrations in the list." });
   const [a, b] = await Promise.all(ids.map((id) => api.get(`/calibrations/${id}`)));
+  /** @type {[name: string, unit: string, a: string, b: string, difference: number, sigmas: number | null][]} */
   const rows = [];
-  for (const cam of ["cam1", "cam2"]) for (const name of NAMES) {
+  for (const cam of CAMERAS) for (const name of NAMES) {
     const key = `${cam}.${name}`;
     const [sa, sb] = [a.sigma?.[key], b.sigma?.[key]];
     const difference = (b[cam]?.[name] ?? NaN) - (a[cam]?.[name] ?? NaN);
-    const both = sa > 0 && sb > 0 ? Math.hypot(sa, sb) : null;
+    const both = sa && sb ? Math.hypot(sa, sb) : null;
     rows.push([`${cam} ${symbol(name)}`, UNIT[name], withSigma(a[cam]?.[name], sa), withSigma(b[cam]?.[name], sb), difference, both ? difference / both : null]);
   }
-  const checks = [["fitted", "RBE fitted"], ["held_out", "RBE held out"]].map(([name, text]) => [text, quantity(a.checks?.[name]?.rbe_px, "px", 3), quantity(b.checks?.[name]?.rbe_px, "px", 3)]);
+  const checks = /** @type {const} */ ([["fitted", "RBE fitted"], ["held_out", "RBE held out"]]).map(([name, text]) => [String(text), quantity(a.checks?.[name]?.rbe_px, "px", 3), quantity(b.checks?.[name]?.rbe_px, "px", 3)]);
   checks.push(["verdict", a.verdict?.level ?? "–", b.verdict?.level ?? "–"], ["made", when(a.plan.created_utc), when(b.plan.created_utc)], ["shape", um(a.uncertainty?.shape_rms_mm), um(b.uncertainty?.shape_rms_mm)]);
   await ask("Two calibrations", h("div", { "data-role": "comparison" },
     table([["Check", (row) => row[0]], [a.plan.label || a.id, (row) => row[1], { numeric: true }], [b.plan.label || b.id, (row) => row[2], { numeric: true }]], checks, { caption: "Checks" }),
@@ -340,15 +428,17 @@ async function comparison(list) {
       ["in σ", (row) => (row[5] === null ? "–" : h(Math.abs(row[5]) > 3 ? "strong" : "span", num(row[5], 2))), { numeric: true }]], rows, { caption: "Parameters; a difference beyond 3 σ of both together is bold" })), [["Close", null]]);
 }
 
+/** @param {(id: string) => Promise<unknown>} done */
 function importer(done) {
   const file = h("input", { type: "file", accept: ".json,.xml,.yml,.yaml,.caldat,.z3d" });
   const label = h("input", { type: "text", maxlength: 300 });
   return h("details", { style: { marginTop: "0.75rem" } }, h("summary", "Import a calibration"), field("File", file, "", "calibration.json, DICe XML, OpenCV YAML of a stereo pair"), field("Label", label),
     action("Import", async () => {
-      if (!file.files.length) throw Object.assign(new Error("No file is chosen."), { remedy: "Choose the file of a stereo calibration." });
+      const [chosen] = file.files ?? [];
+      if (!chosen) throw api.problemOf({ cause: "No file is chosen.", remedy: "Choose the file of a stereo calibration." });
       const form = new FormData();
-      form.append("file", file.files[0]);
-      form.append("label", label.value || file.files[0].name);
+      form.append("file", chosen);
+      form.append("label", label.value || chosen.name);
       const made = await api.upload("/calibrations:import", form);
       notify(`${made.id} is imported.`, "good");
       await done(made.id);

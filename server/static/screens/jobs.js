@@ -1,16 +1,23 @@
 // What runs and ran, and how the machine is.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
-import { h, replace, action, badge, facts, num, quantity, table, when, problemText, notify, STATE_KIND } from "../lib/dom.js";
+import { h, replace, action, badge, facts, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
+/** @import { Model } from "#routes" */
+/** @typedef {Model<"JobReply">} Job */
+
+/** @param {HTMLElement} root */
 export async function open(root) {
   const list = h("div");
   const detail = h("section.panel", { "aria-live": "polite" }, h("p.quiet", "Choose a job to see its course."));
   const health = h("section.panel");
+  /** @type {Map<string, Job>} */
   const jobs = new Map();
-  let chosen = null;
-  const log = new Map(); // job id -> lines
+  let chosen = "";
+  /** @type {Map<string, { key: string, line: string }[]>} lines of each job */
+  const log = new Map();
 
+  /** @param {Job} job */
   function note(job) {
     const { stage, done, total } = job.progress ?? {};
     const line = `${new Date().toLocaleTimeString()}  ${job.state}  ${stage ?? ""} ${total ? `${done}/${total}` : ""}`.trim();
@@ -33,35 +40,42 @@ export async function open(root) {
     ], rows, { caption: "Jobs, newest first", onrow: (job) => { chosen = job.id; show(); }, empty: "No job has run yet." }));
   }
 
+  /** @param {Job} job */
   function progress(job) {
     const { stage, done, total, eta_s: eta } = job.progress ?? {};
-    if (["succeeded", "failed", "cancelled", "interrupted"].includes(job.state)) return job.finished_utc && job.started_utc ? quantity((new Date(job.finished_utc) - new Date(job.started_utc)) / 1000, "s", 3) : "";
+    if (["succeeded", "failed", "cancelled", "interrupted"].includes(job.state)) return job.finished_utc && job.started_utc ? quantity((Date.parse(job.finished_utc) - Date.parse(job.started_utc)) / 1000, "s", 3) : "";
     return h("div", h("progress", { value: total ? done : null, max: total || 1, "aria-label": `Progress of ${job.kind}` }),
       h("small", `${stage ?? ""} ${total ? `${num(100 * done / total, 3)} %` : ""}${eta ? `, ${num(eta, 2)} s left` : ""}`));
   }
 
+  /** @param {Job} job */
   const cancel = (job) => action("Cancel", async () => { take(await api.post(`/jobs/${job.id}/cancel`)); }, { kind: "danger", "aria-label": `Cancel ${job.kind} ${job.id}` });
 
   function show() {
     const job = jobs.get(chosen);
     if (!job) return;
-    const problem = job.problem ? Object.assign(new Error(job.problem.detail ?? job.problem.cause ?? job.problem.title), job.problem) : null;
-    replace(detail,
+        replace(detail,
       h("div.spread", h("h2", `${job.kind} `, h("code", job.id)), badge(job.state, STATE_KIND[job.state])),
       facts([["created", when(job.created_utc)], ["started", when(job.started_utc)], ["finished", when(job.finished_utc)],
-        ...Object.entries(job.subject ?? {}).map(([name, value]) => [name, link(name, value, job.subject)])]),
-      problem ? problemText(problem) : null,
+        ...Object.entries(job.subject ?? {}).map(([name, value]) => /** @type {const} */ ([name, link(name, value, job.subject)]))]),
+      job.problem ? problemText(api.problemOf(job.problem)) : null,
       h("h3", "Course"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Course of the job" }, (log.get(job.id) ?? []).map((one) => `${one.line}\n`)),
       job.result ? h("details", h("summary", "Result as the API gives it"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Result of the job" }, JSON.stringify(job.result, null, 1))) : null);
   }
 
+  /**
+   * @param {string} name
+   * @param {unknown} value
+   * @param {Job["subject"]} subject
+   */
   function link(name, value, subject) {
-    if (name === "test_id") return h("a", { href: `#/test/${value}` }, value);
-    if (name === "analysis_id" && subject.test_id) return h("a", { href: `#/results/${subject.test_id}/${value}` }, value);
-    if (name === "calibration_id") return h("a", { href: `#/calibrate/${value}` }, value);
+    if (name === "test_id") return h("a", { href: `#/test/${value}` }, String(value));
+    if (name === "analysis_id" && subject.test_id) return h("a", { href: `#/results/${subject.test_id}/${value}` }, String(value));
+    if (name === "calibration_id") return h("a", { href: `#/calibrate/${value}` }, String(value));
     return typeof value === "object" ? JSON.stringify(value) : String(value);
   }
 
+  /** @param {Job} job */
   function take(job) {
     jobs.set(job.id, { ...jobs.get(job.id), ...job });
     note(job);
@@ -81,7 +95,7 @@ export async function open(root) {
     if (document.hidden) return;
     try {
       const [well, metrics] = await Promise.all([api.get("/healthz"), api.raw("/metrics").then((r) => r.text())]);
-      const value = (name) => { const found = new RegExp(`^${name}(?:\\{[^}]*\\})? ([-+0-9.eE]+)$`, "m").exec(metrics); return found ? Number(found[1]) : null; };
+      const value = (/** @type {string} */ name) => { const found = new RegExp(`^${name}(?:\\{[^}]*\\})? ([-+0-9.eE]+)$`, "m").exec(metrics); return found ? Number(found[1]) : null; };
       const free = value("stereorig_disk_free_bytes");
       const ready = value("stereorig_ready") === 1;
       replace(health, h("div.spread", h("h2", "System"), badge(ready ? "ready" : "not ready", ready ? "good" : "warn")),

@@ -1,37 +1,57 @@
 // Results: which tests and analyses there are, and one analysis' fields over the image and in space.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
-import { Result, all } from "./results/analysis.js";
+import { Result, allTests } from "./results/analysis.js";
 import { FieldMap, measured } from "../widgets/field_map.js";
 import { Scale } from "../widgets/scale.js";
 import { about, files } from "./results/about.js";
 import { gauges } from "./results/gauges.js";
 import { mark, pinned } from "./results/probe.js";
-import { h, replace, table, badge, when, num, count, quantity, field, select, action, facts, notify, problemText, STATE_KIND } from "../lib/dom.js";
+import { h, replace, table, badge, when, num, count, quantity, field, select, facts, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
+/** @import { Here } from "../main.js" */
+/** @import { Ends } from "#dom" */
+/** @import { Over } from "../widgets/field_map.js" */
+/** @import { Shown } from "./results/analysis.js" */
+/** @typedef {"image" | "surface" | "compare"} Mode */
+/** @typedef {{ step: number | null, field: string | null, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
+/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
+ *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer what the parts of the screen share; `drawn` is told after each change of step, field or scale */
+/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} Stand what stands in the place of the map */
+
+/** @type {[Mode, string][]} */
 const MODES = [["image", "Image"], ["surface", "3-D surface"], ["compare", "Side by side"]];
 
+/**
+ * @param {HTMLElement} root
+ * @param {Here} here
+ */
 export async function open(root, here) {
   const [testId, analysisId] = here.path;
   return testId && analysisId ? show(root, testId, analysisId, here.query) : list(root, testId);
 }
 
+/**
+ * @param {HTMLElement} root
+ * @param {string | undefined} testId
+ */
 async function list(root, testId) {
-  const tests = (await all("/tests", "tests")).reverse();
+  const tests = await allTests();
   const detail = h("section.panel", { "aria-live": "polite" });
   const chosen = tests.find((one) => one.id === testId) ?? tests[0];
+  /** @param {{ id: string }} test */
   async function choose(test) {
     replace(detail, h("p.quiet", "Loading …"));
     try {
       const whole = await api.get(`/tests/${test.id}`);
       replace(detail, h("div.spread", h("h2", whole.name), h("a", { href: `#/test/${whole.id}` }, "the test")),
-        facts([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.steps.length)], ["calibration", whole.calibration_id ?? "–"]]),
+        facts([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.steps?.length)], ["calibration", whole.calibration_id ?? "–"]]),
         h("h3", "Analyses"),
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
           ["Kind", (one) => one.kind],
           ["Begun", (one) => when(one.created_utc)],
-        ], [...whole.analyses].reverse(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
+        ], (whole.analyses ?? []).toReversed(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
           onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
     } catch (error) {
       replace(detail, problemText(error));
@@ -46,16 +66,24 @@ async function list(root, testId) {
     detail));
   if (chosen) choose(chosen);
   else replace(detail, h("p.quiet", "Results appear here once a test was measured."));
-  return events.on("result", (event) => event.test_id === chosen?.id && choose(chosen));
+  return events.on("result", (event) => { if (event.test_id === chosen?.id) choose(chosen); });
 }
 
+/**
+ * @param {HTMLElement} root
+ * @param {string} testId
+ * @param {string} analysisId
+ * @param {URLSearchParams} query
+ */
 async function show(root, testId, analysisId, query) {
   const result = await Result.open(testId, analysisId);
+  /** @type {Ends} */
   const ends = [];
+  const asked = Number(query.get("step") ?? NaN);
+  /** @type {State} */
   const state = {
-    step: Number(query.get("step") ?? NaN), field: query.get("field"), image: "reference", mode: "image", info: null, playing: null,
+    step: result.steps.includes(asked) ? asked : result.steps.at(-1) ?? null, field: query.get("field"), image: "reference", mode: "image", info: null, playing: null,
   };
-  if (!result.steps.includes(state.step)) state.step = result.steps.at(-1) ?? null;
 
   const map = new FieldMap("Field over the image of camera 1", (x, y, event) => screen.onpick(x, y, event));
   ends.push(() => map.close());
@@ -74,14 +102,13 @@ async function show(root, testId, analysisId, query) {
   const stage = h("div", map.view.root);
   const below = h("div");
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
+  /** @type {Viewer} */
   const screen = {
-    result, state, map, scale, stage, below, ends, probe, message,
+    result, state, map, scale, ends, probe, message,
     get step() { return state.step; },
     get info() { return state.info; },
     onpick: (x, y) => pick(x, y),
-    drawn: new Set(), // told after each change of step, field or scale
-    redraw: () => redraw(),
-    setStep: (n) => setStep(n),
+    drawn: new Set(),
   };
 
   async function drawFields() {
@@ -107,17 +134,18 @@ async function show(root, testId, analysisId, query) {
       return;
     }
     slider.max = String(Math.max(result.steps.length - 1, 0));
-    slider.value = String(result.steps.indexOf(state.step));
+    slider.value = String(result.steps.indexOf(state.step ?? NaN));
     slider.setAttribute("aria-valuetext", result.stepText(state.step));
-    stepText.textContent = `${result.stepText(state.step)} · ${result.steps.indexOf(state.step) + 1} of ${result.steps.length}`;
+    stepText.textContent = `${result.stepText(state.step)} · ${result.steps.indexOf(state.step ?? NaN) + 1} of ${result.steps.length}`;
     await drawFields();
-    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field)}`;
+    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field ?? "")}`;
     if (location.hash !== address && location.hash.startsWith(`#/results/${testId}/${analysisId}`)) history.replaceState(null, "", address);
     if (!state.info) {
       message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference, from which displacements are counted." : "choose another field."}`;
       const z = (await result.fields(state.step)).shown.find((one) => one.key === "z_mm");
       if (!z || !(await map.load(result, state.step, z, state.image))) return;
-      map.put(new Float32Array(map.now.values.length).fill(NaN), { ...z, key: state.field, text: state.field, unit: "" });
+      const none = String(state.field);
+      map.put(new Float32Array(map.now?.values.length ?? 0).fill(NaN), { ...z, key: none, text: none, unit: "" });
       await redraw();
       return;
     }
@@ -138,7 +166,7 @@ async function show(root, testId, analysisId, query) {
         const [grid, of] = await Promise.all([result.grid(n), result.values(n, info.key)]);
         each.push(measured(grid, of));
       }
-      if (map.now.info !== info) return;
+      if (map.now?.info !== info) return;
       if (each.length) values = each;
     }
     scale.lay(values, info.unit, info.flags, Boolean(info.signed));
@@ -151,18 +179,20 @@ async function show(root, testId, analysisId, query) {
     for (const listener of screen.drawn) await listener();
   }
 
+  /** @param {number | null} n */
   async function setStep(n) {
     state.step = n;
     await refresh();
   }
 
+  /** @param {boolean} on */
   async function playing(on) {
     play.setAttribute("aria-pressed", String(on));
     play.textContent = on ? "❚❚ Pause" : "▶ Play";
     const mine = on ? {} : null;
     state.playing = mine;
     while (state.playing === mine && mine && document.contains(play)) {
-      const at = (result.steps.indexOf(state.step) + 1) % result.steps.length;
+      const at = (result.steps.indexOf(state.step ?? NaN) + 1) % result.steps.length;
       const began = performance.now();
       try {
         await setStep(result.steps[at]);
@@ -175,19 +205,25 @@ async function show(root, testId, analysisId, query) {
     }
   }
 
+  /**
+   * @param {number} x
+   * @param {number} y
+   */
   async function pick(x, y) {
     const { i } = map.nearest(x, y);
-    if (i < 0) return;
+    if (i < 0 || !map.now || state.step === null) return;
     const { grid } = map.now;
     state.pinned = i;
     const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step });
     pinned(screen, answer);
   }
 
+  /** @type {Stand | null} */
   let other = null; // what stands in the place of the map: the surface, or two maps
+  /** @param {Mode} name */
   async function setMode(name) {
     state.mode = name;
-    for (const button of modes.children) button.setAttribute("aria-pressed", String(button.dataset.mode === name));
+    for (const button of modes.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.mode === name));
     if (other) {
       screen.drawn.delete(other.update);
       other.close();
@@ -198,6 +234,7 @@ async function show(root, testId, analysisId, query) {
       map.view.fit();
       return;
     }
+    /** @type {Stand} */
     const made = name === "surface" ? await (await import("./results/surface.js")).surface(screen) : await (await import("./results/compare.js")).compare(screen);
     if (state.mode !== name || other || !document.contains(stage)) {
       made.close();
@@ -212,18 +249,17 @@ async function show(root, testId, analysisId, query) {
   ends.push(() => other?.close());
 
   fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; scale.forget(); refresh().catch(notify); });
-  imageChoice.addEventListener("change", () => { state.image = imageChoice.value; refresh().catch(notify); });
+  imageChoice.addEventListener("change", () => { state.image = /** @type {Over} */ (imageChoice.value); refresh().catch(notify); });
   slider.addEventListener("input", () => setStep(result.steps[Number(slider.value)]).catch(notify));
-  const fade = () => { map.view.canvas.style.opacity = String(opacity.value / 100); };
+  const fade = () => { map.view.canvas.style.opacity = String(Number(opacity.value) / 100); };
   opacity.addEventListener("input", fade);
   fade();
-  const move = (by) => setStep(result.steps[Math.min(Math.max(result.steps.indexOf(state.step) + by, 0), result.steps.length - 1)]).catch(notify);
+  const move = (/** @type {number} */ by) => setStep(result.steps[Math.min(Math.max(result.steps.indexOf(state.step ?? NaN) + by, 0), result.steps.length - 1)]).catch(notify);
 
   function drawStatus() {
     const { analysis } = result;
-    const problem = analysis.problem ? Object.assign(new Error(analysis.problem.detail ?? analysis.problem.cause), analysis.problem) : null;
     replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]), analysis.stale ? badge("out of date", "warn") : null),
-      analysis.stale ? h("p", h("strong", "Out of date: "), analysis.stale_reasons.join("; ")) : null, problem ? problemText(problem) : null);
+      analysis.stale ? h("p", h("strong", "Out of date: "), (analysis.stale_reasons ?? []).join("; ")) : null, analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
   }
 
   replace(root,

@@ -5,11 +5,19 @@ import { View } from "../widgets/view.js";
 import { chart } from "../widgets/plots.js";
 import { h, replace, field, number, select, action, facts, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
+/** @import { Ends } from "#dom" */
+/** @import { Model } from "#routes" */
+/** @typedef {Model<"RigReply">} Rig */
+/** @typedef {Model<"StageReply">["axes"]} Axes */
+/** @typedef {Awaited<ReturnType<typeof chart>>} Chart */
+
 const CAMERAS = ["cam1", "cam2"];
 const COURSE = 120; // samples of the focus figure that are kept
 
+/** @param {HTMLElement} root */
 export async function open(root) {
   const rig = await api.get("/rig");
+  /** @type {Ends} */
   const ends = [];
   const cameras = CAMERAS.map((cam) => camera(cam, rig.cameras[cam], ends));
   const pair = h("dl.facts");
@@ -18,9 +26,10 @@ export async function open(root) {
   replace(root,
     h("div.spread", h("h1", rig.name || "Rig"), state),
     h("div.grid.two.views", cameras.map((one) => one.root)),
-    h("div.grid.side", { style: { marginTop: "var(--gap)" } }, stage(rig, ends), h("section.panel", h("h2", "Pairs"), pair, rig.sim ? scene(rig) : null)),
+    h("div.grid.side", { style: { marginTop: "var(--gap)" } }, stage(ends), h("section.panel", h("h2", "Pairs"), pair, rig.sim ? scene(rig) : null)),
   );
 
+  /** @type {{ at: number, paired: number } | null} */
   let last = null;
   async function look() {
     if (document.hidden) return;
@@ -28,15 +37,14 @@ export async function open(root) {
       const now = await api.get("/rig");
       const gone = CAMERAS.filter((cam) => now.cameras[cam].fault);
       replace(state, now.fault ? badge("fault", "bad") : gone.length ? badge(`without ${gone.join(" and ")}`, "bad") : badge(now.holder ? `in use: ${now.holder}` : "ready", now.holder ? "busy" : "good"),
-        now.fault ? [problemText(Object.assign(new Error(now.fault.cause ?? String(now.fault)), now.fault)), again] : gone.length ? again : null);
+        now.fault ? [problemText(api.problemOf(now.fault)), again] : gone.length ? again : null);
       const stats = await Promise.all(cameras.map((one) => one.look(now.cameras[one.cam])));
       const figures = stats.find(Boolean)?.pairs;
       if (figures) {
-        const seconds = last && figures.paired >= last.paired ? (performance.now() - last.at) / 1000 : null;
+        const rate = last && figures.paired >= last.paired ? (1000 * (figures.paired - last.paired)) / (performance.now() - last.at) : null;
         replace(pair, [...facts([
           ["paired", count(figures.paired)],
-          ["pairs a second", seconds ? num((figures.paired - last.paired) / seconds, 3) : "–"],
-          ["skew of the last", quantity(figures.skew_ms, "ms", 3)],
+          ["pairs a second", num(rate, 3)],
           ["skew allowed", quantity(now.max_skew_ms, "ms", 3)],
           ["unpaired", count(figures.unpaired)], ["dropped", count(figures.dropped)], ["incomplete", count(figures.incomplete)], ["refused", count(figures.refused)],
         ]).children]);
@@ -44,7 +52,7 @@ export async function open(root) {
       }
     } catch (error) {
       replace(state, badge("not known", "warn"));
-      if (error.status >= 500) replace(state, problemText(error), again);
+      if (error instanceof api.Problem && error.status >= 500) replace(state, problemText(error), again);
     }
   }
   look();
@@ -62,6 +70,11 @@ function reconnect() {
   });
 }
 
+/**
+ * @param {string} cam
+ * @param {Model<"CameraReply">} first
+ * @param {Ends} ends
+ */
 function camera(cam, first, ends) {
   const size = first.nominal?.image_size_px ?? [0, 0];
   const view = new View({
@@ -71,12 +84,12 @@ function camera(cam, first, ends) {
       return `grey ${pixel.value} of ${2 ** pixel.bit_depth - 1}`;
     },
   });
-  view.size(...size);
+  view.size(size[0], size[1]);
   const overlay = h("img", { alt: "", hidden: true });
   view.content.insertBefore(overlay, view.svg);
   const overlayChoice = select([["", "no overlay"], ["saturation", "saturated pixels"], ["texture", "texture quality"]], "", { "aria-label": `What is laid over ${cam}` });
   const legend = h("span.told", { hidden: true }); // over the picture: both cameras' stay at one height
-  let shownOverlay = null;
+  let shownOverlay = "";
   async function layOver() {
     const kind = overlayChoice.value;
     overlay.hidden = !kind;
@@ -102,6 +115,7 @@ function camera(cam, first, ends) {
   // a stream that ended leaves its last picture, and the browser does not say so: an old picture is not shown as a live one
   let dark = false;
   let severed = false;
+  /** @param {string} why */
   function lose(why) {
     dark = true;
     view.blank(`No picture: ${why}`);
@@ -123,34 +137,41 @@ function camera(cam, first, ends) {
   const trouble = h("div", { role: "alert" });
   const histogramPlace = h("div");
   const focusPlace = h("div");
+  /** @type {[number, number][]} time and focus */
   const course = [];
+  /** @type {Chart | null} */
   let histogram = null;
+  /** @type {Chart | null} */
   let focus = null;
+  /** @type {number | null} */
   let began = null;
 
   const exposure = number(first.settings?.exposure_ms, { min: 0, ...limits(first.device?.exposure_range_ms) });
   const gain = number(first.settings?.gain_db, limits(first.device?.gain_range_db));
   const taken = h("p.quiet", { role: "status" });
   const set = action("Set", async () => {
+    /** @type {Model<"SettingsPatch">} */
     const changes = {};
     if (exposure.value !== "") changes.exposure_ms = Number(exposure.value);
     if (gain.value !== "") changes.gain_db = Number(gain.value);
     const answer = await api.patch(`/cameras/${cam}`, changes);
-    exposure.value = answer.settings.exposure_ms ?? "";
-    gain.value = answer.settings.gain_db ?? "";
+    exposure.value = String(answer.settings.exposure_ms ?? "");
+    gain.value = String(answer.settings.gain_db ?? "");
     taken.textContent = `The camera took ${quantity(answer.settings.exposure_ms, "ms")} and ${quantity(answer.settings.gain_db, "dB")}.`;
   }, { kind: "primary" });
   for (const input of [exposure, gain]) input.addEventListener("keydown", (event) => event.key === "Enter" && set.click());
 
   ends.push(() => { view.close(); histogram?.close(); focus?.close(); if (shownOverlay) URL.revokeObjectURL(shownOverlay); });
 
+  /** @type {{ delivered: number, at: number } | null} */
   let counted = null;
   let rounds = 0;
+  /** @param {Rig["cameras"][string]} now */
   async function look(now) {
     const told = JSON.stringify(now?.fault ?? null);
     if (told !== trouble.dataset.told) { // said once, not every second
       trouble.dataset.told = told;
-      replace(trouble, now?.fault ? problemText(Object.assign(new Error(now.fault.cause), now.fault)) : null);
+      replace(trouble, now?.fault ? problemText(api.problemOf(now.fault)) : null);
     }
     if (now?.fault) {
       lose(now.fault.cause);
@@ -164,8 +185,9 @@ function camera(cam, first, ends) {
       stats = await api.get(`/cameras/${cam}/stats`);
       regain();
     } catch (error) {
-      if (error.status >= 500) lose(error.message);
-      replace(figures, facts([["not known", error.message]]).children);
+      if (!(error instanceof Error)) throw error;
+      if (error instanceof api.Problem && error.status >= 500) lose(error.message);
+      replace(figures, [...facts([["not known", error.message]]).children]);
       return null;
     }
     const q = stats.quality;
@@ -174,8 +196,8 @@ function camera(cam, first, ends) {
     course.push([at, q.focus]);
     if (course.length > COURSE) course.shift();
     replace(quality, badge(q.code, STATE_KIND[q.code] ?? "warn"));
-    const goesOn = counted && stats.frames.delivered >= counted.delivered; // a camera that was set anew counts from zero
-    const rate = goesOn ? (stats.frames.delivered - counted.delivered) / ((performance.now() - counted.at) / 1000) : null;
+    // a camera that was set anew counts from zero
+    const rate = counted && stats.frames.delivered >= counted.delivered ? (stats.frames.delivered - counted.delivered) / ((performance.now() - counted.at) / 1000) : null;
     counted = { delivered: stats.frames.delivered, at: performance.now() };
     replace(figures, [...facts([
       ["frame rate", quantity(rate, "Hz", 3)], ["mean grey", num(q.mean_grey, 4)], ["saturated", quantity(100 * q.saturated_share, "%", 3)],
@@ -186,6 +208,7 @@ function camera(cam, first, ends) {
     if (!histogram && histogramPlace.clientWidth) {
       histogram = await chart(histogramPlace, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
     } else histogram?.set([bins, stats.histogram]);
+    /** @type {[number[], number[]]} */
     const courseData = [course.map((p) => p[0]), course.map((p) => p[1])];
     if (!focus && focusPlace.clientWidth && course.length > 1) {
       focus = await chart(focusPlace, { x: "time (s)", y: "focus", height: 130, series: [{ label: "focus" }], data: courseData, label: `Recent course of the focus figure of ${cam}` });
@@ -195,6 +218,7 @@ function camera(cam, first, ends) {
     return stats;
   }
 
+  /** @type {Partial<NonNullable<typeof first.device>>} */
   const device = first.device ?? {};
   const box = h("section.panel", { "aria-label": cam },
     h("div.spread", h("h2", cam, " ", h("span.quiet", [device.model, device.serial].filter(Boolean).join(" · "))), quality),
@@ -207,16 +231,20 @@ function camera(cam, first, ends) {
   return { cam, root: box, look };
 }
 
-const limits = (pair) => (pair ? { min: pair[0], max: pair[1] } : {});
-const range = (pair, name) => (pair ? `${num(pair[0], 3)} to ${num(pair[1], 4)} ${name}` : "");
+/** @typedef {readonly number[] | null | undefined} Span low and high */
+const limits = (/** @type {Span} */ pair) => (pair ? { min: pair[0], max: pair[1] } : {});
+const range = (/** @type {Span} */ pair, /** @type {string} */ name) => (pair ? `${num(pair[0], 3)} to ${num(pair[1], 4)} ${name}` : "");
 
-function stage(rig, ends) {
+/** @param {Ends} ends */
+function stage(ends) {
   const rows = h("div");
   const step = number(1, { min: 0.001, "aria-label": "Step of the jog buttons" });
+  /** @type {Axes} */
   let axes = [];
 
-  async function run(path, body) {
-    const { job } = await api.post(path, body);
+  /** @param {Promise<Model<"Accepted">>} asked */
+  async function run(asked) {
+    const { job } = await asked;
     const ended = await api.finished(job.id);
     await look();
     if (ended.state !== "succeeded") throw api.jobProblem(ended);
@@ -225,19 +253,19 @@ function stage(rig, ends) {
   function draw() {
     replace(rows, axes.map((axis) => {
       const target = number(null, { min: axis.limits?.low_mm, max: axis.limits?.high_mm, placeholder: num(axis.position_mm, 5) });
-      const go = action("Go", () => run("/stage/moves", { positions_mm: { [axis.axis]: Number(target.value) } }));
+      const go = action("Go", () => run(api.post("/stage/moves", { positions_mm: { [axis.axis]: Number(target.value) } })));
       target.addEventListener("keydown", (event) => event.key === "Enter" && go.click());
-      const jog = (sign) => action(sign < 0 ? "◂ −" : "+ ▸", () => run("/stage/moves", { by_mm: { [axis.axis]: sign * Number(step.value) } }), { "aria-label": `Jog axis ${axis.axis} ${sign < 0 ? "back" : "forth"}` });
+      const jog = (/** @type {1 | -1} */ sign) => action(sign < 0 ? "◂ −" : "+ ▸", () => run(api.post("/stage/moves", { by_mm: { [axis.axis]: sign * Number(step.value) } })), { "aria-label": `Jog axis ${axis.axis} ${sign < 0 ? "back" : "forth"}` });
       return h("fieldset", { "data-axis": axis.axis },
         h("legend", `Axis ${axis.axis}${axis.cameras?.length ? ` · ${axis.cameras.join(", ")}` : ""}`),
         h("div.row", h("strong", { "data-role": "position" }, quantity(axis.position_mm, "mm", 6)), h("span", { "data-role": "state" }, stateBadge(axis)),
           h("span.quiet", axis.limits ? `${num(axis.limits.low_mm, 4)} to ${num(axis.limits.high_mm, 4)} mm` : "")),
         h("div.row", jog(-1), jog(1), h("label", { for: `target${axis.axis}` }, "to"), Object.assign(target, { id: `target${axis.axis}` }), h("span.unit", "mm"), go,
-          action("Home", () => run("/stage/home", { axes: [axis.axis] }))));
+          action("Home", () => run(api.post("/stage/home", { axes: [axis.axis] })))));
     }));
   }
 
-  const stateBadge = (axis) => badge(axis.moving ? "moving" : axis.homed === false ? "not homed" : axis.state, axis.moving ? "busy" : axis.homed === false ? "warn" : (STATE_KIND[axis.state] ?? ""));
+  const stateBadge = (/** @type {Axes[number]} */ axis) => badge(axis.moving ? "moving" : axis.homed === false ? "not homed" : axis.state, axis.moving ? "busy" : axis.homed === false ? "warn" : (STATE_KIND[axis.state] ?? ""));
 
   async function look() {
     if (document.hidden) return;
@@ -250,9 +278,9 @@ function stage(rig, ends) {
       } else {
         axes = fresh;
         for (const axis of axes) { // what is being typed stays
-          const box = rows.querySelector(`[data-axis="${axis.axis}"]`);
-          box.querySelector('[data-role="position"]').textContent = quantity(axis.position_mm, "mm", 6);
-          replace(box.querySelector('[data-role="state"]'), stateBadge(axis));
+          const shown = (/** @type {string} */ role) => /** @type {HTMLElement} */ (rows.querySelector(`[data-axis="${axis.axis}"] [data-role="${role}"]`));
+          shown("position").textContent = quantity(axis.position_mm, "mm", 6);
+          replace(shown("state"), stateBadge(axis));
         }
       }
       if (!axes.length) replace(rows, h("p.quiet", now.fault?.cause ?? "This rig has no stage."));
@@ -265,14 +293,14 @@ function stage(rig, ends) {
   const timer = setInterval(look, 700);
   ends.push(() => clearInterval(timer), events.on("stage", look));
   return h("section.panel", h("h2", "Stage"), h("div.fields", field("Jog step", step, "mm")), rows,
-    h("div.row", action("Home all", () => run("/stage/home", {})), h("span.quiet", "The red button stops every axis at once; so does Esc, pressed twice.")));
+    h("div.row", action("Home all", () => run(api.post("/stage/home", {}))), h("span.quiet", "The red button stops every axis at once; so does Esc, pressed twice.")));
 }
 
+/** @param {Rig} rig */
 function scene(rig) {
-  const now = rig.scene ?? {};
-  const which = select(["grid", "steel", "plate", "panel", "block", "strip", "sphere"].map((s) => [s, s]), now.scene);
-  const load = number(now.load ?? 0);
+  const which = select(["grid", "steel", "plate", "panel", "block", "strip", "sphere"].map((s) => [s, s]), rig.scene?.scene);
+  const load = number(rig.scene?.load ?? 0);
   return h("details", h("summary", "Simulated scene"),
     field("Scene", which), field("Load", load, "", "kPa for plate, kN for panel, per cent for strip, share of the motion for block"),
-    action("Show it", () => api.put("/sim/scene", { scene: which.value, load: Number(load.value) })));
+    action("Show it", () => api.put("/sim/scene", { scene: /** @type {Model<"SceneRequest">["scene"]} */ (which.value), load: Number(load.value) })));
 }

@@ -6,27 +6,36 @@ import { factsPanel } from "./test/facts.js";
 import { measurePanel } from "./test/measure.js";
 import { h, replace, field, select, action, table, when, notify } from "../lib/dom.js";
 
+/** @import { Here } from "../main.js" */
+/** @import { Ends } from "#dom" */
+/** @import { Reply } from "#routes" */
+
+/**
+ * @param {HTMLElement} root
+ * @param {Here} here
+ */
 export async function open(root, { path }) {
   return path[0] ? one(root, path[0]) : all(root);
 }
 
 /** Calibrations to choose from: the newest accepted one first, then the newest. */
-export async function calibrationChoice(chosen, attributes = {}) {
+async function calibrationChoice() {
   const usable = (await api.get("/calibrations")).calibrations.filter((c) => c.state === "complete" && c.decision !== "discarded").toReversed();
   const first = usable.find((c) => c.decision === "accepted") ?? usable[0];
-  const text = (c) => `${c.label || c.id} · ${c.verdict?.level ?? "imported"}${c.decision === "accepted" ? " · accepted" : ""} · ${when(c.created_utc)}`;
-  return select([...usable.map((c) => [c.id, text(c)]), ["", "none: images only"]], chosen ?? first?.id ?? "", attributes);
+  const text = (/** @type {Reply<"get", "/calibrations">["calibrations"][number]} */ c) => `${c.label || c.id} · ${c.verdict?.level ?? "imported"}${c.decision === "accepted" ? " · accepted" : ""} · ${when(c.created_utc)}`;
+  return select([...usable.map((c) => [c.id, text(c)]), ["", "none: images only"]], first?.id ?? "");
 }
 
+/** @param {HTMLElement} root */
 async function all(root) {
   const name = h("input", { type: "text", maxlength: 300, required: true });
   const specimen = h("input", { type: "text", maxlength: 300 });
   const notes = h("textarea", { rows: 2, maxlength: 20000 });
-  const calibration = await calibrationChoice(null);
+  const calibration = await calibrationChoice();
   const make = action("Make the test", async () => {
     if (!name.value.trim()) {
       name.focus();
-      throw Object.assign(new Error("The test has no name."), { remedy: "Give it one; it can be changed later." });
+      throw api.problemOf({ cause: "The test has no name.", remedy: "Give it one; it can be changed later." });
     }
     const made = await api.post("/tests", { name: name.value.trim(), specimen: specimen.value, notes: notes.value, calibration_id: calibration.value || null });
     location.hash = `#/test/${made.id}`;
@@ -46,7 +55,12 @@ async function all(root) {
   return events.on("test", () => refresh().catch(notify));
 }
 
+/**
+ * @param {HTMLElement} root
+ * @param {string} id
+ */
 async function one(root, id) {
+  /** @type {Ends} */
   const ends = [];
   let test = await api.get(`/tests/${id}`);
   const head = h("section.panel");
@@ -68,12 +82,13 @@ async function one(root, id) {
     ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
   }
   const title = h("h1", test.name);
-  const steps = await stepsPanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); return test; });
+  const steps = stepsPanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); return test; });
   const measure = await measurePanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); drawAnalyses(); });
-  steps.onchange = (fresh) => { test = fresh; measure.steps(fresh); };
+  steps.onchange((/** @type {typeof test} */ fresh) => { test = fresh; measure.steps(fresh); });
   drawHead();
   drawAnalyses();
-  let later = null;
+  /** @type {number | undefined} */
+  let later;
   ends.push(
     events.on("step", (event) => {
       if (event.test_id !== id) return;

@@ -4,8 +4,18 @@ import { View } from "./view.js";
 import { num, quantity } from "../lib/dom.js";
 import { greyOf } from "./grey.js";
 import { statistics } from "../lib/point_grid.js";
+/** @import { Result, Shown } from "../screens/results/analysis.js" */
+/** @import { Grid, Raster } from "../lib/point_grid.js" */
+/** @import { Scale } from "./scale.js" */
+/** @typedef {"reference" | "cam1" | "cam2"} Over the image that a field is laid over */
+/** @typedef {{ result: Result, n: number, info: Shown, image: Over, grid: Grid, values: ArrayLike<number>, sigma: ArrayLike<number> | null,
+ *   places: ArrayLike<number> | null, statistics: ReturnType<typeof statistics>, withSigma: Promise<unknown> }} Now what is shown */
 
-/** Values of the points that were measured. */
+/**
+ * Values of the points that were measured.
+ * @param {Grid} grid
+ * @param {ArrayLike<number>} values
+ */
 export function measured(grid, values) {
   const out = new Float64Array(values.length);
   let count = 0;
@@ -14,13 +24,23 @@ export function measured(grid, values) {
 }
 
 export class FieldMap {
-  /** @param {string} label for those who do not see it; `onpick(x, y, event)` hears clicks and the Enter key, in the pixels of the picture shown */
+  /**
+   * @param {string} label for those who do not see it
+   * @param {((x: number, y: number, event: Event) => void) | null} onpick hears clicks and the Enter key, in the pixels of the picture shown
+   */
   constructor(label, onpick = null) {
     this.view = new View({ label, grey: (x, y) => this.#under(x, y), onpick: (x, y, event) => onpick?.(x, y, event) });
     this.view.canvas.dataset.role = "map";
+    /** @type {Now | null} */
     this.now = null;
     this.asked = 0;
-    this.canvasSize = null;
+    this.noImage = false;
+    this.address = "";
+    /** @type {Raster | null} */
+    this.raster = null;
+    this.size = ""; // of the picture that the raster was made for
+    /** @type {Scale | null} */
+    this.scale = null;
     this.view.image.addEventListener("load", () => { this.noImage = false; this.redraw(); });
     this.view.image.addEventListener("error", () => {
       if (!this.view.image.getAttribute("src")) return;
@@ -36,10 +56,10 @@ export class FieldMap {
 
   /**
    * Read what is to be shown.
-   * @param {import("../screens/results/analysis.js").Result} result
+   * @param {Result} result
    * @param {number} n step
-   * @param {object} info entry of `result.fields`
-   * @param {string} image "reference", "cam1" or "cam2"
+   * @param {Shown} info entry of `result.fields`
+   * @param {Over} image
    * @returns {Promise<boolean>} false if something newer was asked for meanwhile
    */
   async load(result, n, info, image) {
@@ -59,7 +79,8 @@ export class FieldMap {
       this.address = address;
       this.view.show(address);
     }
-    const now = { result, n, info, image, grid, values, sigma: null, places, statistics: statistics(grid, values) };
+    /** @type {Now} */
+    const now = { result, n, info, image, grid, values, sigma: null, places, statistics: statistics(grid, values), withSigma: Promise.resolve() };
     this.now = now;
     // what the picture does not need may come after it
     now.withSigma = result.sigma(n, info.key).then((sigma) => { if (now.info === info) now.sigma = sigma; return sigma; }, () => null);
@@ -68,15 +89,21 @@ export class FieldMap {
     return true;
   }
 
-  /** Show other values on the same points (a difference). */
+  /**
+   * Show other values on the same points (a difference).
+   * @param {ArrayLike<number>} values
+   * @param {Shown} info
+   * @param {ArrayLike<number> | null} sigma
+   */
   put(values, info, sigma = null) {
-    Object.assign(this.now, { values, info, sigma, statistics: statistics(this.now.grid, values) });
+    const { now } = this;
+    if (now) Object.assign(now, { values, info, sigma, statistics: statistics(now.grid, values) });
     this.raster = null;
   }
 
   /** Measured values, for the colour scale. */
   get measured() {
-    if (!this.now) return [];
+    if (!this.now) return new Float64Array();
     const { grid, values } = this.now;
     return measured(grid, values);
   }
@@ -102,33 +129,50 @@ export class FieldMap {
     this.view.root.dispatchEvent(new CustomEvent("drawn"));
   }
 
-  /** Number of the point nearest to a place in the picture shown, and how far off it is, px. */
+  /**
+   * Number of the point nearest to a place in the picture shown, and how far off it is, px.
+   * @param {number} x
+   * @param {number} y
+   */
   nearest(x, y) {
+    if (!this.now) return { i: -1, distance: Infinity };
     const { grid, places } = this.now;
     const i = places ? grid.nearestOf(places, x, y) : grid.nearest(x, y);
     if (i < 0) return { i, distance: Infinity };
-    const at = places ? [places[2 * i], places[2 * i + 1]] : [grid.x[i], grid.y[i]];
+    const at = this.placeOf(i);
     return { i, distance: Math.hypot(at[0] - x, at[1] - y) };
   }
 
-  /** Where a point lies in the picture shown. */
+  /**
+   * Where a point lies in the picture shown.
+   * @param {number} i
+   * @returns {[number, number]}
+   */
   placeOf(i) {
+    if (!this.now) return [NaN, NaN];
     const { grid, places } = this.now;
     return places ? [places[2 * i], places[2 * i + 1]] : [grid.x[i], grid.y[i]];
   }
 
+  /**
+   * @param {number} column
+   * @param {number} row
+   */
   async #under(column, row) {
     const hover = this.view.hover;
     if (!hover || !this.now) return null;
     const { result, n, image } = this.now;
     const [step, cam] = image === "reference" ? [result.reference, "cam1"] : [n, image];
-    const said = this.#value(hover);
+    const said = this.#value(this.now, hover);
     const grey = await greyOf({ test: result.testId, step, cam }, column, row).catch(() => null); // its image may be gone
     return [said, grey].filter(Boolean).join("   ") || null;
   }
 
-  #value(hover) {
-    const { grid, values, sigma, info } = this.now;
+  /**
+   * @param {Now} now
+   * @param {{ x: number, y: number }} hover
+   */
+  #value({ grid, values, sigma, info }, hover) {
     const { i, distance } = this.nearest(hover.x, hover.y);
     const step = Math.max(Math.abs(grid.dx), Math.abs(grid.dy));
     if (i < 0 || distance > 1.5 * step) return null;

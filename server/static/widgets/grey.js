@@ -5,21 +5,37 @@ import { num } from "../lib/dom.js";
 const TILE = 64;
 const MOST = 256; // tiles that are kept
 
+/** @import { Reply } from "#routes" */
+/** @typedef {{ test: string, step: number, cam: string }} StepImage */
+/** @typedef {Reply<"get", "/tests/{test_id}/steps/{n}/{cam}/pixels">} Pixels */
+
+/** @type {Map<string, Promise<Pixels>>} */
 const tiles = new Map();
 
+/**
+ * @param {StepImage} image
+ * @param {number} column
+ * @param {number} row
+ */
 function tile(image, column, row) {
-  const path = `/tests/${image.test}/steps/${image.step}/${image.cam}/pixels`;
+  const path = /** @type {const} */ (`/tests/${image.test}/steps/${image.step}/${image.cam}/pixels`);
   const query = { x_px: column * TILE, y_px: row * TILE, columns: TILE, rows: TILE };
   const key = api.address(path, query);
   const held = tiles.get(key) ?? api.get(path, query);
   tiles.delete(key); // what was used last is dropped last
   tiles.set(key, held);
   held.catch(() => tiles.delete(key));
-  if (tiles.size > MOST) tiles.delete(tiles.keys().next().value);
+  const [oldest] = tiles.keys();
+  if (tiles.size > MOST) tiles.delete(oldest);
   return held;
 }
 
-/** Text about a pixel of a step's image: image is {test, step, cam}. */
+/**
+ * Text about a pixel of a step's image.
+ * @param {StepImage} image
+ * @param {number} x
+ * @param {number} y
+ */
 export async function greyOf(image, x, y) {
   const { values, grey_scale: scale, full_scale: full } = await tile(image, Math.floor(x / TILE), Math.floor(y / TILE));
   const value = values[y % TILE]?.[x % TILE];

@@ -1,6 +1,9 @@
 // Line plots: uPlot with this page's colours, loaded when the first one is drawn.
 import { num, tick, h } from "../lib/dom.js";
 
+/** @import uPlot from "uplot" */
+
+/** @type {typeof uPlot | null} */
 let library = null;
 async function uplot() {
   if (!library) {
@@ -10,9 +13,16 @@ async function uplot() {
   return library;
 }
 
-/** As wide as the longest number of an axis needs, so that its name stands beside and not over it. */
+/**
+ * As wide as the longest number of an axis needs, so that its name stands beside and not over it.
+ * @param {uPlot} plot
+ * @param {string[] | null} values
+ * @param {number} index
+ * @param {number} cycle
+ */
 function wide(plot, values, index, cycle) {
-  const axis = plot.axes[index];
+  // what uPlot keeps of an axis beyond its types
+  const axis = /** @type {any} */ (plot.axes[index]);
   if (cycle > 1) return axis._size; // it may not go on for ever
   const longest = (values ?? []).reduce((most, one) => (one.length > most.length ? one : most), "");
   plot.ctx.font = axis.font[0];
@@ -31,21 +41,28 @@ function axes() {
   const grid = getComputedStyle(faint).color;
   probe.remove();
   faint.remove();
-  return (text) => ({ label: text, labelSize: 18, labelGap: 0, stroke: soft, size: 50, font: `12px ${css.fontFamily}`, labelFont: `12px ${css.fontFamily}`,
+  /** @returns {uPlot.Axis} */
+  return (/** @type {string} */ text) => ({ label: text, labelSize: 18, labelGap: 0, stroke: soft, size: 50, font: `12px ${css.fontFamily}`, labelFont: `12px ${css.fontFamily}`,
     grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, values: (_, ticks) => ticks.map(tick) });
 }
 
 /**
  * Draw into `place`; returns {set(data), close()}.
+ * @param {HTMLElement} place
  * @param {object} options
  * @param {string} options.x name and unit of the abscissa
  * @param {string} options.y name and unit of the ordinate
  * @param {{label: string, points?: boolean, dots?: boolean, edge?: boolean, colour?: number}[]} options.series `edge`: of a band, without a line of its own
  * @param {boolean|boolean[]} [options.bars] whether (which of) the series are bars
+ * @param {number} [options.height]
+ * @param {uPlot.AlignedData} options.data
+ * @param {string} [options.label] what the plot shows, for those who do not see it
  * @param {number[][]} [options.bands] pairs of series (counted from 1) between which the ground is shaded
  */
 export async function chart(place, { x, y, series, height = 200, data, bars = false, bands = [], label }) {
   const Plot = await uplot();
+  const isBar = (/** @type {number} */ index) => (Array.isArray(bars) ? bars[index] : bars);
+  /** @returns {uPlot.Options} */
   const options = () => {
     const axis = axes();
     return {
@@ -60,9 +77,9 @@ export async function chart(place, { x, y, series, height = 200, data, bars = fa
         ...series.map((one, index) => {
           const colour = COLOURS[(one.colour ?? index) % COLOURS.length];
           return {
-            label: one.label, class: one.edge ? "edge" : null, stroke: colour, width: one.points || one.edge ? 0 : 1.5, points: { show: Boolean(one.points || one.dots), size: 5 },
-            value: (_, v) => num(v, 5), spanGaps: false, paths: (bars[index] ?? bars) === true ? Plot.paths.bars({ size: [1, 100] }) : undefined,
-            fill: (bars[index] ?? bars) === true ? `${colour}99` : undefined,
+            label: one.label, class: one.edge ? "edge" : undefined, stroke: colour, width: one.points || one.edge ? 0 : 1.5, points: { show: Boolean(one.points || one.dots), size: 5 },
+            value: (/** @type {uPlot} */ _, /** @type {number | null} */ v) => num(v, 5), spanGaps: false, paths: isBar(index) ? Plot.paths.bars?.({ size: [1, 100] }) : undefined,
+            fill: isBar(index) ? `${colour}99` : undefined,
           };
         }),
       ],
@@ -86,7 +103,7 @@ export async function chart(place, { x, y, series, height = 200, data, bars = fa
   const observer = new ResizeObserver(() => place.clientWidth > 0 && plot.setSize({ width: place.clientWidth, height }));
   observer.observe(place);
   return {
-    set: (next) => { now = next; plot.setData(next); },
+    set: (/** @type {uPlot.AlignedData} */ next) => { now = next; plot.setData(next); },
     close: () => {
       observer.disconnect();
       window.removeEventListener("themechange", recolour);

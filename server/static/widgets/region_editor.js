@@ -2,8 +2,16 @@
 //
 // Everything is kept in camera 1's pixels, the first pixel's centre at (0, 0), to a tenth of a pixel.
 import { h, svg, replace, num } from "../lib/dom.js";
-import { stroke } from "./view.js";
+import { nudge, onGrab, stroke } from "./view.js";
+/** @import { View, Place } from "./view.js" */
+/** @import { Model } from "#routes" */
+/** @typedef {[x: number, y: number]} Spot */
+/** @typedef {{ form: "rectangle" | "polygon", points: Spot[] }} Outline a rectangle by two opposite corners */
+/** @typedef {{ outline: Outline | null, holes: Spot[][], cracks: Spot[][], seeds: { one: Spot, two: Spot | null }[] }} State */
+/** @typedef {"move" | "rectangle" | "polygon" | "hole" | "crack" | "seed"} Tool */
+/** @typedef {{ kind: "rectangle", points: [Spot, Spot] } | { kind: keyof typeof LEAST, points: Spot[] }} Draft what is being drawn */
 
+/** @type {[tool: Tool, text: string, title: string][]} */
 const TOOLS = [
   ["move", "Move", "Drag corners; arrow keys move the corner in focus, Delete removes it"],
   ["rectangle", "Rectangle", "Drag from corner to corner"],
@@ -14,7 +22,7 @@ const TOOLS = [
 ];
 const KEYS = "By keyboard: arrow keys move the cross-hair (Shift 10 px, Alt 0.1 px), Enter sets a point, Enter there again ends, Escape leaves.";
 const COLOUR = { outline: "#ffd23e", hole: "#ff6a5c", crack: "#ff3df2", seed: "#33e0a0", draft: "#ffffff" };
-const round = (value) => Math.round(value * 10) / 10;
+const round = (/** @type {number} */ value) => Math.round(value * 10) / 10;
 const LEAST = { outline: 3, hole: 3, crack: 2 };
 
 export class RegionEditor {
@@ -27,16 +35,23 @@ export class RegionEditor {
     this.one = one;
     this.two = two;
     this.onchange = onchange;
+    /** @type {State} */
     this.state = { outline: null, holes: [], cracks: [], seeds: [] };
+    /** @type {string[]} states as JSON */
     this.past = [];
+    /** @type {string[]} */
     this.future = [];
+    /** @type {Draft | null} */
     this.draft = null;
+    /** @type {Spot | null} */
     this.tip = null; // where the keyboard's cross-hair is while something is drawn
+    /** @type {Tool} */
     this.tool = "move";
+    /** @type {Model<"SeedsReply">["seeds"]} */
     this.lines = []; // epipolar line of each seed in camera 2
     this.layer = svg("g", { "data-role": "region" });
     this.layer2 = svg("g", { "data-role": "seeds2" });
-    for (const [view, layer, label] of [[one, this.layer, "Region"], [two, this.layer2, "Seeds"]]) {
+    for (const [view, layer, label] of /** @type {[View, SVGElement, string][]} */ ([[one, this.layer, "Region"], [two, this.layer2, "Seeds"]])) {
       view.svg.append(layer);
       view.svg.removeAttribute("aria-hidden");
       view.svg.setAttribute("role", "group");
@@ -59,7 +74,10 @@ export class RegionEditor {
     this.draw();
   }
 
-  /** Take a tool; who took it by keyboard goes on over the picture. */
+  /**
+   * Take a tool; who took it by keyboard goes on over the picture.
+   * @param {Tool} tool
+   */
   use(tool, byKey = false) {
     this.tool = tool;
     this.draft = null;
@@ -68,7 +86,7 @@ export class RegionEditor {
     for (const view of [this.one, this.two]) if (!view.drawing && view.aim) view.setAim(null);
     if (byKey && this.one.drawing) this.one.frame.focus();
     TOOLS.forEach(([name], index) => this.buttons[index].setAttribute("aria-pressed", String(name === tool)));
-    this.hint.textContent = `${TOOLS.find(([name]) => name === tool)[2]}. ${tool === "move" ? "" : KEYS}`;
+    this.hint.textContent = `${TOOLS.find(([name]) => name === tool)?.[2]}. ${tool === "move" ? "" : KEYS}`;
     this.draw();
   }
 
@@ -80,6 +98,7 @@ export class RegionEditor {
     this.future = [];
   }
 
+  /** @param {(state: State) => unknown} edit */
   change(edit) {
     this.#keep();
     edit(this.state);
@@ -92,16 +111,18 @@ export class RegionEditor {
       this.draw();
       return;
     }
-    if (!this.past.length) return;
+    const last = this.past.pop();
+    if (last === undefined) return;
     this.future.push(JSON.stringify(this.state));
-    this.state = JSON.parse(this.past.pop());
+    this.state = JSON.parse(last);
     this.#changed();
   }
 
   redo() {
-    if (!this.future.length) return;
+    const next = this.future.pop();
+    if (next === undefined) return;
     this.past.push(JSON.stringify(this.state));
-    this.state = JSON.parse(this.future.pop());
+    this.state = JSON.parse(next);
     this.#changed();
   }
 
@@ -111,14 +132,9 @@ export class RegionEditor {
     this.onchange();
   }
 
-  set(state) {
-    this.#keep();
-    this.state = state;
-    this.#changed();
-  }
-
   // what the API takes
 
+  /** @returns {Model<"Region"> | null} */
   region() {
     const { outline, holes, cracks } = this.state;
     if (!outline) return null;
@@ -129,13 +145,17 @@ export class RegionEditor {
     return { ...region, holes, cracks };
   }
 
+  /** @returns {{ seeds?: Spot[], seeds_cam2?: (Spot | null)[] }} */
   seeds() {
     const { seeds } = this.state;
     if (!seeds.length) return {};
     return { seeds: seeds.map((seed) => seed.one), ...(seeds.some((seed) => seed.two) ? { seeds_cam2: seeds.map((seed) => seed.two) } : {}) };
   }
 
-  /** Middle of the region, where samples are shown. */
+  /**
+   * Middle of the region, where samples are shown.
+   * @returns {Spot}
+   */
   middle() {
     const outline = this.#corners(this.state.outline);
     if (!outline.length) return [this.one.width / 2, this.one.height / 2];
@@ -143,6 +163,10 @@ export class RegionEditor {
     return [(Math.min(...xs) + Math.max(...xs)) / 2, (Math.min(...ys) + Math.max(...ys)) / 2];
   }
 
+  /**
+   * @param {Outline | null} outline
+   * @returns {Spot[]}
+   */
   #corners(outline) {
     if (!outline) return [];
     if (outline.form !== "rectangle") return outline.points;
@@ -150,15 +174,20 @@ export class RegionEditor {
     return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]];
   }
 
+  /**
+   * @param {readonly number[]} at
+   * @returns {Spot}
+   */
   #inside([x, y], view = this.one) {
     return [round(Math.min(Math.max(x, 0), view.width - 1)), round(Math.min(Math.max(y, 0), view.height - 1))];
   }
 
   // mouse, and the cross-hair that keys move
 
+  /** @param {Place | null} aim */
   #aimed(aim) {
     this.tip = aim && this.#inside([aim.x, aim.y]);
-    if (this.draft?.kind === "rectangle" && aim) this.draft.points[1] = this.tip;
+    if (this.draft?.kind === "rectangle" && this.tip) this.draft.points[1] = this.tip;
     if (this.draft) this.draw();
   }
 
@@ -167,15 +196,20 @@ export class RegionEditor {
     const open = this.state.seeds.findLastIndex((seed) => !seed.two);
     if (open < 0) return null;
     const [x, y] = this.state.seeds[open].one;
-    const away = (p) => Math.hypot(p[0] - x, p[1] - y);
+    const away = (/** @type {readonly number[]} */ p) => Math.hypot(p[0] - x, p[1] - y);
     const course = this.lines[open]?.line_px ?? [];
     const [u, v] = course.length ? course.reduce((a, b) => (away(b) < away(a) ? b : a)) : [x, y];
     return { x: u, y: v };
   }
 
+  /**
+   * @param {number} x
+   * @param {number} y
+   * @param {Event} event
+   */
   #pick(x, y, event) {
     const place = this.#inside([x, y]);
-    const byKey = event?.type === "keydown";
+    const byKey = event.type === "keydown";
     if (this.tool === "seed") {
       this.change((state) => state.seeds.push({ one: place, two: null }));
       if (byKey) {
@@ -196,19 +230,26 @@ export class RegionEditor {
       this.draw();
       return;
     }
-    if (!["polygon", "hole", "crack"].includes(this.tool)) return;
-    if (!this.draft) this.draft = { kind: this.tool === "polygon" ? "outline" : this.tool, points: [] };
-    const first = this.draft.points[0];
+    if (this.tool !== "polygon" && this.tool !== "hole" && this.tool !== "crack") return;
+    this.draft ??= { kind: this.tool === "polygon" ? "outline" : this.tool, points: [] };
+    const { kind, points } = this.draft;
+    if (kind === "rectangle") return;
+    const first = points[0];
     const near = first && Math.hypot(first[0] - place[0], first[1] - place[1]) * this.one.scale < 9;
-    const last = this.draft.points.at(-1);
+    const last = points.at(-1);
     const twice = last && Math.hypot(last[0] - place[0], last[1] - place[1]) * this.one.scale < 3;
-    if ((near && this.draft.kind !== "crack" && this.draft.points.length >= 3) || (twice && this.draft.points.length >= LEAST[this.draft.kind])) this.finish();
+    if ((near && kind !== "crack" && points.length >= 3) || (twice && points.length >= LEAST[kind])) this.finish();
     else if (!twice) {
-      this.draft.points.push(place);
+      points.push(place);
       this.draw();
     }
   }
 
+  /**
+   * @param {number} x
+   * @param {number} y
+   * @param {Event} event
+   */
   #pick2(x, y, event) {
     if (this.tool !== "seed") return;
     const place = this.#inside([x, y], this.two);
@@ -218,14 +259,14 @@ export class RegionEditor {
       return;
     }
     this.change((state) => { state.seeds[open].two = place; });
-    if (event?.type === "keydown") {
+    if (event.type === "keydown") {
       this.two.setAim(null);
       this.one.frame.focus();
     }
   }
 
   finish() {
-    if (!this.draft) return;
+    if (!this.draft || this.draft.kind === "rectangle") return;
     const { kind, points } = this.draft;
     if (points.length < LEAST[kind]) {
       this.hint.textContent = `It needs ${LEAST[kind]} points or more.`;
@@ -234,15 +275,16 @@ export class RegionEditor {
     this.draft = null;
     this.change((state) => {
       if (kind === "outline") state.outline = { form: "polygon", points };
-      else state[`${kind}s`].push(points);
+      else state[kind === "hole" ? "holes" : "cracks"].push(points);
     });
   }
 
   #drag() {
     const frame = this.one.frame;
+    /** @type {Spot | null} */
     let from = null;
     frame.addEventListener("pointerdown", (event) => {
-      if (this.tool !== "rectangle" || event.button !== 0 || event.target.closest(".grab")) return;
+      if (this.tool !== "rectangle" || event.button !== 0 || onGrab(event)) return;
       event.stopImmediatePropagation();
       event.preventDefault();
       frame.focus();
@@ -270,6 +312,7 @@ export class RegionEditor {
     frame.addEventListener("pointercancel", () => { from = null; this.draft = null; this.draw(); });
   }
 
+  /** @param {KeyboardEvent} event */
   #key(event) {
     if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
       if (event.shiftKey) this.redo();
@@ -292,31 +335,34 @@ export class RegionEditor {
 
   draw() {
     const { outline, holes, cracks, seeds } = this.state;
+    /** @type {SVGElement[]} */
     const parts = [];
+    /** @type {(points: Spot[], colour: string, closed: boolean, fill?: string) => SVGElement} */
     const line = (points, colour, closed, fill = "none") => svg("path", { d: points.map((p, k) => `${k ? "L" : "M"}${p[0]} ${p[1]}`).join("") + (closed ? "Z" : ""), ...stroke(colour, 2), fill });
     const corners = this.#corners(outline);
     if (corners.length) parts.push(line(corners, COLOUR.outline, true, "#ffd23e14"));
     for (const hole of holes) parts.push(line(hole, COLOUR.hole, true, "#ff6a5c40"));
     for (const crack of cracks) parts.push(line(crack, COLOUR.crack, false));
-    const course = this.draft && this.tip && this.draft.kind !== "rectangle" ? [...this.draft.points, this.tip] : this.draft?.points;
-    if (this.draft) parts.push(line(this.draft.kind === "rectangle" ? this.#corners({ form: "rectangle", points: course }) : course, COLOUR.draft, this.draft.kind !== "crack", "none"), ...this.draft.points.map((p) => this.#dot(p, COLOUR.draft)));
+    if (this.draft) parts.push(line(this.draft.kind === "rectangle" ? this.#corners({ form: "rectangle", points: this.draft.points }) : this.tip ? [...this.draft.points, this.tip] : this.draft.points, COLOUR.draft, this.draft.kind !== "crack", "none"), ...this.draft.points.map((p) => this.#dot(p, COLOUR.draft)));
     if (outline?.form === "rectangle") {
       corners.forEach((p, k) => parts.push(this.#handle(`outline.${k}`, p, COLOUR.outline, `Corner ${k + 1} of the region`, (to, state) => {
+        if (!state.outline) return;
         const own = state.outline.points;
         own[k === 0 || k === 3 ? 0 : 1][0] = to[0];
         own[k < 2 ? 0 : 1][1] = to[1];
       }, (state) => { state.outline = null; })));
-    } else corners.forEach((p, k) => parts.push(this.#handle(`outline.${k}`, p, COLOUR.outline, `Corner ${k + 1} of the region`, (to, state) => { state.outline.points[k] = to; }, (state) => { state.outline.points.splice(k, 1); if (state.outline.points.length < 3) state.outline = null; })));
-    for (const [kind, name] of [["holes", "hole"], ["cracks", "crack"]]) {
+    } else corners.forEach((p, k) => parts.push(this.#handle(`outline.${k}`, p, COLOUR.outline, `Corner ${k + 1} of the region`, (to, state) => { if (state.outline) state.outline.points[k] = to; }, (state) => { state.outline?.points.splice(k, 1); if (state.outline && state.outline.points.length < 3) state.outline = null; })));
+    for (const [kind, name] of /** @type {const} */ ([["holes", "hole"], ["cracks", "crack"]])) {
       this.state[kind].forEach((points, i) => points.forEach((p, k) => parts.push(this.#handle(`${kind}.${i}.${k}`, p, COLOUR[name], `Point ${k + 1} of ${name} ${i + 1}`,
         (to, state) => { state[kind][i][k] = to; }, (state) => { state[kind][i].splice(k, 1); if (state[kind][i].length < LEAST[name]) state[kind].splice(i, 1); }))));
     }
+    /** @type {SVGElement[]} */
     const second = [];
     seeds.forEach((seed, k) => {
-      parts.push(...this.#seed(seed.one, k), this.#handle(`seed.${k}`, seed.one, COLOUR.seed, `Seed ${k + 1} in camera 1`, (to, state) => { state.seeds[k].one = to; }, (state) => { state.seeds.splice(k, 1); }));
+      parts.push(this.#seed(seed.one, k), this.#handle(`seed.${k}`, seed.one, COLOUR.seed, `Seed ${k + 1} in camera 1`, (to, state) => { state.seeds[k].one = to; }, (state) => { state.seeds.splice(k, 1); }));
       const course = this.lines[k]?.line_px ?? [];
       if (course.length > 1) second.push(svg("path", { d: course.map((p, i) => `${i ? "L" : "M"}${p[0]} ${p[1]}`).join(""), ...stroke(COLOUR.seed, 1.5, [5, 4]), opacity: seed.two ? 0.5 : 1, "data-role": "epipolar" }));
-      if (seed.two) second.push(...this.#seed(seed.two, k), this.#handle(`seed2.${k}`, seed.two, COLOUR.seed, `Seed ${k + 1} in camera 2`, (to, state) => { state.seeds[k].two = to; }, (state) => { state.seeds[k].two = null; }, this.two));
+      if (seed.two) second.push(this.#seed(seed.two, k), this.#handle(`seed2.${k}`, seed.two, COLOUR.seed, `Seed ${k + 1} in camera 2`, (to, state) => { state.seeds[k].two = to; }, (state) => { state.seeds[k].two = null; }, this.two));
     });
     replace(this.layer, parts);
     replace(this.layer2, second);
@@ -324,15 +370,30 @@ export class RegionEditor {
     this.redoButton.setAttribute("aria-disabled", String(!this.future.length));
   }
 
+  /**
+   * @param {Spot} at
+   * @param {string} colour
+   */
   #dot([x, y], colour) {
     return svg("path", { d: `M${x} ${y}h0.001`, ...stroke(colour, 6), "stroke-linecap": "round" });
   }
 
+  /**
+   * @param {Spot} at
+   * @param {number} k
+   */
   #seed([x, y], k) {
-    const text = svg("text", { x, y, fill: COLOUR.seed, "aria-hidden": "true", style: "font: bold calc(15px * var(--px, 1)) sans-serif; paint-order: stroke; stroke: #000; stroke-width: calc(3px * var(--px, 1)); transform: translate(calc(9px * var(--px, 1)), calc(-7px * var(--px, 1)))" }, String(k + 1));
-    return [text];
+    return svg("text", { x, y, fill: COLOUR.seed, "aria-hidden": "true", style: "font: bold calc(15px * var(--px, 1)) sans-serif; paint-order: stroke; stroke: #000; stroke-width: calc(3px * var(--px, 1)); transform: translate(calc(9px * var(--px, 1)), calc(-7px * var(--px, 1)))" }, String(k + 1));
   }
 
+  /**
+   * @param {string} name
+   * @param {Spot} at
+   * @param {string} colour
+   * @param {string} label
+   * @param {(to: Spot, state: State) => unknown} move
+   * @param {(state: State) => unknown} remove
+   */
   #handle(name, [x, y], colour, label, move, remove, view = this.one) {
     // what is drawn already does not catch the clicks that draw something else
     const idle = ["polygon", "hole", "crack"].includes(this.tool) || (this.tool === "seed" && !name.startsWith("seed"));
@@ -344,7 +405,7 @@ export class RegionEditor {
       event.preventDefault();
       moving = true;
       const before = JSON.stringify(this.state);
-      const follow = (next) => {
+      const follow = (/** @type {PointerEvent} */ next) => {
         const at = view.at(next);
         move(this.#inside([at.x, at.y], view), this.state);
         this.draw();
@@ -359,7 +420,7 @@ export class RegionEditor {
         }
         moving = false;
         this.#changed();
-        document.querySelector(`[data-handle="${name}"]`)?.focus();
+        /** @type {SVGElement | null} */ (document.querySelector(`[data-handle="${name}"]`))?.focus();
       };
       window.addEventListener("pointermove", follow);
       window.addEventListener("pointerup", end);
@@ -367,8 +428,7 @@ export class RegionEditor {
     });
     node.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey) return;
-      const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
-      const by = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] }[event.key];
+      const by = nudge(event);
       if (by) this.change((state) => move(this.#inside([x + by[0], y + by[1]], view), state));
       else if (event.key === "Delete" || event.key === "Backspace") this.change((state) => remove(state));
       else return;
@@ -381,7 +441,8 @@ export class RegionEditor {
   /** The same by numbers: for the keyboard, and to be exact. */
   drawList() {
     const { outline, holes, cracks, seeds } = this.state;
-    const text = (points) => points.map((p) => `${p[0]}, ${p[1]}`).join("; ");
+    const text = (/** @type {Spot[]} */ points) => points.map((p) => `${p[0]}, ${p[1]}`).join("; ");
+    /** @type {(label: string, points: Spot[], least: number, put: (state: State, points: Spot[]) => unknown, remove: (state: State) => unknown) => HTMLElement} */
     const row = (label, points, least, put, remove) => {
       const input = h("input", { type: "text", value: text(points), "aria-label": `${label}: x, y of each point, px` });
       const trouble = h("small.hint");
@@ -397,15 +458,18 @@ export class RegionEditor {
         h("button", { type: "button", "aria-label": `Delete ${label}`, onclick: () => this.change(remove) }, "Delete"));
     };
     replace(this.list,
-      outline ? row(outline.form === "rectangle" ? "Rectangle" : "Polygon", outline.points, outline.form === "rectangle" ? 2 : 3, (state, points) => { state.outline.points = outline.form === "rectangle" ? points.slice(0, 2) : points; }, (state) => { state.outline = null; })
+      outline ? row(outline.form === "rectangle" ? "Rectangle" : "Polygon", outline.points, outline.form === "rectangle" ? 2 : 3, (state, points) => { if (state.outline) state.outline.points = outline.form === "rectangle" ? points.slice(0, 2) : points; }, (state) => { state.outline = null; })
         : h("div.row", h("span.quiet", "No region yet."), h("button", { type: "button", onclick: () => this.change((state) => { const [w, k] = [this.one.width, this.one.height]; state.outline = { form: "rectangle", points: [[round(0.2 * w), round(0.2 * k)], [round(0.8 * w), round(0.8 * k)]] }; }) }, "Rectangle in the middle")),
       holes.map((points, i) => row(`Hole ${i + 1}`, points, 3, (state, read) => { state.holes[i] = read; }, (state) => { state.holes.splice(i, 1); })),
       cracks.map((points, i) => row(`Crack ${i + 1}`, points, 2, (state, read) => { state.cracks[i] = read; }, (state) => { state.cracks.splice(i, 1); })),
       seeds.map((seed, i) => row(`Seed ${i + 1}`, seed.two ? [seed.one, seed.two] : [seed.one], 1, (state, read) => { state.seeds[i] = { one: read[0], two: read[1] ?? null }; }, (state) => { state.seeds.splice(i, 1); })),
-      seeds.map((seed, i) => { const off = this.lines[i]?.distance_px; return off === null || off === undefined ? null : h(off > 8 ? "p.problem" : "p.quiet", `Seed ${i + 1}: camera 2's place lies ${num(off, 2)} px from its epipolar line${off > 8 ? "; 8 px are allowed: it is another point." : "."}`); }));
+      seeds.map((_, i) => { const off = this.lines[i]?.distance_px; return off === null || off === undefined ? null : h(off > 8 ? "p.problem" : "p.quiet", `Seed ${i + 1}: camera 2's place lies ${num(off, 2)} px from its epipolar line${off > 8 ? "; 8 px are allowed: it is another point." : "."}`); }));
   }
 
-  /** Epipolar lines as the API gave them. */
+  /**
+   * Epipolar lines as the API gave them.
+   * @param {Model<"SeedsReply">["seeds"]} lines
+   */
   tellLines(lines) {
     this.lines = lines;
     this.draw();

@@ -1,6 +1,9 @@
 // The colour scale: its controls, its bar, and the colouring of values with it.
 import { MAPS, ENTRIES, colours, entry, percentiles, suited, statusColour, bytes } from "../lib/colour.js";
-import { h, replace, field, number, select, num, tick } from "../lib/dom.js";
+import { h, replace, field, number, pen, select, num, tick } from "../lib/dom.js";
+
+/** @import { MapName } from "../lib/colour.js" */
+/** @import { Raster } from "../lib/point_grid.js" */
 
 export class Scale {
   /**
@@ -8,10 +11,14 @@ export class Scale {
    * @param {boolean} steps whether there are several steps to lay it over
    */
   constructor(changed, steps = true) {
+    /** @type {Record<string, string> | null} meanings of a status' values */
     this.flags = null;
     this.unit = "";
     this.low = 0;
     this.high = 1;
+    /** @type {MapName} */
+    this.name = "viridis";
+    this.rgb = colours(this.name);
     this.map = select(MAPS, "auto");
     this.limits = select([["auto", "by percentiles"], ["given", "given limits"]], "auto");
     this.span = select([["step", "each step"], ["all", "all steps"]], "step");
@@ -51,9 +58,12 @@ export class Scale {
     return this.limits.value === "auto" && this.span.value === "all";
   }
 
-  /** Which percentiles are asked for. */
+  /**
+   * Which percentiles are asked for.
+   * @returns {[number, number]}
+   */
   get percentiles() {
-    const of = (input, usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Math.min(Math.max(Number(input.value), 0), 100));
+    const of = (/** @type {HTMLInputElement} */ input, /** @type {number} */ usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Math.min(Math.max(Number(input.value), 0), 100));
     return [of(this.lowest, 1), of(this.highest, 99)];
   }
 
@@ -70,7 +80,7 @@ export class Scale {
    * Lay the scale.
    * @param {ArrayLike<number>[]} values of one step, or of all
    * @param {string} unit
-   * @param {?object} flags meanings of a status' values
+   * @param {Record<string, string> | null} flags meanings of a status' values
    * @param {boolean} signed whether zero is the middle whatever the limits (a difference)
    */
   lay(values, unit, flags = null, signed = false) {
@@ -80,7 +90,7 @@ export class Scale {
       this.low = Number(this.lowGiven.value);
       this.high = Number(this.highGiven.value);
     } else {
-      const found = values.map((one) => percentiles(one, ...this.percentiles)).filter(Boolean);
+      const found = values.map((one) => percentiles(one, ...this.percentiles)).filter((one) => one !== null);
       this.low = found.length ? Math.min(...found.map((one) => one[0])) : 0;
       this.high = found.length ? Math.max(...found.map((one) => one[1])) : 1;
       if (!(this.high - this.low > 1e-9 * Math.abs(this.low))) { // all the same but for rounding
@@ -89,7 +99,7 @@ export class Scale {
         this.high += pad;
       }
     }
-    this.name = this.map.value === "auto" ? (signed ? "diverging" : suited(this.low, this.high)) : this.map.value;
+    this.name = this.map.value === "auto" ? (signed ? "diverging" : suited(this.low, this.high)) : /** @type {MapName} */ (this.map.value);
     if (this.name === "diverging" && this.limits.value !== "given") {
       const most = Math.max(Math.abs(this.low), Math.abs(this.high));
       if (this.low < 0 && this.high > 0) [this.low, this.high] = [-most, most];
@@ -107,7 +117,7 @@ export class Scale {
     }
     const image = new ImageData(ENTRIES, 1);
     for (let i = 0; i < ENTRIES; i += 1) image.data.set([this.rgb[3 * i], this.rgb[3 * i + 1], this.rgb[3 * i + 2], 255], 4 * i);
-    this.bar.getContext("2d").putImageData(image, 0, 0);
+    pen(this.bar).putImageData(image, 0, 0);
     const digits = Math.min(7, Math.max(3, 2 + Math.ceil(Math.log10(Math.max(Math.abs(this.low), Math.abs(this.high)) / (this.high - this.low) || 1))));
     const places = [0, 0.25, 0.5, 0.75, 1];
     replace(this.marks, places.map((share) => h("span", { style: { left: `${100 * share}%` } }, tick(Number((this.low + share * (this.high - this.low)).toPrecision(digits)) * (Math.abs(this.low + share * (this.high - this.low)) < 1e-9 * (this.high - this.low) ? 0 : 1)))),
@@ -118,22 +128,31 @@ export class Scale {
     this.legend.dataset.map = this.name;
   }
 
-  /** [r, g, b] of a value. */
+  /**
+   * [r, g, b] of a value.
+   * @param {number} value
+   */
   colour(value) {
     if (this.flags) return bytes(statusColour(value));
     const i = 3 * entry(value, this.low, this.high);
     return [this.rgb[i], this.rgb[i + 1], this.rgb[i + 2]];
   }
 
-  /** Draw a raster into a canvas of the image's size; what has no value stays transparent. */
+  /**
+   * Draw a raster into a canvas of the image's size; what has no value stays transparent.
+   * @param {HTMLCanvasElement} canvas
+   * @param {number} width
+   * @param {number} height
+   * @param {Raster | null} raster
+   */
   paint(canvas, width, height, raster) {
     if (canvas.width !== width || canvas.height !== height) {
       canvas.width = width;
       canvas.height = height;
     }
-    const context = canvas.getContext("2d");
+    const context = pen(canvas);
     context.clearRect(0, 0, width, height);
-    if (!raster || !raster.width) return;
+    if (!raster?.width) return;
     const image = new ImageData(raster.width, raster.height);
     const out = new Uint32Array(image.data.buffer);
     const { values } = raster;
@@ -152,7 +171,7 @@ export class Scale {
       const each = ENTRIES / (this.high - this.low);
       for (let i = 0; i < out.length; i += 1) {
         const v = values[i];
-        if (v !== v) continue; // NaN
+        if (Number.isNaN(v)) continue;
         const k = Math.floor((v - low) * each);
         out[i] = table[k < 0 ? 0 : k >= ENTRIES ? ENTRIES - 1 : k];
       }

@@ -3,6 +3,10 @@
 // Pixel coordinates are those of the API: the first pixel's centre is (0, 0).
 import { h, svg, num } from "../lib/dom.js";
 
+/** @typedef {{ x: number, y: number }} Place in the picture, px */
+
+/** By one step where an arrow key points. @type {Record<string, [number, number]>} */
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const STEP = 1.25;
 const MOST = 64;
 
@@ -10,8 +14,8 @@ export class View {
   /**
    * @param {object} options
    * @param {string} options.label what the picture is, for those who do not see it
-   * @param {(x: number, y: number) => Promise<?string>} [options.grey] text about the pixel under the mouse
-   * @param {(x: number, y: number, event: PointerEvent) => void} [options.onpick] a click without dragging
+   * @param {((x: number, y: number) => Promise<string | null>) | null} [options.grey] text about the pixel under the mouse
+   * @param {((x: number, y: number, event: Event) => void) | null} [options.onpick] a click without dragging
    * @param {boolean} [options.tools] whether there are buttons
    *
    * By keyboard, Enter shows a cross-hair that arrow keys move and that Enter picks with; Escape leaves it. Who draws over
@@ -26,12 +30,19 @@ export class View {
     this.grey = grey;
     this.onpick = onpick;
     this.fitted = true;
-    this.partner = null;
+    /** @type {Place | null} */
     this.cross = null;
+    /** @type {Place | null} */
     this.aim = null;
+    /** @type {Place | null} */
+    this.hover = null;
+    this.asking = false;
     this.drawing = false;
+    /** @type {((aim: Place | null) => void) | null} */
     this.onaim = null;
+    /** @type {(() => void) | null} */
     this.onleave = null;
+    /** @type {(() => Place | null) | null} */
     this.aimFrom = null;
 
     this.image = h("img", { alt: label, draggable: "false" });
@@ -62,20 +73,30 @@ export class View {
     this.observer.observe(this.frame);
   }
 
-  /** Show an address; an MJPEG stream keeps on loading by itself. */
+  /**
+   * Show an address; an MJPEG stream keeps on loading by itself.
+   * @param {string} address
+   */
   show(address) {
     this.empty.hidden = true;
     this.image.src = address;
   }
 
-  /** Say why there is no picture. */
+  /**
+   * Say why there is no picture.
+   * @param {string} text
+   */
   blank(text) {
     this.image.removeAttribute("src");
     this.empty.textContent = text;
     this.empty.hidden = false;
   }
 
-  /** Fix the size before a picture has come. */
+  /**
+   * Fix the size before a picture has come.
+   * @param {number} width
+   * @param {number} height
+   */
   size(width, height) {
     this.#sized(width, height);
   }
@@ -85,6 +106,10 @@ export class View {
     this.image.removeAttribute("src"); // ends a stream
   }
 
+  /**
+   * @param {number} width
+   * @param {number} height
+   */
   #sized(width, height) {
     if (!width || (width === this.width && height === this.height)) return;
     this.width = width;
@@ -96,13 +121,20 @@ export class View {
     this.#drawCross();
   }
 
-  /** Pixel coordinates under a mouse or pen. */
+  /**
+   * Pixel coordinates under a mouse or pen.
+   * @param {MouseEvent} event
+   */
   at(event) {
     const box = this.frame.getBoundingClientRect();
     return { x: (event.clientX - box.left - this.left) / this.scale - 0.5, y: (event.clientY - box.top - this.top) / this.scale - 0.5 };
   }
 
-  /** Where a pixel lies in the page. */
+  /**
+   * Where a pixel lies in the page.
+   * @param {number} x
+   * @param {number} y
+   */
   where(x, y) {
     const box = this.frame.getBoundingClientRect();
     return { clientX: box.left + this.left + (x + 0.5) * this.scale, clientY: box.top + this.top + (y + 0.5) * this.scale };
@@ -124,12 +156,21 @@ export class View {
     this.#scaleTo(1 / (window.devicePixelRatio || 1), box.width / 2, box.height / 2);
   }
 
+  /**
+   * @param {number} factor
+   * @param {number} [x] what stays where it is, in the frame
+   * @param {number} [y]
+   */
   zoom(factor, x, y) {
     const box = this.frame.getBoundingClientRect();
     this.#scaleTo(this.scale * factor, x ?? box.width / 2, y ?? box.height / 2);
   }
 
-  /** Put a pixel into the middle, at so many screen pixels a picture pixel. */
+  /**
+   * Put a pixel into the middle, at so many screen pixels a picture pixel.
+   * @param {number} x
+   * @param {number} y
+   */
   lookAt(x, y, scale = this.scale) {
     const box = this.frame.getBoundingClientRect();
     this.scale = Math.min(Math.max(scale, 0.01), MOST);
@@ -139,6 +180,11 @@ export class View {
     this.#place();
   }
 
+  /**
+   * @param {number} scale
+   * @param {number} x
+   * @param {number} y
+   */
   #scaleTo(scale, x, y) {
     const next = Math.min(Math.max(scale, 0.01), MOST);
     this.left = x - ((x - this.left) * next) / this.scale;
@@ -157,6 +203,7 @@ export class View {
     this.root.dispatchEvent(new CustomEvent("viewchange"));
   }
 
+  /** @param {WheelEvent} event */
   #wheel(event) {
     event.preventDefault();
     const box = this.frame.getBoundingClientRect();
@@ -164,14 +211,15 @@ export class View {
     this.#read(event);
   }
 
+  /** @param {KeyboardEvent} event */
   #key(event) {
     if (event.ctrlKey || event.metaKey) return;
-    const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    const by = ARROWS[event.key];
     const own = event.target === this.frame; // not a handle that is drawn over it
-    const zoom = (factor) => { const at = this.aim && this.#onFrame(this.aim); this.zoom(factor, at?.[0], at?.[1]); };
-    if (by && own && (this.aim || this.drawing)) {
-      const far = event.altKey ? 0.1 : event.shiftKey ? 10 : 1;
-      this.setAim(this.aim ? { x: this.aim.x + far * by[0], y: this.aim.y + far * by[1] } : this.#aimStart());
+    const zoom = (/** @type {number} */ factor) => { const at = this.aim && this.#onFrame(this.aim); this.zoom(factor, at?.[0], at?.[1]); };
+    const far = nudge(event);
+    if (far && own && (this.aim || this.drawing)) {
+      this.setAim(this.aim ? { x: this.aim.x + far[0], y: this.aim.y + far[1] } : this.#aimStart());
     } else if (event.altKey) return;
     else if (by) {
       const step = event.shiftKey ? 120 : 30;
@@ -197,6 +245,7 @@ export class View {
     event.preventDefault();
   }
 
+  /** @param {Place} place */
   #onFrame({ x, y }) {
     return [this.left + (x + 0.5) * this.scale, this.top + (y + 0.5) * this.scale];
   }
@@ -209,16 +258,19 @@ export class View {
     return { x: Math.round((box.width / 2 - this.left) / this.scale - 0.5), y: Math.round((box.height / 2 - this.top) / this.scale - 0.5) };
   }
 
-  /** Put the cross-hair that keys move onto a pixel, and into sight; null takes it away. */
+  /**
+   * Put the cross-hair that keys move onto a pixel, and into sight; null takes it away.
+   * @param {Place | null} place
+   */
   setAim(place) {
     if (place && !this.width) return;
-    const inside = (value, size) => Math.round(10 * Math.min(Math.max(value, 0), size - 1)) / 10;
+    const inside = (/** @type {number} */ value, /** @type {number} */ size) => Math.round(10 * Math.min(Math.max(value, 0), size - 1)) / 10;
     this.aim = place && { x: inside(place.x, this.width), y: inside(place.y, this.height) };
     if (this.aim) {
       this.readout.setAttribute("aria-live", "polite");
       const box = this.frame.getBoundingClientRect();
       const [x, y] = this.#onFrame(this.aim);
-      const off = (at, size) => (at < 0 || at > size ? size / 2 - at : 0);
+      const off = (/** @type {number} */ at, /** @type {number} */ size) => (at < 0 || at > size ? size / 2 - at : 0);
       const [right, down] = [off(x, box.width), off(y, box.height)];
       if (right || down) {
         this.left += right;
@@ -247,11 +299,14 @@ export class View {
   }
 
   #pointers() {
+    /** @typedef {[x: number, y: number]} Spot */
+    /** @type {Map<number, Spot>} */
     const down = new Map();
+    /** @type {Spot | null} */
     let start = null;
     let moved = false;
     this.frame.addEventListener("pointerdown", (event) => {
-      if (event.button !== 0 || event.target.closest(".grab")) return;
+      if (event.button !== 0 || onGrab(event)) return;
       this.frame.setPointerCapture(event.pointerId);
       down.set(event.pointerId, [event.clientX, event.clientY]);
       start = [event.clientX, event.clientY];
@@ -261,11 +316,12 @@ export class View {
       this.#read(event);
       const before = down.get(event.pointerId);
       if (!before) return;
+      /** @type {Spot} */
       const now = [event.clientX, event.clientY];
       if (start && Math.hypot(now[0] - start[0], now[1] - start[1]) > 4) moved = true;
       if (down.size === 2) {
         const [other] = [...down].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
-        const span = (a) => Math.hypot(a[0] - other[0], a[1] - other[1]);
+        const span = (/** @type {Spot} */ a) => Math.hypot(a[0] - other[0], a[1] - other[1]);
         const box = this.frame.getBoundingClientRect();
         if (span(before) > 5) this.zoom(span(now) / span(before), (now[0] + other[0]) / 2 - box.left, (now[1] + other[1]) / 2 - box.top);
       } else if (moved) {
@@ -276,7 +332,7 @@ export class View {
       }
       down.set(event.pointerId, now);
     });
-    const up = (event) => {
+    const up = (/** @type {PointerEvent} */ event) => {
       if (!down.delete(event.pointerId)) return;
       if (!moved && event.type === "pointerup" && this.onpick) {
         const { x, y } = this.at(event);
@@ -288,6 +344,7 @@ export class View {
     this.frame.addEventListener("pointerleave", () => { this.hover = this.aim; });
   }
 
+  /** @param {MouseEvent} event */
   #read(event) {
     const { x, y } = this.at(event);
     const inside = x >= -0.5 && y >= -0.5 && x < this.width - 0.5 && y < this.height - 0.5;
@@ -327,6 +384,7 @@ export class View {
     this.#drawCross();
   }
 
+  /** @param {Place} place */
   #putCross(place) {
     this.cross = place;
     this.#drawCross();
@@ -342,15 +400,30 @@ export class View {
   }
 }
 
-/** Attributes of a line over a picture that keeps its width, and its dashes, on the screen at any zoom. */
+/**
+ * Attributes of a line over a picture that keeps its width, and its dashes, on the screen at any zoom.
+ * @param {string} colour
+ * @param {number} width
+ * @param {number[]} dashes
+ */
 export function stroke(colour, width, dashes = []) {
-  const fixed = (value) => `calc(${value}px * var(--px, 1))`;
+  const fixed = (/** @type {number} */ value) => `calc(${value}px * var(--px, 1))`;
   return { stroke: colour, fill: "none", style: `stroke-width: ${fixed(width)}${dashes.length ? `; stroke-dasharray: ${dashes.map(fixed).join(" ")}` : ""}` };
 }
 
-/** Bytes of a picture as canvas pixels: paint(canvas, width, height, rgba). */
-export function paint(canvas, width, height, rgba) {
-  canvas.width = width;
-  canvas.height = height;
-  canvas.getContext("2d").putImageData(new ImageData(rgba, width, height), 0, 0);
+/**
+ * How far an arrow key moves what is drawn, px: with Shift farther, with Alt finer; nothing for other keys.
+ * @param {KeyboardEvent} event
+ * @returns {[number, number] | null}
+ */
+export function nudge(event) {
+  const by = ARROWS[event.key];
+  const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
+  return by ? [step * by[0], step * by[1]] : null;
 }
+
+/**
+ * Whether a handle that is drawn over the picture was taken.
+ * @param {Event} event
+ */
+export const onGrab = (event) => event.target instanceof Element && event.target.closest(".grab") !== null;

@@ -5,15 +5,24 @@ import { h, replace, svg, field, select, num, quantity } from "../../lib/dom.js"
 
 const COLOUR = { lines: "#33c6ff", node: "#ffd23e", arrow: "#ff4d3d" };
 const LONGEST = 0.15; // of the picture's width
+/** @import { Model, TakenView } from "#routes" */
+/** @typedef {readonly (number | null)[]} Spot */
+/** @typedef {{ name: string, found_px: Spot[][], residual_px?: Spot[][] | null, rbe_px?: number | null, raz_mm?: number | null }} Found what the fit found in a view */
+
+/** @type {Record<string, string>} */
 const ROLE = { fitted: "fitted", held_out: "held out", zero: "zero", zero_again: "zero, again" };
 
-/** Both cameras' views of one position side by side; {root, close}, or null where none were taken. */
-export async function calibrationViews(calibration, residuals) {
+/**
+ * Both cameras' views of one position side by side; {root, close}, or null where none were taken.
+ * @param {Model<"CalibrationReply">} calibration
+ * @param {Found[] | null} residuals
+ */
+export function calibrationViews(calibration, residuals) {
   const taken = calibration.taken ?? [];
   if (!taken.length) return null;
   const indices = [...new Set(taken.map((view) => view.index))].sort((a, b) => a - b);
-  const at = (index, cam) => taken.find((view) => view.index === index && view.camera === cam);
-  const text = (index) => { const view = at(index, "cam1") ?? at(index, "cam2"); return `${quantity(view.dz_commanded_mm ?? view.dz_mm, "mm", 4)} · ${ROLE[view.role] ?? view.role}`; };
+  const at = (/** @type {number} */ index, /** @type {string} */ cam) => taken.find((view) => view.index === index && view.camera === cam);
+  const text = (/** @type {number} */ index) => { const view = /** @type {TakenView} */ (at(index, "cam1") ?? at(index, "cam2")); return `${quantity(view.dz_commanded_mm ?? view.dz_mm, "mm", 4)} · ${ROLE[view.role] ?? view.role}`; };
   const position = select(indices.map((index) => [index, text(index)]), indices[0]);
   const magnification = h("input", { type: "range", min: 0, max: 4, step: 0.05, value: Math.log10(exaggeration(residuals, calibration.image_size_px?.cam1?.[0] ?? 640)).toFixed(2) });
   const told = h("output");
@@ -36,9 +45,9 @@ export async function calibrationViews(calibration, residuals) {
       const name = taken_?.file.split("/").pop();
       // a look back at zero is compared, not fitted: it has no residuals of its own
       const found = residuals?.find((one) => one.name === name);
-      caption.textContent = taken_ ? `${ROLE[taken_.role] ?? taken_.role}, dZ ${quantity(taken_.dz_mm, "mm", 6)} as read back, ${taken_.frames} frames averaged${found ? `; RBE ${quantity(found.rbe_px, "px", 3)}, RAZ ${quantity(1000 * found.raz_mm, "µm", 3)}` : ""}` : "no view";
+      caption.textContent = taken_ ? `${ROLE[taken_.role] ?? taken_.role}, dZ ${quantity(taken_.dz_mm, "mm", 6)} as read back, ${taken_.frames} frames averaged${found ? `; RBE ${quantity(found.rbe_px, "px", 3)}, RAZ ${quantity(found.raz_mm && 1000 * found.raz_mm, "µm", 3)}` : ""}` : "no view";
       replace(layer, ...(found ? drawing(found, times, lines.checked, arrows.checked) : []));
-      view.svg.parentNode.append(view.svg);
+      view.content.append(view.svg);
     }
   }
 
@@ -58,21 +67,36 @@ export async function calibrationViews(calibration, residuals) {
   return { root, close: () => views.forEach((one) => one.view.close()) };
 }
 
-/** By how much arrows are longer at first: a thousand times, less where the longest would leave the picture. */
+/**
+ * By how much arrows are longer at first: a thousand times, less where the longest would leave the picture.
+ * @param {Found[] | null} residuals
+ * @param {number} width
+ */
 function exaggeration(residuals, width) {
   let longest = 1e-9;
   for (const view of residuals ?? []) for (const r of view.residual_px?.flat() ?? []) if (there(r)) longest = Math.max(longest, Math.hypot(...r));
   return Math.min(1000, Math.max(1, LONGEST * width / longest));
 }
 
-const fine = (colour, width = 1) => stroke(colour, width);
-const there = (xy) => xy && xy[0] !== null && xy[1] !== null && Number.isFinite(xy[0]);
+/**
+ * Whether a point was found.
+ * @param {Spot | undefined} xy
+ * @returns {xy is [number, number]}
+ */
+const there = (xy) => xy !== undefined && xy[0] !== null && xy[1] !== null && Number.isFinite(xy[0]);
 
+/**
+ * @param {Found} view
+ * @param {number} times
+ * @param {boolean} lines
+ * @param {boolean} arrows
+ */
 function drawing({ found_px: found, residual_px: residual }, times, lines, arrows) {
   const parts = [];
   if (lines) {
+    /** @type {string[]} */
     const path = [];
-    const course = (points) => {
+    const course = (/** @type {Spot[]} */ points) => {
       let open = false;
       for (const xy of points) {
         if (there(xy)) { path.push(`${open ? "L" : "M"}${xy[0]} ${xy[1]}`); open = true; } else open = false;
@@ -80,11 +104,12 @@ function drawing({ found_px: found, residual_px: residual }, times, lines, arrow
     };
     found.forEach(course);
     found[0]?.forEach((_, k) => course(found.map((row) => row[k])));
-    parts.push(svg("path", { ...fine(COLOUR.lines), d: path.join(""), "data-role": "lines" }));
+    parts.push(svg("path", { ...stroke(COLOUR.lines, 1), d: path.join(""), "data-role": "lines" }));
     // a cross of a point of no length keeps its size on the screen at any zoom
-    parts.push(svg("path", { ...fine(COLOUR.node, 5), "stroke-linecap": "round", "data-role": "nodes", d: found.flat().filter(there).map(([x, y]) => `M${x} ${y}h0.001`).join("") }));
+    parts.push(svg("path", { ...stroke(COLOUR.node, 5), "stroke-linecap": "round", "data-role": "nodes", d: found.flat().filter(there).map(([x, y]) => `M${x} ${y}h0.001`).join("") }));
   }
   if (arrows && residual) {
+    /** @type {string[]} */
     const path = [];
     found.forEach((row, i) => row.forEach((xy, k) => {
       const r = residual[i]?.[k];
@@ -93,7 +118,7 @@ function drawing({ found_px: found, residual_px: residual }, times, lines, arrow
       const head = 0.25;
       path.push(`M${xy[0]} ${xy[1]}l${dx} ${dy}`, `m${-head * (dx - 0.5 * dy)} ${-head * (dy + 0.5 * dx)}L${xy[0] + dx} ${xy[1] + dy}l${-head * (dx + 0.5 * dy)} ${-head * (dy - 0.5 * dx)}`);
     }));
-    parts.push(svg("path", { ...fine(COLOUR.arrow, 1.5), d: path.join(""), "data-role": "arrows" }));
+    parts.push(svg("path", { ...stroke(COLOUR.arrow, 1.5), d: path.join(""), "data-role": "arrows" }));
   }
   return parts;
 }

@@ -2,13 +2,23 @@
 import * as api from "../../lib/api.js";
 import { h, replace, table, badge, facts, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "../../lib/dom.js";
 
-/** Settings, software, inputs; each step's figures, checks and warnings. */
+/** @import { Viewer } from "../results.js" */
+/** @import { StepSummary } from "#routes" */
+
+/**
+ * Settings, software, inputs; each step's figures, checks and warnings.
+ * @param {Viewer} screen
+ */
 export function about(screen) {
   const { result } = screen;
   const root = h("details.panel", { "data-role": "about" }, h("summary", "Settings, checks and warnings"));
   const body = h("div");
   root.append(body);
 
+  /**
+   * @param {unknown} value
+   * @returns {string}
+   */
   const text = (value) => {
     if (value === null || value === undefined) return "none";
     if (Array.isArray(value)) return value.length > 12 ? `${value.length} entries` : value.map(text).join(", ") || "none";
@@ -20,20 +30,20 @@ export function about(screen) {
     const { analysis } = result;
     const steps = analysis.summary?.steps ?? [];
     const failed = Object.entries(analysis.summary?.steps_failed ?? {});
-    const check = (one) => one.epipolar_check;
-    const warned = steps.filter((one) => check(one) && check(one).level !== "ok");
+    const verdict = (/** @type {StepSummary["epipolar_check"]} */ check) => (check ? h("span", { title: check.reason }, badge(check.level, STATE_KIND[check.level] ?? "warn")) : "–");
+    const warned = steps.flatMap((one) => (one.epipolar_check && one.epipolar_check.level !== "ok" ? [`Step ${one.n}: ${one.epipolar_check.reason}`] : []));
     replace(body,
-      analysis.stale ? h("p", badge("out of date", "warn"), " ", analysis.stale_reasons.join("; ")) : null,
-      warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", `Step ${one.n}: ${check(one).reason}`)))) : null,
+      analysis.stale ? h("p", badge("out of date", "warn"), " ", (analysis.stale_reasons ?? []).join("; ")) : null,
+      warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", one)))) : null,
       failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.cause ?? one.detail ?? one.code} ${one.remedy ?? ""}`)))) : null,
       h("h3", "Settings"),
-      facts([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => [name.replace(/_/g, " "), text(value)]),
+      facts([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
         ["software", analysis.software ?? "–"], ["begun", when(analysis.created_utc)], ["calibration", analysis.inputs?.calibration_sha256 ? h("code", analysis.inputs.calibration_sha256.slice(0, 16)) : "–"]]),
       h("h3", "Steps"),
       table([
         ["Step", (one) => one.n, { numeric: true }],
         ["Measured", (one) => `${count(one.valid)} of ${count(one.points)}`, { numeric: true }],
-        ["Epipolar", (one) => (check(one) ? h("span", { title: check(one).reason }, badge(check(one).level, STATE_KIND[check(one).level] ?? "warn")) : "–")],
+        ["Epipolar", (one) => verdict(one.epipolar_check)],
         ["Off the line", (one) => quantity(one.epipolar_offset_rms_px, "px", 3), { numeric: true }],
         ["Correlation", (one) => num(Math.min(...Object.values(one.zncc_median ?? { none: NaN })), 4), { numeric: true }],
         ["σ Z", (one) => quantity(one.sigma_median_mm?.z_mm, "mm", 2), { numeric: true }],
@@ -42,51 +52,61 @@ export function about(screen) {
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Took", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
       ], steps, { caption: "How each step came out; σ are medians over the points", empty: "No step is finished yet." }),
-      facts(steps.length ? [["epipolar check of the last step", check(steps.at(-1))?.reason ?? "–"], ["patch of the last step", steps.at(-1).patch?.reason ?? "–"]] : []));
+      facts(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
   }
   draw();
   return { root, draw };
 }
 
+/** @typedef {any} Schema of a parameter, as JSON Schema has it: a border */
+/** @typedef {{ name: string, in: string, required?: boolean, description?: string, schema: Schema }} Parameter */
+/** @type {any} */
 let description = null;
 /** The API's own description: which forms a result can be had in. */
 async function operations() {
-  description ??= (await api.raw("/openapi.json")).json();
+  description ??= await (await api.raw("/openapi.json")).json();
   return description;
 }
 
-/** Files in every form that the service offers, and the report. */
+/**
+ * Files in every form that the service offers, and the report.
+ * @param {Viewer} screen
+ */
 export function files(screen) {
   const { result } = screen;
   const root = h("details.panel", { "data-role": "files" }, h("summary", "Export and report"));
   const form = h("div");
   root.append(form);
+  /** @type {Map<string, HTMLInputElement | HTMLSelectElement>} */
   const inputs = new Map();
 
+  /** @param {Parameter} parameter */
   function control(parameter) {
-    const schema = (parameter.schema.anyOf ?? [parameter.schema]).find((one) => one.type !== "null") ?? {};
+    const schema = (parameter.schema.anyOf ?? [parameter.schema]).find((/** @type {Schema} */ one) => one.type !== "null") ?? {};
     const of = schema.enum ?? (schema.const !== undefined ? [schema.const] : null);
     const usual = parameter.schema.default ?? schema.default;
-    if (of) return select([...(parameter.required || usual !== undefined ? [] : [["", "–"]]), ...of.map((one) => [one, String(one)])], usual ?? of[0]);
+    if (of) return select([...(parameter.required || usual !== undefined ? [] : [["", "–"]]), ...of.map((/** @type {string} */ one) => [one, String(one)])], usual ?? of[0]);
     if (schema.type === "boolean") return h("input", { type: "checkbox", checked: Boolean(usual) });
     if (schema.type === "integer" || schema.type === "number") return number(usual ?? null, { min: schema.minimum, max: schema.maximum });
     return h("input", { type: "text", value: usual ?? "" });
   }
 
-  const value = (input) => (input.type === "checkbox" ? (input.checked ? "true" : null) : input.value === "" ? null : input.value);
+  /** @param {HTMLInputElement | HTMLSelectElement} input */
+  function value(input) {
+    if (input instanceof HTMLInputElement && input.type === "checkbox") return input.checked ? "true" : null;
+    return input.value === "" ? null : input.value;
+  }
 
   async function save() {
-    const query = {};
+    const address = new URL(api.address(`${result.path}/export`), location.origin);
     for (const [name, input] of inputs) {
       const v = value(input);
-      if (v !== null) query[name] = input.dataset.many ? v.split(/[\s,]+/) : v;
+      if (v !== null) for (const one of input.dataset.many ? v.split(/[\s,]+/) : [v]) address.searchParams.append(name, one);
     }
-    const address = new URL(api.address(`${result.path}/export`), location.origin);
-    for (const [name, v] of Object.entries(query)) for (const one of [v].flat()) address.searchParams.append(name, one);
     const answer = await api.raw(address.href);
     const told = /filename\*?=(?:UTF-8'')?"?([^";]+)"?/.exec(answer.headers.get("Content-Disposition") ?? "");
     const stale = answer.headers.get("X-Stale");
-    const link = h("a", { href: URL.createObjectURL(await answer.blob()), download: told ? decodeURIComponent(told[1]) : `${result.testId}_${result.analysisId}.${query.format ?? "nc"}` });
+    const link = h("a", { href: URL.createObjectURL(await answer.blob()), download: told ? decodeURIComponent(told[1]) : `${result.testId}_${result.analysisId}.${address.searchParams.get("format") ?? "nc"}` });
     document.body.append(link);
     link.click();
     link.remove();
@@ -97,11 +117,11 @@ export function files(screen) {
   /** What is on the screen, as far as it suits the form: figures show one variable, films all steps. */
   function propose() {
     const form_ = inputs.get("format")?.value;
-    const film = ["gif", "mp4"].includes(form_);
+    const film = ["gif", "mp4"].includes(form_ ?? "");
     const step = inputs.get("step");
     const variables = inputs.get("variables");
     if (step) step.value = film || screen.step === null ? "" : String(screen.step);
-    if (variables) variables.value = (film || ["png", "svg"].includes(form_)) && screen.info ? screen.info.name : "";
+    if (variables) variables.value = (film || ["png", "svg"].includes(form_ ?? "")) && screen.info ? screen.info.name : "";
   }
 
   /** The report in a tab of its own. It is made when it is asked for, which takes a while: that is said. */
@@ -115,15 +135,15 @@ export function files(screen) {
 
   async function draw() {
     const { paths, components } = await operations();
-    const resolved = (schema) => (schema.$ref ? { ...components.schemas[schema.$ref.split("/").at(-1)], default: schema.default } : schema);
-    const at = (end) => paths[`${api.BASE}/tests/{test_id}/analyses/{analysis_id}/${end}`]?.get;
+    const resolved = (/** @type {Schema} */ schema) => (schema.$ref ? { ...components.schemas[schema.$ref.split("/").at(-1)], default: schema.default } : schema);
+    const at = (/** @type {string} */ end) => paths[`${api.BASE}/tests/{test_id}/analyses/{analysis_id}/${end}`]?.get;
     const found = at("export");
     inputs.clear();
-    const rows = (found?.parameters ?? []).filter((one) => one.in === "query").map((given) => {
+    const rows = /** @type {Parameter[]} */ (found?.parameters ?? []).filter((one) => one.in === "query").map((given) => {
       const whole = given.schema.allOf?.length === 1 ? { ...resolved(given.schema.allOf[0]), default: given.schema.default } : resolved(given.schema);
       const parameter = { ...given, schema: { ...whole, anyOf: whole.anyOf?.map(resolved) } };
       const input = control(parameter);
-      const schema = (parameter.schema.anyOf ?? [parameter.schema]).find((one) => one.type !== "null") ?? {};
+      const schema = (parameter.schema.anyOf ?? [parameter.schema]).find((/** @type {Schema} */ one) => one.type !== "null") ?? {};
       if (schema.type === "array") input.dataset.many = "1";
       inputs.set(parameter.name, input);
       return field(parameter.name.replace(/_/g, " "), input, "", parameter.description ?? "");

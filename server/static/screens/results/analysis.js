@@ -2,53 +2,100 @@
 import * as api from "../../lib/api.js";
 import { Grid } from "../../lib/point_grid.js";
 
+/** @import { Model, Reply } from "#routes" */
+/** @typedef {{ key: string, name: string, component: number | null, group: string, text: string, unit: string, about: string,
+ *   flags: Record<string, string> | null, signed?: boolean }} Shown what can be shown of a step */
+
 const MOST_BYTES = 300e6;
 const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;
+/** @type {Record<string, string>} */
 const NAMES = {
   x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
   max_shear: "largest shear", von_mises: "von Mises strain", strain_angle_rad: "direction of e1", epipolar_px: "epipolar residual", noise_grey: "image noise",
   status: "status", strain_status: "status of the strain", iterations: "iterations", theta_rad: "theta", phi_rad: "phi", zp_mm: "zp",
 };
+/** @type {[name: string, variables: RegExp][]} */
 const GROUPS = [
   ["Displacement", /^[uvw]_mm$/], ["Shape", /^[xyz]_mm$/], ["Strain", /^(exx|eyy|exy|e1|e2|max_shear|von_mises|strain_angle_rad)$/],
   ["Quality", /^(zncc|epipolar_px|noise_grey|status|strain_status|iterations|reference_step)/], ["Standard uncertainty", /^sigma_/], ["Strain of the patches", /_patch$/], ["Other", /./],
 ];
 
-/** Unit that a variable is shown in, and what its stored numbers are multiplied by. */
+/**
+ * Unit that a variable is shown in, and what its stored numbers are multiplied by.
+ * @param {string} name
+ * @param {string} units
+ */
 export function shownUnit(name, units) {
   if (STRAIN.test(name)) return { unit: "µm/m", factor: 1e6 };
   return { unit: units === "pixel" ? "px" : units === "1" ? "" : units === "count" ? "grey" : units, factor: 1 };
 }
 
+/** @param {string} name */
 const pretty = (name) => NAMES[name] ?? (name.startsWith("sigma_") ? `σ of ${NAMES[name.slice(6)] ?? name.slice(6)}` : name.replace(/_/g, " "));
 
 export class Result {
-  constructor(testId, analysisId) {
-    this.testId = testId;
-    this.analysisId = analysisId;
-    this.path = `/tests/${testId}/analyses/${analysisId}`;
+  /**
+   * @param {Model<"TestReply">} test
+   * @param {Model<"AnalysisReply">} analysis
+   */
+  constructor(test, analysis) {
+    this.testId = test.id;
+    this.analysisId = analysis.id;
+    this.test = test;
+    this.analysis = analysis;
+    /** @type {Map<string, { bytes: number, promise: Promise<any> }>} each of what its key says */
     this.kept = new Map();
     this.bytes = 0;
   }
 
+  /**
+   * @param {string} testId
+   * @param {string} analysisId
+   */
   static async open(testId, analysisId) {
-    const result = new Result(testId, analysisId);
-    await result.refresh();
-    return result;
+    return new Result(...(await Result.#read(testId, analysisId)));
+  }
+
+  /**
+   * @param {string} testId
+   * @param {string} analysisId
+   */
+  static #read(testId, analysisId) {
+    return Promise.all([api.get(`/tests/${testId}`), api.get(`/tests/${testId}/analyses/${analysisId}`)]);
   }
 
   async refresh() {
-    [this.analysis, this.test] = await Promise.all([api.get(this.path), api.get(`/tests/${this.testId}`)]);
-    this.steps = [...this.analysis.steps_finished].sort((a, b) => a - b);
-    this.reference = this.analysis.settings?.reference ?? this.analysis.steps?.[0] ?? 0;
+    [this.test, this.analysis] = await Result.#read(this.testId, this.analysisId);
   }
 
-  /** Short text of a step: its number and label. */
+  get path() {
+    return /** @type {const} */ (`/tests/${this.testId}/analyses/${this.analysisId}`);
+  }
+
+  /** Steps that are finished, in their order. */
+  get steps() {
+    return this.analysis.steps_finished.toSorted((a, b) => a - b);
+  }
+
+  get reference() {
+    return this.analysis.settings.reference ?? this.analysis.steps?.[0] ?? 0;
+  }
+
+  /**
+   * Short text of a step: its number and label.
+   * @param {number} n
+   */
   stepText(n) {
     const step = (this.test.steps ?? []).find((one) => one.n === n);
     return `step ${n}${step?.label ? `: ${step.label}` : ""}${n === this.reference ? " (reference)" : ""}`;
   }
 
+  /**
+   * @template {object} T `bytes` are counted where it has them
+   * @param {string} key
+   * @param {() => Promise<T>} make
+   * @returns {Promise<T>}
+   */
   #keep(key, make) {
     const held = this.kept.get(key);
     if (held) {
@@ -56,9 +103,9 @@ export class Result {
       this.kept.set(key, held);
       return held.promise;
     }
-    const entry = { bytes: 0 };
-    entry.promise = make().then((value) => {
-      entry.bytes = value.bytes ?? 0;
+    const entry = { bytes: 0, promise: make() };
+    entry.promise = entry.promise.then((value) => {
+      entry.bytes = "bytes" in value ? Number(value.bytes) : 0;
       this.bytes += entry.bytes;
       for (const [old, one] of this.kept) {
         if (this.bytes <= MOST_BYTES || old === key) break;
@@ -72,13 +119,17 @@ export class Result {
     return entry.promise;
   }
 
-  /** What can be shown of a step: [{key, name, component, group, text, unit, about, flags}]. */
+  /**
+   * What can be shown of a step.
+   * @param {number} n
+   */
   fields(n) {
     return this.#keep(`${n}`, async () => {
       const { fields, cuts_px: cuts } = await api.get(`${this.path}/steps/${n}/fields`);
+      /** @type {Shown[]} */
       const shown = [];
       for (const one of fields) {
-        const group = GROUPS.find(([, pattern]) => pattern.test(one.name))[0];
+        const group = GROUPS.find(([, pattern]) => pattern.test(one.name))?.[0] ?? "Other";
         const { unit } = shownUnit(one.name, one.units);
         const common = { name: one.name, group, unit, about: one.long_name, flags: one.flags ?? null };
         if (one.dimensions.join() === "row,col" && !["x_px", "y_px"].includes(one.name)) shown.push({ ...common, key: one.name, component: null, text: pretty(one.name) });
@@ -95,6 +146,10 @@ export class Result {
     });
   }
 
+  /**
+   * @param {number} n
+   * @param {string} name
+   */
   array(n, name) {
     return this.#keep(`${n}/${name}`, async () => {
       const got = await api.npy(`${this.path}/steps/${n}/fields/${name}`, { format: "npy" });
@@ -102,7 +157,11 @@ export class Result {
     });
   }
 
-  /** Where the points lie in a step's image of a camera. */
+  /**
+   * Where the points lie in a step's image of a camera.
+   * @param {number} n
+   * @param {string} cam
+   */
   places(n, cam) {
     return this.#keep(`${n}/${cam}`, async () => {
       const got = await api.npy(`${this.path}/steps/${n}/places/${cam}`, { format: "npy" });
@@ -110,6 +169,7 @@ export class Result {
     });
   }
 
+  /** @param {number} n */
   grid(n) {
     return this.#keep(`${n} grid`, async () => {
       const { cuts } = await this.fields(n);
@@ -119,7 +179,12 @@ export class Result {
     });
   }
 
-  /** Values of one entry of `fields`, in the unit it is shown in. */
+  /**
+   * Values of one entry of `fields`, in the unit it is shown in.
+   * @param {number} n
+   * @param {string} key
+   * @returns {Promise<ArrayLike<number>>}
+   */
   async values(n, key) {
     const [name, component] = key.split(":");
     const { data, shape } = await this.array(n, name);
@@ -133,21 +198,27 @@ export class Result {
     });
   }
 
-  /** Standard uncertainties beside them, null where the file has none. */
+  /**
+   * Standard uncertainties beside them, null where the file has none.
+   * @param {number} n
+   * @param {string} key
+   */
   async sigma(n, key) {
     const { all } = await this.fields(n);
     return all.has(`sigma_${key}`) ? this.values(n, `sigma_${key}`) : null;
   }
 }
 
-/** Every page of a list, whatever the API calls the rest. */
-export async function all(path, name, query = {}) {
+/** Every test, newest first. */
+export async function allTests() {
   const out = [];
-  let cursor = null;
+  /** @type {string | null | undefined} */
+  let cursor;
   do {
-    const page = await api.get(path, { ...query, cursor });
-    out.push(...page[name]);
-    cursor = page.next_cursor ?? null;
+    /** @type {Reply<"get", "/tests">} */
+    const page = await api.get("/tests", { cursor });
+    out.push(...page.tests);
+    cursor = page.next_cursor;
   } while (cursor);
-  return out;
+  return out.reverse();
 }

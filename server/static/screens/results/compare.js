@@ -1,14 +1,27 @@
 // Two analyses beside each other: the same field with linked zoom, and their difference.
 import * as api from "../../lib/api.js";
 import { FieldMap } from "../../widgets/field_map.js";
-import { Result, all } from "./analysis.js";
+import { Result, allTests } from "./analysis.js";
 import { Scale } from "../../widgets/scale.js";
 import { chart } from "../../widgets/plots.js";
 import { h, replace, select, field, facts, count, quantity, notify } from "../../lib/dom.js";
 
+/** @import { Grid } from "../../lib/point_grid.js" */
+/** @import { Model } from "#routes" */
+/** @import { Viewer } from "../results.js" */
+/** @import { Shown } from "./analysis.js" */
+/** @import { Statistics } from "../../lib/point_grid.js" */
+/** @typedef {{ grid: Grid, values: ArrayLike<number>, sigma: ArrayLike<number> | null }} Field */
+/** @typedef {Model<"TestReply">["analyses"]} Analyses */
+
 const BINS = 41;
 
-/** Values of B at the points of A: the same where the grids are, else between B's points by the rule of the map. */
+/**
+ * Values of B at the points of A: the same where the grids are, else between B's points by the rule of the map.
+ * @param {Grid} gridA
+ * @param {Grid} gridB
+ * @param {ArrayLike<number>} values
+ */
 export function onto(gridA, gridB, values) {
   if (gridA.same(gridB)) return { values: Float64Array.from(values, (v, i) => (gridB.valid[i] ? v : NaN)), interpolated: false };
   const out = new Float64Array(gridA.x.length);
@@ -16,19 +29,21 @@ export function onto(gridA, gridB, values) {
   return { values: out, interpolated: true };
 }
 
-/** Differences A - B at A's points, and the standard uncertainty of each where both have one. */
+/**
+ * Differences A - B at A's points, and the standard uncertainty of each where both have one.
+ * @param {Field} a
+ * @param {Field} b
+ */
 export function difference(a, b) {
   const other = onto(a.grid, b.grid, b.values);
   const sigmaB = b.sigma ? onto(a.grid, b.grid, b.sigma).values : null;
   const values = new Float64Array(a.values.length);
-  const sigma = a.sigma && sigmaB ? new Float64Array(values.length) : null;
-  for (let i = 0; i < values.length; i += 1) {
-    values[i] = a.grid.valid[i] ? a.values[i] - other.values[i] : NaN;
-    if (sigma) sigma[i] = Math.hypot(a.sigma[i], sigmaB[i]);
-  }
+  const sigma = a.sigma && sigmaB ? Float64Array.from(a.sigma, (own, i) => Math.hypot(own, sigmaB[i])) : null;
+  for (let i = 0; i < values.length; i += 1) values[i] = a.grid.valid[i] ? a.values[i] - other.values[i] : NaN;
   return { values, sigma, interpolated: other.interpolated };
 }
 
+/** @param {Viewer} screen */
 export async function compare(screen) {
   const { map, result } = screen;
   const right = new FieldMap("Field of the other analysis over the image of camera 1");
@@ -41,28 +56,29 @@ export async function compare(screen) {
   const figures = h("dl.facts", { "data-role": "difference" });
   const histogramPlace = h("div", { "data-role": "difference-histogram" });
   const bar = h("div", scale.root);
+  /** @type {Result | null} */
   let other = null;
+  /** @type {Awaited<ReturnType<typeof chart>> | null} */
   let plot = null;
   let asked = 0;
 
-  const options = [];
-  for (const test of (await all("/tests", "tests")).reverse()) {
-    const own = test.id === result.testId ? result.test : null;
-    if (own) options.unshift([own.name, test.id, own.analyses]);
-    else options.push([test.name || test.id, test.id, null]);
-  }
+  const tests = await allTests();
+  tests.sort((a, b) => Number(b.id === result.testId) - Number(a.id === result.testId)); // its own first
   // analyses of other tests are asked for when their test is chosen
-  const testChoice = select(options.map(([name, id]) => [id, name]), result.testId);
+  /** @type {Map<string, Analyses>} */
+  const analyses = new Map([[result.testId, result.test.analyses]]);
+  const testChoice = select(tests.map((one) => [one.id, one.name || one.id]), result.testId);
   async function fillAnalyses() {
-    const of = options.find(([, id]) => id === testChoice.value);
-    of[2] ??= (await api.get(`/tests/${of[1]}`)).analyses;
-    const others = of[2].filter((one) => one.id !== result.analysisId);
+    const id = testChoice.value;
+    if (!analyses.has(id)) analyses.set(id, (await api.get(`/tests/${id}`)).analyses);
+    const others = (analyses.get(id) ?? []).filter((one) => one.id !== result.analysisId);
     replace(choice, others.length ? null : h("option", { value: "" }, "no other analysis"), others.map((one) => h("option", { value: one.id }, one.label || one.id)));
     await choose();
   }
   async function choose() {
     other = choice.value ? await Result.open(testChoice.value, choice.value) : null;
-    replace(stepChoice, h("option", { value: "same" }, "the same step"), (other?.steps ?? []).map((n) => h("option", { value: n }, other.stepText(n))));
+    const of = other;
+    replace(stepChoice, h("option", { value: "same" }, "the same step"), of ? of.steps.map((n) => h("option", { value: n }, of.stepText(n))) : null);
     await update();
   }
   testChoice.addEventListener("change", () => fillAnalyses().catch(notify));
@@ -72,7 +88,7 @@ export async function compare(screen) {
 
   // what one view shows, the other shows too
   let following = false;
-  const follow = (from, to) => () => {
+  const follow = (/** @type {FieldMap} */ from, /** @type {FieldMap} */ to) => () => {
     if (following || !from.view.width || !to.view.width) return;
     following = true;
     const box = from.view.frame.getBoundingClientRect();
@@ -86,11 +102,11 @@ export async function compare(screen) {
 
   const left = h("div", h("h2", "This analysis"));
   const rightName = h("h2", "The other");
+  const panel = h("div.grid.two", { hidden: true, "data-role": "difference-panel" }, h("div.panel", bar, figures), h("div.panel", histogramPlace));
   const root = h("div", { "data-role": "compare" },
     h("div.row", field("Test", testChoice), field("Compared with", choice), field("At", stepChoice), field("Right view", show)),
     h("div.grid.two.views", left, h("div", rightName, right.view.root)), note,
-    h("div.grid.two", { hidden: true, "data-role": "difference-panel" }, h("div.panel", bar, figures), h("div.panel", histogramPlace)));
-  const panel = root.lastChild;
+    panel);
 
   async function update() {
     asked += 1;
@@ -125,18 +141,20 @@ export async function compare(screen) {
       return;
     }
     const a = map.now;
-    await Promise.all([a.withSigma, right.now.withSigma]);
+    const b = right.now;
+    if (!b) return;
+    await Promise.all([a.withSigma, b.withSigma]);
     if (mine !== asked) return;
-    const d = difference(a, right.now);
+    const d = difference(a, b);
     const info = { ...found, key: `${key} difference`, text: `difference of ${found.text}`, flags: null, signed: true };
-    Object.assign(right.now, { grid: a.grid, places: a.places });
+    Object.assign(b, { grid: a.grid, places: a.places });
     right.put(d.values, info, d.sigma);
     scale.lay([right.measured], found.unit, null, true);
     right.redraw(scale);
-    const s = right.now.statistics;
+    const s = b.statistics;
     let squares = 0;
     let told = 0;
-    if (d.sigma) d.values.forEach((v, i) => { if (Number.isFinite(v) && Number.isFinite(d.sigma[i])) { squares += d.sigma[i] ** 2; told += 1; } });
+    d.sigma?.forEach((sigma, i) => { if (Number.isFinite(d.values[i]) && Number.isFinite(sigma)) { squares += sigma ** 2; told += 1; } });
     const rmsTold = told ? Math.sqrt(squares / told) : null;
     replace(figures, [...facts([
       ["mean difference", quantity(s.mean, found.unit)], ["rms", quantity(s.rms, found.unit)], ["sd", quantity(s.sd, found.unit)], ["told σ of a difference, rms", quantity(rmsTold, found.unit)],
@@ -148,18 +166,25 @@ export async function compare(screen) {
     there();
   }
 
+  /**
+   * @param {Float64Array} values
+   * @param {Statistics} s
+   * @param {Shown} info
+   * @param {number | null} sigma
+   */
   async function histogram(values, s, info, sigma) {
     plot?.close();
     plot = null;
-    if (!(s.max > s.min)) {
-      replace(histogramPlace, h("p.quiet", s.count ? `Every difference is ${quantity(s.min, info.unit)}.` : "No point has a value in both."));
+    const { min, max, mean } = s;
+    if (min === null || max === null || mean === null || !(max > min)) {
+      replace(histogramPlace, h("p.quiet", s.count ? `Every difference is ${quantity(min, info.unit)}.` : "No point has a value in both."));
       return;
     }
-    const width = (s.max - s.min) / BINS;
+    const width = (max - min) / BINS;
     const bins = new Array(BINS).fill(0);
-    for (const v of values) bins[Math.min(Math.floor((v - s.min) / width), BINS - 1)] += 1;
-    const x = bins.map((_, k) => s.min + (k + 0.5) * width);
-    const normal = sigma ? x.map((v) => (s.count * width * Math.exp(-0.5 * ((v - s.mean) / sigma) ** 2)) / (sigma * Math.sqrt(2 * Math.PI))) : null;
+    for (const v of values) bins[Math.min(Math.floor((v - min) / width), BINS - 1)] += 1;
+    const x = bins.map((_, k) => min + (k + 0.5) * width);
+    const normal = sigma ? x.map((v) => (s.count * width * Math.exp(-0.5 * ((v - mean) / sigma) ** 2)) / (sigma * Math.sqrt(2 * Math.PI))) : null;
     plot = await chart(histogramPlace, { x: `difference${info.unit ? ` (${info.unit})` : ""}`, y: "points", height: 220, bars: [true, false], series: [{ label: "points" }, ...(normal ? [{ label: "by the told σ, about the mean" }] : [])],
       data: [x, bins, ...(normal ? [normal] : [])], label: "Histogram of the difference" });
   }

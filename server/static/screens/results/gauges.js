@@ -1,14 +1,27 @@
 // Gauges drawn on the picture: a line, extensometers, an area; read by the API's gauges operation.
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
-import { h, svg, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
+import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
+import { nudge, onGrab } from "../../widgets/view.js";
 import { shownUnit } from "./analysis.js";
+/** @import { Attributes } from "#dom" */
+/** @import { Body, GaugeReadings, Model } from "#routes" */
+/** @import { Viewer } from "../results.js" */
+/** @typedef {[x: number, y: number]} Spot */
+/** @typedef {[x0: number, y0: number, x1: number, y1: number]} Four */
+/** @typedef {"line" | "extensometer" | "area"} Kind of a gauge */
+/** @typedef {Kind | "probe"} Tool */
+/** @typedef {"strain" | "elongation_mm" | "length_mm" | "true_strain"} Elongation */
+/** @typedef {Body<"post", "/tests/{test_id}/analyses/{analysis_id}/gauges">} Request */
 
+/** @type {[tool: Tool, text: string, title: string][]} */
 const TOOLS = [["probe", "Probe", "A click shows every number of a point; dragging moves the picture"], ["line", "Line", "Drag a line: values along it"],
   ["extensometer", "Extensometer", "Two clicks or a drag: elongation over the steps"], ["area", "Area", "Drag a rectangle: statistics of it"]];
-const INK = { line: "#ff9d1e", extensometer: "#ff5fa2", area: "#5ad1ff" };
+/** @type {Record<Tool, string>} */
+const INK = { probe: "#fff", line: "#ff9d1e", extensometer: "#ff5fa2", area: "#5ad1ff" };
 const EXTENSOMETER = [["strain", "strain"], ["elongation_mm", "elongation (mm)"], ["length_mm", "length (mm)"], ["true_strain", "true strain"]];
 
+/** @param {Viewer} screen */
 export function gauges(screen) {
   const { result, map } = screen;
   const { view } = map;
@@ -17,13 +30,16 @@ export function gauges(screen) {
   view.svg.removeAttribute("aria-hidden");
   view.svg.setAttribute("role", "group");
   view.svg.setAttribute("aria-label", "Gauges drawn over the picture");
+  /** @type {{ tool: Tool, line: [Spot, Spot] | null, area: Four | null, extensometers: { name: string, a: Spot, b: Spot }[], serial: number, first: Spot | null }} */
   const state = { tool: "probe", line: null, area: null, extensometers: [], serial: 0, first: null };
   const rigid = h("input", { type: "checkbox" });
-  const body = (more) => ({ ...more, ...(rigid.checked ? { remove_rigid: {} } : {}) });
+  /** @type {(more: Partial<Request>) => Request} */
+  const body = (more) => /** @type {Request} */ ({ ...more, ...(rigid.checked ? { remove_rigid: {} } : {}) });
 
   // tools ------------------------------------------------------------------------------------------------------
   const buttons = TOOLS.map(([name, text, title]) => h("button", { type: "button", title, "data-tool": name, "aria-pressed": String(name === "probe"), onclick: (event) => choose(name, event.detail === 0) }, text));
   view.tools.append(h("span.row", { role: "group", "aria-label": "Tool" }, buttons));
+  /** @param {Tool} name */
   function choose(name, byKey = false) {
     state.tool = name;
     state.first = null;
@@ -41,22 +57,24 @@ export function gauges(screen) {
 
   const inReference = () => map.now?.image === "reference";
   view.onleave = () => choose("probe");
-  view.onaim = (aim) => state.first && draw(aim && [aim.x, aim.y]);
+  view.onaim = (aim) => { if (state.first) draw(aim && [aim.x, aim.y]); };
   const probe = screen.onpick;
   screen.onpick = (x, y, event) => {
-    if (state.tool === "probe") return void probe(x, y);
-    if (event?.type !== "keydown" || !inReference()) return; // the mouse draws below
+    if (state.tool === "probe") return void probe(x, y, event);
+    if (event.type !== "keydown" || !inReference()) return; // the mouse draws below
     if (!state.first) {
       state.first = [x, y];
-      return draw([x, y]);
+      draw([x, y]);
+      return;
     }
     const from = state.first;
     state.first = null;
     made(state.tool, from, [x, y]);
   };
+  /** @type {{ from: Spot, to: Spot, at: Spot, moved: boolean } | null} */
   let drag = null;
   view.frame.addEventListener("pointerdown", (event) => {
-    if (state.tool === "probe" || event.button !== 0 || !inReference() || event.target.closest(".grab")) return;
+    if (state.tool === "probe" || event.button !== 0 || !inReference() || onGrab(event)) return;
     event.stopImmediatePropagation();
     event.preventDefault();
     view.frame.focus();
@@ -72,7 +90,7 @@ export function gauges(screen) {
       draw();
     } else if (state.first) draw([x, y]);
   });
-  const up = (event) => {
+  const up = (/** @type {PointerEvent} */ event) => {
     if (!drag) return;
     const done = drag;
     drag = null;
@@ -93,22 +111,37 @@ export function gauges(screen) {
     draw();
   });
 
-  /** Gauges lie inside the grid of points. */
+  /**
+   * Gauges lie inside the grid of points.
+   * @param {readonly number[]} at
+   * @returns {Spot}
+   */
   function within([x, y]) {
+    if (!map.now) return [x, y];
     const { grid } = map.now;
-    const clip = (v, a, b) => Math.min(Math.max(v, Math.min(a, b)), Math.max(a, b));
-    return [clip(x, grid.x0, grid.x0 + (grid.cols - 1) * grid.dx), clip(y, grid.y0, grid.y0 + (grid.rows - 1) * grid.dy)].map((v) => Math.round(v * 10) / 10);
+    /** @type {(v: number, a: number, b: number) => number} */
+    const clip = (v, a, b) => Math.round(10 * Math.min(Math.max(v, Math.min(a, b)), Math.max(a, b))) / 10;
+    return [clip(x, grid.x0, grid.x0 + (grid.cols - 1) * grid.dx), clip(y, grid.y0, grid.y0 + (grid.rows - 1) * grid.dy)];
   }
 
+  /**
+   * @param {Tool} tool
+   * @param {Spot} a
+   * @param {Spot} b
+   */
   function made(tool, a, b) {
     const [from, to] = [within(a), within(b)];
-    if (Math.hypot(from[0] - to[0], from[1] - to[1]) < 1) return draw();
+    if (Math.hypot(from[0] - to[0], from[1] - to[1]) < 1) {
+      draw();
+      return;
+    }
     if (tool === "line") state.line = [from, to];
     if (tool === "area") state.area = [Math.min(from[0], to[0]), Math.min(from[1], to[1]), Math.max(from[0], to[0]), Math.max(from[1], to[1])];
     if (tool === "extensometer") { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: from, b: to }); }
-    changed(tool);
+    if (tool !== "probe") changed(tool);
   }
 
+  /** @param {Kind} tool */
   function changed(tool) {
     draw();
     fillInputs();
@@ -118,25 +151,37 @@ export function gauges(screen) {
   }
 
   // drawing ----------------------------------------------------------------------------------------------------
+  /** @type {(colour: string, extra?: Attributes) => Attributes} */
   const stroke = (colour, extra = {}) => ({ stroke: colour, fill: "none", "stroke-width": 2, "vector-effect": "non-scaling-stroke", ...extra });
+  /**
+   * @param {string} d
+   * @param {string} colour
+   */
   function path(d, colour) {
     return [svg("path", { d, ...stroke("#000", { "stroke-width": 4, opacity: 0.6 }) }), svg("path", { d, ...stroke(colour) })];
   }
-  let later = null;
+  /** @type {number | undefined} */
+  let later;
   screen.ends.push(() => clearTimeout(later));
+  /**
+   * @param {Spot} at
+   * @param {string} colour
+   * @param {(x: number, y: number) => void} move
+   * @param {Kind} tool
+   * @param {string} name
+   */
   function handle(at, colour, move, tool, name) {
     const grab = svg("circle", { class: "grab", tabindex: 0, role: "button", "data-handle": name, "aria-label": `${name}, at ${num(at[0], 5)}, ${num(at[1], 5)} px`, cx: at[0], cy: at[1], fill: colour, stroke: "#000", "stroke-width": 1, "vector-effect": "non-scaling-stroke", style: { r: "calc(6px * var(--px))" } });
     grab.addEventListener("pointerdown", (event) => {
       event.stopPropagation();
       grab.setPointerCapture(event.pointerId);
-      const moving = (e) => { const { x, y } = view.at(e); const [u, v] = within([x, y]); move(u, v); grab.setAttribute("cx", u); grab.setAttribute("cy", v); };
+      const moving = (/** @type {PointerEvent} */ e) => { const { x, y } = view.at(e); const [u, v] = within([x, y]); move(u, v); grab.setAttribute("cx", String(u)); grab.setAttribute("cy", String(v)); };
       grab.addEventListener("pointermove", moving);
       grab.addEventListener("pointerup", () => { grab.removeEventListener("pointermove", moving); changed(tool); }, { once: true });
     });
     grab.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey) return;
-      const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
-      const by = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] }[event.key];
+      const by = nudge(event);
       if (!by) return;
       event.preventDefault();
       event.stopPropagation();
@@ -147,46 +192,61 @@ export function gauges(screen) {
     });
     return grab;
   }
+  /** @param {Spot | null} mouse */
   function draw(mouse = null) {
+    const { area, line } = state;
     const parts = [];
     if (inReference()) {
-      const segment = (a, b) => `M${a[0]} ${a[1]}L${b[0]} ${b[1]}`;
-      const box = ([x0, y0, x1, y1]) => `M${x0} ${y0}H${x1}V${y1}H${x0}Z`;
-      if (state.area) parts.push(...path(box(state.area), INK.area), handle(state.area.slice(0, 2), INK.area, (x, y) => { state.area = [Math.min(x, state.area[2] - 1), Math.min(y, state.area[3] - 1), state.area[2], state.area[3]]; }, "area", "Upper left corner of the area"),
-        handle(state.area.slice(2), INK.area, (x, y) => { state.area = [state.area[0], state.area[1], Math.max(x, state.area[0] + 1), Math.max(y, state.area[1] + 1)]; }, "area", "Lower right corner of the area"));
-      if (state.line) parts.push(...path(segment(...state.line), INK.line), ...[0, 1].map((k) => handle(state.line[k], INK.line, (x, y) => { state.line[k] = [x, y]; }, "line", `${k ? "End" : "Beginning"} of the line`)));
+      const segment = (/** @type {Spot} */ a, /** @type {Spot} */ b) => `M${a[0]} ${a[1]}L${b[0]} ${b[1]}`;
+      const box = (/** @type {Four} */ [x0, y0, x1, y1]) => `M${x0} ${y0}H${x1}V${y1}H${x0}Z`;
+      if (area) {
+        parts.push(...path(box(area), INK.area),
+          handle([area[0], area[1]], INK.area, (x, y) => { area.splice(0, 2, Math.min(x, area[2] - 1), Math.min(y, area[3] - 1)); }, "area", "Upper left corner of the area"),
+          handle([area[2], area[3]], INK.area, (x, y) => { area.splice(2, 2, Math.max(x, area[0] + 1), Math.max(y, area[1] + 1)); }, "area", "Lower right corner of the area"));
+      }
+      if (line) parts.push(...path(segment(...line), INK.line), ...line.map((end, k) => handle(end, INK.line, (x, y) => { line[k] = [x, y]; }, "line", `${k ? "End" : "Beginning"} of the line`)));
       for (const one of state.extensometers) {
-        parts.push(...path(segment(one.a, one.b), INK.extensometer), ...["a", "b"].map((k) => handle(one[k], INK.extensometer, (x, y) => { one[k] = [x, y]; }, "extensometer", `End ${k} of extensometer ${one.name}`)),
+        parts.push(...path(segment(one.a, one.b), INK.extensometer), .../** @type {const} */ (["a", "b"]).map((k) => handle(one[k], INK.extensometer, (x, y) => { one[k] = [x, y]; }, "extensometer", `End ${k} of extensometer ${one.name}`)),
           svg("text", { x: (one.a[0] + one.b[0]) / 2, y: (one.a[1] + one.b[1]) / 2, fill: "#fff", stroke: "#000", "stroke-width": 3, "paint-order": "stroke", style: { fontSize: "calc(13px * var(--px))", strokeWidth: "calc(3px * var(--px))" } }, ` ${one.name}`));
       }
+      /** @type {[Spot, Spot] | null} */
       const going = drag ? [drag.from, drag.to] : state.first && mouse ? [state.first, mouse] : null;
-      if (going) parts.push(...path(state.tool === "area" ? box([...going[0], ...going[1]]) : segment(...going), INK[state.tool] ?? "#fff"));
+      if (going) parts.push(...path(state.tool === "area" ? box(/** @type {Four} */ (going.flat())) : segment(...going), INK[state.tool]));
       else if (state.first) parts.push(svg("circle", { cx: state.first[0], cy: state.first[1], fill: INK[state.tool], style: { r: "calc(5px * var(--px))" } }));
     }
     replace(layer, parts);
   }
 
   // numbers by keyboard ----------------------------------------------------------------------------------------
+  /** @type {(names: string[], set: (v: Four) => unknown) => { inputs: HTMLInputElement[], row: HTMLElement }} */
   const four = (names, set) => {
     const inputs = names.map((name) => number(null, { "aria-label": name, placeholder: name.split(" ").slice(1).join(" "), style: "width:6em" }));
     const use = action("Use", async () => {
       const v = inputs.map((one) => Number(one.value));
       if (inputs.some((one) => one.value === "") || !v.every(Number.isFinite)) throw new Error("Give all four numbers, in pixels of camera 1's reference image.");
-      await set(v);
+      await set(/** @type {Four} */ (v));
     });
-    return { inputs, use, row: h("div.row", inputs, h("span.unit", "px"), use) };
+    return { inputs, row: h("div.row", inputs, h("span.unit", "px"), use) };
   };
-  const lineInputs = four(["Line from x", "Line from y", "Line to x", "Line to y"], (v) => { state.line = [v.slice(0, 2), v.slice(2)]; return changed("line"); });
+  const lineInputs = four(["Line from x", "Line from y", "Line to x", "Line to y"], ([x0, y0, x1, y1]) => { state.line = [[x0, y0], [x1, y1]]; return changed("line"); });
   const areaInputs = four(["Area left", "Area top", "Area right", "Area bottom"], (v) => { state.area = v; return changed("area"); });
-  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], (v) => { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: v.slice(0, 2), b: v.slice(2) }); return changed("extensometer"); });
+  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], ([x0, y0, x1, y1]) => { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: [x0, y0], b: [x1, y1] }); return changed("extensometer"); });
   function fillInputs() {
-    if (state.line) state.line.flat().forEach((v, k) => { lineInputs.inputs[k].value = v; });
-    if (state.area) state.area.forEach((v, k) => { areaInputs.inputs[k].value = v; });
+    if (state.line) state.line.flat().forEach((v, k) => { lineInputs.inputs[k].value = String(v); });
+    if (state.area) state.area.forEach((v, k) => { areaInputs.inputs[k].value = String(v); });
   }
 
   // reading ----------------------------------------------------------------------------------------------------
+  /** @typedef {NonNullable<GaugeReadings["lines"]>[number]} Line */
+  /** @type {{ line: { line: Line, from: [Spot, Spot], name: string } | null, extensometer: GaugeReadings[] | null }} */
   const answers = { line: null, extensometer: null };
+  /** @type {Partial<Record<Kind, Awaited<ReturnType<typeof chart>> | null>>} */
   const plots = {};
+  /**
+   * @param {Kind} name
+   * @param {HTMLElement} place
+   * @param {Parameters<typeof chart>[1]} options
+   */
   async function plot(name, place, options) {
     plots[name]?.close();
     plots[name] = null;
@@ -198,36 +258,41 @@ export function gauges(screen) {
   const along = select([["mm", "mm along the surface"], ["px", "pixels of the image"]], "mm");
   along.addEventListener("change", () => drawLine().catch(notify));
   async function readLine() {
-    if (!state.line || !screen.info) return;
+    if (!state.line || !screen.info || screen.step === null) return;
+    const from = state.line;
     if (screen.info.component !== null) return void replace(lineText, h("p.quiet", "A line reads variables of one number a point; choose another field."));
     const name = screen.info.name;
     replace(lineText, h("p.quiet", "Reading …"));
-    const answer = await api.post(`${result.path}/gauges`, body({ lines: [{ vertices_px: state.line }], variables: [name, "x_mm", "y_mm", "z_mm"].filter((v, k, each) => each.indexOf(v) === k), steps: [screen.step] }));
-    const step = answer.steps[0];
-    if (step.problem) return void replace(lineText, problemText(Object.assign(new Error(step.problem.detail ?? step.problem.cause), step.problem)));
-    answers.line = { line: step.lines[0], name };
+    const answer = await api.post(`${result.path}/gauges`, body({ lines: [{ vertices_px: from }], variables: [name, "x_mm", "y_mm", "z_mm"].filter((v, k, each) => each.indexOf(v) === k), steps: [screen.step] }));
+    const [step] = answer.steps;
+    if (step.problem) return void replace(lineText, problemText(api.problemOf(step.problem)));
+    const [line] = step.lines ?? [];
+    answers.line = { line, from, name };
     await drawLine();
   }
+  /** @type {(values: (number | null)[], sigma: (number | null)[], sign: 1 | -1) => (number | null)[]} */
+  const beside = (values, sigma, sign) => values.map((v, k) => { const s = sigma[k]; return v === null || s === null ? null : v + sign * s; });
   async function drawLine() {
     if (!answers.line) return;
-    const { line, name } = answers.line;
+    const { line, from, name } = answers.line;
     const { value, sigma, units } = line.values[name];
     const { unit, factor } = shownUnit(name, units);
-    const scaled = (list) => list.map((v) => (v === null ? null : v * factor));
+    const scaled = (/** @type {(number | null)[]} */ list) => list.map((v) => (v === null ? null : v * factor));
     const values = scaled(value);
     const errors = scaled(sigma);
-    const place = { x: line.values.x_mm.value, y: line.values.y_mm.value, z: line.values.z_mm.value };
+    const places = values.map((_, k) => ["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value[k] ?? NaN));
     let length = 0;
     const mm = values.map((_, k) => {
-      if (k && place.x[k] !== null && place.x[k - 1] !== null) length += Math.hypot(...["x", "y", "z"].map((a) => place[a][k] - place[a][k - 1]));
+      const way = k ? Math.hypot(...places[k].map((to, axis) => to - places[k - 1][axis])) : 0;
+      if (Number.isFinite(way)) length += way;
       return length;
     });
-    const whole = place.x.every((v) => v !== null);
+    const whole = places.every(([x]) => Number.isFinite(x));
     const inMm = along.value === "mm" && whole;
     const x = inMm ? mm : line.distance_px;
-    const band = (sign) => values.map((v, k) => (v === null || errors[k] === null ? null : v + sign * errors[k]));
+    const band = (/** @type {1 | -1} */ sign) => beside(values, errors, sign);
     const missing = value.filter((v) => v === null).length;
-    replace(lineText, h("p.quiet", `${count(value.length)} places from (${state.line[0].join(", ")}) to (${state.line[1].join(", ")}) px`,
+    replace(lineText, h("p.quiet", `${count(value.length)} places from (${from[0].join(", ")}) to (${from[1].join(", ")}) px`,
       missing ? `; ${missing} without a value: ${[...new Set(line.missing.filter(Boolean))].join(", ").replace(/_/g, " ")}` : "",
       along.value === "mm" && !whole ? "; the way in mm is not known where points are missing, so it is in pixels" : "", errors.some((v) => v !== null) ? "; the band is one standard uncertainty" : "; its uncertainty is not known"));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
@@ -251,10 +316,11 @@ export function gauges(screen) {
       return;
     }
     if (!answers.extensometer) replace(extTable, h("p.quiet", "Reading …"));
-    answers.extensometer = await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }));
+    answers.extensometer = (await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }))).steps;
     await abscissas();
     await drawExtensometers();
   }
+  /** @type {Map<number, Partial<Model<"StepReply">>>} */
   const channels = new Map(); // step -> its document, for channels
   async function abscissas() {
     const listed = result.test.steps ?? [];
@@ -268,46 +334,54 @@ export function gauges(screen) {
     }
     const names = new Set([...channels.values()].flatMap((one) => Object.keys(one.channels ?? {})));
     for (const name of names) found.push([`channel:${name}`, name]);
-    if (listed.some((one) => Number.isFinite(parseFloat(one.label)))) found.push(["label", "number in the label"]);
+    if (listed.some((one) => Number.isFinite(parseFloat(one.label ?? "")))) found.push(["label", "number in the label"]);
     const before = over.value;
     replace(over, found.map(([value, text]) => h("option", { value, selected: value === before }, text)));
   }
+  /**
+   * @param {number} n
+   * @returns {number | null}
+   */
   function abscissa(n) {
-    const step = (result.test.steps ?? []).find((one) => one.n === n) ?? {};
-    const first = (result.test.steps ?? []).find((one) => one.n === result.reference) ?? {};
-    const time = (one) => new Date(one.timestamp_utc ?? one.captured_utc).valueOf();
+    const listed = (/** @type {number} */ n) => (result.test.steps ?? []).find((one) => one.n === n);
+    const step = listed(n);
+    const time = (/** @type {typeof step} */ one) => Date.parse(one?.timestamp_utc ?? one?.captured_utc ?? "");
     if (over.value === "n") return n;
-    if (over.value === "time") return (time(step) - time(first)) / 1000;
-    if (over.value === "load") return step.load_n ?? null;
-    if (over.value === "label") return Number.isFinite(parseFloat(step.label)) ? parseFloat(step.label) : null;
+    if (over.value === "time") return (time(step) - time(listed(result.reference))) / 1000;
+    if (over.value === "load") return step?.load_n ?? null;
+    if (over.value === "label") return Number.isFinite(parseFloat(step?.label ?? "")) ? parseFloat(step?.label ?? "") : null;
     return channels.get(n)?.channels?.[over.value.slice(8)] ?? null;
   }
   async function drawExtensometers() {
     if (!answers.extensometer) return;
     const name = what.value;
-    const steps = answers.extensometer.steps.filter((one) => !one.problem);
-    const rows = steps.map((one) => ({ n: one.n, label: one.label, x: abscissa(one.n), each: one.extensometers })).filter((one) => one.x !== null && Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
+    const steps = answers.extensometer.filter((one) => !one.problem);
+    const rows = steps.map((one) => ({ n: one.n, label: one.label, x: abscissa(one.n) ?? NaN, each: one.extensometers ?? [] })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
     const strain = name.endsWith("strain");
     const factor = strain ? 1e6 : 1;
-    const of = (one, k, part) => one.each[k]?.values[name]?.[part] ?? null;
+    /** @typedef {typeof rows[number]} Row */
+    const of = (/** @type {Row} */ one, /** @type {number} */ k, /** @type {"value" | "sigma"} */ part) => one.each[k]?.values[name]?.[part] ?? null;
+    /** @type {Parameters<typeof chart>[1]["series"]} */
     const series = [];
+    /** @type {number[][]} */
     const bands = [];
+    /** @type {[number[], ...(number | null)[][]]} */
     const data = [rows.map((one) => one.x)];
     state.extensometers.forEach((gauge, k) => {
       const value = rows.map((one) => of(one, k, "value")).map((v) => (v === null ? null : v * factor));
       const sigma = rows.map((one) => of(one, k, "sigma")).map((v) => (v === null ? null : v * factor));
       const at = data.length;
-      data.push(value, value.map((v, i) => (v === null || sigma[i] === null ? null : v + sigma[i])), value.map((v, i) => (v === null || sigma[i] === null ? null : v - sigma[i])));
+      data.push(value, beside(value, sigma, 1), beside(value, sigma, -1));
       series.push({ label: gauge.name, colour: k, dots: true }, { label: `${gauge.name} + σ`, edge: true, colour: k }, { label: `${gauge.name} − σ`, edge: true, colour: k });
       bands.push([at + 1, at + 2]);
     });
     extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
     const unit = strain ? "µm/m" : "mm";
-    await plot("extensometer", extChart, { x: over.selectedOptions[0].textContent, y: `${EXTENSOMETER.find(([v]) => v === name)[1].replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
-    const told = (one, k) => { const v = of(one, k, "value"); const s = of(one, k, "sigma"); return v === null ? one.each[k]?.missing?.replace(/_/g, " ") || "–" : `${num(v * factor, 5)}${s === null ? "" : ` ± ${num(s * factor, 2)}`}`; };
+    await plot("extensometer", extChart, { x: over.selectedOptions[0].text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
+    const told = (/** @type {Row} */ one, /** @type {number} */ k) => { const v = of(one, k, "value"); const s = of(one, k, "sigma"); return v === null ? one.each[k]?.missing?.replace(/_/g, " ") || "–" : `${num(v * factor, 5)}${s === null ? "" : ` ± ${num(s * factor, 2)}`}`; };
     replace(extTable, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [[over.selectedOptions[0].textContent, (one) => num(one.x, 6), { numeric: true }]]),
-      ...state.extensometers.map((gauge, k) => [`${gauge.name} (${unit})`, (one) => told(one, k), { numeric: true }]),
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(over.selectedOptions[0].text, (/** @type {Row} */ one) => num(one.x, 6))]),
+      ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => told(one, k))),
     ], rows, { caption: "With one standard uncertainty" }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
   }
@@ -319,18 +393,19 @@ export function gauges(screen) {
     const { name } = screen.info;
     if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
     const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }));
-    const { unit, factor } = shownUnit(name, answer.steps.at(-1)?.areas[0]?.values[name]?.units ?? "");
-    const cell = (one, part, digits = 5) => { const v = one.areas?.[0]?.values[name]?.[part]; return num(v === null || v === undefined ? null : v * factor, digits); };
+    const { unit, factor } = shownUnit(name, answer.steps.at(-1)?.areas?.[0]?.values[name]?.units ?? "");
+    /** @type {(one: GaugeReadings, part: "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max", digits?: number) => string} */
+    const cell = (one, part, digits = 5) => num((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, digits);
     areaBox.dataset.answer = JSON.stringify(answer.steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], ["± σ", (one) => cell(one, "mean_sigma", 2), { numeric: true }],
       ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Smallest", (one) => cell(one, "min"), { numeric: true }], ["Largest", (one) => cell(one, "max"), { numeric: true }],
-      ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas[0].valid} of ${one.areas[0].points}`), { numeric: true }],
+      ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas?.[0].valid} of ${one.areas?.[0].points}`), { numeric: true }],
     ], answer.steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle` }));
   }
 
   rigid.addEventListener("change", () => { for (const read of [readLine, readArea, readExtensometers]) read().catch(notify); });
-  const clear = (tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else areaBox.replaceChildren(); draw(); } }, "Clear");
+  const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else areaBox.replaceChildren(); draw(); } }, "Clear");
   const panels = {
     line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart),
     extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),

@@ -2,19 +2,27 @@
 import { h, svg, replace, table, num, badge, STATE_KIND } from "../../lib/dom.js";
 import { shownUnit } from "./analysis.js";
 
+/** @import { Reply } from "#routes" */
+/** @import { Viewer } from "../results.js" */
+
 const CORRELATIONS = 3;
 
-/** Show a probe's answer and mark its point in the picture. */
+/**
+ * Show a probe's answer and mark its point in the picture.
+ * @param {Viewer} screen
+ * @param {Reply<"get", "/tests/{test_id}/analyses/{analysis_id}/probe">} answer
+ */
 export function pinned(screen, answer) {
+  /** @type {{ name: string, value: number | null, unit: string, sigma: number | null }[]} */
   const rows = [];
   for (const [name, { value, units }] of Object.entries(answer.values)) {
     if (name.startsWith("sigma_") || name === "status" || name === "strain_status") continue;
     const { unit, factor } = shownUnit(name, units);
     if (Array.isArray(value)) {
-      if (value.length <= CORRELATIONS) value.forEach((one, k) => rows.push({ name: `${name} ${k + 1}`, value: one, unit, sigma: null }));
+      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ name: `${name} ${k + 1}`, value: one, unit, sigma: null })));
       continue;
     }
-    const sigma = answer.values[`sigma_${name}`]?.value ?? null;
+    const sigma = /** @type {number | null} */ (answer.values[`sigma_${name}`]?.value ?? null);
     rows.push({ name, value: value === null ? null : value * factor, unit, sigma: sigma === null ? null : sigma * factor });
   }
   replace(screen.probe,
@@ -25,7 +33,10 @@ export function pinned(screen, answer) {
   mark(screen);
 }
 
-/** Mark the pinned point where it lies in the picture that is shown now. */
+/**
+ * Mark the pinned point where it lies in the picture that is shown now.
+ * @param {Viewer} screen
+ */
 export function mark(screen) {
   const { view, now } = screen.map;
   view.svg.querySelector(".pin")?.remove();

@@ -2,6 +2,12 @@
 import { h, replace, field, number, action, tick } from "../../lib/dom.js";
 import { ENTRIES } from "../../lib/colour.js";
 
+/** @import { Viewer } from "../results.js" */
+/** @import { Grid } from "../../lib/point_grid.js" */
+/** @typedef {[number, number, number]} Triple */
+/** @typedef {ArrayLike<number>[]} Each of three coordinates, a number a point */
+
+/** @type {Promise<[typeof import("../../vendor/three/three.module.js"), typeof import("../../vendor/three/OrbitControls.js")]> | null} */
 let library = null;
 async function three() {
   library ??= Promise.all([import("../../vendor/three/three.module.js"), import("../../vendor/three/OrbitControls.js")]);
@@ -9,23 +15,34 @@ async function three() {
   return { THREE, OrbitControls };
 }
 
-/** 1, 2 or 5 times a power of ten, not above `value`. */
+/** Radians about the vertical and the horizontal. @type {Record<string, [number, number]>} */
+const TURNS = { ArrowLeft: [0.12, 0], ArrowRight: [-0.12, 0], ArrowUp: [0, 0.12], ArrowDown: [0, -0.12] };
+
+/**
+ * 1, 2 or 5 times a power of ten, not above `value`.
+ * @param {number} value
+ */
 function round125(value) {
   if (!(value > 0) || !Number.isFinite(value)) return 1;
   const power = 10 ** Math.floor(Math.log10(value));
   return ([5, 2, 1].find((one) => one * power <= value) ?? 1) * power;
 }
 
-/** Even marks between two numbers. */
+/**
+ * Even marks between two numbers.
+ * @param {number} low
+ * @param {number} high
+ */
 function marks(low, high, most = 5) {
   const rough = (high - low) / most;
   const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
+  const step = ([1, 2, 5, 10].find((one) => one * power >= rough) ?? 10) * power;
   const out = [];
   for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : Number(v.toPrecision(12)));
   return out;
 }
 
+/** @param {Viewer} screen */
 export async function surface(screen) {
   const { THREE, OrbitControls } = await three();
   const { result, map, scale } = screen;
@@ -39,6 +56,7 @@ export async function surface(screen) {
   const root = h("div.panel", { "data-role": "surface" },
     h("div.row", field("Displacement ×", magnification), field("Depth ×", depth), h("label.check", grid, "grid lines"), reset, action("Save picture", save), note), place);
 
+  /** @type {import("three").WebGLRenderer} */
   let renderer;
   try {
     renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
@@ -68,25 +86,29 @@ export async function surface(screen) {
   const box = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: 0x808a90 }));
   scene.add(mesh, wire, box);
 
-  let held = null; // {step, position, motion, valid}
+  /** @type {{ n: number, grid: Grid, position: Each, motion: Each | null } | null} */
+  let held = null;
+  /** @type {{ span: [number, number][], origin: number[], size: number, times: number, deep: number } | null} */
   let bounds = null;
+  /** @type {{ at: number[], text: string }[]} */
   let ticks = [];
+  /** @type {number[]} */
   let triangles = [];
   let asked = 0;
 
-  async function read() {
-    const n = map.now.n;
-    const grid_ = map.now.grid;
+  /** @param {{ n: number, grid: Grid }} of */
+  async function read({ n, grid }) {
     const { all } = await result.fields(n);
-    const of = (names) => Promise.all(names.map((name) => result.array(n, name).then((one) => one.data)));
+    const of = (/** @type {string[]} */ names) => Promise.all(names.map((name) => result.array(n, name).then((one) => one.data)));
     const [position, motion] = await Promise.all([of(["x_mm", "y_mm", "z_mm"]), all.has("u_mm") ? of(["u_mm", "v_mm", "w_mm"]) : null]);
-    return { n, grid: grid_, position, motion };
+    return { n, grid, position, motion };
   }
 
-  const factor = (input, usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Number(input.value));
+  const factor = (/** @type {HTMLInputElement} */ input, /** @type {number} */ usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Number(input.value));
 
   /** Triangles over cells whose corners all have a place: never over a missing point or a cut. */
   function build() {
+    if (!held) return false;
     const { grid: g, position, motion } = held;
     const count = g.x.length;
     let most = 0;
@@ -110,6 +132,7 @@ export async function surface(screen) {
     const middle = (low[2] + high[2]) / 2;
     const at = new Float32Array(3 * count);
     const uv = new Float32Array(2 * count).fill(0.5);
+    /** @type {[number, number][]} */
     const span = [[Infinity, -Infinity], [Infinity, -Infinity], [Infinity, -Infinity]];
     const origin = [0, 1, 2].map((k) => (low[k] + high[k]) / 2);
     for (let i = 0; i < count; i += 1) {
@@ -123,8 +146,9 @@ export async function surface(screen) {
       }
     }
     triangles = [];
+    /** @type {number[]} */
     const lines = [];
-    const whole = (i) => g.valid[i] && Number.isFinite(at[3 * i]) && (!motion || Number.isFinite(motion[0][i]));
+    const whole = (/** @type {number} */ i) => g.valid[i] && Number.isFinite(at[3 * i]) && (!motion || Number.isFinite(motion[0][i]));
     for (let r = 0; r < g.rows - 1; r += 1) {
       for (let c = 0; c < g.cols - 1; c += 1) {
         const cell = r * g.cols + c;
@@ -153,26 +177,28 @@ export async function surface(screen) {
     wire.visible = grid.checked;
     // a flat surface still needs a box to stand in
     for (const one of span) if (one[1] - one[0] < 0.02 * size) { const m = (one[0] + one[1]) / 2; one[0] = m - 0.01 * size; one[1] = m + 0.01 * size; }
-    bounds = { span, origin, size, times, deep, middle, motion: Boolean(motion) };
-    axes();
+    bounds = { span, origin, size, times, deep };
+    axes(bounds);
     place.dataset.triangles = String(triangles.length / 3);
     place.dataset.magnification = String(times);
     note.textContent = `${motion ? `displacement × ${tick(times)}${times === 1 ? " (as it is)" : ""}` : "shape; this step has no displacement"}${deep === 1 ? "" : `, depth × ${tick(deep)}`}; axes in mm`;
     return true;
   }
 
-  function axes() {
-    const { span, origin } = bounds;
+  /** @param {NonNullable<typeof bounds>} bounds */
+  function axes({ span, origin, size, times, deep }) {
+    /** @type {number[]} */
     const v = [];
-    const corner = (i, j, k) => [span[0][i] - origin[0], span[1][j] - origin[1], span[2][k] - origin[2]];
-    const edge = (a, b) => v.push(...a, ...b);
+    const corner = (/** @type {number} */ i, /** @type {number} */ j, /** @type {number} */ k) => [span[0][i] - origin[0], span[1][j] - origin[1], span[2][k] - origin[2]];
+    const edge = (/** @type {number[]} */ a, /** @type {number[]} */ b) => v.push(...a, ...b);
     for (const j of [0, 1]) for (const k of [0, 1]) {
       edge(corner(0, j, k), corner(1, j, k));
       edge(corner(j, 0, k), corner(j, 1, k));
       edge(corner(j, k, 0), corner(j, k, 1));
     }
     ticks = [];
-    const long = 0.015 * bounds.size;
+    const long = 0.015 * size;
+    /** @type {(axis: number, value: number, from: number[], out: Triple) => number[]} */
     const put = (axis, value, from, out) => {
       const a = [...from];
       a[axis] = value - origin[axis];
@@ -180,14 +206,15 @@ export async function surface(screen) {
       edge(a, b);
       return a.map((x, k) => x + 3 * out[k] * long);
     };
-    const most = (axis) => Math.max(2, Math.min(5, Math.round((6 * (span[axis][1] - span[axis][0])) / bounds.size)));
+    const most = (/** @type {number} */ axis) => Math.max(2, Math.min(5, Math.round((6 * (span[axis][1] - span[axis][0])) / size)));
     // X along the lower edge of the picture, Y along the left one, Z along the far left corner; Y_sys points down in it
     for (const value of marks(...span[0], most(0))) ticks.push({ at: put(0, value, corner(0, 1, 0), [0, 1, 0]), text: tick(value) });
     for (const value of marks(...span[1], most(1))) ticks.push({ at: put(1, value, corner(0, 0, 0), [-1, 0, 0]), text: tick(value) });
-    for (const value of bounds.times > 1 || bounds.deep !== 1 ? [] : marks(...span[2], most(2))) ticks.push({ at: put(2, value, corner(1, 1, 0), [1, 0, 0]), text: tick(value) });
+    for (const value of times > 1 || deep !== 1 ? [] : marks(...span[2], most(2))) ticks.push({ at: put(2, value, corner(1, 1, 0), [1, 0, 0]), text: tick(value) });
+    /** @type {(axis: number, from: number[], out: Triple) => number[]} */
     const mid = (axis, from, out) => { const a = [...from]; a[axis] = (span[axis][0] + span[axis][1]) / 2 - origin[axis]; return a.map((x, k) => x + 7 * out[k] * long); };
     ticks.push({ at: mid(0, corner(0, 1, 0), [0, 1, 0]), text: "X (mm)" }, { at: mid(1, corner(0, 0, 0), [-1, 0, 0]), text: "Y (mm)" },
-      { at: mid(2, corner(1, 1, 0), [0.6, 0, 0]), text: bounds.times > 1 || bounds.deep !== 1 ? "Z (magnified)" : "Z (mm)" });
+      { at: mid(2, corner(1, 1, 0), [0.6, 0, 0]), text: times > 1 || deep !== 1 ? "Z (magnified)" : "Z (mm)" });
     replace(labels, ticks.map((one) => h("span", one.text)));
     box.geometry.dispose();
     box.geometry = new THREE.BufferGeometry();
@@ -196,6 +223,7 @@ export async function surface(screen) {
 
   /** The field's colours on the points. */
   function paint() {
+    if (!map.now) return;
     const { values, grid: g, info } = map.now;
     if (values.length !== g.x.length || !mesh.geometry.attributes.uv || mesh.geometry.attributes.uv.count !== g.x.length) return;
     const uv = mesh.geometry.attributes.uv;
@@ -205,7 +233,9 @@ export async function surface(screen) {
       uv.array[2 * i] = Number.isFinite(share) ? Math.min(Math.max(share, 0.5 / ENTRIES), 1 - 0.5 / ENTRIES) : 0.5;
     }
     uv.needsUpdate = true;
+    /** @type {number[]} */
     const coloured = [];
+    /** @type {number[]} */
     const others = [];
     for (let k = 0; k < triangles.length; k += 3) {
       const three_ = [triangles[k], triangles[k + 1], triangles[k + 2]];
@@ -217,7 +247,7 @@ export async function surface(screen) {
     mesh.geometry.clearGroups();
     mesh.geometry.addGroup(0, coloured.length, 0);
     mesh.geometry.addGroup(coloured.length, others.length, 1);
-    const data = texture.image.data;
+    const data = /** @type {Uint8Array} */ (texture.image.data);
     for (let i = 0; i < ENTRIES; i += 1) {
       const rgb = flags ? scale.colour(i) : [scale.rgb[3 * i], scale.rgb[3 * i + 1], scale.rgb[3 * i + 2]];
       data.set([...rgb, 255], 4 * i);
@@ -258,19 +288,21 @@ export async function surface(screen) {
       renderer.render(scene, camera);
       const v = new THREE.Vector3();
       ticks.forEach((one, k) => {
-        v.set(...one.at).project(camera);
-        const span = labels.children[k];
+        v.fromArray(one.at).project(camera);
+        const span = /** @type {HTMLElement | undefined} */ (labels.children[k]);
         if (!span) return;
         span.style.transform = `translate(${((v.x + 1) / 2) * width}px, ${((1 - v.y) / 2) * height}px) translate(-50%, -50%)`;
         span.hidden = v.z > 1;
       });
-      place.dataset.drawn = `${map.now.n} ${map.now.info.key}`;
+      place.dataset.drawn = `${map.now?.n} ${map.now?.info.key}`;
     });
   }
 
   async function save() {
     renderer.render(scene, camera);
+    /** @type {Blob | null} */
     const blob = await new Promise((resolve) => renderer.domElement.toBlob(resolve, "image/png"));
+    if (!blob || !map.now) return;
     const link = h("a", { href: URL.createObjectURL(blob), download: `${result.testId}_${result.analysisId}_step${map.now.n}_surface.png` });
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
@@ -282,7 +314,7 @@ export async function surface(screen) {
     if (!map.now) return;
     const fresh = !held || held.n !== map.now.n;
     if (fresh) {
-      const got = await read();
+      const got = await read(map.now);
       if (mine !== asked) return;
       const first = !bounds;
       held = got;
@@ -299,7 +331,7 @@ export async function surface(screen) {
   for (const input of [magnification, depth]) input.addEventListener("change", () => { if (held && build()) { paint(); draw(); } });
   grid.addEventListener("change", () => { wire.visible = grid.checked; draw(); });
   place.addEventListener("keydown", (event) => {
-    const turn = { ArrowLeft: [0.12, 0], ArrowRight: [-0.12, 0], ArrowUp: [0, 0.12], ArrowDown: [0, -0.12] }[event.key];
+    const turn = TURNS[event.key];
     const off = camera.position.clone().sub(controls.target);
     if (turn) {
       const polar = new THREE.Spherical().setFromVector3(off.clone().applyQuaternion(new THREE.Quaternion().setFromUnitVectors(camera.up, new THREE.Vector3(0, 1, 0))));

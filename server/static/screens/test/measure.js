@@ -5,17 +5,31 @@ import { greyOf } from "../../widgets/grey.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
 import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../../lib/dom.js";
 
+/** @import { Ends } from "#dom" */
+/** @import { Model } from "#routes" */
+/** @typedef {Model<"AnalysisRequest">} Request */
+/** @typedef {Model<"TestReply">} Test */
+
+/** @type {Record<string, string>} */
 const LEVEL = { good: "good", usable: "warn", poor: "bad" };
 
+/**
+ * @param {string} id
+ * @param {Test} test
+ * @param {Ends} ends
+ * @param {() => Promise<unknown>} done
+ */
 export async function measurePanel(id, test, ends, done) {
   const root = h("section.panel", { "aria-label": "Region and analysis" }, h("h2", "Region and analysis"));
   const body = h("div");
   root.append(body);
+  /** @type {Awaited<ReturnType<typeof build>> | null} */
   let built = null;
 
+  /** @param {Test} fresh */
   async function steps(fresh) {
     test = fresh;
-    if (!test.steps.length) {
+    if (!test.steps?.length) {
       replace(body, h("p.quiet", "The region is drawn over the reference step: capture or import it first."));
       return;
     }
@@ -40,6 +54,7 @@ export async function measurePanel(id, test, ends, done) {
     const overlays = views.map((view) => { const image = h("img", { alt: "", hidden: true }); view.content.insertBefore(image, view.svg); return image; });
     const texture = h("div", { role: "status", "data-role": "texture" });
 
+    /** @type {number | null} */
     let shownStep = null;
     function showReference() {
       const n = Number(reference.value);
@@ -56,9 +71,10 @@ export async function measurePanel(id, test, ends, done) {
       const [cx, cy] = editor.middle().map(Math.round);
       const half = Number(subset.value) / 2;
       const apart = Number(step.value);
+      /** @type {(d: string, colour: string, width: number, more?: import("#dom").Attributes, dashes?: number[]) => SVGElement} */
       const path = (d, colour, width, more = {}, dashes = []) => svg("path", { d, ...stroke(colour, width, dashes), ...more });
       if (showSample.checked && half > 0 && apart > 0) {
-        const square = (x, y) => `M${x - half} ${y - half}h${2 * half}v${2 * half}h${-2 * half}z`;
+        const square = (/** @type {number} */ x, /** @type {number} */ y) => `M${x - half} ${y - half}h${2 * half}v${2 * half}h${-2 * half}z`;
         parts.push(path(square(cx + apart, cy) + square(cx, cy + apart), "#33c6ff", 1, {}, [4, 3]), path(square(cx, cy), "#33c6ff", 2, { "data-role": "subset" }));
         const dots = [];
         for (let i = -3; i <= 3; i += 1) for (let k = -3; k <= 3; k += 1) dots.push(`M${cx + i * apart} ${cy + k * apart}h0.001`);
@@ -80,8 +96,8 @@ export async function measurePanel(id, test, ends, done) {
         const told = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), step_px: Number(step.value), noise_id: noiseChoice.value || null });
         if (mine !== asked) return;
         replace(texture,
-          h("p", badge({ good: "good texture", usable: "usable texture", poor: "poor texture" }[told.level] ?? told.level, LEVEL[told.level] ?? ""), ` ${num(100 * told.good_share, 3)} % of ${count(told.subsets)} subsets below ${told.good_px} px, ${num(100 * told.usable_share, 3)} % below ${told.usable_px} px; median ${quantity(told.median_error_px, "px", 2)} at a noise of ${num(told.noise_grey, 3)} grey levels.`),
-          told.proposed_subset_px && told.proposed_subset_px !== told.subset_px ? h("p.row", `The smallest subset that would do: ${told.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = told.proposed_subset_px; changed(); } }, "Take it")) : null,
+          h("p", badge(`${told.level} texture`, LEVEL[told.level] ?? ""), ` ${num(100 * told.good_share, 3)} % of ${count(told.subsets)} subsets below ${told.good_px} px, ${num(100 * told.usable_share, 3)} % below ${told.usable_px} px; median ${quantity(told.median_error_px, "px", 2)} at a noise of ${num(told.noise_grey, 3)} grey levels.`),
+          told.proposed_subset_px && told.proposed_subset_px !== told.subset_px ? h("p.row", `The smallest subset that would do: ${told.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = String(told.proposed_subset_px); changed(); } }, "Take it")) : null,
           told.proposed_subset_px ? null : h("p", "No subset up to 91 px would do: the pattern is too faint, or too coarse."),
           h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${told.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${told.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], told.sizes, { caption: "Share of the region's subsets with an expected random error" })));
       } catch (error) {
@@ -89,6 +105,7 @@ export async function measurePanel(id, test, ends, done) {
       }
     }
 
+    /** @type {string[]} */
     let shownMaps = [];
     async function layTexture() {
       const on = showTexture.checked;
@@ -104,25 +121,26 @@ export async function measurePanel(id, test, ends, done) {
     }
     ends.push(() => shownMaps.forEach((url) => URL.revokeObjectURL(url)));
 
-    let seedsAsked = "[]";
+    let seedsAsked = "";
     async function checkSeeds() {
-      const told = editor.seeds();
-      const question = JSON.stringify([told, reference.value]);
+      const { seeds, seeds_cam2 } = editor.seeds();
+      const question = JSON.stringify([seeds, seeds_cam2, reference.value]);
       if (question === seedsAsked) return;
       seedsAsked = question;
-      if (!told.seeds) {
+      if (!seeds) {
         editor.tellLines([]);
         return;
       }
       try {
-        const answer = await api.post(`/tests/${id}/seeds:check`, { ...told, reference: Number(reference.value) });
+        const answer = await api.post(`/tests/${id}/seeds:check`, { seeds, seeds_cam2, reference: Number(reference.value) });
         if (question === seedsAsked) editor.tellLines(answer.seeds);
       } catch (error) {
         notify(error);
       }
     }
 
-    let timer = null;
+    /** @type {number | undefined} */
+    let timer;
     ends.push(() => clearTimeout(timer));
     function changed() {
       drawSample();
@@ -146,7 +164,7 @@ export async function measurePanel(id, test, ends, done) {
     const window_ = number(9, { min: 3, step: 2 });
     const order = select([[1, "planes"], [2, "quadratics"]], 1);
     const tensor = select([["green_lagrange", "Green-Lagrange"], ["infinitesimal", "infinitesimal"], ["hencky", "Hencky (logarithmic)"]], "green_lagrange");
-    const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, one.label || one.id])], "");
+    const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, String(one.plan.label || one.id)])], "");
     noiseChoice.addEventListener("change", changed);
     const update = select([["auto", "auto"], ["never", "never (total)"], ["always", "always (incremental)"]], "auto");
     const which = h("input", { type: "text", placeholder: "all", "aria-describedby": "which-hint" });
@@ -163,20 +181,25 @@ export async function measurePanel(id, test, ends, done) {
     ends.push(() => stopped.abort());
     const start = action("Measure", async () => {
       const region = editor.region();
-      if (!region) throw Object.assign(new Error("There is no region."), { remedy: "Draw a rectangle or a polygon over camera 1's image." });
+      if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
+      /** @type {Request} */
       const body_ = {
-        kind: kind.value, region, subset_px: Number(subset.value), step_px: Number(step.value), patch: patch.value, interpolation: interpolation.value, prefilter_px: Number(prefilter.value),
-        reference: Number(reference.value), reference_update: update.value, noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
-        smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? { window: Number(window_.value), order: Number(order.value), tensor: tensor.value } : null,
+        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), step_px: Number(step.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
+        reference: Number(reference.value), reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
+        smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: Number(order.value), tensor: tensor.value }) : null,
       };
       const wanted = stepList(which.value);
       if (wanted) body_.steps = wanted;
       if (follow_.checked) body_.follow = true;
       const { job, analysis_id: analysis } = await api.post(`/tests/${id}/analyses`, body_);
       await done();
-      follow(job, analysis).catch((error) => error.name === "AbortError" || notify(error));
+      follow(job, analysis).catch((error) => api.aborted(error) || notify(error));
     }, { kind: "primary" });
 
+    /**
+     * @param {Model<"JobReply">} job
+     * @param {string} analysis
+     */
     async function follow(job, analysis) {
       const bar = h("progress", { max: 1, "aria-label": "Progress of the analysis" });
       const text = h("span");
@@ -216,7 +239,7 @@ export async function measurePanel(id, test, ends, done) {
     return {
       steps() {
         const kept = reference.value;
-        replace(reference, test.steps.map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)));
+        replace(reference, (test.steps ?? []).map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)));
         if (reference.selectedIndex < 0) reference.selectedIndex = 0;
         showReference();
       },
@@ -224,16 +247,19 @@ export async function measurePanel(id, test, ends, done) {
   }
 
   await steps(test);
-  return { root, steps: (fresh) => steps(fresh).catch(notify) };
+  return { root, steps: (/** @type {Test} */ fresh) => steps(fresh).catch(notify) };
 }
 
-/** "1-5, 8" -> [1, 2, 3, 4, 5, 8]; nothing where all are meant. */
+/**
+ * "1-5, 8" -> [1, 2, 3, 4, 5, 8]; nothing where all are meant.
+ * @param {string} text
+ */
 export function stepList(text) {
   if (!text.trim() || text.trim() === "all") return null;
   const out = [];
   for (const part of text.split(/[\s,;]+/).filter(Boolean)) {
     const found = /^(\d+)(?:[-–](\d+))?$/.exec(part);
-    if (!found) throw Object.assign(new Error(`“${part}” is no step.`), { remedy: "Write numbers and spans between commas: 1-5, 8." });
+    if (!found) throw api.problemOf({ cause: `“${part}” is no step.`, remedy: "Write numbers and spans between commas: 1-5, 8." });
     const last = Number(found[2] ?? found[1]);
     for (let n = Number(found[1]); n <= last && out.length <= 10000; n += 1) out.push(n);
   }

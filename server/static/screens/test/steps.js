@@ -2,41 +2,60 @@
 import * as api from "../../lib/api.js";
 import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "../../lib/dom.js";
 
+/** @import { Ends } from "#dom" */
+/** @import { Model } from "#routes" */
+/** @typedef {Model<"TestReply">} Test */
+/** @typedef {Model<"StepReply">} Step */
+
+/** @type {Record<string, string>} */
 const KIND = { ok: "good", dark: "warn", blurred: "warn", low_texture: "warn", saturated: "warn", blank: "bad", cameras_off_zero: "bad" };
+/** @type {Record<string, string>} */
 const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "little texture", saturated: "saturated", blank: "nothing to see", cameras_off_zero: "cameras are off their calibrated place" };
 
-export async function stepsPanel(id, test, ends, reread) {
-  const panel = { onchange: () => {}, root: null, refresh };
+/**
+ * @param {string} id
+ * @param {Test} test
+ * @param {Ends} ends
+ * @param {() => Promise<Test>} reread
+ */
+export function stepsPanel(id, test, ends, reread) {
   const thumbs = h("div.thumbs", { "data-role": "thumbnails", style: { maxHeight: "22rem", overflow: "auto" }, tabindex: 0, role: "region", "aria-label": "Thumbnails" });
   const detail = h("div", { role: "status", "data-role": "quality" });
+  /** @type {number | null} */
   let chosen = null;
+  /** @type {(test: Test) => void} */
+  let changed = () => {};
 
   async function refresh() {
     test = await reread();
     draw();
-    panel.onchange(test);
+    changed(test);
   }
 
   function draw() {
-    if (!test.steps.length) {
+    const steps = test.steps ?? [];
+    if (!steps.length) {
       replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference."));
       return;
     }
-    replace(thumbs, test.steps.map((step) => h("figure", { "data-step": step.n },
+    replace(thumbs, steps.map((step) => h("figure", { "data-step": step.n },
       h("button.plain", { type: "button", style: { padding: 0, display: "block", width: "100%" }, "aria-pressed": String(step.n === chosen), "aria-label": `Step ${step.n}${step.label ? `, ${step.label}` : ""}`, onclick: () => show(step.n).catch(notify) },
         h("img", { loading: "lazy", alt: "", width: 132, src: api.address(`/tests/${id}/steps/${step.n}/cam1/preview`, { width_px: 132 }) })),
       h("figcaption", h("strong", `${step.n}`), ` ${step.label ?? ""} `, step.load_n !== null && step.load_n !== undefined ? `${quantity(step.load_n, "N", 4)} ` : "", step.quality && step.quality !== "ok" ? badge(WORDS[step.quality] ?? step.quality, KIND[step.quality] ?? "warn") : null))),
-    (test.incomplete_steps ?? []).length ? h("p.quiet", `Incomplete: ${test.incomplete_steps.join(", ")}.`) : null);
+    test.incomplete_steps?.length ? h("p.quiet", `Incomplete: ${test.incomplete_steps.join(", ")}.`) : null);
   }
 
+  /** @param {number} n */
   async function show(n) {
     chosen = n;
     tell(await api.get(`/tests/${id}/steps/${n}`));
-    for (const button of thumbs.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.closest("[data-step]").dataset.step === String(n)));
+    for (const button of thumbs.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.closest(`[data-step="${n}"]`) !== null));
   }
 
+  /** @param {Step} step */
   function tell(step) {
-    const quality = step.quality ?? {};
+    const quality = /** @type {Partial<NonNullable<Step["quality"]>>} */ (step.quality ?? {});
+    /** @type {(readonly [string, (q: Exclude<NonNullable<Step["quality"]>["cam1"], undefined | null>) => import("#dom").Part])[]} */
     const rows = [
       ["verdict", (q) => badge(WORDS[q.code] ?? q.code, KIND[q.code] ?? "warn")], ["mean grey", (q) => `${num(q.mean_grey, 4)}${q.mean_share ? ` (${num(100 * q.mean_share, 3)} %)` : ""}`],
       ["saturated", (q) => quantity(100 * q.saturated_share, "%", 3)], ["contrast", (q) => quantity(q.contrast_grey, "grey", 3)],
@@ -44,7 +63,7 @@ export async function stepsPanel(id, test, ends, reread) {
     ];
     const channels = Object.entries(step.channels ?? {}).map(([name, value]) => `${name} ${num(value, 6)}`).join(", ");
     replace(detail,
-      h("div.spread", h("h3", `Step ${step.n}${step.label ? `: ${step.label}` : ""}`), h("span.row", badge(WORDS[quality.code] ?? quality.code ?? "not judged", KIND[quality.code] ?? ""),
+      h("div.spread", h("h3", `Step ${step.n}${step.label ? `: ${step.label}` : ""}`), h("span.row", badge(WORDS[quality.code ?? ""] ?? quality.code ?? "not judged", KIND[quality.code ?? ""] ?? ""),
         action("Delete …", async () => {
           if (await ask(`Delete step ${step.n}?`, h("p", "It goes to the trash; its number is not given again, and analyses that used it are stale."), [["Cancel", null], ["Delete", "yes"]])) {
             await api.remove(`/tests/${id}/steps/${step.n}`);
@@ -52,16 +71,22 @@ export async function stepsPanel(id, test, ends, reread) {
             await refresh();
           }
         }))),
-      h("p.quiet", [when(step.captured_utc), step.load_n !== null && step.load_n !== undefined ? `load ${quantity(step.load_n, "N", 6)}` : null, channels || null, step.skew_ms !== null && step.skew_ms !== undefined ? `skew ${quantity(step.skew_ms, "ms", 3)}${quality.max_skew_ms ? ` of ${quantity(quality.max_skew_ms, "ms", 3)} allowed` : ""}` : null, step.frames > 1 ? `${step.frames} frames averaged` : null].filter(Boolean).join(" · ")),
+      h("p.quiet", [when(step.captured_utc), step.load_n !== null && step.load_n !== undefined ? `load ${quantity(step.load_n, "N", 6)}` : null, channels || null, step.skew_ms !== null && step.skew_ms !== undefined ? `skew ${quantity(step.skew_ms, "ms", 3)}${quality.max_skew_ms ? ` of ${quantity(quality.max_skew_ms, "ms", 3)} allowed` : ""}` : null, (step.frames ?? 1) > 1 ? `${step.frames} frames averaged` : null].filter(Boolean).join(" · ")),
       table([["Figure", (row) => row[0], { unseen: true }], ["cam1", (row) => (quality.cam1 ? row[1](quality.cam1) : "–"), { numeric: true }], ["cam2", (row) => (quality.cam2 ? row[1](quality.cam2) : "–"), { numeric: true }]], rows, { caption: "What the pair is worth" }));
   }
 
-  panel.root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
+  const root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
     h("div.grid.side", h("div", thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; tell(step); await refresh(); }, ends, refresh)));
   draw();
-  return panel;
+  return { root, refresh, onchange: (/** @type {typeof changed} */ listener) => { changed = listener; } };
 }
 
+/**
+ * @param {string} id
+ * @param {(step: Step) => unknown} done
+ * @param {Ends} ends
+ * @param {() => unknown} refresh
+ */
 function capture(id, done, ends, refresh) {
   const label = h("input", { type: "text", maxlength: 300, placeholder: "1.25 kN" });
   const load = number(null);
@@ -74,11 +99,12 @@ function capture(id, done, ends, refresh) {
   ends.push(() => stopped.abort());
 
   const take = action("Capture", async () => {
+    /** @type {Model<"StepRequest">} */
     const body = { label: label.value, channels: parseChannels(channels.value), frames: Number(frames.value) };
     if (load.value !== "") body.load_n = Number(load.value);
     if (Number(count.value) > 1) Object.assign(body, { count: Number(count.value), interval_ms: Number(interval.value) });
     const made = await api.post(`/tests/${id}/steps`, body);
-    if (!made.job) return done(made);
+    if (!("job" in made)) return done(made);
     const bar = h("progress", { max: 1, "aria-label": "Progress of the burst" });
     replace(progress, bar, action("Cancel", () => api.post(`/jobs/${made.job.id}/cancel`), { kind: "danger" }));
     const ended = await api.finished(made.job.id, { signal: stopped.signal, onprogress: (job) => { if (job.progress?.total) bar.value = job.progress.done / job.progress.total; } });
@@ -91,26 +117,40 @@ function capture(id, done, ends, refresh) {
     h("details", h("summary", "A burst"), h("div.fields", field("Steps", count), field("One every", interval, "ms"))), h("div.row", take), progress);
 }
 
-/** "stroke_mm = 0.42, temperature_c = 21.3" -> {stroke_mm: 0.42, ...} */
+/**
+ * "stroke_mm = 0.42, temperature_c = 21.3" -> {stroke_mm: 0.42, ...}
+ * @param {string} text
+ */
 export function parseChannels(text) {
+  /** @type {Record<string, number>} */
   const out = {};
   for (const part of text.split(/[,;\n]+/).map((one) => one.trim()).filter(Boolean)) {
     const [name, value, ...more] = part.split("=").map((one) => one.trim());
-    if (!name || more.length || !value || !Number.isFinite(Number(value))) throw Object.assign(new Error(`“${part}” is no channel.`), { remedy: "Write name = number, with a point, between commas." });
+    if (!name || more.length || !value || !Number.isFinite(Number(value))) throw api.problemOf({ cause: `“${part}” is no channel.`, remedy: "Write name = number, with a point, between commas." });
     out[name] = Number(value);
   }
   return out;
 }
 
-/** Pairs of files in the order of their names, numbers in them counted as numbers. */
+/**
+ * Pairs of files in the order of their names, numbers in them counted as numbers.
+ * @param {ArrayLike<File>} one
+ * @param {ArrayLike<File>} two
+ * @returns {[File, File][]}
+ */
 export function pairsOf(one, two) {
   const order = new Intl.Collator("en", { numeric: true });
-  const sorted = (files) => [...files].sort((a, b) => order.compare(a.name, b.name));
+  const sorted = (/** @type {ArrayLike<File>} */ files) => Array.from(files).sort((a, b) => order.compare(a.name, b.name));
   const [first, second] = [sorted(one), sorted(two)];
-  if (first.length !== second.length || !first.length) throw Object.assign(new Error(`Camera 1 has ${first.length} images, camera 2 has ${second.length}.`), { remedy: "Choose as many images of each camera; they are matched in the order of their names." });
+  if (first.length !== second.length || !first.length) throw api.problemOf({ cause: `Camera 1 has ${first.length} images, camera 2 has ${second.length}.`, remedy: "Choose as many images of each camera; they are matched in the order of their names." });
   return first.map((file, index) => [file, second[index]]);
 }
 
+/**
+ * @param {string} id
+ * @param {() => unknown} refresh
+ * @param {Ends} ends
+ */
 function importPairs(id, refresh, ends) {
   const accept = ".tif,.tiff,.png,.bmp,.jpg,.jpeg";
   const one = h("input", { type: "file", multiple: true, accept });
@@ -118,14 +158,16 @@ function importPairs(id, refresh, ends) {
   const matched = h("div", { role: "status" });
   const progress = h("div", { role: "status" });
   const byName = h("input", { type: "checkbox", checked: true });
+  /** @type {AbortController | null} */
   let going = null;
+  const files = (/** @type {HTMLInputElement} */ input) => input.files ?? [];
   ends.push(() => going?.abort());
 
   function match() {
-    if (!one.files.length || !two.files.length) return replace(matched);
+    if (!files(one).length || !files(two).length) return replace(matched);
     try {
-      const pairs = pairsOf(one.files, two.files);
-      return replace(matched, table([["Number", (row) => String(row[2] + 1), { unseen: true }], ["Camera 1", (row) => row[0].name], ["Camera 2", (row) => row[1].name]], pairs.map((pair, k) => [...pair, k]).slice(0, 200), { caption: `${pairs.length} pairs, in the order of their names` }));
+      const pairs = pairsOf(files(one), files(two));
+      return replace(matched, table([["Number", (row) => String(row[2] + 1), { unseen: true }], ["Camera 1", (row) => row[0].name], ["Camera 2", (row) => row[1].name]], pairs.map(([a, b], k) => /** @type {const} */ ([a, b, k])).slice(0, 200), { caption: `${pairs.length} pairs, in the order of their names` }));
     } catch (error) {
       return replace(matched, problemText(error));
     }
@@ -133,15 +175,16 @@ function importPairs(id, refresh, ends) {
   one.addEventListener("change", match);
   two.addEventListener("change", match);
   const start = action("Import", async () => {
-    const pairs = pairsOf(one.files, two.files);
-    going = new AbortController();
+    const pairs = pairsOf(files(one), files(two));
+    const stopping = new AbortController();
+    going = stopping;
     const bar = h("progress", { max: pairs.length, value: 0, "aria-label": "Progress of the import" });
     const text = h("span");
-    replace(progress, h("div.row", h("span", { style: { flex: 1 } }, bar), text, h("button.danger", { type: "button", onclick: () => going.abort() }, "Stop")));
+    replace(progress, h("div.row", h("span", { style: { flex: 1 } }, bar), text, h("button.danger", { type: "button", onclick: () => stopping.abort() }, "Stop")));
     let ready = 0;
     try {
       for (const [first, second] of pairs) {
-        if (going.signal.aborted) break;
+        if (stopping.signal.aborted) break;
         text.textContent = `${ready} of ${pairs.length}: ${first.name}`;
         const form = new FormData();
         form.append("cam1", first);
@@ -150,7 +193,7 @@ function importPairs(id, refresh, ends) {
         try {
           await api.upload(`/tests/${id}/steps:import`, form);
         } catch (error) {
-          error.message = `${first.name} and ${second.name}: ${error.message}`;
+          if (error instanceof Error) error.message = `${first.name} and ${second.name}: ${error.message}`;
           throw error;
         }
         ready += 1;
