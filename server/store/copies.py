@@ -16,7 +16,7 @@ def content_of(tests: TestStore, test_id: str) -> dict[str, Any]:
     digest = hashlib.sha256()
     steps = tests.step_numbers(test_id)
     for n in steps:
-        digest.update(f"{n} {sorted(tests.step(test_id, n).document['sha256'].items())}\n".encode())
+        digest.update(f"{n} {sorted(tests.step(test_id, n).document.sha256.items())}\n".encode())
     results = 0
     for analysis_id in tests.analysis_ids(test_id):
         for n in tests.finished_steps(test_id, analysis_id):

@@ -55,3 +55,79 @@ class Finished(Document):
 
     steps: list[StepFound] = Field(default_factory=list)
     steps_failed: dict[str, JobProblem] = Field(default_factory=dict)
+
+
+class KeptRequest(Document):
+    """The request with an Idempotency-Key that a thing was made for."""
+
+    scope: str
+    key: str
+    body_sha256: str
+
+
+class Kept(Document):
+    """Anything that a request makes."""
+
+    def shown(self) -> dict[str, object]:
+        """Return what the API shows of it."""
+        return self.model_dump(exclude_unset=True, exclude={"request"})
+
+
+class BurstPlace(Document):
+    """Where a step stands in its burst."""
+
+    job_id: str
+    index: int
+    count: int
+    interval_ms: float
+    since_first_ms: float
+
+
+class Watched(Document):
+    """The watched channel of a reading that took a step."""
+
+    channel: str
+    value: float | None = None
+    last_value: float | None = None
+    threshold: float | None = None
+
+
+class StepFacts(Kept):
+    """What the client said of a step, and what it was taken for."""
+
+    label: str | None = None
+    load_n: float | None = None
+    timestamp_utc: str | None = None
+    channels: dict[str, float] = Field(default_factory=dict)
+    request: KeptRequest | None = None
+    burst: BurstPlace | None = None
+    watch: Watched | None = None
+
+
+class PairQuality(Document):
+    """What a pair of images is worth."""
+
+    code: str | None = None
+
+
+class StepRecord(StepFacts):
+    """``step.json``."""
+
+    n: int
+    test_id: str
+    source: str | None = None
+    captured_utc: str | None = None
+    host_monotonic_ns: int | None = None
+    skew_ms: float | None = None
+    cameras: dict[str, object] | None = None
+    frames: int | None = None
+    grey_scale: int | float | None = None
+    bit_depth: dict[str, int] | None = None
+    quality: PairQuality | None = None
+    image_size_px: dict[str, list[int]] = Field(default_factory=dict)
+    sha256: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def quality_code(self) -> str | None:
+        """``ok``, or the first thing that is wrong with the pair."""
+        return None if self.quality is None else self.quality.code

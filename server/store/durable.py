@@ -9,13 +9,18 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
 
 from core.errors import FileFormatError
 from server.base.json_values import without_nan
+from server.base.models import Document
 from server.formats import disk as _disk
 from server.formats import files
 from server.formats.files import fsync_path, storage_error
+
+Record = TypeVar("Record", bound=Document)
 
 
 def make_folder(folder: Path) -> None:
@@ -62,6 +67,27 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise FileFormatError(f"{path.name} holds {type(document).__name__}, not an object.", file=path.name)
     return document
+
+
+def record_of(kind: type[Record], document: object, path: Path) -> Record:
+    """Return what a file holds as a record.
+
+    Raises
+    ------
+    FileFormatError
+        If it says what cannot be, naming the file and the field.
+    """
+    try:
+        return kind.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise FileFormatError(f"{path.name} holds a wrong {place}: {first['msg']}.", file=path.name) from error
+
+
+def read_record(kind: type[Record], path: Path) -> Record:
+    """Read a record; see :func:`read_json` and :func:`record_of`."""
+    return record_of(kind, read_json(path), path)
 
 
 def known_json(path: Path) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from server.base.errors import NotFoundError
 from server.base.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
+from server.store.documents import StepRecord
 from server.store.folder import DataFolder, is_id
-from server.store.lost_jobs import LostJobs
+from server.store.lost_jobs import LostJobs, request_of
 from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
@@ -39,10 +40,10 @@ def test_entry(document: dict[str, Any]) -> dict[str, Any]:
     return {k: document.get(k) for k in ("id", "name", "specimen", "calibration_id", "created_utc")}
 
 
-def step_entry(document: dict[str, Any]) -> dict[str, Any]:
+def step_entry(step: StepRecord) -> dict[str, object]:
     """What a list shows of a step."""
-    entry = {k: document.get(k) for k in ("n", "label", "load_n", "timestamp_utc", "source", "captured_utc", "skew_ms")}
-    return {**entry, "quality": document.get("quality", {}).get("code")}
+    names = ("n", "label", "load_n", "timestamp_utc", "source", "captured_utc", "skew_ms")
+    return {**{name: getattr(step, name) for name in names}, "quality": step.quality_code}
 
 
 def analysis_entry(document: dict[str, Any]) -> dict[str, Any]:
@@ -70,10 +71,10 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
 
     def test() -> Entry:
         document = tests.read(test_id)
-        lost.made(document, {"test_id": test_id})
+        lost.made(request_of(document), {"test_id": test_id})
         return "test", "", test_id, test_entry(document)
 
-    def step(n: int, document: dict[str, Any] | FileFormatError) -> Entry:
+    def step(n: int, document: StepRecord | FileFormatError) -> Entry:
         if isinstance(document, FileFormatError):
             raise document
         lost.step(document)

@@ -12,7 +12,7 @@ from typing import Any
 from server.base.models import Ids, JobState
 from server.base.problem import RESTART, JobProblem, problem_of
 from server.store.catalog import Catalog
-from server.store.documents import JobRecord, Progress
+from server.store.documents import BurstPlace, JobRecord, KeptRequest, Progress, StepRecord
 from server.store.folder import IdMaker, is_id
 
 
@@ -22,13 +22,12 @@ class LostJobs:
     def __init__(self) -> None:
         self._jobs: dict[str, JobRecord] = {}
         self._requests: dict[tuple[str, str], tuple[str, Ids]] = {}
-        self._bursts: dict[str, list[dict[str, Any]]] = {}
+        self._bursts: dict[str, list[tuple[BurstPlace, StepRecord]]] = {}
 
-    def made(self, document: dict[str, Any], ids: Ids) -> None:
-        """Take the request that a document was made for."""
-        request = document.get("request")
-        if request:
-            self._requests.setdefault((request["scope"], request["key"]), (request["body_sha256"], ids))
+    def made(self, request: KeptRequest | None, ids: Ids) -> None:
+        """Take the request that something was made for."""
+        if request is not None:
+            self._requests.setdefault((request.scope, request.key), (request.body_sha256, ids))
 
     def calibration(self, document: dict[str, Any]) -> None:
         """A calibration, as its store reads it."""
@@ -43,7 +42,7 @@ class LostJobs:
         ids = {f"{kind}_id": document["id"]}
         job_id = plan.get("job_id")
         if plan.get("source") == "import":
-            self.made(plan, ids)
+            self.made(request_of(plan), ids)
         if job_id is None:
             return
         problem = document.get("problem")
@@ -51,15 +50,14 @@ class LostJobs:
             "succeeded" if document["state"] == "complete" else (problem or {}).get("job_state", "interrupted")
         )
         self._job(job_id, kind, ids, state, plan["created_utc"], ids if state == "succeeded" else None, problem)
-        self.made(plan, {**ids, "job_id": job_id})
+        self.made(request_of(plan), {**ids, "job_id": job_id})
 
-    def step(self, document: dict[str, Any]) -> None:
+    def step(self, document: StepRecord) -> None:
         """A step; those of a burst belong to its job."""
-        burst = document.get("burst")
-        if burst is None:
-            self.made(document, {"test_id": document["test_id"], "n": document["n"]})
+        if document.burst is None:
+            self.made(document.request, {"test_id": document.test_id, "n": document.n})
             return
-        self._bursts.setdefault(burst["job_id"], []).append(document)
+        self._bursts.setdefault(document.burst.job_id, []).append((document.burst, document))
 
     def analysis(self, document: dict[str, Any], runs: list[dict[str, Any]], summary: dict[str, Any] | None) -> None:
         """An analysis, with the jobs that worked on it, the last one last."""
@@ -78,7 +76,7 @@ class LostJobs:
                 result,
                 known.get("problem"),
             )
-            self.made(run, {**ids, "job_id": run["job_id"]})
+            self.made(request_of(run), {**ids, "job_id": run["job_id"]})
 
     def _job(
         self,
@@ -110,21 +108,16 @@ class LostJobs:
 
     def _end_bursts(self) -> None:
         for job_id, steps in self._bursts.items():
-            burst = steps[0]["burst"]
-            subject = {"test_id": steps[0]["test_id"]}
+            burst, first = steps[0]
+            subject: Ids = {"test_id": first.test_id}
             taken = [
-                {
-                    "index": s["burst"]["index"],
-                    "n": s["n"],
-                    "quality": s.get("quality", {}).get("code"),
-                    "sha256": s["sha256"],
-                }
-                for s in steps
+                {"index": place.index, "n": step.n, "quality": step.quality_code, "sha256": step.sha256}
+                for place, step in steps
             ]
-            result = {**subject, "count": burst["count"], "steps": taken, "failures": []}
-            state: JobState = "succeeded" if len(steps) == burst["count"] else "interrupted"
-            self._job(job_id, "burst", subject, state, steps[0]["captured_utc"], result, None)
-            self.made(steps[0], {**subject, "job_id": job_id})
+            result = {**subject, "count": burst.count, "steps": taken, "failures": []}
+            state: JobState = "succeeded" if len(steps) == burst.count else "interrupted"
+            self._job(job_id, "burst", subject, state, first.captured_utc or "", result, None)
+            self.made(first.request, {**subject, "job_id": job_id})
 
     def restore(self, catalog: Catalog, ids: IdMaker) -> None:
         """Add what the catalogue does not know."""
@@ -140,3 +133,8 @@ class LostJobs:
                 if (scope, key) not in known_keys
             ],
         )
+
+
+def request_of(document: Mapping[str, object]) -> KeptRequest | None:
+    found = document.get("request")
+    return None if found is None else KeptRequest.model_validate(found)

@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from core.names import CAMERAS
 from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
-from server.store.durable import make_folder, read_json, write_bytes, write_json
+from server.store.documents import StepRecord
+from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
 MAX_STEPS = 9999
@@ -34,7 +35,7 @@ _DELETED = re.compile(r"(\d{4})\.deleted")
 class StepFiles:
     """A complete step: its document and the paths of both images."""
 
-    document: dict[str, Any]
+    document: StepRecord
     cam1: Path
     cam2: Path
 
@@ -188,7 +189,7 @@ class TestStore:
         """Return something cheap that differs whenever the steps of a test may have changed."""
         return (self.path(test_id) / "steps").stat().st_mtime_ns, self._commits
 
-    def step_documents(self, test_id: str) -> Iterator[tuple[int, dict[str, Any] | FileFormatError]]:
+    def step_documents(self, test_id: str) -> Iterator[tuple[int, StepRecord | FileFormatError]]:
         """Return the number and ``step.json`` of every complete step, ascending, or why it cannot be read.
 
         A start reads them all: with ten thousand steps, each look at a path counts.
@@ -198,16 +199,20 @@ class TestStore:
         for name in names:
             if len(name) != 4 or not name.isdecimal():
                 continue
+            path = Path(f"{steps}/{name}/step.json")
             try:
-                document = json.loads(Path(f"{steps}/{name}/step.json").read_bytes())
+                document = json.loads(path.read_bytes())
                 if not isinstance(document, dict):
                     raise ValueError("it holds no object")
+                record = record_of(StepRecord, document, path)
             except FileNotFoundError:
                 continue
             except (OSError, ValueError) as error:
                 yield int(name), FileFormatError(f"step.json cannot be read: {error}.", file=f"steps/{name}/step.json")
+            except FileFormatError as error:
+                yield int(name), error
             else:
-                yield int(name), document
+                yield int(name), record
 
     def incomplete_steps(self, test_id: str) -> list[int]:
         """Numbers of step folders without their commit mark, those set aside among them."""
@@ -222,7 +227,7 @@ class TestStore:
         marks = {int(found[1]) for p in steps.iterdir() if (found := _DELETED.fullmatch(p.name)) is not None}
         return sorted(marks.difference(self.step_numbers(test_id)))
 
-    def add_step(self, test_id: str, images: dict[str, bytes], document: dict[str, Any]) -> dict[str, Any]:
+    def add_step(self, test_id: str, images: dict[str, bytes], facts: Mapping[str, object]) -> StepRecord:
         """Commit a step: both images, then ``step.json`` with their checksums.
 
         Returns when it is durable. A number is never used twice, also not that of an incomplete step.
@@ -243,13 +248,13 @@ class TestStore:
             make_folder(folder)
             try:
                 sha256 = {cam: write_bytes(folder / f"{cam}.tif", images[cam]) for cam in CAMERAS}
-                document = {"n": n, "test_id": test_id, **document, "sha256": sha256}
+                document = {"n": n, "test_id": test_id, **facts, "sha256": sha256}
                 write_json(folder / "step.json", document)
                 self._commits += 1
             except StorageError:
                 shutil.rmtree(folder, ignore_errors=True)  # frees the number where the disk allows it
                 raise
-        return document
+        return StepRecord.model_validate(document)
 
     def step(self, test_id: str, n: int) -> StepFiles:
         """Return a complete step.
@@ -262,15 +267,15 @@ class TestStore:
         folder = self.path(test_id) / "steps" / f"{n:04d}"
         if not 0 <= n <= MAX_STEPS or not (folder / "step.json").is_file():
             raise NotFoundError(f"Test {test_id} has no step {n}.", what="step")
-        return StepFiles(read_json(folder / "step.json"), folder / "cam1.tif", folder / "cam2.tif")
+        return StepFiles(read_record(StepRecord, folder / "step.json"), folder / "cam1.tif", folder / "cam2.tif")
 
-    def update_step(self, test_id: str, n: int, changes: dict[str, Any]) -> dict[str, Any]:
+    def update_step(self, test_id: str, n: int, changes: Mapping[str, object]) -> StepRecord:
         """Change fields of a step's ``step.json``; its images and their checksums stay."""
         with self._lock:
-            step = self.step(test_id, n)
-            document = step.document | changes
-            write_json(step.cam1.with_name("step.json"), document)
-        return document
+            path = self.step(test_id, n).cam1.with_name("step.json")
+            document = {**read_json(path), **changes}
+            write_json(path, document)
+        return record_of(StepRecord, document, path)
 
     def verified_step(self, test_id: str, n: int) -> StepFiles:
         """Return a step whose images match their checksums.
@@ -282,7 +287,7 @@ class TestStore:
         """
         step = self.step(test_id, n)
         for cam, path in (("cam1", step.cam1), ("cam2", step.cam2)):
-            if not path.is_file() or sha256_of(path) != step.document["sha256"][cam]:
+            if not path.is_file() or sha256_of(path) != step.document.sha256.get(cam):
                 raise FileFormatError(
                     f"{path.name} of step {n} of test {test_id} does not match its checksum.",
                     code="checksum_mismatch",

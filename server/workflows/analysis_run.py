@@ -221,7 +221,7 @@ class AnalysisRun:
         if not self._document.get("follow"):
             return
         calibration = self._service.tests.calibration_file(self._test_id)
-        check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.get("cameras"), f"Step {n}")
+        check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.cameras, f"Step {n}")
 
     def _take_new_steps(self) -> bool:
         """Make the steps that have landed since part of the analysis; whether there are any."""
@@ -229,7 +229,7 @@ class AnalysisRun:
         known = set(steps)
         new = [n for n in tests.step_numbers(self._test_id) if n > steps[0] and n not in known]
         if new:
-            hashes = {str(n): tests.step(self._test_id, n).document["sha256"] for n in new}
+            hashes = {str(n): tests.step(self._test_id, n).document.sha256 for n in new}
             self._document = tests.extend_analysis(self._test_id, self._document["id"], new, hashes)
         return bool(new)
 
@@ -257,7 +257,7 @@ def task_of(
     reference = document["steps"][0] if displacement else n
     ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
     for k, step in ((reference, ref), (n, now)):
-        if step.document["sha256"] != document["inputs"]["steps"][str(k)]:
+        if step.document.sha256 != document["inputs"]["steps"][str(k)]:
             raise FileFormatError(
                 f"Step {k} of test {test_id} was replaced since the analysis was made.",
                 code="step_changed",
@@ -273,9 +273,9 @@ def task_of(
     if following is not None and displacement:
         with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
             after = service.tests.step(test_id, following)
-    about = {"label": str(now.document["label"]), "test_step": str(n)}
-    if now.document["load_n"] is not None:
-        about["load_n"] = repr(now.document["load_n"])
+    about = {"label": now.document.label or "", "test_step": str(n)}
+    if now.document.load_n is not None:
+        about["load_n"] = repr(now.document.load_n)
     folder = service.tests.analysis_path(test_id, document["id"])
     return StepTask(
         folder=folder,
@@ -294,9 +294,12 @@ def task_of(
 
 def images_of(n: int, step: StepFiles) -> StepImages:
     """Return a stored step's images as the worker is told of them."""
-    sha256 = step.document["sha256"]
+    sha256 = step.document.sha256
     return StepImages(
-        n=n, files=(step.cam1, step.cam2), sha256=(sha256["cam1"], sha256["cam2"]), averages=averages_of(step.document)
+        n=n,
+        files=(step.cam1, step.cam2),
+        sha256=(sha256["cam1"], sha256["cam2"]),
+        averages=averages_of(step.document.plain()),
     )
 
 

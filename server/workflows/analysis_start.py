@@ -62,7 +62,7 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
     """Checksums of everything that an analysis reads, fixed when it is made."""
     return {
         "calibration_sha256": sha256_of(calibration),
-        "steps": {str(n): service.tests.step(test_id, n).document["sha256"] for n in steps},
+        "steps": {str(n): service.tests.step(test_id, n).document.sha256 for n in steps},
     }
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from core.errors import MeasurementError, StereorigError
 from server.base.metrics import timed_capture
-from server.base.problem import problem_of
+from server.base.problem import JobProblem, problem_of
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
+from server.store.documents import BurstPlace, StepFacts, StepRecord
 from server.workflows.capture import commit_pair
 from server.workflows.service import Service
 
@@ -28,7 +28,7 @@ class BurstIncompleteError(MeasurementError):
 def start_burst(
     service: Service,
     test_id: str,
-    facts: dict[str, Any],
+    facts: StepFacts,
     *,
     count: int,
     interval_ms: float,
@@ -56,54 +56,49 @@ def start_burst(
 
 
 def _run(
-    service: Service, job: Job, test_id: str, facts: dict[str, Any], count: int, interval_ms: float, frames: int
-) -> dict[str, Any]:
-    steps: list[dict[str, Any]] = []
-    failures: list[dict[str, Any]] = []
-    result: dict[str, Any] = {"test_id": test_id, "count": count, "steps": steps, "failures": failures}
+    service: Service, job: Job, test_id: str, facts: StepFacts, count: int, interval_ms: float, frames: int
+) -> dict[str, object]:
+    steps: list[dict[str, object]] = []
+    failures: list[dict[str, object]] = []
+    problems: list[tuple[int, JobProblem]] = []
+    result: dict[str, object] = {"test_id": test_id, "count": count, "steps": steps, "failures": failures}
     job.result = result
     began = time.monotonic()
     first_ns: int | None = None
     for index in range(count):
         job.progress("steps", index, count)
         _wait_until(job, began + index * interval_ms / 1000.0)
-        place = {"job_id": job.id, "index": index, "count": count, "interval_ms": interval_ms}
+        place = BurstPlace(job_id=job.id, index=index, count=count, interval_ms=interval_ms, since_first_ms=0.0)
         try:
             step = _take(service, job, test_id, facts, frames, place, first_ns)
         except StereorigError as error:
             if error.code not in _OF_THE_PAIR:
                 raise
-            failures.append({"index": index, "problem": problem_of(error)})
+            problems.append((index, problem_of(error)))
+            failures.append({"index": index, "problem": problems[-1][1]})
             continue
-        first_ns = step["host_monotonic_ns"] if first_ns is None else first_ns
-        told = {"index": index, "n": step["n"], "since_first_ms": step["burst"]["since_first_ms"]}
-        steps.append({**told, "quality": step["quality"]["code"], "sha256": step["sha256"]})
+        first_ns = step.host_monotonic_ns if first_ns is None else first_ns
+        told = {"index": index, "n": step.n, "since_first_ms": step.burst and step.burst.since_first_ms}
+        steps.append({**told, "quality": step.quality_code, "sha256": step.sha256})
     job.progress("steps", count, count)
-    if failures:
-        first = failures[0]
+    if problems:
+        first, problem = problems[0]
         raise BurstIncompleteError(
-            f"{len(failures)} of {count} steps were not taken; the first, number {first['index']}: "
-            f"{first['problem']['cause']}",
-            failed=[failure["index"] for failure in failures],
+            f"{len(problems)} of {count} steps were not taken; the first, number {first}: {problem.cause}",
+            failed=[index for index, _ in problems],
         )
     return result
 
 
 @timed_capture("capture")
 def _take(
-    service: Service,
-    job: Job,
-    test_id: str,
-    facts: dict[str, Any],
-    frames: int,
-    place: dict[str, Any],
-    first_ns: int | None,
-) -> dict[str, Any]:
+    service: Service, job: Job, test_id: str, facts: StepFacts, frames: int, place: BurstPlace, first_ns: int | None
+) -> StepRecord:
     service.require_room()
     shot, positions_mm = service.rig.pair.shoot(frames, job.check), service.rig.positions_mm()
     since_ns = 0 if first_ns is None else shot.host_ns - first_ns
-    burst = {**place, "since_first_ms": round(since_ns / 1e6, 3)}
-    return commit_pair(service, test_id, {**facts, "burst": burst}, shot, positions_mm)
+    burst = place.model_copy(update={"since_first_ms": round(since_ns / 1e6, 3)})
+    return commit_pair(service, test_id, facts.model_copy(update={"burst": burst}), shot, positions_mm)
 
 
 def _wait_until(job: Job, moment: float) -> None:

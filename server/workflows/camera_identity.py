@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from core.errors import CameraError
 from core.names import CAMERAS
 from server.store.durable import read_json
 
-Identities = Mapping[str, Mapping[str, str]]
+Identities = Mapping[str, object]
 
 
 def calibrated_cameras(calibration: Path) -> Identities | None:
@@ -56,6 +55,6 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, what: str)
 
 
 def _serial(identities: Identities, cam: str) -> str | None:
-    record: Any = identities.get(cam)
+    record = identities.get(cam)
     serial = record.get("serial") if isinstance(record, Mapping) else None
     return serial if isinstance(serial, str) and serial else None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from core.errors import ImageError
@@ -13,6 +11,7 @@ from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode_image, encode_tiff
 from server.results.quality import image_quality, pair_quality
 from server.rig.cameras import PairShot
+from server.store.documents import StepFacts, StepRecord
 from server.store.folder import now_utc
 from server.store.index import step_entry
 from server.workflows.camera_identity import check_same_cameras
@@ -23,7 +22,7 @@ OFF_ZERO_MM = 0.01
 
 
 @timed_capture("capture")
-def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frames: int) -> dict[str, Any]:
+def capture_step(service: Service, test_id: str, facts: StepFacts, *, frames: int) -> StepRecord:
     """Capture a pair and commit it as the test's next step; returns ``step.json``."""
     service.require_room()
     with service.gate.hold("the capture of a step", test_id=test_id):
@@ -32,8 +31,8 @@ def capture_step(service: Service, test_id: str, facts: dict[str, Any], *, frame
 
 
 def commit_pair(
-    service: Service, test_id: str, facts: dict[str, Any], shot: PairShot, positions_mm: dict[int, float]
-) -> dict[str, Any]:
+    service: Service, test_id: str, facts: StepFacts, shot: PairShot, positions_mm: dict[int, float]
+) -> StepRecord:
     """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
 
     Parameters
@@ -64,7 +63,7 @@ def commit_pair(
     for cam in CAMERAS:
         quality[cam] |= shot.settings[cam] | {"frames": shot.frame_counts[cam]}
     document = {
-        **facts,
+        **facts.plain(),
         "source": "capture",
         "captured_utc": now_utc(),
         "host_monotonic_ns": shot.host_ns,
@@ -86,7 +85,7 @@ def commit_pair(
 
 
 @timed_capture("import")
-def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: dict[str, Any]) -> dict[str, Any]:
+def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: StepFacts) -> StepRecord:
     """Commit two image files as the test's next step; returns ``step.json``.
 
     Raises
@@ -102,7 +101,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: d
     _check_content(images)
     depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
     document = {
-        **facts,
+        **facts.plain(),
         "source": "import",
         "captured_utc": now_utc(),
         "skew_ms": None,
@@ -136,7 +135,7 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
     known: dict[str, tuple[str, list[int]]] = {}
     numbers = service.tests.step_numbers(test_id)
     if numbers:
-        first = service.tests.step(test_id, numbers[0]).document.get("image_size_px", {})
+        first = service.tests.step(test_id, numbers[0]).document.image_size_px
         known |= {cam: ("the test's others are", list(size)) for cam, size in first.items()}
     if service.tests.is_calibrated(test_id):
         calibration = load_calibration(service.tests.calibration_file(test_id))
@@ -152,10 +151,10 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
             )
 
 
-def _announce(service: Service, step: dict[str, Any]) -> dict[str, Any]:
+def _announce(service: Service, step: StepRecord) -> StepRecord:
     entry = step_entry(step)
-    service.catalog.put_entry("step", step["test_id"], f"{step['n']:04d}", entry)
-    job = {"job_id": step["burst"]["job_id"]} if step.get("burst") else {}
-    service.hub.publish("step", {"test_id": step["test_id"], **entry, **job})
-    service.jobs.landed(step["test_id"])
+    service.catalog.put_entry("step", step.test_id, f"{step.n:04d}", entry)
+    job = {} if step.burst is None else {"job_id": step.burst.job_id}
+    service.hub.publish("step", {"test_id": step.test_id, **entry, **job})
+    service.jobs.landed(step.test_id)
     return step

@@ -70,7 +70,7 @@ def _name(service: Service, kind: Kind, ids: Ids) -> str:
             return ""  # what is damaged can be deleted too
     if kind == "step":
         try:
-            return str(service.tests.step(str(ids["test_id"]), int(ids["n"])).document.get("label", ""))
+            return str(service.tests.step(str(ids["test_id"]), int(ids["n"])).document.label or "")
         except StereorigError as error:
             if error.code == "not_found":
                 raise

@@ -13,6 +13,7 @@ from typing import Any
 
 from core.errors import StateError
 from server.base.errors import NotFoundError
+from server.store.documents import StepFacts, Watched
 from server.store.durable import read_json, write_json
 from server.store.folder import now_utc
 from server.workflows.capture import capture_step
@@ -22,10 +23,9 @@ from server.workflows.service import Service
 LOAD = "load_n"
 
 
-def value_of(step: dict[str, Any], channel: str) -> float | None:
+def value_of(step: StepFacts, channel: str) -> float | None:
     """Value of a channel in a step's document, or in a reading's; None where it has none."""
-    value = step.get("load_n") if channel == LOAD else step.get("channels", {}).get(channel)
-    return None if value is None else float(value)
+    return step.load_n if channel == LOAD else step.channels.get(channel)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Watches:
                 return n, value
         return None
 
-    def reading(self, test_id: str, facts: dict[str, Any]) -> Outcome:
+    def reading(self, test_id: str, facts: StepFacts) -> Outcome:
         """Take a step if the watched channel has changed enough.
 
         Parameters
@@ -162,9 +162,7 @@ class Watches:
             change = None if last_value is None else abs(value - last_value)
             if change is not None and (change < threshold or change == 0.0):
                 return Outcome("below_threshold", value, last_value)
-            label = facts["label"] or document.get("label", "")
-            watch = {"channel": channel, "value": value, "last_value": last_value, "threshold": threshold}
-            step = capture_step(
-                self._service, test_id, {**facts, "label": label, "watch": watch}, frames=int(document["frames"])
-            )
-            return Outcome("first" if last is None else "changed", value, last_value, step["n"])
+            watch = Watched(channel=channel, value=value, last_value=last_value, threshold=threshold)
+            taken = facts.model_copy(update={"label": facts.label or document.get("label", ""), "watch": watch})
+            step = capture_step(self._service, test_id, taken, frames=int(document["frames"]))
+            return Outcome("first" if last is None else "changed", value, last_value, step.n)

@@ -73,10 +73,10 @@ class Session:
             images = {cam: encode_tiff(image(10 * k + int(cam[-1]))) for cam in ("cam1", "cam2")}
             step = self._ask(lambda k=k, images=images: self.tests.add_step(test_id, images, {"label": f"load {k}"}))
             if step is not None:
-                folder = self.tests.path(test_id) / "steps" / f"{step['n']:04d}"
+                folder = self.tests.path(test_id) / "steps" / f"{step.n:04d}"
                 for name in ("cam1.tif", "cam2.tif", "step.json"):
                     self._keep(folder / name)
-                assert step["sha256"] == {cam: hashlib.sha256(images[cam]).hexdigest() for cam in images}
+                assert step.sha256 == {cam: hashlib.sha256(images[cam]).hexdigest() for cam in images}
         updated = self._ask(lambda: self.tests.update(test_id, {"name": "renamed"}))
         self.acknowledged = [pair for pair in self.acknowledged if pair[0].name != "test.json"]
         # a change that was refused may be there or not (the rename was made, its fsync failed), but never half
@@ -136,7 +136,7 @@ def test_after_the_disk_has_room_again_the_same_test_goes_on(tmp_path: Path, mon
         with pytest.raises(StorageError):
             add_steps(tests, test_id, images)
         monkeypatch.undo()
-        assert tests.add_step(test_id, images, {})["n"] == tests.step_numbers(test_id)[-1]
+        assert tests.add_step(test_id, images, {}).n == tests.step_numbers(test_id)[-1]
     numbers = tests.step_numbers(test_id)
     assert numbers == list(range(len(numbers))), "no number is lost to a full disk"
     catalog = Catalog(folder.root / "catalog.sqlite").open()

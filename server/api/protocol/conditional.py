@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import Header, Response
@@ -39,7 +40,7 @@ def etag_of(document: Any) -> str:
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
 
 
-def tagged(response: Response, document: dict[str, Any]) -> dict[str, Any]:
+def tagged(response: Response, document: Mapping[str, object]) -> Mapping[str, object]:
     """Return the document, and name its state in the answer's ETag."""
     response.headers["ETag"] = etag_of(document)
     return document

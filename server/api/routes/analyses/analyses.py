@@ -47,7 +47,7 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
     analysis_start.check_calibration(service, test_id, calibration)
     steps = analysis_start.steps_to_measure(service, test_id, body.reference, body.steps)
     for n in steps:
-        check_same_cameras(calibration, service.tests.step(test_id, n).document.get("cameras"), f"Step {n}")
+        check_same_cameras(calibration, service.tests.step(test_id, n).document.cameras, f"Step {n}")
     mask = mask_of(body.region)
     noise = None if body.noise_id is None else service.noise.file(body.noise_id)
     record = (

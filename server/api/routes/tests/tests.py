@@ -15,6 +15,7 @@ from server.api.models import (
     BurstAccepted,
     Channels,
     Label,
+    ReadingRequest,
     StepList,
     StepPatch,
     StepReply,
@@ -34,6 +35,7 @@ from server.api.protocol.problems import errors
 from server.base.models import FormNumber, Ids
 from server.formats.images import read_image
 from server.jobs.idempotency import RequestMark
+from server.store.documents import StepFacts
 from server.store.index import step_entry, test_entry
 from server.workflows.burst import start_burst
 from server.workflows.calibration_review import check_not_discarded, newest_accepted
@@ -142,26 +144,22 @@ async def create_step(
     return await run_in_threadpool(_capture, service, test_id, body, key)
 
 
-def _facts(body: StepRequest, sent: RequestMark) -> dict[str, Any]:
+def step_facts(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepFacts:
     """What the client said of a step, as its document keeps it."""
-    return {
-        "label": body.label,
-        "load_n": body.load_n,
-        "timestamp_utc": None if body.timestamp_utc is None else utc_text(body.timestamp_utc),
-        "channels": body.channels,
-        **sent.document(),
-    }
+    stamp = None if body.timestamp_utc is None else utc_text(body.timestamp_utc)
+    said = {"label": body.label, "load_n": body.load_n, "timestamp_utc": stamp, "channels": body.channels}
+    return StepFacts.model_validate({**said, **sent.document()})
 
 
-def _capture(service: Service, test_id: str, body: StepRequest, key: str | None) -> dict[str, Any]:
+def _capture(service: Service, test_id: str, body: StepRequest, key: str | None) -> StepReply:
     service.tests.path(test_id)
     sent = mark(f"tests/{test_id}/steps", key, body)
 
     def make() -> Ids:
-        return {"n": capture_step(service, test_id, _facts(body, sent), frames=body.frames)["n"]}
+        return {"n": capture_step(service, test_id, step_facts(body, sent), frames=body.frames).n}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
-    return step_reply(service, test_id, int(made["n"]))
+    return StepReply.model_validate(step_reply(service, test_id, int(made["n"])))
 
 
 def _start_burst(service: Service, test_id: str, body: StepRequest, key: str | None) -> str:
@@ -172,7 +170,7 @@ def _start_burst(service: Service, test_id: str, body: StepRequest, key: str | N
         job_id = start_burst(
             service,
             test_id,
-            _facts(body, sent),
+            step_facts(body, sent),
             count=body.count,
             interval_ms=body.interval_ms,
             frames=body.frames,
@@ -234,14 +232,9 @@ def import_images(
     request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], said)
 
     def make() -> Ids:
-        facts = {
-            "label": label,
-            "load_n": load_n,
-            "timestamp_utc": stamp,
-            "channels": readings or {},
-            **request.document(),
-        }
-        return {"n": import_step(service, test_id, data, facts)["n"]}
+        told = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
+        facts = StepFacts.model_validate({**told, **request.document()})
+        return {"n": import_step(service, test_id, data, facts).n}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return StepReply.model_validate(step_reply(service, test_id, int(made["n"])))
@@ -255,9 +248,9 @@ def list_steps(service: ServiceDep, test_id: TestId, page: PageDep) -> StepList:
     return StepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 
-def step_reply(service: Service, test_id: str, n: int) -> dict[str, Any]:
+def step_reply(service: Service, test_id: str, n: int) -> dict[str, object]:
     """Return a step as the API shows it."""
-    return {k: v for k, v in service.tests.step(test_id, n).document.items() if k != "request"}
+    return service.tests.step(test_id, n).document.shown()
 
 
 @router.get("/{test_id}/steps/{n}", summary="One step", responses=errors(404, 422))

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import JSONResponse
 
-from server.api.models import ReadingReply, ReadingRequest, WatchReply, WatchRequest, utc_text
+from server.api.models import ReadingReply, ReadingRequest, WatchReply, WatchRequest
 from server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.problems import errors
-from server.api.routes.tests.tests import step_reply
+from server.api.routes.tests.tests import step_facts
 from server.base.models import Ids
 from server.workflows.watch import Watches
 
@@ -85,23 +85,16 @@ def post_channels(
     sent = mark(f"tests/{test_id}/channels", key, body)
 
     def make() -> Ids:
-        facts = {
-            "label": body.label,
-            "load_n": body.load_n,
-            "timestamp_utc": None if body.timestamp_utc is None else utc_text(body.timestamp_utc),
-            "channels": body.channels,
-            **sent.document(),
-        }
-        outcome = watches.reading(test_id, facts)
+        outcome = watches.reading(test_id, step_facts(body, sent))
         told = {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
         return {name: value for name, value in told.items() if value is not None}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
-    step = None if made.get("n") is None else step_reply(service, test_id, int(made["n"]))
+    step = None if made.get("n") is None else service.tests.step(test_id, int(made["n"])).document
+    told: dict[str, object] = {name: made.get(name) for name in ("reason", "value", "last_value")}
     if step is not None and "reason" not in made:  # told by the step, the catalogue was lost
-        watch = step.get("watch", {})
-        made = {**made, "reason": "first" if watch.get("last_value") is None else "changed", **watch}
-    reply = ReadingReply.model_validate(
-        {"taken": step is not None, "step": step, **{k: made.get(k) for k in ("reason", "value", "last_value")}}
-    )
+        value, last = (None, None) if step.watch is None else (step.watch.value, step.watch.last_value)
+        told = {"reason": "first" if last is None else "changed", "value": value, "last_value": last}
+    shown = None if step is None else step.shown()
+    reply = ReadingReply.model_validate({"taken": step is not None, "step": shown, **told})
     return JSONResponse(reply.model_dump(mode="json"), status_code=200 if step is None else 201)
