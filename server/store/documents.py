@@ -131,3 +131,59 @@ class StepRecord(StepFacts):
     def quality_code(self) -> str | None:
         """``ok``, or the first thing that is wrong with the pair."""
         return None if self.quality is None else self.quality.code
+
+
+class TestRecord(Kept):
+    """``test.json``."""
+
+    __test__ = False
+
+    id: str
+    created_utc: str | None = None
+    name: str | None = None
+    specimen: str | None = None
+    notes: str | None = None
+    calibration_id: str | None = None
+    calibration_sha256: str | None = None
+    facts: object = None
+    request: KeptRequest | None = None
+
+
+class AnalysisInputs(Document):
+    """Checksums of everything that an analysis reads, fixed when it is made."""
+
+    calibration_sha256: str | None = None
+    steps: dict[str, dict[str, str]] = Field(default_factory=dict)
+
+
+class AnalysisRecord(Kept):
+    """``analysis.json``."""
+
+    id: str
+    test_id: str
+    created_utc: str | None = None
+    kind: str | None = None
+    label: str | None = None
+    settings: dict[str, object] = Field(default_factory=dict)
+    steps: list[int] = Field(default_factory=list)
+    follow: bool = False
+    software: str | None = None
+    inputs: AnalysisInputs = AnalysisInputs()
+    request: KeptRequest | None = None
+
+
+class AnalysisJob(Document):
+    """A job that worked on an analysis, and the request that asked for it."""
+
+    job_id: str
+    request: KeptRequest | None = None
+    created_utc: str | None = None
+
+
+class SummaryRecord(Document):
+    """``summary.json`` of an analysis; see :class:`server.formats.results.summary.SequenceSummary`."""
+
+    state: JobState = "interrupted"
+    steps: list[StepFound] = Field(default_factory=list)
+    job_id: str | None = None
+    problem: JobProblem | None = None

@@ -11,9 +11,9 @@ from server.base.errors import NotFoundError
 from server.base.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
-from server.store.documents import StepRecord
+from server.store.documents import AnalysisRecord, StepRecord, TestRecord
 from server.store.folder import DataFolder, is_id
-from server.store.lost_jobs import LostJobs, request_of
+from server.store.lost_jobs import LostJobs
 from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
@@ -35,9 +35,9 @@ def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str,
     }
 
 
-def test_entry(document: dict[str, Any]) -> dict[str, Any]:
+def test_entry(test: TestRecord) -> dict[str, object]:
     """What a list shows of a test."""
-    return {k: document.get(k) for k in ("id", "name", "specimen", "calibration_id", "created_utc")}
+    return {name: getattr(test, name) for name in ("id", "name", "specimen", "calibration_id", "created_utc")}
 
 
 def step_entry(step: StepRecord) -> dict[str, object]:
@@ -46,9 +46,10 @@ def step_entry(step: StepRecord) -> dict[str, object]:
     return {**{name: getattr(step, name) for name in names}, "quality": step.quality_code}
 
 
-def analysis_entry(document: dict[str, Any]) -> dict[str, Any]:
-    """What a list shows of an analysis."""
-    return {k: document.get(k) for k in ("id", "kind", "label", "created_utc", "job_id")}
+def analysis_entry(analysis: AnalysisRecord, job_id: str | None = None) -> dict[str, object]:
+    """What a list shows of an analysis, and of the last job that worked on it."""
+    names = ("id", "kind", "label", "created_utc")
+    return {**{name: getattr(analysis, name) for name in names}, "job_id": job_id}
 
 
 def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: list[str]) -> list[Entry]:
@@ -71,7 +72,7 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
 
     def test() -> Entry:
         document = tests.read(test_id)
-        lost.made(request_of(document), {"test_id": test_id})
+        lost.made(document.request, {"test_id": test_id})
         return "test", "", test_id, test_entry(document)
 
     def step(n: int, document: StepRecord | FileFormatError) -> Entry:
@@ -84,8 +85,8 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
         document = tests.analysis(test_id, analysis_id)
         runs = tests.analysis_jobs(test_id, analysis_id)
         lost.analysis(document, runs, tests.summary(test_id, analysis_id))
-        shown = {**document, "job_id": runs[-1]["job_id"] if runs else None}
-        return "analysis", test_id, analysis_id, analysis_entry(shown)
+        job_id = runs[-1].job_id if runs else None
+        return "analysis", test_id, analysis_id, analysis_entry(document, job_id)
 
     take(f"test {test_id}", test)
     for n, document in tests.step_documents(test_id):

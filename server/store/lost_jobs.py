@@ -12,7 +12,16 @@ from typing import Any
 from server.base.models import Ids, JobState
 from server.base.problem import RESTART, JobProblem, problem_of
 from server.store.catalog import Catalog
-from server.store.documents import BurstPlace, JobRecord, KeptRequest, Progress, StepRecord
+from server.store.documents import (
+    AnalysisJob,
+    AnalysisRecord,
+    BurstPlace,
+    JobRecord,
+    KeptRequest,
+    Progress,
+    StepRecord,
+    SummaryRecord,
+)
 from server.store.folder import IdMaker, is_id
 
 
@@ -59,24 +68,16 @@ class LostJobs:
             return
         self._bursts.setdefault(document.burst.job_id, []).append((document.burst, document))
 
-    def analysis(self, document: dict[str, Any], runs: list[dict[str, Any]], summary: dict[str, Any] | None) -> None:
+    def analysis(self, document: AnalysisRecord, runs: list[AnalysisJob], summary: SummaryRecord | None) -> None:
         """An analysis, with the jobs that worked on it, the last one last."""
-        ids = {"test_id": document["test_id"], "analysis_id": document["id"]}
+        ids: Ids = {"test_id": document.test_id, "analysis_id": document.id}
         for run in runs:
-            known = summary if summary is not None and summary.get("job_id") == run["job_id"] else {}
-            state = known.get("state", "interrupted")
-            steps = known.get("steps", [])
-            result = {**ids, "steps_finished": [s["n"] for s in steps], "steps": steps}
-            self._job(
-                run["job_id"],
-                "analysis",
-                ids,
-                state,
-                run.get("created_utc", document["created_utc"]),
-                result,
-                known.get("problem"),
-            )
-            self.made(request_of(run), {**ids, "job_id": run["job_id"]})
+            known = summary if summary is not None and summary.job_id == run.job_id else SummaryRecord()
+            found = [step.plain() for step in known.steps]
+            result = {**ids, "steps_finished": [step.n for step in known.steps], "steps": found}
+            created = run.created_utc or document.created_utc or ""
+            self._job(run.job_id, "analysis", ids, known.state, created, result, known.problem)
+            self.made(run.request, {**ids, "job_id": run.job_id})
 
     def _job(
         self,
@@ -136,5 +137,6 @@ class LostJobs:
 
 
 def request_of(document: Mapping[str, object]) -> KeptRequest | None:
+    """Return the request that a plan was made for, None without one."""
     found = document.get("request")
     return None if found is None else KeptRequest.model_validate(found)

@@ -15,14 +15,13 @@ import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from core.errors import FileFormatError, StateError, StorageError
 from core.names import CAMERAS
 from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
-from server.store.documents import StepRecord
+from server.store.documents import AnalysisJob, AnalysisRecord, StepFound, StepRecord, SummaryRecord, TestRecord
 from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -98,7 +97,7 @@ class TestStore:
         """Ids of all tests, in the order of their making."""
         return sorted(p.parent.name for p in self._folder.tests.glob("t*/test.json") if is_id(p.parent.name, "t"))
 
-    def create(self, document: dict[str, Any], calibration: Path | None) -> dict[str, Any]:
+    def create(self, document: Mapping[str, object], calibration: Path | None) -> TestRecord:
         """Make a test, with its own copy of the calibration; ``test.json`` last."""
         test_id = self._folder.ids.new("t")
         path = self._folder.tests / test_id
@@ -111,18 +110,19 @@ class TestStore:
             document = {**document, "calibration_sha256": digest}
         document = {"id": test_id, "created_utc": now_utc(), **document}
         write_json(path / "test.json", document)
-        return document
+        return TestRecord.model_validate(document)
 
-    def read(self, test_id: str) -> dict[str, Any]:
+    def read(self, test_id: str) -> TestRecord:
         """Return ``test.json``."""
-        return read_json(self.path(test_id) / "test.json")
+        return read_record(TestRecord, self.path(test_id) / "test.json")
 
-    def update(self, test_id: str, changes: dict[str, Any]) -> dict[str, Any]:
+    def update(self, test_id: str, changes: Mapping[str, object]) -> TestRecord:
         """Change fields of ``test.json``."""
+        path = self.path(test_id) / "test.json"
         with self._lock:
-            document = self.read(test_id) | changes
-            write_json(self.path(test_id) / "test.json", document)
-        return document
+            document = {**read_json(path), **changes}
+            write_json(path, document)
+        return record_of(TestRecord, document, path)
 
     @contextlib.contextmanager
     def still(self) -> Iterator[None]:
@@ -130,12 +130,14 @@ class TestStore:
         with self._lock:
             yield
 
-    def facts(self, test_id: str) -> dict[str, Any]:
+    def facts(self, test_id: str) -> dict[str, object]:
         """Return what was told about a test besides its images; empty where nothing was."""
-        found = self.read(test_id).get("facts")
+        found = self.read(test_id).facts
         return found if isinstance(found, dict) else {}
 
-    def put_facts(self, test_id: str, facts: dict[str, Any], expected: dict[str, Any] | None = None) -> None:
+    def put_facts(
+        self, test_id: str, facts: Mapping[str, object], expected: Mapping[str, object] | None = None
+    ) -> None:
         """Replace what was told about a test; durable when this returns.
 
         Parameters
@@ -149,7 +151,7 @@ class TestStore:
             ``facts_changed`` if they are not what was expected.
         """
         with self._lock:
-            document = self.read(test_id)
+            document = read_json(self.path(test_id) / "test.json")
             if expected is not None and document.get("facts", {}) != expected:
                 raise StateError(
                     f"The facts of test {test_id} were changed meanwhile.",
@@ -313,11 +315,11 @@ class TestStore:
     def create_analysis(
         self,
         test_id: str,
-        document: dict[str, Any],
+        document: Mapping[str, object],
         mask: bytes | None = None,
         noise: Path | None = None,
-        run: dict[str, Any] | None = None,
-    ) -> dict[str, Any]:
+        run: Mapping[str, object] | None = None,
+    ) -> AnalysisRecord:
         """Make an analysis: settings and inputs, fixed from now on; with its own copy of the noise models.
 
         ``run`` is the job that will work on it, see `add_analysis_job`.
@@ -333,41 +335,43 @@ class TestStore:
             write_json(path / "jobs.json", {"jobs": [{**run, "created_utc": now_utc()}]})
         document = {"id": analysis_id, "test_id": test_id, "created_utc": now_utc(), **document}
         write_json(path / "analysis.json", document)
-        return document
+        return AnalysisRecord.model_validate(document)
 
-    def analysis(self, test_id: str, analysis_id: str) -> dict[str, Any]:
+    def analysis(self, test_id: str, analysis_id: str) -> AnalysisRecord:
         """Return ``analysis.json``."""
-        return read_json(self.analysis_path(test_id, analysis_id) / "analysis.json")
+        return read_record(AnalysisRecord, self.analysis_path(test_id, analysis_id) / "analysis.json")
 
-    def analysis_jobs(self, test_id: str, analysis_id: str) -> list[dict[str, Any]]:
-        """Jobs that worked on an analysis, the last one last: ``job_id``, and the ``request`` that asked for each."""
+    def analysis_jobs(self, test_id: str, analysis_id: str) -> list[AnalysisJob]:
+        """Jobs that worked on an analysis, the last one last."""
         path = self.analysis_path(test_id, analysis_id) / "jobs.json"
-        return list(read_json(path)["jobs"]) if path.is_file() else []
+        return [record_of(AnalysisJob, job, path) for job in read_json(path)["jobs"]] if path.is_file() else []
 
-    def add_analysis_job(self, test_id: str, analysis_id: str, run: dict[str, Any]) -> None:
+    def add_analysis_job(self, test_id: str, analysis_id: str, run: Mapping[str, object]) -> None:
         """Note that another job goes on with an analysis."""
-        jobs = [*self.analysis_jobs(test_id, analysis_id), {**run, "created_utc": now_utc()}]
-        write_json(self.analysis_path(test_id, analysis_id) / "jobs.json", {"jobs": jobs})
+        path = self.analysis_path(test_id, analysis_id) / "jobs.json"
+        jobs = read_json(path)["jobs"] if path.is_file() else []
+        write_json(path, {"jobs": [*jobs, {**run, "created_utc": now_utc()}]})
 
     def extend_analysis(
         self, test_id: str, analysis_id: str, steps: list[int], sha256: dict[str, dict[str, str]]
-    ) -> dict[str, Any]:
+    ) -> AnalysisRecord:
         """Make further steps, with their images' checksums, part of an analysis that follows its test."""
-        document = self.analysis(test_id, analysis_id)
+        path = self.analysis_path(test_id, analysis_id) / "analysis.json"
+        document = read_json(path)
         document["steps"] = [*document["steps"], *steps]
         document["inputs"]["steps"] |= sha256
-        write_json(self.analysis_path(test_id, analysis_id) / "analysis.json", document)
-        return document
+        write_json(path, document)
+        return record_of(AnalysisRecord, document, path)
 
-    def put_step_summary(self, test_id: str, analysis_id: str, n: int, summary: dict[str, Any]) -> None:
+    def put_step_summary(self, test_id: str, analysis_id: str, n: int, summary: Mapping[str, object]) -> None:
         """Write what was found in one step, beside its result."""
         write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
-    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, dict[str, Any]]:
+    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepFound]:
         """What was found, by step; only of steps whose result is there."""
         path = self.analysis_path(test_id, analysis_id)
         files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
-        return {n: read_json(file) for n, file in files.items() if file.is_file()}
+        return {n: read_record(StepFound, file) for n, file in files.items() if file.is_file()}
 
     def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:
         """Numbers of the steps whose result file is there."""
@@ -411,12 +415,12 @@ class TestStore:
             path.unlink(missing_ok=True)
         return removed
 
-    def put_summary(self, test_id: str, analysis_id: str, document: dict[str, Any]) -> None:
+    def put_summary(self, test_id: str, analysis_id: str, document: Mapping[str, object]) -> None:
         """Write what the analysis found, step by step."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
         write_json(path, document)
 
-    def summary(self, test_id: str, analysis_id: str) -> dict[str, Any] | None:
+    def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
         """Return ``summary.json``, or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
-        return read_json(path) if path.exists() else None
+        return read_record(SummaryRecord, path) if path.exists() else None

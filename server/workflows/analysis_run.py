@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -20,7 +20,7 @@ from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
-from server.store.documents import Finished
+from server.store.documents import AnalysisRecord, Finished, StepFound
 from server.store.folder import now_utc
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
@@ -48,9 +48,9 @@ def calibration_changed(where: str) -> FileFormatError:
     )
 
 
-def is_independent(document: dict[str, Any]) -> bool:
+def is_independent(document: AnalysisRecord) -> bool:
     """Whether the steps of an analysis need no step but the reference."""
-    return bool(document["kind"] == "profile" or document["settings"].get("start_from") == "reference")
+    return document.kind == "profile" or document.settings.get("start_from") == "reference"
 
 
 class AnalysisRun:
@@ -65,14 +65,13 @@ class AnalysisRun:
     def __init__(self, service: Service, test_id: str) -> None:
         self._service = service
         self._test_id = test_id
-        self._loaded = False
-        self._document: dict[str, Any] = {}
-        self._summaries: dict[int, dict[str, Any]] = {}  # of the steps that are finished
+        self._loaded: AnalysisRecord | None = None
+        self._summaries: dict[int, StepFound] = {}  # of the steps that are finished
         self._failed: dict[int, StereorigError] = {}  # in this run
         self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from
         self._next = 0  # place of that step
 
-    def __call__(self, job: Job) -> dict[str, Any]:
+    def __call__(self, job: Job) -> dict[str, object]:
         """Measure what is not measured yet: a step that fails does not take the others with it.
 
         Raises
@@ -82,7 +81,7 @@ class AnalysisRun:
         Waiting
             It follows a test and has measured all that there is.
         """
-        if not self._loaded:
+        if self._loaded is None:
             self._load(job)
         while True:
             self._measure(job)
@@ -93,38 +92,43 @@ class AnalysisRun:
                 continue
             if finishing:
                 break
-            count = len(self._document["steps"])
+            count = len(self._document.steps)
             job.progress("waiting for the next step", 1000 * count, 1000 * count)
             raise Waiting
-        steps = self._document["steps"]
+        steps = self._document.steps
         job.progress("done", 1000 * len(steps), 1000 * len(steps))
         return self._result(job)
+
+    @property
+    def _document(self) -> AnalysisRecord:
+        assert self._loaded is not None, "loaded when the job begins"
+        return self._loaded
 
     def _load(self, job: Job) -> None:
         """Take over what another run finished; a result without summary, or damaged, is measured again."""
         tests, analysis_id = self._service.tests, str(job.subject["analysis_id"])
-        self._document = tests.analysis(self._test_id, analysis_id)
+        document = tests.analysis(self._test_id, analysis_id)
         known = tests.step_summaries(self._test_id, analysis_id)
-        for n in self._document["steps"]:
+        for n in document.steps:
             with contextlib.suppress(StereorigError):
                 tests.result_file(self._test_id, analysis_id, n)
                 if n in known:
                     self._summaries[n] = known[n]
-        self._loaded = True
+        self._loaded = document
         self._tell(job)
 
     def _tell(self, job: Job) -> None:
         """Put what is finished into the job's result."""
-        finished = [self._summaries[n] for n in self._document["steps"] if n in self._summaries]
+        finished = [self._summaries[n] for n in self._document.steps if n in self._summaries]
         job.result = {
-            "analysis_id": self._document["id"],
+            "analysis_id": self._document.id,
             "test_id": self._test_id,
-            "steps_finished": [s["n"] for s in finished],
-            "steps": finished,
+            "steps_finished": [found.n for found in finished],
+            "steps": [found.plain() for found in finished],
         }
 
     def _measure(self, job: Job) -> None:
-        steps: list[int] = self._document["steps"]
+        steps = self._document.steps
         if is_independent(self._document):
             self._measure_side_by_side(job)
             return
@@ -139,7 +143,7 @@ class AnalysisRun:
             self._next += 1
 
     def _measure_one(self, job: Job, index: int, n: int) -> None:
-        service, document, steps = self._service, self._document, self._document["steps"]
+        service, document, steps = self._service, self._document, self._document.steps
 
         def progress(stage: str, found: int, of: int) -> None:
             # steps are the unit a user thinks in; within a step, the points found so far
@@ -158,8 +162,8 @@ class AnalysisRun:
 
     def _measure_side_by_side(self, job: Job) -> None:
         """Measure steps that need no other than the reference, as many at once as there are workers."""
-        steps: list[int] = self._document["steps"]
-        if self._next == 0 and self._document["kind"] == "displacement":  # the others need it
+        steps = self._document.steps
+        if self._next == 0 and self._document.kind == "displacement":  # the others need it
             if steps[0] not in self._summaries:
                 job.check()
                 self._measure_one(job, 0, steps[0])
@@ -198,49 +202,49 @@ class AnalysisRun:
 
     def _note_failure(self, n: int, error: StereorigError) -> None:
         """Keep a step's own failure; raise what is not its own doing, or what nothing can go on without."""
-        displacement = self._document["kind"] == "displacement"
+        displacement = self._document.kind == "displacement"
         if isinstance(error, Cancelled | StorageError | WorkerDiedError | ClusterError):
             raise error
-        if displacement and n == self._document["steps"][0]:
+        if displacement and n == self._document.steps[0]:
             raise error
         self._failed[n] = error
 
-    def _note(self, job: Job, n: int, summary: dict[str, Any], started: float) -> None:
+    def _note(self, job: Job, n: int, summary: Mapping[str, object], started: float) -> None:
         """A step is finished: durable first, then told."""
-        service, analysis_id = self._service, self._document["id"]
+        service, analysis_id = self._service, self._document.id
         seconds = round(time.monotonic() - started, 3)
-        summary = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
-        service.tests.put_step_summary(self._test_id, analysis_id, n, summary)
-        self._summaries[n] = summary
+        told = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
+        service.tests.put_step_summary(self._test_id, analysis_id, n, told)
+        self._summaries[n] = StepFound.model_validate(told)
         self._done[n] = service.tests.step(self._test_id, n)
         self._tell(job)
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
 
     def _check_cameras(self, n: int) -> None:
         """Refuse a step of other cameras: what lands later was not there to be checked when the analysis was made."""
-        if not self._document.get("follow"):
+        if not self._document.follow:
             return
         calibration = self._service.tests.calibration_file(self._test_id)
         check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.cameras, f"Step {n}")
 
     def _take_new_steps(self) -> bool:
         """Make the steps that have landed since part of the analysis; whether there are any."""
-        tests, steps = self._service.tests, self._document["steps"]
+        tests, steps = self._service.tests, self._document.steps
         known = set(steps)
         new = [n for n in tests.step_numbers(self._test_id) if n > steps[0] and n not in known]
         if new:
             hashes = {str(n): tests.step(self._test_id, n).document.sha256 for n in new}
-            self._document = tests.extend_analysis(self._test_id, self._document["id"], new, hashes)
+            self._loaded = tests.extend_analysis(self._test_id, self._document.id, new, hashes)
         return bool(new)
 
-    def _result(self, job: Job) -> dict[str, Any]:
+    def _result(self, job: Job) -> dict[str, object]:
         self._tell(job)
         assert job.result is not None
         if self._failed:
             first = min(self._failed)
             job.result["steps_failed"] = {str(n): problem_of(error) for n, error in self._failed.items()}
             raise StepsFailedError(
-                f"{len(self._failed)} of {len(self._document['steps'])} steps failed; step {first}: "
+                f"{len(self._failed)} of {len(self._document.steps)} steps failed; step {first}: "
                 f"{self._failed[first].cause}",
                 code=self._failed[first].code,
                 remedy=self._failed[first].remedy,
@@ -250,22 +254,22 @@ class AnalysisRun:
 
 
 def task_of(
-    service: Service, document: dict[str, Any], n: int, done: dict[int, StepFiles], following: int | None
+    service: Service, document: AnalysisRecord, n: int, done: dict[int, StepFiles], following: int | None
 ) -> StepTask:
     """Return the task of one step, its inputs compared with those that the analysis was made of."""
-    test_id, displacement = document["test_id"], document["kind"] == "displacement"
-    reference = document["steps"][0] if displacement else n
+    test_id, displacement = document.test_id, document.kind == "displacement"
+    reference = document.steps[0] if displacement else n
     ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
     for k, step in ((reference, ref), (n, now)):
-        if step.document.sha256 != document["inputs"]["steps"][str(k)]:
+        if step.document.sha256 != document.inputs.steps.get(str(k)):
             raise FileFormatError(
                 f"Step {k} of test {test_id} was replaced since the analysis was made.",
                 code="step_changed",
                 remedy="Start a new analysis.",
             )
-    if sha256_of(service.tests.calibration_file(test_id)) != document["inputs"]["calibration_sha256"]:
+    if sha256_of(service.tests.calibration_file(test_id)) != document.inputs.calibration_sha256:
         raise calibration_changed(f"of test {test_id}, on which the analysis rests,")
-    settings = stored_settings(document["settings"])
+    settings = stored_settings(document.settings)
     earlier: dict[int, StepFiles] = {}
     if displacement and settings.reference_update != "never":
         earlier = {k: step for k, step in done.items() if k != reference}
@@ -276,7 +280,7 @@ def task_of(
     about = {"label": now.document.label or "", "test_step": str(n)}
     if now.document.load_n is not None:
         about["load_n"] = repr(now.document.load_n)
-    folder = service.tests.analysis_path(test_id, document["id"])
+    folder = service.tests.analysis_path(test_id, document.id)
     return StepTask(
         folder=folder,
         calibration=service.tests.calibration_file(test_id),
@@ -310,8 +314,8 @@ def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str
         state=state,
         software_version=software_version(),
         created=now_utc(),
-        calibration={"sha256": document["inputs"]["calibration_sha256"]},
-        settings=document["settings"],
+        calibration={"sha256": document.inputs.calibration_sha256},
+        settings=document.settings,
         seconds=round(sum(step.wall_s or 0.0 for step in found.steps), 3),
         steps=[step.plain() for step in found.steps],
         steps_failed={n: problem.plain() for n, problem in found.steps_failed.items()},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from core.errors import InputError, StateError
 from core.settings import AnalysisSettings
@@ -16,6 +15,7 @@ from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.results.staleness import stale_inputs
+from server.store.documents import AnalysisRecord
 from server.store.index import analysis_entry
 from server.workflows.analysis_run import AnalysisRun, calibration_changed, close
 from server.workflows.service import Service
@@ -58,7 +58,7 @@ def steps_to_measure(service: Service, test_id: str, reference: int, wanted: lis
     return [reference, *[n for n in dict.fromkeys(wanted) if n != reference]]
 
 
-def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Path) -> dict[str, Any]:
+def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Path) -> dict[str, object]:
     """Checksums of everything that an analysis reads, fixed when it is made."""
     return {
         "calibration_sha256": sha256_of(calibration),
@@ -66,15 +66,15 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
     }
 
 
-def stale_reasons(service: Service, test_id: str, document: dict[str, Any]) -> list[str]:
+def stale_reasons(service: Service, test_id: str, document: AnalysisRecord) -> list[str]:
     """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
-    test, inputs = service.tests.path(test_id), document.get("inputs", {})
+    test, inputs = service.tests.path(test_id), document.inputs
     return stale_inputs(
         test,
-        {int(n): hashes for n, hashes in inputs.get("steps", {}).items()},
+        {int(n): hashes for n, hashes in inputs.steps.items()},
         calibration=test / "calibration.json",
-        calibration_sha256=inputs.get("calibration_sha256"),
-        reference=document["steps"][0],
+        calibration_sha256=inputs.calibration_sha256,
+        reference=document.steps[0],
     )
 
 
@@ -86,7 +86,7 @@ def check_calibration(service: Service, test_id: str, calibration: Path) -> None
     FileFormatError
         ``calibration_changed``.
     """
-    made_with = service.tests.read(test_id).get("calibration_sha256")
+    made_with = service.tests.read(test_id).calibration_sha256
     if made_with is not None and sha256_of(calibration) != made_with:
         raise calibration_changed(f"of test {test_id}")
 
@@ -121,7 +121,7 @@ def submit(
     )
     analysis_id = str(job.subject["analysis_id"])
     stored = service.tests.analysis(test_id, analysis_id)
-    service.catalog.put_entry("analysis", test_id, analysis_id, analysis_entry({**stored, "job_id": job.id}))
+    service.catalog.put_entry("analysis", test_id, analysis_id, analysis_entry(stored, job.id))
     return job
 
 
@@ -147,15 +147,15 @@ def continue_analysis(
 def _continue(service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool) -> Job:
     document = service.tests.analysis(test_id, analysis_id)
     runs = service.tests.analysis_jobs(test_id, analysis_id)
-    if runs and service.jobs.is_active(runs[-1]["job_id"]):
+    if runs and service.jobs.is_active(runs[-1].job_id):
         raise StateError(
             f"Analysis {analysis_id} is being worked on.",
             code="analysis_running",
             remedy="Follow its job, or cancel it first.",
-            job_id=runs[-1]["job_id"],
+            job_id=runs[-1].job_id,
         )
     summary = service.tests.summary(test_id, analysis_id)
-    if summary is not None and summary["state"] == "succeeded":
+    if summary is not None and summary.state == "succeeded":
         raise StateError(
             f"Analysis {analysis_id} is finished: nothing is left to continue.",
             code="analysis_finished",
@@ -169,7 +169,7 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
             remedy="Restore the files from a backup, or start a new analysis.",
             reasons=stale,
         )
-    begun_by, now = document.get("software"), software_version()
+    begun_by, now = document.software, software_version()
     if begun_by != now and not other_version:
         raise StateError(
             f"Analysis {analysis_id} was begun by version {begun_by}, this is {now}: its steps might not agree.",
@@ -183,4 +183,4 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
         service.tests.add_analysis_job(test_id, analysis_id, {"job_id": job.id, **request.document()})
         return {"analysis_id": analysis_id}
 
-    return submit(service, test_id, prepare, request, follow=bool(document.get("follow")))
+    return submit(service, test_id, prepare, request, follow=document.follow)

@@ -65,7 +65,7 @@ def _name(service: Service, kind: Kind, ids: Ids) -> str:
     if kind == "test":
         service.tests.path(str(ids["test_id"]))
         try:
-            return str(service.tests.read(str(ids["test_id"])).get("name", ""))
+            return str(service.tests.read(str(ids["test_id"])).name or "")
         except StereorigError:
             return ""  # what is damaged can be deleted too
     if kind == "step":

@@ -67,7 +67,7 @@ class Session:
         made = self._ask(lambda: self.tests.create({"name": "one"}, None))
         if made is None:
             return
-        test_id = made["id"]
+        test_id = made.id
         self._keep(self.tests.path(test_id) / "test.json")
         for k in range(4):
             images = {cam: encode_tiff(image(10 * k + int(cam[-1]))) for cam in ("cam1", "cam2")}
@@ -80,11 +80,11 @@ class Session:
         updated = self._ask(lambda: self.tests.update(test_id, {"name": "renamed"}))
         self.acknowledged = [pair for pair in self.acknowledged if pair[0].name != "test.json"]
         # a change that was refused may be there or not (the rename was made, its fsync failed), but never half
-        assert self.tests.read(test_id)["name"] in ({"renamed"} if updated is not None else {"one", "renamed"})
+        assert self.tests.read(test_id).name in ({"renamed"} if updated is not None else {"one", "renamed"})
         self._keep(self.tests.path(test_id) / "test.json")
         analysis = self._ask(lambda: self.tests.create_analysis(test_id, {"settings": {}}, mask=b"no picture"))
         if analysis is not None:
-            self._ask(lambda: self.tests.put_summary(test_id, analysis["id"], {"steps": []}))
+            self._ask(lambda: self.tests.put_summary(test_id, analysis.id, {"steps": []}))
 
 
 @pytest.mark.normal_depth("full", "write_error")
@@ -129,7 +129,7 @@ def add_steps(tests: TestStore, test_id: str, images: dict[str, bytes]) -> None:
 def test_after_the_disk_has_room_again_the_same_test_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = DataFolder(tmp_path / "data").open()
     tests = TestStore(folder)
-    test_id = tests.create({"name": "one"}, None)["id"]
+    test_id = tests.create({"name": "one"}, None).id
     images = {cam: encode_tiff(image(int(cam[-1]))) for cam in ("cam1", "cam2")}
     for n in range(1, 8):
         monkeypatch.setattr(disk_module, "disk", FaultyDisk("full", n))

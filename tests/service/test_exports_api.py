@@ -38,9 +38,9 @@ def url(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
     """An analysis whose results were put there, with a step whose images are gone since."""
     test = service.tests.create({"name": "Panel", "specimen": "", "notes": ""}, None)
     document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
-    analysis = service.tests.create_analysis(test["id"], document)
-    write_results(service.tests.analysis_path(test["id"], analysis["id"]))
-    return f"/api/v1/tests/{test['id']}/analyses/{analysis['id']}/export"
+    analysis = service.tests.create_analysis(test.id, document)
+    write_results(service.tests.analysis_path(test.id, analysis.id))
+    return f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export"
 
 
 def _content(data: bytes) -> dict[str, bytes]:
@@ -116,8 +116,8 @@ def test_refusals_are_problems(
 
 def test_no_finished_step(client: httpx.Client, service: Service) -> None:
     test = service.tests.create({"name": "", "specimen": "", "notes": ""}, None)
-    analysis = service.tests.create_analysis(test["id"], {"kind": "profile", "steps": [0], "settings": {}})
-    reply = client.get(f"/api/v1/tests/{test['id']}/analyses/{analysis['id']}/export", params={"format": "csv"})
+    analysis = service.tests.create_analysis(test.id, {"kind": "profile", "steps": [0], "settings": {}})
+    reply = client.get(f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export", params={"format": "csv"})
     assert (reply.status_code, reply.json()["code"]) == (404, "no_results")
 
 

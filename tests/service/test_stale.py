@@ -264,7 +264,7 @@ def test_what_changes_between_asking_and_measuring_is_refused(
     made = service.tests.create_analysis(place.name, document)
     spoil(place, "the calibration was replaced")
     with pytest.raises(FileFormatError) as caught:
-        task_of(service, {**made, "test_id": place.name}, 1, {}, None)
+        task_of(service, made.model_copy(update={"test_id": place.name}), 1, {}, None)
     assert caught.value.code == "calibration_changed"
 
 

@@ -110,7 +110,7 @@ def test_what_a_job_or_a_capture_uses_is_not_deleted(service: Service, client: h
     go = threading.Event()
     test_id = new_test(client)
     add_step(client, test_id, 1)
-    analysis_id = service.tests.create_analysis(test_id, {"kind": "profile", "steps": [0]})["id"]
+    analysis_id = service.tests.create_analysis(test_id, {"kind": "profile", "steps": [0]}).id
     subject = {"test_id": test_id, "analysis_id": analysis_id}
     job = service.jobs.submit("analysis", "x", subject, [Phase("compute", lambda _: go.wait(20) and None)])
     try:
@@ -179,7 +179,7 @@ def folder(tmp_path: Path) -> DataFolder:
 
 def small_test(folder: DataFolder, steps: int = 2) -> str:
     tests = TestStore(folder)
-    test_id = str(tests.create({"name": "one"}, None)["id"])
+    test_id = str(tests.create({"name": "one"}, None).id)
     for k in range(steps):
         tests.add_step(test_id, {"cam1": picture(k), "cam2": picture(k + 100)}, {})
     return test_id

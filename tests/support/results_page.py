@@ -71,11 +71,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
     """The plate's results with three points missing, a cut between two columns, and 1 um more deflection."""
     whole = service.tests.analysis_path(test_id, analysis_id)
-    told = service.tests.analysis(test_id, analysis_id)
+    told = service.tests.analysis(test_id, analysis_id).plain()
     kept = {k: told[k] for k in ("kind", "settings", "steps", "inputs", "software")}
     document = service.tests.create_analysis(test_id, {**kept, "label": "with a cut"})
-    service.catalog.put_entry("analysis", test_id, document["id"], analysis_entry(document))
-    folder = service.tests.analysis_path(test_id, document["id"])
+    service.catalog.put_entry("analysis", test_id, document.id, analysis_entry(document))
+    folder = service.tests.analysis_path(test_id, document.id)
     for n in told["steps"]:
         field = read_field(whole / f"step_{n:04d}.nc")
         field.status[4, 5] = field.status[4, 6] = field.status[8, 2] = 6
@@ -84,7 +84,7 @@ def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
             field.uvw_mm[..., 2] += 1e-3
         provenance = Provenance({"subset_px": 25, "step_px": 10}, {"a": "b"}, "0.1.0", step=n)
         write_field(folder / f"step_{n:04d}.nc", field, provenance)
-    return str(document["id"])
+    return document.id
 
 
 @pytest.fixture

@@ -78,7 +78,7 @@ def test_only_what_was_changed_is_refused_and_the_next_service_still_starts(tmp_
 def test_a_step_whose_document_cannot_be_read_takes_no_other_with_it(tmp_path: Path) -> None:
     folder = DataFolder(tmp_path / "data").open()
     tests = TestStore(folder)
-    test_id = tests.create({"name": "one"}, None)["id"]
+    test_id = tests.create({"name": "one"}, None).id
     for _ in range(4):
         tests.add_step(test_id, {"cam1": b"1", "cam2": b"2"}, {})
     (tests.path(test_id) / "steps" / "0001" / "step.json").write_text('{"n": 1, ')

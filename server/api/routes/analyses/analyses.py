@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from typing import Any
 
 from fastapi import APIRouter
 
@@ -14,14 +13,13 @@ from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, 
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
-from server.base.models import Ids
+from server.base.models import Ids, JobState
 from server.compute.seeds import check_seeds
 from server.formats.images import read_image
 from server.formats.noise_json import load_noise
 from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job
-from server.store.documents import JobRecord
 from server.workflows import analysis_start
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
@@ -41,7 +39,7 @@ def create_analysis(
     )
 
 
-def _begin(service: Service, test_id: str, body: AnalysisRequest, request: RequestMark) -> dict[str, Any]:
+def _begin(service: Service, test_id: str, body: AnalysisRequest, request: RequestMark) -> Ids:
     """Check everything that can be checked now, make the analysis and its job; return both ids."""
     calibration = service.tests.calibration_file(test_id)
     analysis_start.check_calibration(service, test_id, calibration)
@@ -73,10 +71,10 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
     def prepare(job: Job) -> Ids:
         run = {"job_id": job.id, **request.document()}
         stored = service.tests.create_analysis(test_id, document, mask, noise, run)
-        return {"analysis_id": stored["id"]}
+        return {"analysis_id": stored.id}
 
     job = analysis_start.submit(service, test_id, prepare, request, follow=body.follow)
-    return {"analysis_id": job.subject["analysis_id"], "job_id": job.id}
+    return {"analysis_id": str(job.subject["analysis_id"]), "job_id": job.id}
 
 
 def mask_of(region: Region) -> bytes | None:
@@ -98,36 +96,38 @@ def mask_of(region: Region) -> bytes | None:
         ) from error
 
 
-def analysis_reply(service: Service, test_id: str, analysis_id: str) -> dict[str, Any]:
+def analysis_reply(service: Service, test_id: str, analysis_id: str) -> AnalysisReply:
     """Return an analysis as the API shows it."""
     document = service.tests.analysis(test_id, analysis_id)
     summary = service.tests.summary(test_id, analysis_id)
     entries = service.catalog.entries("analysis", test_id)
     job_id = next((e.get("job_id") for e in entries if e["id"] == analysis_id), None)
-    state = summary["state"] if summary else "interrupted"
-    if summary is None or summary.get("job_id", job_id) != job_id:  # killed, or at work, perhaps once more
+    state: JobState = "interrupted" if summary is None else summary.state
+    shown = None if summary is None else summary.plain()
+    problem = None if summary is None else summary.problem
+    if summary is None or (summary.job_id or job_id) != job_id:  # killed, or at work, perhaps once more
         known = service.tests.step_summaries(test_id, analysis_id)
-        steps = [known[n] for n in document["steps"] if n in known]
-        summary = {"analysis_id": analysis_id, "state": state, "job_id": job_id, "steps": steps} if steps else None
-    job: JobRecord | None = None
+        steps = [known[n].plain() for n in document.steps if n in known]
+        shown = {"analysis_id": analysis_id, "state": state, "job_id": job_id, "steps": steps} if steps else None
+        problem = None
     if job_id is not None:
         try:
             job = service.jobs.document(str(job_id))
-            state = job.state
+            state, problem = job.state, job.problem
         except NotFoundError:
             job_id = None  # the catalogue was lost with its jobs; the files tell the rest
     stale = analysis_start.stale_reasons(service, test_id, document)
-    problem = job.plain()["problem"] if job else (summary or {}).get("problem")
-    return {
-        **{k: v for k, v in document.items() if k != "request"},
+    told = {
+        **document.shown(),
         "state": state,
         "job_id": job_id,
-        "problem": problem,
+        "problem": None if problem is None else problem.plain(),
         "steps_finished": service.tests.finished_steps(test_id, analysis_id),
-        "summary": summary,
+        "summary": shown,
         "stale": bool(stale),
         "stale_reasons": stale,
     }
+    return AnalysisReply.model_validate(told)
 
 
 @router.get("", summary="A test's analyses, oldest first", responses=errors(404, 422))
@@ -141,7 +141,7 @@ def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> Analys
 @router.get("/{analysis_id:plain_id}", summary="One analysis", responses=errors(404))
 def get_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> AnalysisReply:
     """Return settings, state and summary."""
-    return AnalysisReply.model_validate(analysis_reply(service, test_id, analysis_id))
+    return analysis_reply(service, test_id, analysis_id)
 
 
 @router.post(
@@ -187,5 +187,5 @@ def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisI
     """Measure the steps that have landed so far, then end the job; cancelling it instead ends it at once."""
     service.tests.analysis_path(test_id, analysis_id)
     runs = service.tests.analysis_jobs(test_id, analysis_id)
-    job_id = runs[-1]["job_id"] if runs else ""
+    job_id = runs[-1].job_id if runs else ""
     return AnalysisAccepted.model_validate({"job": service.jobs.finish(job_id).plain(), "analysis_id": analysis_id})

@@ -40,7 +40,7 @@ def field(
 ) -> Response:
     """Answer with a result file (NetCDF-4) of the step as `align` and `remove_rigid` ask for; nothing is stored."""
     source = service.tests.result_file(test_id, analysis_id, step)
-    reference = service.tests.analysis(test_id, analysis_id)["steps"][0]
+    reference = service.tests.analysis(test_id, analysis_id).steps[0]
     # a frame is laid through the reference's shape
     steps = {reference, step} if reference in service.tests.finished_steps(test_id, analysis_id) else {step}
     files = [service.tests.result_file(test_id, analysis_id, n) for n in sorted(steps)]

@@ -46,10 +46,9 @@ router = APIRouter(prefix="/tests", tags=["tests"])
 _CHANNELS: TypeAdapter[dict[str, float]] = TypeAdapter(Channels)
 
 
-def _reply(service: Service, test_id: str) -> dict[str, Any]:
-    document = {k: v for k, v in service.tests.read(test_id).items() if k != "request"}
+def _reply(service: Service, test_id: str) -> dict[str, object]:
     return {
-        **document,
+        **service.tests.read(test_id).shown(),
         "steps": service.catalog.entries("step", test_id),
         "incomplete_steps": service.tests.incomplete_steps(test_id),
         "analyses": service.catalog.entries("analysis", test_id),
@@ -78,9 +77,9 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
         document = service.tests.create(
             {**body.model_dump(), "calibration_id": calibration_id, **request.document()}, path
         )
-        service.catalog.put_entry("test", "", document["id"], test_entry(document))
-        service.hub.publish("test", {"test_id": document["id"]})
-        return {"test_id": document["id"]}
+        service.catalog.put_entry("test", "", document.id, test_entry(document))
+        service.hub.publish("test", {"test_id": document.id})
+        return {"test_id": document.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return TestReply.model_validate(_reply(service, str(made["test_id"])))
