@@ -36,7 +36,7 @@ from server.formats.noise_json import LoadedNoise
 from server.formats.results.reading import read_measured
 from server.formats.results.starts import read_starts, starts_file, write_starts
 from server.formats.results.summary import summarise
-from server.formats.results.writing import Provenance, write_field
+from server.formats.results.writing import Provenance, as_read_back, write_field
 from server.formats.version import software_version
 from server.worker.tasks import StepImages
 
@@ -164,7 +164,8 @@ class SequenceMeasurement:
             images = images or self.read(step)
             result = self._updating(shape).measure(images, earlier, **more)
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
-        self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
+        kept = {n: f for n, f in self._fields.items() if n == self.reference.n}
+        self._fields = kept | {step.n: as_read_back(result)}
         return result
 
     def finish(

@@ -16,9 +16,9 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
-from server.formats.results.reading import read_field, read_head
+from server.formats.results.reading import read_field, read_head, read_measured
 from server.formats.results.summary import summarise, to_json
-from server.formats.results.writing import Provenance, write_field
+from server.formats.results.writing import Provenance, as_read_back, write_field
 
 ROWS, COLS = 4, 6
 PROVENANCE = Provenance(
@@ -98,6 +98,19 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool)
     assert head.step == 7
     assert head.attributes.get("patch_reason") == ("curved: Gründe" if curved else None)
     assert summarise(field).document()["patch"] == (field.patch.document() if field.patch else None)
+
+
+@pytest.mark.parametrize("motion", [False, True])
+def test_memory_goes_on_with_what_the_file_holds(tmp_path: Path, motion: bool) -> None:
+    field = a_field(motion=motion)
+    write_field(tmp_path / "a.nc", field, PROVENANCE, measured=field)
+    kept, read = as_read_back(field), read_measured(tmp_path / "a.nc")
+    assert not np.array_equal(kept.covariance, field.covariance)
+    for item in dataclasses.fields(Field):
+        a, b = getattr(kept, item.name), getattr(read, item.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype, item.name
+            np.testing.assert_array_equal(a, b, err_msg=item.name)
 
 
 def test_xarray_understands_the_file(tmp_path: Path) -> None:
