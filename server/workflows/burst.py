@@ -73,7 +73,7 @@ def _run(
         except StereorigError as error:
             if error.code not in _OF_THE_PAIR:
                 raise
-            failures.append({"index": index, "problem": problem_of(error)})
+            failures.append({"index": index, "problem": problem_of(error).plain()})
             continue
         first_ns = step["host_monotonic_ns"] if first_ns is None else first_ns
         told = {"index": index, "n": step["n"], "since_first_ms": step["burst"]["since_first_ms"]}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -277,19 +277,6 @@ def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, object]:
         "inputs_sha256": json.dumps(provenance.inputs, sort_keys=True),
         **provenance.extra,
     }
-
-
-def as_read_back(measured: Field) -> Field:
-    """Return a measured field as :func:`server.formats.results.reading.read_measured` gives it back from its file.
-
-    Some variables are kept in single precision. What goes on from a step begins with the same numbers, whether the
-    field is still in memory or was read.
-    """
-    names = {v.attribute for v in (*SHAPE, *MOTION, *CURVATURE) if v.dtype == "f4"} | {"zncc", "covariance"}
-    stored = {name: getattr(measured, name) for name in names}
-    return replace(
-        measured, **{name: v.astype(np.float32).astype(np.float64) for name, v in stored.items() if v is not None}
-    )
 
 
 def write_field(
