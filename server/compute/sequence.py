@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from server.formats.files import sha256_of
 from server.formats.images import read_image
 from server.formats.noise_json import LoadedNoise
 from server.formats.results.reading import read_measured
-from server.formats.results.starts import read_starts, starts_file, write_starts
+from server.formats.results.starts import starts_file, with_starts, write_starts
 from server.formats.results.summary import summarise
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
@@ -195,7 +195,9 @@ class SequenceMeasurement:
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
         if result.starts is not None and keep_starts:
-            write_starts(starts_file(path), result.starts)  # first: where the result is, they are
+            write_starts(
+                starts_file(path), result, reference=step.n == self.reference.n
+            )  # first: where the result is, they are
         write_field(path, shown, self._provenance(step, result, about), strain, measured=result, checksum=checksum)
         summary = summarise(shown, rbe_px=self._rbe_px, reference=self.reference.n).document()
         return FinishedStep(
@@ -254,7 +256,7 @@ class SequenceMeasurement:
                 raise FileFormatError(
                     f"The result of step {n} is missing.", code="file_missing", remedy="Start the analysis again."
                 )
-            measured = replace(read_measured(path), starts=read_starts(starts_file(path)))
+            measured = with_starts(read_measured(path), starts_file(path))
             if n != self.reference.n:
                 return measured
             self._fields[n] = measured

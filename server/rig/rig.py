@@ -117,7 +117,7 @@ class Rig:
 
     def _lost(self, cam: CameraName, error: CameraError) -> None:
         _log.warning("%s was lost: %s", cam, error)
-        self._announce("camera", {"camera": cam, "state": "lost", "problem": problem_of(error)})
+        self._announce("camera", {"camera": cam, "state": "lost", "problem": problem_of(error).plain()})
 
     def _came_back(self, cam: CameraName) -> None:
         _log.warning("%s is connected again", cam)
@@ -187,7 +187,7 @@ class Rig:
             unit = self._devices.pair.units[cam]
             shown["device"] = asdict(unit.description)
             shown["settings"] = asdict(unit.settings)
-            shown["fault"] = None if unit.fault is None else problem_of(unit.fault)
+            shown["fault"] = None if unit.fault is None else problem_of(unit.fault).plain()
             shown["reconnections"] = unit.reconnections
         return shown
 
@@ -230,7 +230,7 @@ class Rig:
                 "identity": None,
                 "axes": [],
                 "zero_mm": section.zero_mm,
-                "fault": problem_of(error),
+                "fault": problem_of(error).plain(),
             }
 
     def describe_stage(self) -> dict[str, Any]:

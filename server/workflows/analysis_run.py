@@ -242,7 +242,7 @@ class AnalysisRun:
         assert job.result is not None
         if self._failed:
             first = min(self._failed)
-            job.result["steps_failed"] = {str(n): problem_of(error) for n, error in self._failed.items()}
+            job.result["steps_failed"] = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
             raise StepsFailedError(
                 f"{len(self._failed)} of {len(self._document.steps)} steps failed; step {first}: "
                 f"{self._failed[first].cause}",

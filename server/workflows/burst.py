@@ -74,17 +74,18 @@ def _run(
         except StereorigError as error:
             if error.code not in _OF_THE_PAIR:
                 raise
-            problems.append((index, problem_of(error)))
-            failures.append({"index": index, "problem": problems[-1][1]})
+            problem = problem_of(error)
+            problems.append((index, problem))
+            failures.append({"index": index, "problem": problem.plain()})
             continue
         first_ns = step.host_monotonic_ns if first_ns is None else first_ns
         told = {"index": index, "n": step.n, "since_first_ms": step.burst and step.burst.since_first_ms}
         steps.append({**told, "quality": step.quality_code, "sha256": step.sha256})
     job.progress("steps", count, count)
     if problems:
-        first, problem = problems[0]
+        first, why = problems[0]
         raise BurstIncompleteError(
-            f"{len(problems)} of {count} steps were not taken; the first, number {first}: {problem.cause}",
+            f"{len(problems)} of {count} steps were not taken; the first, number {first}: {why.cause}",
             failed=[index for index, _ in problems],
         )
     return result

@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import io
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from core.field.points.result import Field
 from core.field.points.starts import Starts
 from server.formats.files import write_bytes
+
+#: what a result file holds in single precision
+_SINGLE = ("covariance", "zncc", "epipolar_px", "noise_grey")
 
 
 def starts_file(result: Path) -> Path:
@@ -21,24 +26,37 @@ def starts_file(result: Path) -> Path:
     return result.with_name(result.stem.replace("step_", "starts_") + ".npz")
 
 
-def write_starts(path: Path, starts: Starts) -> None:
-    """Write them durably.
+def write_starts(path: Path, measured: Field, *, reference: bool) -> None:
+    """Write durably what a measured field has besides its result file.
+
+    Parameters
+    ----------
+    measured
+        The field, with its starts.
+    reference
+        Also keep in double precision what the result file has in single: every step's errors are computed from the
+        reference's.
 
     Raises
     ------
     StorageError
         ``storage_full`` or ``storage_failed``.
     """
+    starts = measured.starts
+    assert starts is not None
     arrays = {"w": starts.w} if starts.G is None else {"w": starts.w, "G": starts.G}
+    if reference:
+        arrays |= {name: getattr(measured, name) for name in _SINGLE}
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its stubs take a name for a flag
     write_bytes(path, buffer.getvalue())
 
 
-def read_starts(path: Path) -> Starts | None:
-    """Read them back; None where there are none, or none that can be read: starts are found anew then."""
+def with_starts(measured: Field, path: Path) -> Field:
+    """Return a field with what lies beside its result file; where that cannot be read, starts are found anew."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return Starts(arrays["w"], arrays.get("G"))
+            exact = {name: arrays[name] for name in _SINGLE if name in arrays}
+            return replace(measured, starts=Starts(arrays["w"], arrays.get("G")), **exact)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        return None
+        return measured

@@ -14,9 +14,11 @@ import xarray as xr
 from core.errors import FileFormatError, StorageError
 from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
+from core.field.points.starts import Starts
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
-from server.formats.results.reading import read_field, read_head
+from server.formats.results.reading import read_field, read_head, read_measured
+from server.formats.results.starts import with_starts, write_starts
 from server.formats.results.summary import summarise, to_json
 from server.formats.results.writing import Provenance, write_field
 
@@ -98,6 +100,25 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool)
     assert head.step == 7
     assert head.attributes.get("patch_reason") == ("curved: Gründe" if curved else None)
     assert summarise(field).document()["patch"] == (field.patch.document() if field.patch else None)
+
+
+@pytest.mark.parametrize("motion", [False, True])
+def test_a_later_process_goes_on_with_the_same_numbers(tmp_path: Path, motion: bool) -> None:
+    field = a_field(motion=motion)
+    # as it was measured, before points outside the calibrated volume are marked
+    status = np.where(field.status == PointStatus.EXTRAPOLATED, PointStatus.OK, field.status).astype(np.int8)
+    field = dataclasses.replace(field, status=status, starts=Starts(np.random.default_rng(1).random((24, 6)), None))
+    write_field(tmp_path / "a.nc", field, PROVENANCE, measured=field)
+    write_starts(tmp_path / "starts.npz", field, reference=True)
+    read = with_starts(read_measured(tmp_path / "a.nc"), tmp_path / "starts.npz")
+    for item in dataclasses.fields(Field):
+        a, b = getattr(field, item.name), getattr(read, item.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype, item.name
+            np.testing.assert_array_equal(a, b, err_msg=item.name)
+    assert read.starts is not None
+    assert field.starts is not None
+    np.testing.assert_array_equal(read.starts.w, field.starts.w)
 
 
 def test_xarray_understands_the_file(tmp_path: Path) -> None:
