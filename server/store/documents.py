@@ -114,7 +114,7 @@ class StepRecord(StepFacts):
     """``step.json``."""
 
     n: int
-    test_id: str
+    test_id: str | None = None
     source: str | None = None
     captured_utc: str | None = None
     host_monotonic_ns: int | None = None

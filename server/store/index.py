@@ -78,7 +78,7 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
     def step(n: int, document: StepRecord | FileFormatError) -> Entry:
         if isinstance(document, FileFormatError):
             raise document
-        lost.step(document)
+        lost.step(test_id, document)
         return "step", test_id, f"{n:04d}", step_entry(document)
 
     def analysis(analysis_id: str) -> Entry:

@@ -31,7 +31,7 @@ class LostJobs:
     def __init__(self) -> None:
         self._jobs: dict[str, JobRecord] = {}
         self._requests: dict[tuple[str, str], tuple[str, Ids]] = {}
-        self._bursts: dict[str, list[tuple[BurstPlace, StepRecord]]] = {}
+        self._bursts: dict[tuple[str, str], list[tuple[BurstPlace, StepRecord]]] = {}
 
     def made(self, request: KeptRequest | None, ids: Ids) -> None:
         """Take the request that something was made for."""
@@ -61,12 +61,12 @@ class LostJobs:
         self._job(job_id, kind, ids, state, plan["created_utc"], ids if state == "succeeded" else None, problem)
         self.made(request_of(plan), {**ids, "job_id": job_id})
 
-    def step(self, document: StepRecord) -> None:
+    def step(self, test_id: str, document: StepRecord) -> None:
         """A step; those of a burst belong to its job."""
         if document.burst is None:
-            self.made(document.request, {"test_id": document.test_id, "n": document.n})
+            self.made(document.request, {"test_id": test_id, "n": document.n})
             return
-        self._bursts.setdefault(document.burst.job_id, []).append((document.burst, document))
+        self._bursts.setdefault((test_id, document.burst.job_id), []).append((document.burst, document))
 
     def analysis(self, document: AnalysisRecord, runs: list[AnalysisJob], summary: SummaryRecord | None) -> None:
         """An analysis, with the jobs that worked on it, the last one last."""
@@ -108,9 +108,9 @@ class LostJobs:
         )
 
     def _end_bursts(self) -> None:
-        for job_id, steps in self._bursts.items():
+        for (test_id, job_id), steps in self._bursts.items():
             burst, first = steps[0]
-            subject: Ids = {"test_id": first.test_id}
+            subject: Ids = {"test_id": test_id}
             taken = [
                 {"index": place.index, "n": step.n, "quality": step.quality_code, "sha256": step.sha256}
                 for place, step in steps

@@ -81,7 +81,7 @@ def commit_pair(
         "image_size_px": sizes,
     }
     images: dict[str, bytes] = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
-    return _announce(service, service.tests.add_step(test_id, images, document))
+    return _announce(service, test_id, service.tests.add_step(test_id, images, document))
 
 
 @timed_capture("import")
@@ -110,7 +110,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: S
         "image_size_px": sizes,
     }
     data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
-    return _announce(service, service.tests.add_step(test_id, data, document))
+    return _announce(service, test_id, service.tests.add_step(test_id, data, document))
 
 
 def _check_content(images: dict[str, GrayImage]) -> None:
@@ -151,10 +151,10 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
             )
 
 
-def _announce(service: Service, step: StepRecord) -> StepRecord:
+def _announce(service: Service, test_id: str, step: StepRecord) -> StepRecord:
     entry = step_entry(step)
-    service.catalog.put_entry("step", step.test_id, f"{step.n:04d}", entry)
+    service.catalog.put_entry("step", test_id, f"{step.n:04d}", entry)
     job = {} if step.burst is None else {"job_id": step.burst.job_id}
-    service.hub.publish("step", {"test_id": step.test_id, **entry, **job})
-    service.jobs.landed(step.test_id)
+    service.hub.publish("step", {"test_id": test_id, **entry, **job})
+    service.jobs.landed(test_id)
     return step
