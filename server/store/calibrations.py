@@ -6,14 +6,14 @@ holds it is a calibration. What a verdict refused lies in ``rejected.json`` in i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from server.base.errors import NotFoundError
 from server.formats.files import known_sha256, mismatch, require_recorded, sha256_of
 from server.formats.images import GrayImage, encode_tiff
-from server.store.durable import make_folder, read_json, write_bytes, write_json
+from server.store.documents import CalibrationRecord
+from server.store.durable import make_folder, read_json, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
 REJECTED = "rejected.json"
@@ -44,7 +44,7 @@ class CalibrationStore:
             p.parent.name for p in self._folder.calibrations.glob("c*/plan.json") if is_id(p.parent.name, "c")
         )
 
-    def create(self, plan: dict[str, Any], target: dict[str, Any]) -> str:
+    def create(self, plan: Mapping[str, object], target: Mapping[str, object]) -> str:
         """Make the folder of a new calibration and return its id."""
         calibration_id = self._folder.ids.new("c")
         path = self._folder.calibrations / calibration_id
@@ -54,7 +54,7 @@ class CalibrationStore:
         write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
         return calibration_id
 
-    def add_imported(self, plan: dict[str, Any], content: dict[str, Any]) -> str:
+    def add_imported(self, plan: Mapping[str, object], content: Mapping[str, object]) -> str:
         """Store a calibration that was made elsewhere, complete at once; return its id."""
         calibration_id = self._folder.ids.new("c")
         path = self._folder.calibrations / calibration_id
@@ -70,7 +70,7 @@ class CalibrationStore:
         digest = write_bytes(self.path(calibration_id) / "views" / name, encode_tiff(image))
         return {"file": f"views/{name}", "sha256": digest}
 
-    def put_views_done(self, calibration_id: str, views: list[dict[str, Any]]) -> None:
+    def put_views_done(self, calibration_id: str, views: Sequence[Mapping[str, object]]) -> None:
         """Write ``view.json``: every view with camera, read-back position and checksum."""
         write_json(self.path(calibration_id) / "view.json", {"views": views})
 
@@ -78,18 +78,22 @@ class CalibrationStore:
         """Record why there is no calibration."""
         write_json(self.path(calibration_id) / "failure.json", problem)
 
-    def put_judgement(self, calibration_id: str, document: dict[str, Any] | None) -> None:
+    def put_judgement(self, calibration_id: str, document: Mapping[str, object] | None) -> None:
         """Keep what was decided on a calibration beside it; None takes it back."""
         path = self.path(calibration_id) / "judgement.json"
         write_json(path, {"decision": None} if document is None else document)
 
-    def read(self, calibration_id: str) -> dict[str, Any]:
+    def read(self, calibration_id: str) -> CalibrationRecord:
         """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``).
 
         One that failed its verdict has the result that was refused.
         """
         path = self.path(calibration_id)
-        document: dict[str, Any] = {"id": calibration_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
+        document: dict[str, object] = {
+            "id": calibration_id,
+            "state": "unfinished",
+            "plan": read_json(path / "plan.json"),
+        }
         document["taken"] = read_json(path / "view.json")["views"] if (path / "view.json").exists() else None
         if (path / "calibration.json").exists():
             require_recorded(
@@ -103,7 +107,7 @@ class CalibrationStore:
                 document = {**read_json(path / REJECTED), **document}
         judgement = read_json(path / "judgement.json") if (path / "judgement.json").exists() else {}
         document["judgement"] = judgement if judgement.get("decision") is not None else None
-        return document
+        return record_of(CalibrationRecord, document, path / "plan.json")
 
     def view_file(self, calibration_id: str, index: int, cam: str) -> Path:
         """Path of one stored view."""

@@ -5,6 +5,8 @@ What a document lacks is missing; what a later version added is kept. Replies of
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from server.base.models import Document, JobState
@@ -187,3 +189,65 @@ class SummaryRecord(Document):
     steps: list[StepFound] = Field(default_factory=list)
     job_id: str | None = None
     problem: JobProblem | None = None
+
+
+class Plan(Kept):
+    """``plan.json`` of a calibration or a noise measurement; what else it holds depends on which."""
+
+    created_utc: str
+    label: str = ""
+    source: str | None = None
+    request: KeptRequest | None = None
+    job_id: str | None = None
+
+
+class Failure(JobProblem):
+    """``failure.json``: why nothing came of it, and how its job ended."""
+
+    job_state: JobState = "interrupted"
+
+
+class MadeRecord(Document):
+    """A calibration or noise measurement as its folder tells of it: what was found stands beside these fields."""
+
+    id: str
+    state: Literal["unfinished", "failed", "complete"]
+    plan: Plan
+    problem: Failure | None = None
+
+
+class Decided(Document):
+    """``judgement.json``: what somebody decided on a calibration."""
+
+    decision: str | None = None
+    note: str | None = None
+
+
+class ViewRecord(Document):
+    """A view in ``view.json``."""
+
+    index: int | None = None
+    camera: str | None = None
+    full_scale: int | float | None = None
+    file: str | None = None
+    sha256: str | None = None
+
+
+class CalibrationRecord(MadeRecord):
+    """A calibration."""
+
+    taken: list[ViewRecord] | None = None
+    judgement: Decided | None = None
+    verdict: object = None
+
+
+class WatchRecord(Document):
+    """``watch.json``, and what the next reading is compared with."""
+
+    channel: str
+    threshold: float
+    frames: int = 1
+    label: str | None = None
+    active: bool = False
+    last_value: float | None = None
+    last_step: int | None = None

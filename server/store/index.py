@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 from core.errors import FileFormatError
 from server.base.errors import NotFoundError
@@ -21,17 +20,16 @@ from server.store.trash import Trash
 Entry = tuple[str, str, str, Mapping[str, object]]  # kind, parent, id, document
 
 
-def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, Any]:
+def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, object]:
     """What a list shows of a calibration."""
-    document = store.read(calibration_id)
-    verdict = document.get("verdict")
+    made = store.read(calibration_id)
     return {
         "id": calibration_id,
-        "state": document["state"],
-        "label": document["plan"].get("label", ""),
-        "created_utc": document["plan"]["created_utc"],
-        "verdict": verdict if isinstance(verdict, dict) else None,  # an imported file may hold anything
-        "decision": (document["judgement"] or {}).get("decision"),
+        "state": made.state,
+        "label": made.plan.label,
+        "created_utc": made.plan.created_utc,
+        "verdict": made.verdict if isinstance(made.verdict, dict) else None,  # an imported file may hold anything
+        "decision": None if made.judgement is None else made.judgement.decision,
     }
 
 
@@ -116,7 +114,7 @@ def rebuild(
     for calibration_id in calibrations.ids():
         folder.ids.seen(calibration_id)
         try:
-            if calibrations.read(calibration_id)["state"] == "unfinished":
+            if calibrations.read(calibration_id).state == "unfinished":
                 # nobody works on it any more: the job that did ended with the last service
                 calibrations.put_failure(calibration_id, problem_of(RESTART).plain())
             lost.calibration(calibrations.read(calibration_id))

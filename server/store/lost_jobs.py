@@ -7,7 +7,6 @@ a client that sends its request once more gets what it made, with its job as it 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from server.base.models import Ids, JobState
 from server.base.problem import RESTART, JobProblem, problem_of
@@ -18,6 +17,7 @@ from server.store.documents import (
     BurstPlace,
     JobRecord,
     KeptRequest,
+    MadeRecord,
     Progress,
     StepRecord,
     SummaryRecord,
@@ -38,28 +38,25 @@ class LostJobs:
         if request is not None:
             self._requests.setdefault((request.scope, request.key), (request.body_sha256, ids))
 
-    def calibration(self, document: dict[str, Any]) -> None:
+    def calibration(self, made: MadeRecord) -> None:
         """A calibration, as its store reads it."""
-        self._single("calibration", document)
+        self._single("calibration", made)
 
-    def noise(self, document: dict[str, Any]) -> None:
+    def noise(self, made: MadeRecord) -> None:
         """A noise measurement, as its store reads it."""
-        self._single("noise", document)
+        self._single("noise", made)
 
-    def _single(self, kind: str, document: dict[str, Any]) -> None:
-        plan = document["plan"]
-        ids = {f"{kind}_id": document["id"]}
-        job_id = plan.get("job_id")
-        if plan.get("source") == "import":
-            self.made(request_of(plan), ids)
-        if job_id is None:
+    def _single(self, kind: str, made: MadeRecord) -> None:
+        plan, problem = made.plan, made.problem
+        ids: Ids = {f"{kind}_id": made.id}
+        if plan.source == "import":
+            self.made(plan.request, ids)
+        if plan.job_id is None:
             return
-        problem = document.get("problem")
-        state: JobState = (
-            "succeeded" if document["state"] == "complete" else (problem or {}).get("job_state", "interrupted")
-        )
-        self._job(job_id, kind, ids, state, plan["created_utc"], ids if state == "succeeded" else None, problem)
-        self.made(request_of(plan), {**ids, "job_id": job_id})
+        failed: JobState = "interrupted" if problem is None else problem.job_state
+        state: JobState = "succeeded" if made.state == "complete" else failed
+        self._job(plan.job_id, kind, ids, state, plan.created_utc, ids if state == "succeeded" else None, problem)
+        self.made(plan.request, {**ids, "job_id": plan.job_id})
 
     def step(self, test_id: str, document: StepRecord) -> None:
         """A step; those of a burst belong to its job."""
@@ -87,11 +84,11 @@ class LostJobs:
         state: JobState,
         created_utc: str,
         result: Mapping[str, object] | None,
-        problem: object,
+        problem: JobProblem | None,
     ) -> None:
         if not is_id(job_id, "j"):  # a folder from elsewhere may say anything
             return
-        told = JobProblem.model_validate(problem) if problem is not None else None
+        told = None if problem is None else JobProblem.model_validate(problem.plain())
         if state != "succeeded" and told is None:
             told = problem_of(RESTART)
         self._jobs[job_id] = JobRecord(
@@ -134,9 +131,3 @@ class LostJobs:
                 if (scope, key) not in known_keys
             ],
         )
-
-
-def request_of(document: Mapping[str, object]) -> KeptRequest | None:
-    """Return the request that a plan was made for, None without one."""
-    found = document.get("request")
-    return None if found is None else KeptRequest.model_validate(found)

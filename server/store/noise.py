@@ -7,16 +7,16 @@ it is a noise measurement.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from core.errors import FileFormatError, StateError
 from server.base.errors import NotFoundError
 from server.base.problem import RESTART, problem_of
 from server.formats.files import require_recorded
 from server.formats.images import GrayImage, encode_tiff
-from server.store.durable import make_folder, read_json, write_bytes, write_json
+from server.store.documents import MadeRecord
+from server.store.durable import make_folder, read_json, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
 
@@ -31,7 +31,7 @@ class NoiseStore:
         for noise_id in self.ids():
             self._folder.ids.seen(noise_id)
             with contextlib.suppress(FileFormatError):  # one that is damaged must not keep the service from starting
-                if self.read(noise_id)["state"] == "unfinished":
+                if self.read(noise_id).state == "unfinished":
                     # nobody works on it any more: the job that did ended with the last service
                     self.put_failure(noise_id, problem_of(RESTART).plain())
 
@@ -56,7 +56,7 @@ class NoiseStore:
         """Ids of all noise measurements, finished or not, in the order of their making."""
         return sorted(p.parent.name for p in self._root.glob("n*/plan.json") if is_id(p.parent.name, "n"))
 
-    def create(self, plan: dict[str, Any]) -> str:
+    def create(self, plan: Mapping[str, object]) -> str:
         """Make the folder of a new noise measurement and return its id."""
         noise_id = self._folder.ids.new("n")
         if not self._root.exists():
@@ -67,12 +67,12 @@ class NoiseStore:
         write_json(path / "plan.json", {"id": noise_id, "created_utc": now_utc(), **plan})
         return noise_id
 
-    def put_frame(self, noise_id: str, index: int, cam: str, image: GrayImage) -> dict[str, Any]:
+    def put_frame(self, noise_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
         """Store one frame; return its camera, file name and checksum."""
         name = f"frames/{index:03d}_{cam}.tif"
         return {"camera": cam, "file": name, "sha256": write_bytes(self.path(noise_id) / name, encode_tiff(image))}
 
-    def put_frames_done(self, noise_id: str, frames: list[dict[str, Any]], facts: dict[str, Any]) -> None:
+    def put_frames_done(self, noise_id: str, frames: Sequence[Mapping[str, str]], facts: Mapping[str, object]) -> None:
         """Write ``frames.json``: every frame with camera and checksum, and the cameras' settings."""
         write_json(self.path(noise_id) / "frames.json", {**facts, "frames": frames})
 
@@ -80,16 +80,16 @@ class NoiseStore:
         """Record why there are no models."""
         write_json(self.path(noise_id) / "failure.json", problem)
 
-    def read(self, noise_id: str) -> dict[str, Any]:
+    def read(self, noise_id: str) -> MadeRecord:
         """Return plan, models and state (``unfinished``, ``failed``, ``complete``)."""
         path = self.path(noise_id)
-        document: dict[str, Any] = {"id": noise_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
+        document: dict[str, object] = {"id": noise_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
         if (path / "noise.json").exists():
             require_recorded(path / "noise.json", f"noise measurement {noise_id}", f"noise/{noise_id}")
             document = {**read_json(path / "noise.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
-        return document
+        return record_of(MadeRecord, document, path / "plan.json")
 
     def file(self, noise_id: str) -> Path:
         """Path of ``noise.json``.
@@ -102,7 +102,7 @@ class NoiseStore:
         path = self.path(noise_id) / "noise.json"
         if not path.is_file():
             raise StateError(
-                f"Noise measurement {noise_id} is {self.read(noise_id)['state']}.",
+                f"Noise measurement {noise_id} is {self.read(noise_id).state}.",
                 code="noise_not_complete",
                 remedy="Wait for its job, or measure again.",
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from core.calibration import CalibrationOptions
 from core.calibration.expect import LineModel, expect
@@ -18,7 +18,7 @@ from server.workflows.service import Service
 Decision = Literal["accepted", "discarded"]
 
 
-def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None, roll_deg: float) -> dict[str, Any]:
+def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None, roll_deg: float) -> dict[str, object]:
     """Return what a plan may be expected to leave uncertain, as the API shows it.
 
     Raises
@@ -76,7 +76,7 @@ def decide(service: Service, calibration_id: str, decision: Decision | None, not
     StateError
         ``calibration_not_complete`` where there is nothing to accept.
     """
-    state = service.calibrations.read(calibration_id)["state"]
+    state = service.calibrations.read(calibration_id).state
     if state == "unfinished" or (state != "complete" and decision == "accepted"):
         raise StateError(
             f"Calibration {calibration_id} is {state}.",
@@ -117,9 +117,9 @@ def check_not_discarded(service: Service, calibration_id: str) -> None:
     StateError
         ``calibration_discarded``.
     """
-    judgement = service.calibrations.read(calibration_id).get("judgement")
-    if judgement is not None and judgement["decision"] == "discarded":
-        why = f": {judgement['note']}" if judgement.get("note") else "."
+    judgement = service.calibrations.read(calibration_id).judgement
+    if judgement is not None and judgement.decision == "discarded":
+        why = f": {judgement.note}" if judgement.note else "."
         raise StateError(
             f"Calibration {calibration_id} was discarded{why}",
             code="calibration_discarded",

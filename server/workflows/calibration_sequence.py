@@ -81,11 +81,11 @@ def targets_of(service: Service, plan: CalibrationPlan) -> list[dict[int, float]
     return stops
 
 
-def take_views(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> dict[str, Any]:
+def take_views(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> dict[str, object]:
     """Hardware phase: every view on disk, with its read-back dZ."""
     rig = service.rig
     stops = [*plan.stops_mm(), 0.0]
-    views: list[dict[str, Any]] = []
+    views: list[dict[str, object]] = []
     cameras = rig.identities()
     for index, dz in enumerate(stops):
         job.check()
@@ -124,10 +124,11 @@ def _role(plan: CalibrationPlan, dz: float, *, last: bool) -> str:
     return "fitted" if dz in plan.positions_mm else "zero"
 
 
-def fit(service: Service, job: Job, calibration_id: str) -> dict[str, Any]:
+def fit(service: Service, job: Job, calibration_id: str) -> dict[str, object]:
     """Compute phase: find the grid in every view, adjust, check; ``calibration.json`` is there when this returns."""
-    document = service.calibrations.read(calibration_id)
-    task = FitTask(str(service.calibrations.path(calibration_id)), document["plan"], document["taken"])
+    made = service.calibrations.read(calibration_id)
+    views = [view.plain() for view in made.taken or []]
+    task = FitTask(str(service.calibrations.path(calibration_id)), made.plan.plain(), views)
     return dict(run_task(service.worker, job, fit_calibration, task))
 
 
@@ -142,7 +143,7 @@ def rig_facts(config: RigConfig) -> dict[str, Any]:
     }
 
 
-def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, Any]:
+def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, object]:
     """``plan.json``."""
     return {**asdict(plan), "rig": rig_facts(config)}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
 
 from core.names import CAMERAS
 from server.jobs.job import Job
@@ -12,7 +11,7 @@ from server.workflows.service import Service
 from server.workflows.waiting import run_task
 
 
-def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[str, Any]:
+def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[str, object]:
     """Hardware phase: ``frames`` pairs on disk, none averaged."""
     rig = service.rig
     taken = []
@@ -31,7 +30,7 @@ def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[
     return {"noise_id": noise_id, "frames": frames}
 
 
-def fit(service: Service, job: Job, noise_id: str) -> dict[str, Any]:
+def fit(service: Service, job: Job, noise_id: str) -> dict[str, object]:
     """Compute phase: ``noise.json`` is there when this returns."""
     return dict(run_task(service.worker, job, fit_noise, NoiseTask(str(service.noise.path(noise_id)))))
 
@@ -40,4 +39,4 @@ def close(service: Service, job: Job, noise_id: str, state: str) -> None:
     """Leave a record of a measurement that did not come to be, and tell who listens."""
     if state != "succeeded" and job.problem is not None:
         service.noise.put_failure(noise_id, {**job.problem.plain(), "job_state": state})
-    service.hub.publish("noise", {"noise_id": noise_id, "state": service.noise.read(noise_id)["state"]})
+    service.hub.publish("noise", {"noise_id": noise_id, "state": service.noise.read(noise_id).state})

@@ -7,14 +7,13 @@ that bears it: both outlive a restart, and a reading that asked for a step and g
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from core.errors import StateError
 from server.base.errors import NotFoundError
-from server.store.documents import StepFacts, Watched
-from server.store.durable import read_json, write_json
+from server.store.documents import StepFacts, Watched, WatchRecord
+from server.store.durable import read_json, read_record, write_json
 from server.store.folder import now_utc
 from server.workflows.capture import capture_step
 from server.workflows.service import Service
@@ -63,8 +62,8 @@ class Watches:
             return self._locks.setdefault(test_id, threading.Lock())
 
     def begin(
-        self, test_id: str, settings: dict[str, Any], allow: Callable[[dict[str, Any] | None], None] | None = None
-    ) -> dict[str, Any]:
+        self, test_id: str, settings: Mapping[str, object], allow: Callable[[WatchRecord | None], None] | None = None
+    ) -> WatchRecord:
         """Watch a channel from now on, in place of what was watched before.
 
         Parameters
@@ -80,23 +79,23 @@ class Watches:
             write_json(self._service.tests.path(test_id) / "watch.json", document)
         return self.read(test_id)
 
-    def end(self, test_id: str) -> dict[str, Any]:
+    def end(self, test_id: str) -> WatchRecord:
         """Take no further steps."""
         with self._turn(test_id):
-            document = self._document(test_id)
-            if document["active"]:
-                write_json(self._service.tests.path(test_id) / "watch.json", {**document, "active": False})
+            path = self._service.tests.path(test_id) / "watch.json"
+            if self._record(test_id).active:
+                write_json(path, {**read_json(path), "active": False})
         return self.read(test_id)
 
-    def _document(self, test_id: str) -> dict[str, Any]:
+    def _record(self, test_id: str) -> WatchRecord:
         path = self._service.tests.path(test_id) / "watch.json"
         if not path.is_file():
             raise NotFoundError(
                 f"Nothing is watched in test {test_id}.", what="watch", remedy="PUT /tests/{id}/watch with a channel."
             )
-        return read_json(path)
+        return read_record(WatchRecord, path)
 
-    def read(self, test_id: str) -> dict[str, Any]:
+    def read(self, test_id: str) -> WatchRecord:
         """Return what is watched, and what the next reading is compared with.
 
         Raises
@@ -104,10 +103,10 @@ class Watches:
         NotFoundError
             If nothing ever was.
         """
-        document = self._document(test_id)
-        last = self._last(test_id, document["channel"])
+        watch = self._record(test_id)
+        last = self._last(test_id, watch.channel)
         n, value = (None, None) if last is None else last
-        return {**document, "last_value": value, "last_step": n}
+        return watch.model_copy(update={"last_value": value, "last_step": n})
 
     def _last(self, test_id: str, channel: str) -> tuple[int, float] | None:
         """Newest step that bears a channel, and its value; looked up once until there are other steps."""
@@ -142,19 +141,19 @@ class Watches:
             No step was taken; the same reading may be sent again.
         """
         with self._turn(test_id):
+            watch: WatchRecord | None = None
             try:
-                document = self._document(test_id)
+                watch = self._record(test_id)
             except NotFoundError as error:
                 if error.context.get("what") != "watch":
                     raise
-                document = {"active": False}
-            if not document["active"]:
+            if watch is None or not watch.active:
                 raise StateError(
                     f"Nothing is watched in test {test_id}: the reading would be lost.",
                     code="watch_off",
                     remedy="PUT /tests/{id}/watch with a channel, or POST /tests/{id}/steps.",
                 )
-            channel, threshold = str(document["channel"]), float(document["threshold"])
+            channel, threshold = watch.channel, watch.threshold
             value, last = value_of(facts, channel), self._last(test_id, channel)
             last_value = None if last is None else last[1]
             if value is None:
@@ -162,7 +161,7 @@ class Watches:
             change = None if last_value is None else abs(value - last_value)
             if change is not None and (change < threshold or change == 0.0):
                 return Outcome("below_threshold", value, last_value)
-            watch = Watched(channel=channel, value=value, last_value=last_value, threshold=threshold)
-            taken = facts.model_copy(update={"label": facts.label or document.get("label", ""), "watch": watch})
-            step = capture_step(self._service, test_id, taken, frames=int(document["frames"]))
+            why = Watched(channel=channel, value=value, last_value=last_value, threshold=threshold)
+            taken = facts.model_copy(update={"label": facts.label or watch.label or "", "watch": why})
+            step = capture_step(self._service, test_id, taken, frames=watch.frames)
             return Outcome("first" if last is None else "changed", value, last_value, step.n)

@@ -60,8 +60,8 @@ def test_only_what_was_changed_is_refused_and_the_next_service_still_starts(tmp_
         assert caught.value.code == "checksum_mismatch"
         assert any(str(caught.value.context["file"]) == path for path in changed)
     assert {f.path for f in verify(folder.root).findings if f.level == "damaged"} == set(changed)
-    assert calibrations.read(good)["baseline_mm"] == 400.25
-    assert noise.read(noises[1])["gain"] == 1.25
+    assert calibrations.read(good).plain()["baseline_mm"] == 400.25
+    assert noise.read(noises[1]).plain()["gain"] == 1.25
     assert calibrations.view_file(taken, 1, "cam1").is_file()
 
     folder.close()

@@ -158,10 +158,10 @@ def get_view_preview(
 ) -> Response:
     """Return it in 8 bit and no wider than asked for."""
     path = service.calibrations.view_file(calibration_id, index, cam)
-    taken = service.calibrations.read(calibration_id)["taken"] or []
-    view = next((v for v in taken if v["index"] == index and v["camera"] == cam), None)
+    taken = service.calibrations.read(calibration_id).taken or []
+    view = next((v for v in taken if v.index == index and v.camera == cam), None)
     pixels = read_image(path)
-    return _jpeg(preview(pixels, _full_scale(pixels, None if view is None else view.get("full_scale")), width_px))
+    return _jpeg(preview(pixels, _full_scale(pixels, None if view is None else view.full_scale), width_px))
 
 
 def _within(pixels: GrayImage, x_px: int, y_px: int) -> None:

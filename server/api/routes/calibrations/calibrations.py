@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path as FilePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import cv2
 from fastapi import APIRouter, File, Form, Path, Query, UploadFile
@@ -69,7 +69,7 @@ def create_calibration(
         service.require_room()
         check_plan(plan)
         targets_of(service, plan)
-        made: dict[str, Any] = {}
+        made: dict[str, str] = {}
 
         def prepare(job: Job) -> Ids:
             document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
@@ -115,7 +115,7 @@ def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response
 
     One that failed its verdict has what was refused in the same places, to be looked at; `state` stays `failed`.
     """
-    return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id)))
+    return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id).plain()))
 
 
 @router.post(
@@ -148,7 +148,7 @@ def import_calibration(
         return {"calibration_id": calibration_id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return CalibrationReply.model_validate(service.calibrations.read(str(made["calibration_id"])))
+    return CalibrationReply.model_validate(service.calibrations.read(str(made["calibration_id"])).plain())
 
 
 def complete(service: ServiceDep, calibration_id: str) -> FilePath:
@@ -161,7 +161,7 @@ def complete(service: ServiceDep, calibration_id: str) -> FilePath:
     """
     path = service.calibrations.path(calibration_id)
     if not (path / "calibration.json").exists():
-        state = service.calibrations.read(calibration_id)["state"]
+        state = service.calibrations.read(calibration_id).state
         raise StateError(
             f"Calibration {calibration_id} is {state}.",
             code="calibration_not_complete",
@@ -179,7 +179,8 @@ def complete(service: ServiceDep, calibration_id: str) -> FilePath:
 )
 def list_views(service: ServiceDep, calibration_id: CalibrationId) -> ViewList:
     """Return camera, role, read-back dZ and checksum of every view; empty until all are taken."""
-    return ViewList.model_validate({"views": service.calibrations.read(calibration_id)["taken"] or []})
+    taken = service.calibrations.read(calibration_id).taken or []
+    return ViewList.model_validate({"views": [view.plain() for view in taken]})
 
 
 @router.get("/{calibration_id}/residuals", summary="Residuals of every view", responses=errors(404, 409))

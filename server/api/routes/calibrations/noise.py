@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path
 from fastapi.responses import FileResponse
@@ -17,6 +17,7 @@ from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.models import Ids
 from server.jobs.job import Job, Phase
+from server.store.documents import MadeRecord
 from server.workflows import noise_sequence
 
 router = APIRouter(prefix="/noise", tags=["noise"])
@@ -31,7 +32,7 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
 
     def make() -> Ids:
         service.require_room()
-        made: dict[str, Any] = {}
+        made: dict[str, str] = {}
 
         def prepare(job: Job) -> Ids:
             facts = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name}
@@ -75,7 +76,7 @@ def list_noise(service: ServiceDep, page: PageDep) -> NoiseList:
 @router.get("/{noise_id}", summary="One noise measurement", responses=errors(404, 409))
 def get_noise(service: ServiceDep, noise_id: NoiseId) -> NoiseReply:
     """Return plan, state and, once complete, both cameras' models."""
-    return NoiseReply.model_validate(_shown(service.noise.read(noise_id)))
+    return _shown(service.noise.read(noise_id))
 
 
 @router.get(
@@ -89,6 +90,5 @@ def get_noise_file(service: ServiceDep, noise_id: NoiseId) -> FileResponse:
     return FileResponse(service.noise.file(noise_id), media_type="application/json")
 
 
-def _shown(document: dict[str, Any]) -> dict[str, Any]:
-    plan = {k: v for k, v in document["plan"].items() if k != "request"}
-    return {**document, "plan": plan}
+def _shown(made: MadeRecord) -> NoiseReply:
+    return NoiseReply.model_validate({**made.plain(), "plan": made.plan.shown()})

@@ -50,7 +50,7 @@ def put_judgement(
     service.calibrations.path(calibration_id)
     with service.changes:  # nobody else's decision comes between the look and ours
         if if_match is not None:
-            now = etag_of(service.calibrations.read(calibration_id))
+            now = etag_of(service.calibrations.read(calibration_id).plain())
             require_match(if_match, now, f"calibration {calibration_id}")
         calibration_review.decide(service, calibration_id, body.decision, body.note, person_name(request))
-    return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id)))
+    return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id).plain()))

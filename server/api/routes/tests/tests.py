@@ -65,7 +65,7 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
         calibration_id = newest_accepted(service) if body.calibration_id == "accepted" else body.calibration_id
         if calibration_id is not None:
             path = service.calibrations.path(calibration_id) / "calibration.json"
-            state = service.calibrations.read(calibration_id)["state"]
+            state = service.calibrations.read(calibration_id).state
             if state != "complete":
                 raise StateError(
                     f"Calibration {calibration_id} is {state}.",

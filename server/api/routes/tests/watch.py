@@ -13,6 +13,7 @@ from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.problems import errors
 from server.api.routes.tests.tests import step_facts
 from server.base.models import Ids
+from server.store.documents import WatchRecord
 from server.workflows.watch import Watches
 
 
@@ -43,24 +44,26 @@ def put_watch(
     """
     service.tests.path(test_id)
 
-    def allow(now: dict[str, Any] | None) -> None:
+    def allow(now: WatchRecord | None) -> None:
         if now is None and if_match is not None:  # `*` too means something that is there
             raise PreconditionFailedError(f"Nothing is watched in test {test_id}.")
-        require_match(if_match, etag_of(now), f"the watch of test {test_id}", required=False)
+        require_match(
+            if_match, etag_of(None if now is None else now.plain()), f"the watch of test {test_id}", required=False
+        )
 
-    return WatchReply.model_validate(tagged(response, watches.begin(test_id, body.model_dump(), allow)))
+    return WatchReply.model_validate(tagged(response, watches.begin(test_id, body.model_dump(), allow).plain()))
 
 
 @router.get("/watch", summary="What is watched", responses=errors(404))
 def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> WatchReply:
     """Return channel and threshold, and the value that the next reading is compared with; ETag names this state."""
-    return WatchReply.model_validate(tagged(response, watches.read(test_id)))
+    return WatchReply.model_validate(tagged(response, watches.read(test_id).plain()))
 
 
 @router.post("/watch:end", summary="End the watch", responses=errors(404, 507))
 def end_watch(watches: WatchesDep, test_id: TestId) -> WatchReply:
     """Take no further steps; readings are refused from now on. Harmless when it has ended already."""
-    return WatchReply.model_validate(watches.end(test_id))
+    return WatchReply.model_validate(watches.end(test_id).plain())
 
 
 @router.post(
