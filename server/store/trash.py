@@ -8,6 +8,7 @@ that half of something never comes back.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -71,7 +72,7 @@ class Trash:
 
     # in and out ------------------------------------------------------------------------------------------------
 
-    def put(self, folder: DataFolder, kind: Kind, ids: dict[str, Any], *, name: str, by: str, why: str) -> str:
+    def put(self, folder: DataFolder, kind: Kind, ids: Mapping[str, object], *, name: str, by: str, why: str) -> str:
         """Move something into the trash; return the entry's id.
 
         Parameters
@@ -168,7 +169,7 @@ class Trash:
                 done.append(f"removed what was left of trash/{entry.name}")
         return done
 
-    def place(self, kind: object, ids: dict[str, Any]) -> Path:
+    def place(self, kind: object, ids: Mapping[str, object]) -> Path:
         """Return where something lies that is not deleted; ids that are none never become a path.
 
         Raises

@@ -14,8 +14,10 @@ import numpy as np
 
 from core.errors import CalibrationInputError
 from core.names import CAMERAS
+from server.base.models import Ids
 from server.config.rig_file import RigConfig
-from server.jobs.job import Job
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import Job, Phase
 from server.store.index import calibration_entry
 from server.worker.tasks import FitTask, fit_calibration
 from server.workflows.service import Service
@@ -79,6 +81,44 @@ def targets_of(service: Service, plan: CalibrationPlan) -> list[dict[int, float]
         service.rig.check_targets(targets)
         stops.append(targets)
     return stops
+
+
+def begin(service: Service, plan: CalibrationPlan, request: RequestMark) -> Ids:
+    """Make a calibration and its job; return both ids.
+
+    Raises
+    ------
+    CalibrationInputError, StateError
+        A plan that would be refused before anything moves.
+    BusyError
+        Somebody has the cameras.
+    StorageError
+        ``storage_full``.
+    """
+    service.require_room()
+    check_plan(plan)
+    targets_of(service, plan)
+    made: dict[str, str] = {}
+
+    def prepare(job: Job) -> Ids:
+        document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
+        made["calibration_id"] = service.calibrations.create(document, service.config.target.model_dump(mode="json"))
+        return dict(made)
+
+    job = service.jobs.submit(
+        "calibration",
+        "a calibration",
+        {},
+        [
+            Phase("hardware", lambda job: take_views(service, job, made["calibration_id"], plan)),
+            Phase("compute", lambda job: fit(service, job, made["calibration_id"])),
+        ],
+        prepare=prepare,
+        request=request,
+        on_end=lambda job, state: close(service, job, made["calibration_id"], state),
+        on_cancel=service.stop_job,
+    )
+    return {**made, "job_id": job.id}
 
 
 def take_views(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> dict[str, object]:

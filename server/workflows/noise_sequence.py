@@ -5,10 +5,45 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from core.names import CAMERAS
-from server.jobs.job import Job
+from server.base.models import Ids
+from server.jobs.idempotency import RequestMark
+from server.jobs.job import Job, Phase
 from server.worker.tasks import NoiseTask, fit_noise
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
+
+
+def begin(service: Service, frames: int, label: str, request: RequestMark) -> Ids:
+    """Make a noise measurement and its job; return both ids.
+
+    Raises
+    ------
+    BusyError
+        Somebody has the cameras.
+    StorageError
+        ``storage_full``.
+    """
+    service.require_room()
+    made: dict[str, str] = {}
+
+    def prepare(job: Job) -> Ids:
+        facts = {"frames": frames, "label": label, "rig": service.config.rig.name}
+        made["noise_id"] = service.noise.create({**facts, **request.document(), "job_id": job.id})
+        return dict(made)
+
+    job = service.jobs.submit(
+        "noise",
+        "a noise measurement",
+        {},
+        [
+            Phase("hardware", lambda job: take_frames(service, job, made["noise_id"], frames)),
+            Phase("compute", lambda job: fit(service, job, made["noise_id"])),
+        ],
+        prepare=prepare,
+        request=request,
+        on_end=lambda job, state: close(service, job, made["noise_id"], state),
+    )
+    return {**made, "job_id": job.id}
 
 
 def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[str, object]:

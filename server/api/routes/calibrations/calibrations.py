@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Annotated, Literal
@@ -32,19 +31,10 @@ from server.base.models import Ids
 from server.formats.calibrations.plausibility import check_calibration
 from server.formats.calibrations.recognise import imported_content, parse_calibration
 from server.formats.images import read_image
-from server.jobs.job import Job, Phase
 from server.results.reader import read_residuals
 from server.store.calibrations import REJECTED
 from server.store.index import calibration_entry
-from server.workflows.calibration_sequence import (
-    CalibrationPlan,
-    check_plan,
-    close,
-    fit,
-    plan_document,
-    take_views,
-    targets_of,
-)
+from server.workflows.calibration_sequence import CalibrationPlan, begin
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -65,38 +55,7 @@ def create_calibration(
     )
     request = mark("calibrations", key, body)
 
-    def make() -> Ids:
-        service.require_room()
-        check_plan(plan)
-        targets_of(service, plan)
-        made: dict[str, str] = {}
-
-        def prepare(job: Job) -> Ids:
-            document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
-            made["calibration_id"] = service.calibrations.create(
-                document, service.config.target.model_dump(mode="json")
-            )
-            return dict(made)
-
-        def hardware(job: Job) -> Mapping[str, object]:
-            return take_views(service, job, made["calibration_id"], plan)
-
-        def compute(job: Job) -> Mapping[str, object]:
-            return fit(service, job, made["calibration_id"])
-
-        job = service.jobs.submit(
-            "calibration",
-            "a calibration",
-            {},
-            [Phase("hardware", hardware), Phase("compute", compute)],
-            prepare=prepare,
-            request=request,
-            on_end=lambda job, state: close(service, job, made["calibration_id"], state),
-            on_cancel=service.stop_job,
-        )
-        return {**made, "job_id": job.id}
-
-    made, _ = service.once(request.scope, key, request.body_sha256, make)
+    made, _ = service.once(request.scope, key, request.body_sha256, lambda: begin(service, plan, request))
     return CalibrationAccepted.model_validate(
         {"job": service.jobs.document(str(made["job_id"])).plain(), "calibration_id": made["calibration_id"]}
     )

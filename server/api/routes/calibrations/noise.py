@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
 from typing import Annotated
 
 from fastapi import APIRouter, Path
@@ -16,7 +15,6 @@ from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.models import Ids
-from server.jobs.job import Job, Phase
 from server.store.documents import MadeRecord
 from server.workflows import noise_sequence
 
@@ -31,31 +29,7 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
     request = mark("noise", key, body)
 
     def make() -> Ids:
-        service.require_room()
-        made: dict[str, str] = {}
-
-        def prepare(job: Job) -> Ids:
-            facts = {"frames": body.frames, "label": body.label, "rig": service.config.rig.name}
-            plan = {**facts, **request.document(), "job_id": job.id}
-            made["noise_id"] = service.noise.create(plan)
-            return dict(made)
-
-        def hardware(job: Job) -> Mapping[str, object]:
-            return noise_sequence.take_frames(service, job, made["noise_id"], body.frames)
-
-        def compute(job: Job) -> Mapping[str, object]:
-            return noise_sequence.fit(service, job, made["noise_id"])
-
-        job = service.jobs.submit(
-            "noise",
-            "a noise measurement",
-            {},
-            [Phase("hardware", hardware), Phase("compute", compute)],
-            prepare=prepare,
-            request=request,
-            on_end=lambda job, state: noise_sequence.close(service, job, made["noise_id"], state),
-        )
-        return {**made, "job_id": job.id}
+        return noise_sequence.begin(service, body.frames, body.label, request)
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return NoiseAccepted.model_validate(
