@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from dataclasses import asdict, dataclass
 
 from core.errors import StateError
 from server.formats.files import known_sha256, recorded_sha256
@@ -11,7 +11,16 @@ from server.store.folder import now_utc
 from server.store.tests import TestStore
 
 
-def content_of(tests: TestStore, test_id: str) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Content:
+    """What there is of a test to copy: complete steps, result files, and the SHA-256 of all their checksums."""
+
+    steps: int
+    results: int
+    sha256: str
+
+
+def content_of(tests: TestStore, test_id: str) -> Content:
     """Return how many complete steps and result files a test has, and the SHA-256 of all their checksums."""
     digest = hashlib.sha256()
     steps = tests.step_numbers(test_id)
@@ -23,10 +32,10 @@ def content_of(tests: TestStore, test_id: str) -> dict[str, Any]:
             path = tests.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
             digest.update(f"{analysis_id} {n} {recorded_sha256(path) or known_sha256(path)}\n".encode())
             results += 1
-    return {"steps": len(steps), "results": results, "sha256": digest.hexdigest()}
+    return Content(len(steps), results, digest.hexdigest())
 
 
-def acknowledge_export(tests: TestStore, test_id: str, *, steps: int, results: int, by: str) -> dict[str, Any]:
+def acknowledge_export(tests: TestStore, test_id: str, *, steps: int, results: int, by: str) -> dict[str, object]:
     """Keep with the test that a copy of it lies elsewhere; return what was kept.
 
     Raises
@@ -37,15 +46,15 @@ def acknowledge_export(tests: TestStore, test_id: str, *, steps: int, results: i
         ``export_differs`` when the copy cannot hold all of it.
     """
     content = content_of(tests, test_id)
-    if (content["steps"], content["results"]) != (steps, results):
+    if (content.steps, content.results) != (steps, results):
         raise StateError(
-            f"The copy holds {steps} steps and {results} results, test {test_id} has {content['steps']} and "
-            f"{content['results']}.",
+            f"The copy holds {steps} steps and {results} results, test {test_id} has {content.steps} and "
+            f"{content.results}.",
             code="export_differs",
             remedy="Copy it again, then acknowledge that.",
-            steps=content["steps"],
-            results=content["results"],
+            steps=content.steps,
+            results=content.results,
         )
-    exported = {"utc": now_utc(), "by": by, **content}
+    exported = {"utc": now_utc(), "by": by, **asdict(content)}
     tests.update(test_id, {"exported": exported})
     return exported
