@@ -74,7 +74,7 @@ def measure_step(task: StepTask) -> dict[str, Any]:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
     result = sequence.measure(task.step, images, previous=task.previous, progress=channel.progress, cancel=channel)
     compute_s = round(time.perf_counter() - began, 3)
-    finished = sequence.finish(task.step, result, about=task.about, checksum=True, keep_starts=task.keeps_starts)
+    finished = sequence.finish(task.step, result, about=task.about, in_service=True, keep_starts=task.keeps_starts)
     if task.previous not in (None, task.reference.n):
         # nobody starts from there any more
         starts_file(sequence.file_of(task.previous)).unlink(missing_ok=True)
