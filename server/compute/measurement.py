@@ -11,7 +11,6 @@ import time
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -52,7 +51,7 @@ _kept: OrderedDict[str, _Kept] = OrderedDict()
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 
 
-def measure_step(task: StepTask) -> dict[str, Any]:
+def measure_step(task: StepTask) -> dict[str, object]:
     """Measure one step and write ``step_<nnnn>.nc``; returns its summary.
 
     Raises
