@@ -20,7 +20,7 @@ class BusyError(StateError):
     code = "hardware_busy"
     remedy = "Wait until the holder is done, or cancel its job."
 
-    def __init__(self, holder: dict[str, Any]) -> None:
+    def __init__(self, holder: dict[str, object]) -> None:
         super().__init__(f"The hardware is held by {holder.get('what', 'another task')}.", holder=holder)
 
     def __reduce__(self) -> tuple[Any, ...]:

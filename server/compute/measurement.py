@@ -11,7 +11,6 @@ import time
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -52,7 +51,7 @@ _kept: OrderedDict[str, _Kept] = OrderedDict()
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 
 
-def measure_step(task: StepTask) -> dict[str, Any]:
+def measure_step(task: StepTask) -> dict[str, object]:
     """Measure one step and write ``step_<nnnn>.nc``; returns its summary.
 
     Raises
@@ -74,7 +73,7 @@ def measure_step(task: StepTask) -> dict[str, Any]:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
     result = sequence.measure(task.step, images, previous=task.previous, progress=channel.progress, cancel=channel)
     compute_s = round(time.perf_counter() - began, 3)
-    finished = sequence.finish(task.step, result, about=task.about, checksum=True, keep_starts=task.keeps_starts)
+    finished = sequence.finish(task.step, result, about=task.about, in_service=True, keep_starts=task.keeps_starts)
     if task.previous not in (None, task.reference.n):
         # nobody starts from there any more
         starts_file(sequence.file_of(task.previous)).unlink(missing_ok=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 from core.errors import ImageError, InputError
 from core.names import CAMERAS
@@ -14,7 +13,7 @@ from server.formats.noise_json import noise_content, write_noise
 from server.worker.tasks import NoiseTask
 
 
-def fit_noise(task: NoiseTask) -> dict[str, Any]:
+def fit_noise(task: NoiseTask) -> dict[str, object]:
     """Measure both cameras' noise from a folder's frames and write ``noise.json``.
 
     Raises

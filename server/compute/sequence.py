@@ -30,12 +30,12 @@ from server.compute.seeds import seeds_of
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import rbe_of, volume_of
-from server.formats.files import sha256_of
+from server.formats.files import sha256_of, write_bytes
 from server.formats.images import read_image
 from server.formats.noise_json import LoadedNoise
 from server.formats.results.reading import read_measured
 from server.formats.results.starts import starts_file, with_starts, write_starts
-from server.formats.results.summary import summarise
+from server.formats.results.summary import summarise, to_json
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
 from server.worker.tasks import StepImages
@@ -168,7 +168,7 @@ class SequenceMeasurement:
         return result
 
     def finish(
-        self, step: StepImages, result: Field, *, about: Mapping[str, str], checksum: bool, keep_starts: bool
+        self, step: StepImages, result: Field, *, about: Mapping[str, str], in_service: bool, keep_starts: bool = False
     ) -> FinishedStep:
         """Smooth, mark and strain a measured step, write its file, and summarise it.
 
@@ -178,8 +178,9 @@ class SequenceMeasurement:
             As :meth:`measure` gave it.
         about
             Further text attributes of the file.
-        checksum
-            Put the file's SHA-256 beside it.
+        in_service
+            Put the file's SHA-256 and its summary beside it: what a kill leaves is a step with all that belongs to it,
+            or none.
         keep_starts
             Keep the matcher's own unknowns beside the file, for a process that goes on from there.
 
@@ -194,23 +195,20 @@ class SequenceMeasurement:
         shown = mark_extrapolated(shown, self._volume)
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
-        if result.starts is not None and keep_starts:
-            write_starts(
-                starts_file(path), result, reference=step.n == self.reference.n
-            )  # first: where the result is, they are
-        write_field(path, shown, self._provenance(step, result, about), strain, measured=result, checksum=checksum)
-        summary = summarise(shown, rbe_px=self._rbe_px, reference=self.reference.n).document()
+        summary = {
+            "n": step.n,
+            "step": step.n,
+            "file": path.name,
+            **summarise(shown, rbe_px=self._rbe_px, reference=self.reference.n).document(),
+            "strain": None if strain is None else summarise_strain(strain).document(),
+        }
+        if in_service:  # first: where the result is, they are
+            write_bytes(path.with_suffix(".json"), to_json(summary))
+            if result.starts is not None and keep_starts:
+                write_starts(starts_file(path), result, reference=step.n == self.reference.n)
+        write_field(path, shown, self._provenance(step, result, about), strain, measured=result, checksum=in_service)
         return FinishedStep(
-            n=step.n,
-            field=shown,
-            summary={
-                "n": step.n,
-                "step": step.n,
-                "file": path.name,
-                **summary,
-                "strain": None if strain is None else summarise_strain(strain).document(),
-                "write_s": round(time.perf_counter() - began, 3),
-            },
+            n=step.n, field=shown, summary={**summary, "write_s": round(time.perf_counter() - began, 3)}
         )
 
     def file_of(self, n: int) -> Path:

@@ -6,7 +6,7 @@ A fact that nobody told is None, never a guess.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
@@ -40,7 +40,7 @@ class CameraFacts(ClosedFacts):
     lens: LensFacts | None = Field(None, description="The lens.")
 
 
-def merged(over: CameraFacts | None, under: Mapping[str, Any] | None) -> CameraFacts:
+def merged(over: CameraFacts | None, under: Mapping[str, object] | None) -> CameraFacts:
     """Facts of a camera, one by one: those of ``over`` go before those of ``under``, as a step's record has them."""
     told = CameraFacts.model_validate({k: v for k, v in (under or {}).items() if k in CameraFacts.model_fields})
     if over is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field, StringConstraints, ValidationError
 
@@ -63,7 +63,7 @@ class TestFacts(ClosedFacts):
         """Facts of one camera."""
         return self.cam1 if cam == "cam1" else self.cam2
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return what was told, nothing else."""
         return self.model_dump(mode="json", exclude_none=True)
 

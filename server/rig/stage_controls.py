@@ -7,7 +7,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
 
 from core.errors import DeviceError
 from drivers.stages.protocol import AxisState, Stage
@@ -28,7 +27,7 @@ class StageControls:
 
     def __init__(self, stage: Callable[[], Stage]) -> None:
         self._stage = stage
-        self._messages: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._messages: deque[dict[str, object]] = deque(maxlen=_KEPT)
         self._next_message = 1
         self._collecting = threading.Lock()
         #: axis -> velocity and acceleration that were asked for, so that a reconnected stage gets them again
@@ -47,11 +46,13 @@ class StageControls:
             else:
                 stage.disable(axis)
 
-    def read_dynamics(self, axis: int) -> dict[str, Any]:
+    def read_dynamics(self, axis: int) -> dict[str, object]:
         """Return velocity and acceleration as the controller has them."""
         return asdict(self._stage().dynamics(axis))
 
-    def set_dynamics(self, axis: int, velocity_mm_s: float | None, acceleration_mm_s2: float | None) -> dict[str, Any]:
+    def set_dynamics(
+        self, axis: int, velocity_mm_s: float | None, acceleration_mm_s2: float | None
+    ) -> dict[str, object]:
         """Set velocity, acceleration or both and return what was read back; on the owner thread, with the hold."""
         taken = self._stage().set_dynamics(axis, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2)
         velocity, acceleration = self.dynamics.get(axis, (None, None))
@@ -78,7 +79,7 @@ class StageControls:
                 self._messages.append({"id": self._next_message, "utc": now_utc(), **asdict(message)})
                 self._next_message += 1
 
-    def messages(self) -> list[dict[str, Any]]:
+    def messages(self) -> list[dict[str, object]]:
         """Return the controller's messages, oldest first, with the time at which they were read; none is lost by it.
 
         A controller that is silent or not connected adds none.

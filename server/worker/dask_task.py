@@ -39,7 +39,7 @@ def stop(name: str) -> None:
 class _Channel(TaskChannel):
     """Progress through the scheduler, a few times a second; cancellation by :func:`stop`."""
 
-    def __init__(self, name: str, tell: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, name: str, tell: Callable[[dict[str, object]], None]) -> None:
         super().__init__(lambda _: None, 0, None)
         self._name = name
         self._tell = tell

@@ -38,7 +38,7 @@ class _Task:
     future: TaskFuture
     function: Callable[..., Any]
     args: tuple[Any, ...]
-    kwargs: dict[str, Any]
+    kwargs: dict[str, object]
     #: what its log lines name
     ids: dict[str, str] = field(default_factory=ids_now)
 

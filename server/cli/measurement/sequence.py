@@ -175,7 +175,7 @@ class _Runner:
         step = self._job.steps[k]
         one, two = step.files
         about = {"cam1_file": str(one), "cam2_file": str(two)}
-        finished = self.sequence.finish(step, result, about=about, checksum=False, keep_starts=False)
+        finished = self.sequence.finish(step, result, about=about, in_service=False)
         seconds = round(time.monotonic() - started, 3)
         summary = {
             **finished.summary,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class StepReadings:
     lines: Sequence[LineReading] = ()
     areas: Sequence[AreaReading] = ()
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return it as plain values."""
         whole = asdict(self)
         if self.problem is not None:
@@ -193,7 +192,7 @@ class GaugeReadings:
             "alignment": None if self.alignment is None else asdict(self.alignment),
         }
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return it as plain values."""
         whole = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return whole | {"alignment": self.about()["alignment"], "steps": [step.document() for step in self.steps]}

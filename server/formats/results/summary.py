@@ -90,7 +90,7 @@ class StepSummary:
     points_by_reference: dict[str, int] | None = None
     displacement_mm: dict[str, Span | None] | None = None
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return it as plain values; a shape has no entries for what only displacements have."""
         of_motion = ("reference_step", "points_by_reference", "displacement_mm")
         return {k: v for k, v in asdict(self).items() if self.kind == "displacement" or k not in of_motion}
@@ -176,14 +176,14 @@ class SequenceSummary:
     state: str
     software_version: str
     created: str
-    calibration: Mapping[str, Any]
-    settings: Mapping[str, Any]
+    calibration: Mapping[str, object]
+    settings: Mapping[str, object]
     seconds: float
-    steps: Sequence[Mapping[str, Any]]
-    steps_failed: Mapping[str, Any] = field(default_factory=dict)
+    steps: Sequence[Mapping[str, object]]
+    steps_failed: Mapping[str, object] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return it as plain values."""
         return asdict(self)
 

@@ -65,7 +65,7 @@ class Provenance:
         Further text attributes (a label, a load).
     """
 
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     inputs: Mapping[str, str]
     software_version: str
     frame: str = "target"
