@@ -39,13 +39,13 @@ SEED_SIZE = (2448, 2048)
 LARGE_SIZE, LARGE_POINTS = (6000, 4000), 250_000
 STAGES = (
     # what, where it is looked up, under which name
-    ("read and decode", "server.cli.measurement.sequence", "read_image"),
+    ("read and decode", "server.compute.sequence", "read_image"),
     ("splines", "core.field.points.images", "prepare"),
     ("fit", "core.field.points.fitter", "fit_motion"),
-    ("gates", "core.field.growth.state", "apply_gates"),
-    ("assemble", "core.field.growth.run", "assemble"),
-    ("summary", "server.cli.measurement.sequence", "summarise"),
-    ("write", "server.cli.measurement.sequence", "write_field"),
+    ("gates", "core.field.growth.check", "apply_gates"),
+    ("assemble", "core.field.growth.field", "assemble"),
+    ("summary", "server.compute.sequence", "summarise"),
+    ("write", "server.compute.sequence", "write_field"),
 )
 BESIDE = ("read and decode", "splines", "summary", "write")  # on threads of their own
 _CHILD_TIMEOUT_S = 1800

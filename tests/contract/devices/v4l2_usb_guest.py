@@ -5,7 +5,6 @@ Runs in the guest that `test_v4l2_in_qemu` boots. What the driver says is compar
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,10 +16,10 @@ import pytest
 from core.errors import CameraError
 from drivers.acquisition.frame_counter import SequenceReader
 from drivers.acquisition.reader import CameraReader
+from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber, FrameStatus
 from drivers.cameras.v4l2 import discover, make
 from tests.support.camera_bench import frames_of, seconds_until
-from tests.support.requirements import ROOT
 from tests.support.usb_camera import UsbCamera
 
 
@@ -248,16 +247,10 @@ def test_a_webcam_that_falls_silent_is_lost_by_the_watchdog_and_closes_quickly(w
 
 @pytest.mark.fault(11)
 def test_the_rig_s_camera_comes_back_with_its_settings_within_three_seconds(tmp_path: Path) -> None:
-    # the file alone: the package around it brings the whole service, which takes minutes to load in the guest
-    spec = importlib.util.spec_from_file_location("rig_unit", ROOT / "server" / "rig" / "unit.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     camera = fresh = UsbCamera(2, "SN-2000")
     link = tmp_path / "lasting_name"  # udev makes such links, and makes them anew
     link.symlink_to(camera.plug())
-    unit = module.CameraUnit(
+    unit = CameraUnit(
         "cam1",
         lambda: make(CameraOptions(device=str(link))),
         trigger="free",

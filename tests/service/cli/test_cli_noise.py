@@ -49,7 +49,8 @@ def test_both_cameras_are_measured(frames: Path, capsys: pytest.CaptureFixture[s
     for cam, model in zip(SENSORS, loaded.models, strict=True):
         assert model is not None
         np.testing.assert_allclose(model.variance(grey), true_variance(cam, grey), rtol=0.05)
-    assert [len(loaded.content[cam]["source"]) for cam in SENSORS] == [6, 6]
+    content = json.loads(out.read_text())
+    assert [len(content[cam]["source"]) for cam in SENSORS] == [6, 6]
     assert loaded.record()["cam1"]["coefficients"] == list(loaded.models[0].coefficients)  # type: ignore[union-attr]
 
 
