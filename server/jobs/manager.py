@@ -273,7 +273,7 @@ class JobManager:
     def cancel_hardware(self) -> str | None:
         """Cancel the job that holds the hardware, if one does; return its id."""
         holder = self._gate.holder
-        job_id = holder.get("job_id") if holder else None
+        job_id = None if holder is None else holder.job_id
         if job_id is None:
             return None
         with self._lock:
@@ -281,7 +281,7 @@ class JobManager:
             if job is None:
                 return None
             job._cancel.set()
-        return str(job_id)
+        return job_id
 
     # running ---------------------------------------------------------------------------------------------------
 

@@ -95,8 +95,8 @@ def _check_unused(service: Service, kind: Kind, ids: Ids) -> None:
         if service.jobs.is_active(job.id) and uses({**job.subject, **(job.result or {})}):
             raise _in_use(kind, f"by job {job.id} ({job.kind})", "Wait for the job or cancel it.", job_id=job.id)
     holder = service.gate.holder
-    if holder is not None and uses(holder):
-        raise _in_use(kind, f"by {holder['what']}", "Try again when that is done.")
+    if holder is not None and uses(holder.plain()):
+        raise _in_use(kind, f"by {holder.what}", "Try again when that is done.")
 
 
 def _in_use(kind: str, by: str, remedy: str, **more: Any) -> StateError:

@@ -29,25 +29,14 @@ from server.api.models.noise import NoiseAccepted, NoiseList, NoiseModelReply, N
 from server.api.models.rig import (
     AxesRequest,
     DynamicsPatch,
-    DynamicsReply,
     FlashConsent,
     HomeRequest,
     MoveRequest,
     SceneRequest,
     SettingsPatch,
-    StageMessage,
-    StageMessages,
     StopReply,
 )
-from server.api.models.rig_replies import (
-    CameraReply,
-    CameraSet,
-    CamerasReply,
-    CameraStats,
-    RigReply,
-    SceneReply,
-    StageReply,
-)
+from server.api.models.rig_replies import CameraSet, CamerasReply, CameraStats, StageMessages
 from server.api.models.tests import (
     BurstAccepted,
     ReadingReply,
@@ -64,6 +53,7 @@ from server.api.models.tests import (
     WatchRequest,
 )
 from server.base.models import Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
+from server.rig.description import CameraReply, DynamicsReply, RigReply, SceneReply, StageMessage, StageReply
 
 __all__ = [
     "Accepted",

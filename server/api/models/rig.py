@@ -81,16 +81,6 @@ class DynamicsPatch(Request):
         return self
 
 
-class DynamicsReply(Reply):
-    """How fast an axis moves, as read back from the controller."""
-
-    axis: int = Field(description="Axis number.")
-    velocity_mm_s: float = Field(description="Velocity of moves.")
-    acceleration_mm_s2: float = Field(description="Acceleration of moves.")
-    max_velocity_mm_s: float | None = Field(None, description="The greatest; null where the controller does not tell.")
-    max_acceleration_mm_s2: float | None = Field(None, description="The greatest; null where it does not tell.")
-
-
 class FlashConsent(Request):
     """Consent to what cannot be taken back."""
 
@@ -104,22 +94,6 @@ class FlashConsent(Request):
         if value is not True:
             raise ValueError("must be true")
         return value
-
-
-class StageMessage(Reply):
-    """Something that the controller had to say."""
-
-    id: int = Field(description="Grows by one with each message.")
-    utc: str = Field(description="When it was read.")
-    code: str = Field(description="The controller's own code.", examples=["103"])
-    text: str = Field(description="The controller's own words.", examples=["FOLLOWING ERROR THRESHOLD EXCEEDED"])
-    axis: int | None = Field(None, description="Axis that it concerns; null for none in particular.")
-
-
-class StageMessages(Reply):
-    """Messages of the controller, oldest first."""
-
-    messages: list[StageMessage] = Field(description="The last 200 at most.")
 
 
 class StopReply(Reply):
