@@ -104,9 +104,10 @@ class _Pace:
 
     def _eta_s(self) -> float | None:
         """Seconds left in these units, from their own pace; None while there is nothing to go by."""
-        if self._from is None or self._total <= 0:
+        begun = self._from  # the phases' thread may set it anew meanwhile
+        if begun is None or self._total <= 0:
             return None
-        since, first = self._from
+        since, first = begun
         if self._done <= first:
             return None
         pace_s = (time.monotonic() - since) / (self._done - first)
@@ -201,7 +202,7 @@ class Job:
         self._pace.reset()
 
     def begin(self) -> bool:
-        """Leave the queue; return whether it was still in its first phase's."""
+        """Say that it runs; return False where an earlier phase did."""
         if self.record.state != "queued":
             return False
         self._change(state="running", started_utc=now_utc())

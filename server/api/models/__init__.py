@@ -28,15 +28,18 @@ from server.api.models.jobs import Accepted, JobList, JobProblem, JobReply, Prog
 from server.api.models.noise import NoiseAccepted, NoiseList, NoiseModelReply, NoiseReply, NoiseRequest
 from server.api.models.rig import (
     AxesRequest,
+    CameraSet,
+    CamerasReply,
+    CameraStats,
     DynamicsPatch,
     FlashConsent,
     HomeRequest,
     MoveRequest,
     SceneRequest,
     SettingsPatch,
+    StageMessages,
     StopReply,
 )
-from server.api.models.rig_replies import CameraSet, CamerasReply, CameraStats, StageMessages
 from server.api.models.tests import (
     BurstAccepted,
     ReadingReply,

@@ -10,7 +10,7 @@ from core.names import CAMERAS
 from drivers.acquisition.pairing import PairingAccount
 from drivers.cameras.protocol import CameraDescription, CameraSettings, FoundDevice, FrameCounters
 from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, AxisStatus, ControllerMessage, StageIdentity
-from server.api.models.rig_replies import FrameCounts, PairCounts
+from server.api.models.rig import FrameCounts, PairCounts
 from server.base.models import Reply, Reported
 from server.config.camera_facts import CameraFacts, LensFacts
 from server.rig import description as said
