@@ -14,7 +14,7 @@ COMPILING = "compiling kernels, once per machine, about half a minute"
 
 
 @contextlib.contextmanager
-def told_when_compiling(tell: Callable[[], None]) -> Iterator[None]:
+def report_compiling(tell: Callable[[], None]) -> Iterator[None]:
     """Call ``tell`` when the first kernel inside the block is about to be compiled; never if all are on disk.
 
     Parameters

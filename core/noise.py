@@ -18,14 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from core.arrays import Bool, Float, Float32
 from core.errors import ImageError, InputError
 
-LARGEST_SHIFT_PX = 0.1
+MAX_SHIFT_PX = 0.1
 """Frames that moved further from one to the next are no still scene: the first-order correction would not hold."""
-LARGEST_EXCESS = 0.25
+MAX_EXCESS = 0.25
 """Share by which variance at steep places may exceed that at flat ones of the same grey level."""
 
 _BINS = 48
-_FEWEST_PIXELS = 400  # of a bin
-_MOST_PIXELS = 600_000  # looked at in one frame; more tell nothing new
+_MIN_PIXELS = 400  # of a bin
+_MAX_PIXELS = 600_000  # looked at in one frame; more tell nothing new
 _OUTLIER = 6.0  # sd of a difference
 _CLIPPED_SD = 3.0  # distance from black and white, in sd, below which a level's noise is cut off
 _CLEAR = 0.25  # of the variance at the lowest level seen
@@ -170,12 +170,12 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
         rest, gain, moved = _still(b.astype(np.float64) - a, basis, free)
         drift, shift = max(drift, gain), max(shift, moved)
         differences.append(rest.astype(np.float32))
-    if shift > LARGEST_SHIFT_PX:
+    if shift > MAX_SHIFT_PX:
         raise _not_static(f"they move by {shift:.2f} px from one frame to the next")
     square: Float32 = np.float32(0.5) * np.stack(differences) ** 2
     bins = _binned(mean, square, free, steep)
     excess, levels = bins.excess, bins.levels
-    if excess > LARGEST_EXCESS and excess > _SURE * bins.excess_sd:
+    if excess > MAX_EXCESS and excess > _SURE * bins.excess_sd:
         raise _not_static(f"steep places vary by {100 * excess:.0f} % more than flat ones of the same grey level")
     c, sd, misfit = _fit(levels, bins.variances, bins.sds)
     low, high = float(levels[0]), float(levels[-1])
@@ -242,7 +242,7 @@ def _checked(frames: Sequence[ArrayLike]) -> list[NDArray[Any]]:
 def rows_looked_at(shape: tuple[int, ...]) -> slice:
     """Return which rows of frames of (rows, cols) :func:`measure_noise` uses: a band from the middle of large ones."""
     count = shape[0]
-    height = max(min(count, _MOST_PIXELS // shape[1]), min(count, 16))
+    height = max(min(count, _MAX_PIXELS // shape[1]), min(count, 16))
     top = (count - height) // 2
     return slice(top, top + height)
 
@@ -301,7 +301,7 @@ class _Bins(NamedTuple):
 def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> _Bins:
     g, v, s = mean[free], square[:, free], steep[free]
     order = np.argsort(g, kind="stable")
-    count = int(np.clip(len(g) // _FEWEST_PIXELS, 1, _BINS))
+    count = int(np.clip(len(g) // _MIN_PIXELS, 1, _BINS))
     # half the differences share a frame with their neighbour: 1.5 times the variance of independent ones
     repeat = 1.0 if len(v) == 1 else 1.5
     levels, variances, sds, ratio, weight = [], [], [], 0.0, 0.0

@@ -37,7 +37,7 @@ class Cancel:
         self._event.set()
 
 
-def no_progress(stage: str, done: int, total: int) -> None:
+def no_progress(phase: str, done: int, total: int) -> None:
     """Drop the report: the default where nobody listens."""
 
 

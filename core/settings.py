@@ -72,7 +72,7 @@ SubsetPx = Annotated[
     Whole, Field(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Subset size, odd.", json_schema_extra=ODD)
 ]
 StepPx = Annotated[Whole, Field(ge=STEP_PX.low, le=STEP_PX.high, description="Distance of neighbouring points.")]
-Place = tuple[Pixel, Pixel]
+PixelPosition = tuple[Pixel, Pixel]
 Rectangle = tuple[Pixel, Pixel, Pixel, Pixel]
 
 
@@ -103,14 +103,14 @@ class Region(Settings):
     rectangle: Rectangle | None = Field(
         None, description="x0, y0, x1, y1 in camera 1's reference image, inclusive.", examples=[[120, 100, 400, 380]]
     )
-    polygon: list[Place] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
-    cracks: list[Annotated[list[Place], Field(min_length=2, max_length=MAX_CORNERS)]] = Field(
+    polygon: list[PixelPosition] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
+    cracks: list[Annotated[list[PixelPosition], Field(min_length=2, max_length=MAX_CORNERS)]] = Field(
         [],
         description="Lines in camera 1's reference image, each the points that it goes through.",
         max_length=MAX_CUTS,
         examples=[[[[150, 240], [260, 238.5], [362, 241]]]],
     )
-    holes: list[Annotated[list[Place], Field(min_length=3, max_length=MAX_CORNERS)]] = Field(
+    holes: list[Annotated[list[PixelPosition], Field(min_length=3, max_length=MAX_CORNERS)]] = Field(
         [],
         description="Corners of polygons in camera 1's reference image inside which nothing is measured.",
         max_length=MAX_CUTS,
@@ -152,10 +152,10 @@ class AnalysisSettings(Settings):
         0.0,
         description="Sd of a Gaussian that all images are blurred with, px, at most a quarter of subset_px; 0: none.",
     )
-    seeds: Annotated[list[Place], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
+    seeds: Annotated[list[PixelPosition], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
     )
-    seeds_cam2: Annotated[list[Place | None], Field(max_length=MAX_SEEDS)] | None = Field(
+    seeds_cam2: Annotated[list[PixelPosition | None], Field(max_length=MAX_SEEDS)] | None = Field(
         None,
         description="The same points in camera 2's reference image, where known: as many as `seeds`, null where not. "
         "They start the search there; one further than 8 px from its epipolar line is refused.",

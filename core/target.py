@@ -15,7 +15,7 @@ import numpy as np
 from core.arrays import Float
 from core.errors import TargetError
 
-_LEAST_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
+_MIN_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +52,8 @@ class GridTarget:
         if len(lines) != 2 or any(isinstance(n, bool) or int(n) != n for n in lines):
             raise _invalid(f"lines must be two whole numbers, got {self.lines!r}")
         object.__setattr__(self, "lines", (int(lines[0]), int(lines[1])))
-        if min(self.lines) < _LEAST_LINES:
-            raise _invalid(f"a grid needs at least {_LEAST_LINES} lines each way, got {list(self.lines)}")
+        if min(self.lines) < _MIN_LINES:
+            raise _invalid(f"a grid needs at least {_MIN_LINES} lines each way, got {list(self.lines)}")
         if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
             raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")
         if not (0.0 < self.line_width_mm < 0.5 * self.pitch_mm):

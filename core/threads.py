@@ -63,7 +63,7 @@ def apply_threads() -> None:
     numba.set_num_threads(min(_threads, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
 
 
-def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: int | None = None) -> None:
+def run_ranges(function: Callable[[int, int], None], n: int, size: int, min_size: int | None = None) -> None:
     """Call ``function(first, last)`` over 0 ... n in ranges of ``size``, on all threads; the caller's is one of them.
 
     The first exception is raised again, once all threads have stopped.
@@ -74,11 +74,11 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: i
         What to call.
     n, size
         End of the last range, and length of a range.
-    least
+    min_size
         Length down to which the last ranges shrink, so that all threads end at about the same time; all are of one
         length when left out.
     """
-    cuts = _cuts(n, size, least or size)
+    cuts = _cuts(n, size, min_size or size)
     ranges = iter(pairwise(cuts))
     take = threading.Lock()
 
@@ -103,11 +103,11 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: i
             future.result()
 
 
-def _cuts(n: int, size: int, least: int) -> list[int]:
+def _cuts(n: int, size: int, min_size: int) -> list[int]:
     cuts = [0]
     while cuts[-1] < n:
         left = n - cuts[-1]
-        cuts.append(cuts[-1] + min(left, size, max(least, left // (2 * _threads))))
+        cuts.append(cuts[-1] + min(left, size, max(min_size, left // (2 * _threads))))
     return cuts
 
 

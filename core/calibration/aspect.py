@@ -28,8 +28,8 @@ _BLOCK = 5
 _CENTRE_PRIOR = 0.04  # of the image's width: the image centre is never far from the middle, and hardly matters
 _KAPPA_PRIOR = 0.1  # kappa r^2 at the image's corner
 _SIGMA_FLOOR_PX = 1e-4
-_LEAST_MOVED = 3
-_LEAST_SCALE_CHANGE = 1e-3
+_MIN_MOVED = 3
+_MIN_SCALE_CHANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
         span = float(np.median(np.abs(views[0].xy_px[_BLOCK - 1 :, : 1 - _BLOCK] - views[0].xy_px[: 1 - _BLOCK, 4:])))
         first_estimate_sigma = 2.0 * float(np.median(views[0].sigma_px)) / max(span, 1.0)
     if dz_mm is None:
-        if n < _LEAST_MOVED:
+        if n < _MIN_MOVED:
             return AspectResult(first, first_estimate_sigma, first, first_estimate_sigma, blocks, None, None, None)
         value, sigma = _refine_moved(views, first)
         return AspectResult(value, sigma, first, first_estimate_sigma, blocks, value, sigma, None)
@@ -229,10 +229,10 @@ def _start(xy: Float, points: Float, dz: Float, aspect: float, size: tuple[int, 
         shift.append(middle / abs(s))
     slope, offset = np.polyfit(dz, np.array(inverse_scale), 1)
     change = abs(slope) * np.ptp(dz) / offset
-    if slope <= 0.0 or change < _LEAST_SCALE_CHANGE:
+    if slope <= 0.0 or change < _MIN_SCALE_CHANGE:
         raise CalibrationInputError(
             f"the grid's scale changes by {slope * np.ptp(dz) / offset:.2e} over {np.ptp(dz):g} mm of travel; it must"
-            f" shrink by {_LEAST_SCALE_CHANGE:g} at least",
+            f" shrink by {_MIN_SCALE_CHANGE:g} at least",
             code="aspect_views",
             remedy="Give dZ in mm, positive away from the target, and travel further.",
         )

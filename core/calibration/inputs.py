@@ -12,7 +12,7 @@ from core.arrays import Bool, Float
 from core.errors import CalibrationInputError
 from core.names import CameraName
 
-_SMALLEST_SPREAD_PX = 5.0  # rms over the narrower direction
+_MIN_SPREAD_PX = 5.0  # rms over the narrower direction
 
 
 class TargetLike(Protocol):
@@ -191,7 +191,7 @@ def check_view(view: CalibrationView, target: TargetLike, nominal: NominalCamera
         )
     width, height = nominal.image_size_px
     xy = view.xy_px[found]
-    if np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)[-1] < _SMALLEST_SPREAD_PX * np.sqrt(len(xy)):
+    if np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)[-1] < _MIN_SPREAD_PX * np.sqrt(len(xy)):
         raise CalibrationInputError(
             f"{view.label} shows the intersections within {np.ptp(xy, axis=0).round(1).tolist()} px, no grid.",
             code="view_degenerate",

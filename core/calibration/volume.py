@@ -19,7 +19,7 @@ from core.calibration.uncertainty import point_derivatives
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 
-_FEWEST_POINTS = 8
+_MIN_POINTS = 8
 _AT_ONCE = 20_000
 _TEN = [*range(10), *range(N_CAMERA, N_CAMERA + 10)]
 
@@ -132,7 +132,7 @@ def calibrated_volume(
         if not travel > 0.0:
             return None
         seen = np.concatenate([_seen(camera.moved(dz), points, size) for dz in sorted(set(positions))])
-        if len(seen) < _FEWEST_POINTS:
+        if len(seen) < _MIN_POINTS:
             return None
         slope[c] = ((np.hypot(seen[:, 0], seen[:, 1]) + pitch_mm) / seen[:, 2]).max()
         depth[c] = seen[:, 2].min() - travel, seen[:, 2].max() + travel

@@ -37,7 +37,7 @@ class LensFit:
     pixels_with_ray: float
 
 
-def image_places(image_size_px: tuple[int, int]) -> Float:
+def image_positions(image_size_px: tuple[int, int]) -> Float:
     """Return a grid of places (n, 2) over an image (width, height), its corners included."""
     width, height = image_size_px
     x, y = np.meshgrid(np.linspace(-0.5, width - 0.5, _ACROSS), np.linspace(-0.5, height - 0.5, _ACROSS))
@@ -93,7 +93,7 @@ def fit_seidel(lens: LensModel, image_size_px: tuple[int, int]) -> LensFit:
 
 
 def _rays(lens: LensModel, image_size_px: tuple[int, int]) -> tuple[Float, Float, float]:
-    xy = image_places(image_size_px)
+    xy = image_positions(image_size_px)
     rays = lens.normalised_from_image(xy)
     share = float(rays.valid.mean())
     if share < 0.5:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from core.errors import InputError
-from core.field.checks.gates import GateOptions
+from core.field.checks.validity import ValidityOptions
 from core.field.prefilter import check_prefilter
 from core.field.region.region import check_subset
 from core.matching.blur import Blur
@@ -36,9 +36,9 @@ class MeasureOptions:
         in all; shape and motion are decided apart, and a sequence that went over to curved patches keeps them.
     interpolation
         ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
-    least_zncc
+    min_zncc
         Correlation below which no comparison is a match. The field's own scatter decides above it.
-    gates
+    validity
         Limits of the checks that every point must pass.
     prefilter_px
         Standard deviation of a Gaussian that all images are blurred with before they are compared, px; 0: none. At
@@ -51,16 +51,16 @@ class MeasureOptions:
     subset_px: int = SUBSET_PX.default
     patch: PatchSetting = DEFAULT_PATCH
     interpolation: Interpolation = DEFAULT_INTERPOLATION
-    least_zncc: float = 0.6
-    gates: GateOptions = field(default_factory=GateOptions)
+    min_zncc: float = 0.6
+    validity: ValidityOptions = field(default_factory=ValidityOptions)
     prefilter_px: float = 0.0
     noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)
         check_prefilter(self.prefilter_px, self.subset_px)
-        if not 0.0 < self.least_zncc < 1.0:
-            raise InputError(f"least_zncc is {self.least_zncc}, it must lie in 0 to 1.", code="option_out_of_range")
+        if not 0.0 < self.min_zncc < 1.0:
+            raise InputError(f"min_zncc is {self.min_zncc}, it must lie in 0 to 1.", code="option_out_of_range")
         if self.patch not in PATCH_SETTINGS:
             raise InputError(
                 f"patch is {self.patch!r}, it must be one of {', '.join(PATCH_SETTINGS)}.", code="option_out_of_range"

@@ -96,7 +96,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     resolution_px = (window - 1) * step[0] + subset_px
     mm_per_px = _mm_per_px(field, step)
     n_whole = int(whole.sum())
-    told = Smoothing(
+    record = Smoothing(
         window=window,
         order=order,
         step_px=step[0],
@@ -107,7 +107,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
         reduced=int(valid.sum()) - n_whole - n_raw,
         raw=n_raw,
     )
-    return replace(field, uvw_mm=uvw, covariance=covariance, smoothing=told)
+    return replace(field, uvw_mm=uvw, covariance=covariance, smoothing=record)
 
 
 def _held(field: Field) -> Float:

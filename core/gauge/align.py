@@ -102,10 +102,10 @@ def align_plane(
     gain[used] = np.linalg.solve(H, (A * weight[:, None]).T).T[:, :, None] * R[2]
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
     each = gain @ roots
-    three = np.einsum("rcij,rckj->ik", each, shared.places.summed(field, each))
+    three = np.einsum("rcij,rckj->ik", each, shared.positions.summed(field, each))
     full = np.zeros((6, 6))
-    place = np.ix_([0, 1, 5], [0, 1, 5])
-    full[place] = 0.5 * (three + three.T)
+    position = np.ix_([0, 1, 5], [0, 1, 5])
+    full[position] = 0.5 * (three + three.T)
     rms = float(np.sqrt(np.mean(((x - origin) @ normal) ** 2)))
     return Alignment(R, origin, full, rms, len(x))
 
@@ -139,19 +139,19 @@ def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> 
             code="gauge_unusable",
             remedy="Give three places on the plane, two on the line, one at the origin.",
         )
-    places = sample(field, xy)
-    if not places.found.all():
-        k = int(np.argmin(places.found))
+    positions = sample(field, xy)
+    if not positions.found.all():
+        k = int(np.argmin(positions.found))
         raise MeasurementError(
             f"Place {k + 1} of 3-2-1, ({xy[k, 0]:g}, {xy[k, 1]:g}) px, has no measured point about it: "
-            f"{places.missing[k]}.",
+            f"{positions.missing[k]}.",
             code="too_few_points",
             remedy="Choose places where the shape was measured.",
         )
-    x = places.of(field.xyz_mm)
+    x = positions.of(field.xyz_mm)
     R, origin = _three_two_one(x)
     first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
-    blocks = places.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
+    blocks = positions.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
     joint = np.swapaxes(blocks, 1, 2).reshape(18, 18)
     slope = np.empty((6, 18))
     step = 1e-5 * float(np.abs(x - x.mean(axis=0)).max())

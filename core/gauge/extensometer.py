@@ -69,14 +69,14 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
             code="gauge_unusable",
             remedy="Give two different places.",
         )
-    places = sample(field, ends)
-    why = [f"end {k}: {text}" for k, text in zip("ab", places.missing, strict=True) if text]
+    samples = sample(field, ends)
+    why = [f"end {k}: {text}" for k, text in zip("ab", samples.missing, strict=True) if text]
     if why:
         return Extensometer(missing=", ".join(why))
-    cov = _both_ends(places, shared)
+    cov = _both_ends(samples, shared)
     n = cov.shape[0] // 2
-    start = places.of(field.xyz_mm)
-    now = start if field.uvw_mm is None else start + places.of(field.uvw_mm)
+    start = samples.of(field.xyz_mm)
+    now = start if field.uvw_mm is None else start + samples.of(field.uvw_mm)
     along0, along = start[1] - start[0], now[1] - now[0]
     length0, length = float(np.linalg.norm(along0)), float(np.linalg.norm(along))
     rest = np.zeros(n - 3)
@@ -98,7 +98,7 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     )
 
 
-def _both_ends(places: Samples, shared: SharedPixels) -> Float:
+def _both_ends(samples: Samples, shared: SharedPixels) -> Float:
     """(2 n, 2 n) covariance of both ends' positions and displacements."""
-    aa, ab, bb = places.covariance(shared, [0, 0, 1], [0, 1, 1])
+    aa, ab, bb = samples.covariance(shared, [0, 0, 1], [0, 1, 1])
     return np.block([[aa, ab], [ab.T, bb]])

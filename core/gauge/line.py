@@ -10,10 +10,10 @@ from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import steps_px
 
-MOST_PLACES = 100_000
+MAX_POSITIONS = 100_000
 
 
-def places_along(field: Field, vertices_px: ArrayLike, count: int | None = None) -> tuple[Float, Float]:
+def positions_along(field: Field, vertices_px: ArrayLike, count: int | None = None) -> tuple[Float, Float]:
     """Lay places evenly along a polyline, both ends included.
 
     Parameters
@@ -42,13 +42,13 @@ def places_along(field: Field, vertices_px: ArrayLike, count: int | None = None)
     if reach[-1] == 0.0:
         raise RegionError("The line has no length.", code="gauge_unusable", remedy="Give two different places.")
     if count is None:
-        count = min(int(np.floor(reach[-1] / min(steps_px(field)))) + 1, MOST_PLACES)
+        count = min(int(np.floor(reach[-1] / min(steps_px(field)))) + 1, MAX_POSITIONS)
         count = max(count, 2)
-    if not 2 <= count <= MOST_PLACES:
+    if not 2 <= count <= MAX_POSITIONS:
         raise RegionError(
             f"A line of {count} places cannot be read.",
             code="gauge_unusable",
-            remedy=f"Give 2 to {MOST_PLACES} places.",
+            remedy=f"Give 2 to {MAX_POSITIONS} places.",
         )
     at = np.linspace(0.0, reach[-1], count)
     return np.column_stack([np.interp(at, reach, v[:, 0]), np.interp(at, reach, v[:, 1])]), at

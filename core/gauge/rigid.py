@@ -20,7 +20,7 @@ from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
-_FEWEST = 3
+_MIN_POINTS = 3
 _ROUNDS = 50
 _OUTER_ROUNDS = 30
 _EXTRA_SETTLED = 1e-3
@@ -234,7 +234,7 @@ def _vector_slope(v: Float) -> Float:
 
 
 def _check_spread(x: Float) -> None:
-    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) if len(x) >= _FEWEST else np.zeros(2)
+    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) if len(x) >= _MIN_POINTS else np.zeros(2)
     if spread[1] <= _LINE * spread[0]:
         raise MeasurementError(
             f"{len(x)} points are left, or they lie on one line: no rigid motion can be told from them.",

@@ -19,9 +19,9 @@ from core.target import GridTarget
 
 Cause = Literal["", "dirt", "glare"]
 
-_LEAST_INSIDE_PX = 3.0
+_MIN_INSIDE_PX = 3.0
 _DEPTH_RANGE = (0.4, 2.2)  # of what the neighbours show
-_LEAST_CERTAIN = 0.25  # standard deviation of a piece's place, as part of the line's width and blur
+_MIN_CERTAIN = 0.25  # standard deviation of a piece's place, as part of the line's width and blur
 _RMS_RATIO = 3.0
 _GLARING_SHARE = 0.0005  # of the image's pixels, in spots; a glare large enough to hide lines has such a core
 _GLARE_RISE = 0.5  # ground above its neighbours', as part of the lines' depth
@@ -82,8 +82,8 @@ def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]
 
 def inside(nodes_px: Float, size_px: tuple[int, int]) -> Bool:
     """Which intersections lie inside the image with room for their lines, (...)."""
-    low = nodes_px >= _LEAST_INSIDE_PX
-    high = nodes_px <= np.array(size_px) - 1.0 - _LEAST_INSIDE_PX
+    low = nodes_px >= _MIN_INSIDE_PX
+    high = nodes_px <= np.array(size_px) - 1.0 - _MIN_INSIDE_PX
     return np.asarray((low & high).all(axis=-1))
 
 
@@ -141,7 +141,7 @@ def blame_glare(error: TargetError, grey: Float32, saturation: float) -> TargetE
     )
 
 
-def judge_pieces(
+def check_pieces(
     table: PieceTable, fits: Float, target: GridTarget, saturation: float
 ) -> tuple[Bool, NDArray[np.str_]]:
     """Tell good pieces from spoilt ones.
@@ -160,7 +160,7 @@ def judge_pieces(
     with np.errstate(invalid="ignore"):
         fits_shape = rms < _RMS_RATIO * np.nanmedian(rms) + 0.02 * np.abs(typical)
         seen = (depth > _DEPTH_RANGE[0] * typical) & (depth < _DEPTH_RANGE[1] * typical)
-        certain = np.sqrt(fits[:, OUT["var_c0"]]) < _LEAST_CERTAIN * (fits[:, OUT["width"]] + fits[:, OUT["blur"]])
+        certain = np.sqrt(fits[:, OUT["var_c0"]]) < _MIN_CERTAIN * (fits[:, OUT["width"]] + fits[:, OUT["blur"]])
         # clipped peaks of the noise do no harm; a level that is itself within the noise of the limit does
         level = fits[:, OUT["ground"]] + (0.0 if target.dark_lines else depth)
         saturated = (fits[:, OUT["brightest"]] >= saturation) & ~(level + rms < saturation)

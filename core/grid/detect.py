@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
-from core.grid.checks import blame_glare, check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
+from core.grid.checks import blame_glare, check_coverage, check_lattice, check_pieces, check_regular, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
 from core.grid.directions import directions
 from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
@@ -177,7 +177,7 @@ def _measure(
     node_sigma_px = target.node_tolerance_mm / np.sqrt(3.0) * pitch_px(nodes_px) / target.pitch_mm
     table = piece_table(nodes_px, target, blur_px=blur_px)
     fits = fit_pieces(grey, table.rows, dark_lines=target.dark_lines)
-    good, cause = judge_pieces(table, fits, target, saturation)
+    good, cause = check_pieces(table, fits, target, saturation)
     check_coverage(table, good, cause, options)
     pp = line_points(table, fits)
     size = (grey.shape[1], grey.shape[0])

@@ -71,8 +71,8 @@ _STEPS = 12
 _N = 8  # c0, c1, B, B_t, B_d, A, s, w
 _WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be told from their depth
 _WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
-_MOST_BLUR = 8.0
-_LEAST_PIXELS = 20
+_MAX_BLUR = 8.0
+_MIN_PIXELS = 20
 
 
 @njit(cache=True, nogil=True)
@@ -236,7 +236,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
                 gs[n] = image[y, x]
                 brightest = max(brightest, gs[n])
                 n += 1
-    if n < _LEAST_PIXELS:
+    if n < _MIN_PIXELS:
         return
     out[7] = gs[:n].mean()  # kept also where the fit fails: it tells glare from dirt
     out[14] = brightest
@@ -329,7 +329,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
         for i in range(_N):
             trial[i] = par[i] + delta[i]
         trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
-        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MOST_BLUR, 2.0 * par[6] + 0.1))
+        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MAX_BLUR, 2.0 * par[6] + 0.1))
         trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
     dof = n - (_N if fit_width else _N - 1)
     variance = best / dof

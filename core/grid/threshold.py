@@ -19,7 +19,7 @@ from core.arrays import Bool, Float, Float32
 from core.errors import ImageError
 from core.target import GridTarget
 
-_LEAST_SIDE_PX = 64
+_MIN_SIDE_PX = 64
 # a coarse picture of this many pixels on its short side shows every line of a grid worth measuring
 _COARSE_SIDE_PX = 720.0
 
@@ -60,9 +60,9 @@ def checked_image(image: NDArray[Any]) -> Float32:
     array = np.asarray(image)
     if array.ndim != 2:
         raise ImageError(f"a gray image has two axes, this one has shape {array.shape}", code="image_unsupported")
-    if min(array.shape) < _LEAST_SIDE_PX:
+    if min(array.shape) < _MIN_SIDE_PX:
         raise ImageError(
-            f"the image has {array.shape[1]} x {array.shape[0]} px; a grid needs at least {_LEAST_SIDE_PX} each way",
+            f"the image has {array.shape[1]} x {array.shape[0]} px; a grid needs at least {_MIN_SIDE_PX} each way",
             code="image_unusable",
         )
     if array.dtype.kind not in "uif":
@@ -82,14 +82,14 @@ def noise_level(grey: Float32) -> float:
 
 def coarse_factors(size_px: tuple[int, int], target: GridTarget) -> tuple[float, ...]:
     """Full-size pixels per coarse pixel to try in turn; 0.5 doubles the image for lines that stand close."""
-    widest_pitch = _widest_pitch_px(size_px, target)
+    max_pitch = _max_pitch_px(size_px, target)
     # a grid worth measuring fills a third of the view at least; coarse pixels no wider than its lines keep them
-    by_width = 0.35 * widest_pitch * target.line_width_mm / target.pitch_mm
+    by_width = 0.35 * max_pitch * target.line_width_mm / target.pitch_mm
     first = float(int(max(1.0, min(round(by_width), round(min(size_px) / _COARSE_SIDE_PX)))))
     return (first, 0.5 * first, 2.0 * first) if first > 1.0 else (1.0, 0.5, 2.0)
 
 
-def _widest_pitch_px(size_px: tuple[int, int], target: GridTarget) -> float:
+def _max_pitch_px(size_px: tuple[int, int], target: GridTarget) -> float:
     return max(size_px) / (min(target.lines) - 1)
 
 
@@ -117,8 +117,8 @@ def line_picture(grey: Float32, target: GridTarget, factor: float) -> LinePictur
         coarse = np.asarray(cv2.resize(block, size, interpolation=how), dtype=np.float32)
     signed = coarse if target.dark_lines else -coarse
     smooth = cv2.GaussianBlur(signed, (0, 0), 0.8 / min(factor, 1.0))
-    widest_pitch = _widest_pitch_px((width, height), target)
-    widest_line = (target.line_width_mm / target.pitch_mm * widest_pitch + 3.0) / factor
+    max_pitch = _max_pitch_px((width, height), target)
+    widest_line = (target.line_width_mm / target.pitch_mm * max_pitch + 3.0) / factor
     k = 2 * int(np.ceil(widest_line)) + 1
     ground = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
     depth = (ground - smooth).astype(np.float32)

@@ -22,7 +22,7 @@ from core.threads import run_ranges
 Int = NDArray[np.int32]
 
 POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to call it
-FEWEST_AT_ONCE = 16
+MIN_AT_ONCE = 16
 _TINY = 1e-6  # grey levels squared
 
 
@@ -115,10 +115,7 @@ def run_kernel(kernel: Any, make_space: Callable[[int], Any], given: Given, out:
     status, iterations = np.ones(n, np.int8), np.zeros(n, np.int32)
     space = one_a_thread(make_space, given.setting.subset)
     run_ranges(
-        lambda first, last: kernel(first, last, given, space(), out, status, iterations),
-        n,
-        POINTS_AT_ONCE,
-        FEWEST_AT_ONCE,
+        lambda first, last: kernel(first, last, given, space(), out, status, iterations), n, POINTS_AT_ONCE, MIN_AT_ONCE
     )
     return status, iterations
 

@@ -288,11 +288,11 @@ def _with_blurred_noise(
     col, row = (np.clip(np.rint(a), 0, last - 1).astype(int) for a, last in zip(xy.T, (cols, rows), strict=True))
     factor = spread[row, col].astype(np.float64)
     before = [image.sharp for image in images]
-    told = sharp([image for image in before if image is not None], replace(options, max_iterations=1))
+    unblurred = sharp([image for image in before if image is not None], replace(options, max_iterations=1))
     if not all(image.noise_variance for image in images):
-        factor *= blur.gain * told.variance / assumed_variance(images[0])
-    unseen = (fit.status == PointStatus.OK) & ~np.isfinite(told.variance)
-    status, noise = np.where(unseen, told.status, fit.status), np.sqrt(blur.gain) * told.noise
+        factor *= blur.gain * unblurred.variance / assumed_variance(images[0])
+    unseen = (fit.status == PointStatus.OK) & ~np.isfinite(unblurred.variance)
+    status, noise = np.where(unseen, unblurred.status, fit.status), np.sqrt(blur.gain) * unblurred.noise
     covariance = fit.covariance * factor[:, None, None]
     return replace(
         fit, status=status, noise=noise, covariance=covariance, epipolar_sigma_px=np.sqrt(covariance[:, -1, -1])

@@ -28,15 +28,15 @@ REACH = 3
 """The filter is 7 x 7; 9 x 9 gains less than 0.05 % of the information."""
 
 _TILE = 128
-_MOST_TILES = 48
-_LEAST_POWER = 0.1  # of a strong tile's grey-level variance: tiles below it show no texture
+_MAX_TILES = 48
+_MIN_POWER = 0.1  # of a strong tile's grey-level variance: tiles below it show no texture
 _RINGS = (0.6, 0.8)  # of the Nyquist frequency, both ways: beyond the second, lenses leave little but noise
 _FALL = 2.0  # by which the sharpest texture's spectrum falls from one ring to the next
 _LEVEL = 1.05  # rings that differ by less show noise alone
-_MOST_NOISE = 0.5  # of the grey levels' variance
+_MAX_NOISE = 0.5  # of the grey levels' variance
 _INTERPOLATION_COUNTS = 100.0  # a third off the mean error in sharp speckle, for 1 % of random error there
 _BLANK = 1e-20  # of the squared grey levels: rounding
-_LEAST_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
+_MIN_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,18 +120,18 @@ def slope_filter(
     S = _lags(spectrum) / W  # index 0 is lag 0, negative lags come from the end
     if not S[0, 0] > 0.0:
         return None
-    noise = min(noise, _MOST_NOISE * float(S[0, 0]))
+    noise = min(noise, _MAX_NOISE * float(S[0, 0]))
     colour = np.ones_like(spectrum) if blur is None else blur.spectrum(len(spectrum))
     E = _lags(np.maximum(spectrum - noise * colour, 0.0) * _interpolation_error(len(spectrum), order)) / W
     C = _lags(colour)
     N = noise * C
-    least = _LEAST_NOISE * float(S[0, 0] - noise)
+    floor = _MIN_NOISE * float(S[0, 0] - noise)
     S -= N
     lag = np.arange(-REACH, REACH + 1)
     y, x = (v.ravel() for v in np.meshgrid(lag, lag, indexing="ij"))
     apart = y[:, None] - y, x[:, None] - x
     R = S[apart] + N[apart]
-    R[np.diag_indices(side**2)] += least
+    R[np.diag_indices(side**2)] += floor
     slope = derivative(5)
     far = min(len(slope) // 2, len(S) // 2 - 1 - REACH)
     tap = np.arange(-far, far + 1)
@@ -154,7 +154,7 @@ def _spectra(image: NDArray[Any]) -> tuple[Float | None, Float]:
     rows, cols = image.shape
     side = min(_TILE, rows // 2 * 2, cols // 2 * 2)
     places = [(y, x) for y in range(0, rows - side + 1, side) for x in range(0, cols - side + 1, side)]
-    places = places[:: -(-len(places) // _MOST_TILES)]
+    places = places[:: -(-len(places) // _MAX_TILES)]
     tiles = np.stack([image[y : y + side, x : x + side] for y, x in places]).astype(np.float64)
     hann = np.hanning(side + 2)[1:-1]
     window = np.outer(hann, hann)
@@ -162,7 +162,7 @@ def _spectra(image: NDArray[Any]) -> tuple[Float | None, Float]:
     power = (tiles**2).mean(axis=(1, 2))
     if not power.max() > _BLANK * float(np.abs(image[::8, ::8]).max()) ** 2:
         return None, window
-    tiles = tiles[power >= _LEAST_POWER * np.quantile(power, 0.9)]
+    tiles = tiles[power >= _MIN_POWER * np.quantile(power, 0.9)]
     return np.abs(fft.rfft2(tiles)) ** 2 / (window**2).sum(), window
 
 

@@ -21,7 +21,7 @@ from core.names import CAMERAS
 
 _P = 2 * N_CAMERA
 _NOISE_ROUNDS = 4
-_SMALLEST_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
+_MIN_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def adjust(
 
 
 def _noise(normal: _Normal, redundancy: Float) -> Float:
-    return np.maximum(np.sqrt(normal.weighted_squares / np.maximum(redundancy, 1.0)), _SMALLEST_NOISE_PX)
+    return np.maximum(np.sqrt(normal.weighted_squares / np.maximum(redundancy, 1.0)), _MIN_NOISE_PX)
 
 
 def _assemble(

@@ -35,10 +35,10 @@ def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], su
     return np.asarray(clear)
 
 
-def refuse_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
+def reject_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
     """Give points the status OUTSIDE_IMAGE whose patch comes so near to an image's border that the blur lacks some."""
     ok = np.flatnonzero(points.ok)
     off = leaves_an_image(fitter, xy_px[ok], xy_px[ok], points.take(ok), margin_px=blur.edge_px)
-    gone = np.zeros(len(points.status), bool)
-    gone[ok[off]] = True
-    points.refuse(gone, PointStatus.OUTSIDE_IMAGE)
+    rejected = np.zeros(len(points.status), bool)
+    rejected[ok[off]] = True
+    points.reject(rejected, PointStatus.OUTSIDE_IMAGE)

@@ -17,8 +17,8 @@ from core.field.region.trend import smooth_terms
 Level = Literal["ok", "warning", "failed"]
 
 WARNING_PX, FAILED_PX = 0.05, 0.1
-_FEWEST_FOR_SURFACE = 60
-_FEWEST = 4
+_MIN_POINTS_FOR_SURFACE = 60
+_MIN_POINTS = 4
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,10 @@ def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
     """
     valid = field.valid & np.isfinite(field.epipolar_px)
     offset = field.epipolar_px[valid]
-    if len(offset) < _FEWEST:
+    if len(offset) < _MIN_POINTS:
         return None
     terms = smooth_terms(np.column_stack([field.x_px[valid], field.y_px[valid]]))
-    design = terms if len(offset) >= _FEWEST_FOR_SURFACE else terms[:, :1]
+    design = terms if len(offset) >= _MIN_POINTS_FOR_SURFACE else terms[:, :1]
     smooth = design @ np.linalg.lstsq(design, offset, rcond=1e-9)[0]
     left = float(np.sum((offset - smooth) ** 2)) / max(len(offset) - design.shape[1], 1)
     # what noise alone lets a surface of so many terms explain is taken out

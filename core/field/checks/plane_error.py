@@ -15,8 +15,8 @@ import numpy as np
 from core.arrays import Float
 from core.field.points.fitter import PointFits
 
-_FEWEST = 16
-_NOT_HEARD = 0.02
+_MIN_POINTS = 16
+_TRIMMED = 0.02
 _FAR_SUBSETS = 2.0
 
 
@@ -54,9 +54,9 @@ def plane_error(
     step_px, subset_px
         Distance of the points and width of the subset.
     """
-    apart = max(1, int(np.ceil(subset_px / step_px)))
+    separation = max(1, int(np.ceil(subset_px / step_px)))
     rows, cols = shape
-    if apart * step_px > _FAR_SUBSETS * subset_px or min(rows, cols) < 2 * apart + 1:
+    if separation * step_px > _FAR_SUBSETS * subset_px or min(rows, cols) < 2 * separation + 1:
         return None
     w, G = points.w[:, 0], points.G[:, :, 0]
     moved = points.zncc.shape[1] == 3
@@ -69,22 +69,22 @@ def plane_error(
     else:
         by_w = -rays / w[:, None] ** 2
         variance = (by_w**2).sum(1) * points.covariance[:, 0, 0]
-    factor = (subset_px**2 - 1) / 24.0 / (apart * step_px) ** 2
-    bend_w, noise = _laplacian(w.reshape(shape), apart), _gathered(variance.reshape(shape), apart) * factor**2
-    inner = (slice(apart, rows - apart), slice(apart, cols - apart))
+    factor = (subset_px**2 - 1) / 24.0 / (separation * step_px) ** 2
+    bend_w, noise = _laplacian(w.reshape(shape), separation), _gathered(variance.reshape(shape), separation) * factor**2
+    inner = (slice(separation, rows - separation), slice(separation, cols - separation))
     off = factor * bend_w[..., None] * by_w.reshape(rows, cols, 3)[inner]
     if moved:
-        bends = np.stack([_laplacian(G[:, i].reshape(shape), apart) for i in range(3)], axis=-1)
+        bends = np.stack([_laplacian(G[:, i].reshape(shape), separation) for i in range(3)], axis=-1)
         off += factor * bends / w.reshape(shape)[inner][..., None]
     square = (off**2).sum(-1)
     known = np.isfinite(square) & (noise > 0.0)
-    if known.sum() < _FEWEST:
+    if known.sum() < _MIN_POINTS:
         return None
     square, noise, own = square[known], noise[known], variance.reshape(shape)[inner][known]
     # two per cent are not heard: single wrong points, and steps at cracks and edges
-    heard = np.argsort(square / noise)[: len(square) - int(np.ceil(_NOT_HEARD * len(square)))]
-    error2 = max(float(np.mean(square[heard] - noise[heard])), 0.0)
-    below2 = error2 + 2.0 * float(np.std(square[heard])) / np.sqrt(len(heard))
+    used = np.argsort(square / noise)[: len(square) - int(np.ceil(_TRIMMED * len(square)))]
+    error2 = max(float(np.mean(square[used] - noise[used])), 0.0)
+    below2 = error2 + 2.0 * float(np.std(square[used])) / np.sqrt(len(used))
     return PlaneError(float(np.sqrt(error2)), float(np.sqrt(below2)), float(np.sqrt(np.mean(own))))
 
 

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
-from core.matching.observed import observed_covariance
+from core.matching.cluster_robust import cluster_robust_covariance
 from core.progress import CancelToken, raise_if_cancelled
 from core.robust import spread_indices
 from core.status import PointStatus
 
 _SAMPLE = 256
-_FEWEST = 30  # of a sample, to say something of a field
+_MIN_POINTS = 30  # of a sample, to say something of a field
 _MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent pulls
 _AS_NOISE = (0.8, 1.25)  # a sample's variance over the told one: within, nothing needs to be corrected
-_ONE_VOICE = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
+_MAX_DISAGREEMENT = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
 _UNUSUAL = 1.5  # residual energy over the field's median
-_MOSTLY_OTHER = 2.0  # a sample's variance over the told one: more than half of it is not noise
+_MOSTLY_NOT_NOISE = 2.0  # a sample's variance over the told one: more than half of it is not noise
 _AT_ONCE = 4096
 
 
@@ -48,7 +48,7 @@ class SigmaLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
+class TestedResiduals:
     """What came out.
 
     Attributes
@@ -58,16 +58,16 @@ class Judged:
         told ones; NaN where there were too few points to say.
     one_by_one
         How many points were judged by their own residuals.
-    refused
+    rejected
         How many of them scatter too far.
     """
 
     factor: Float
     one_by_one: int
-    refused: int
+    rejected: int
 
 
-def judge(
+def residual_test(
     fitter: Fitter,
     points: PointFits,
     *,
@@ -75,7 +75,7 @@ def judge(
     texture: Float,
     limits: SigmaLimits,
     cancel: CancelToken | None = None,
-) -> Judged:
+) -> TestedResiduals:
     """Correct the covariances of points in place and refuse those that scatter too far.
 
     Parameters
@@ -92,7 +92,7 @@ def judge(
         Stops the work.
     """
     q = points.covariance.shape[-1]
-    nothing = Judged(factor=np.full(q, np.nan), one_by_one=0, refused=0)
+    nothing = TestedResiduals(factor=np.full(q, np.nan), one_by_one=0, rejected=0)
     ok = np.flatnonzero(points.ok)
     if len(ok) == 0:
         return nothing
@@ -104,30 +104,30 @@ def judge(
     own = own[np.isfinite(own).all(axis=1)]
     factor = nothing.factor
     told = np.ones(q)  # the offset's, the last, is no witness: interpolation and images of unlike noise raise it
-    if len(own) >= _FEWEST:
+    if len(own) >= _MIN_POINTS:
         factor = np.median(own, axis=0) / _MEDIAN_OF_MEAN
         told = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
         if fitter.ref1.blur is not None:  # its noise hangs together over more than a block
             told = np.maximum(told, 1.0)
         # what all say is less than noise, as of a shape that less noisy images tell, is no reason to doubt
-        one_voice = (np.quantile(own, 0.9, axis=0) < _ONE_VOICE * np.maximum(np.median(own, axis=0), 1.0)).all()
-        if not one_voice or (told[:-1] > _MOSTLY_OTHER).any():
+        one_voice = (np.quantile(own, 0.9, axis=0) < _MAX_DISAGREEMENT * np.maximum(np.median(own, axis=0), 1.0)).all()
+        if not one_voice or (told[:-1] > _MOSTLY_NOT_NOISE).any():
             unusual[:] = True
     else:
         unusual[:] = True
     usual, alone = ok[~unusual], ok[unusual]
     _scale(points, usual, told / np.where(told > 1.0, _shared_texture(points, usual), 1.0))
-    refused = 0
+    rejected = 0
     if (told[:-1] > 1.0).any():
-        refused = _refuse_far(fitter, points, usual, xy_px, limits)
+        rejected = _reject_far(fitter, points, usual, xy_px, limits)
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
         # a single estimate scatters itself: what the field in general shows is the least
         _scale(points, index, np.fmax(own, told) / _shared_texture(points, index))
-        refused += _refuse_far(fitter, points, index, xy_px, limits)
-    return Judged(factor=factor, one_by_one=len(alone), refused=refused)
+        rejected += _reject_far(fitter, points, index, xy_px, limits)
+    return TestedResiduals(factor=factor, one_by_one=len(alone), rejected=rejected)
 
 
 def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> Float:
@@ -138,7 +138,7 @@ def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_
     images = [fitter.ref1, fitter.ref2]
     if fitter.cur1 is not None and fitter.cur2 is not None:
         images += [fitter.cur1, fitter.cur2]
-    observed, _ = observed_covariance(
+    robust, _ = cluster_robust_covariance(
         fitter.pair,
         images,
         xy_px[index],
@@ -146,11 +146,11 @@ def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_
         points.G[index] if len(images) == 4 else None,
         points.epipolar_px[index],
         fitter.options,
-        None if fitter.sight is None else fitter.sight.at(xy_px[index]),
+        None if fitter.visibility is None else fitter.visibility.at(xy_px[index]),
     )
     told = _diagonal(points.covariance[index])
     factors = np.full(told.shape, np.nan)
-    np.divide(_diagonal(observed), told, out=factors, where=told > 0.0)
+    np.divide(_diagonal(robust), told, out=factors, where=told > 0.0)
     return factors
 
 
@@ -165,12 +165,12 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -
     points.epipolar_sigma_px[index] *= root[:, -1]
 
 
-def _refuse_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
+def _reject_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
     motion, depth = _sigma_px(fitter, points, index, xy_px)
     far = ~((motion < limits.motion_px) & (depth < limits.depth_px))
     mask = np.zeros(len(points.status), bool)
     mask[index[far]] = True
-    points.refuse(mask, PointStatus.LOW_CORRELATION)
+    points.reject(mask, PointStatus.LOW_CORRELATION)
     return int(far.sum())
 
 

@@ -26,13 +26,13 @@ def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) 
         (n, 2) and (n,).
     """
     open_ = np.flatnonzero(usable & (points.status == PointStatus.NOT_SEEDED))
-    standing = np.flatnonzero(points.ok)
-    if len(open_) == 0 or len(standing) == 0:
+    valid = np.flatnonzero(points.ok)
+    if len(open_) == 0 or len(valid) == 0:
         return
     subset = fitter.options.subset_px
-    distance, nearest = cKDTree(xy_px[standing]).query(xy_px[open_])
+    distance, nearest = cKDTree(xy_px[valid]).query(xy_px[open_])
     near = np.asarray(distance) < _REACH_SUBSETS * subset
-    open_, parent = open_[near], standing[np.asarray(nearest)[near]]
+    open_, parent = open_[near], valid[np.asarray(nearest)[near]]
     outside = leaves_an_image(fitter, xy_px[open_], xy_px[parent], points.take(parent))
     points.status[open_[outside]] = PointStatus.OUTSIDE_IMAGE
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import PointFits
 from core.field.points.starts import move_matrix, move_w
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.robust import MAD_TO_SIGMA
 from core.status import PointStatus
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
 _ALL_AT_ONCE = 512
-_MOST_A_BATCH = 4096  # a cancel is heard within a second even on a slow machine
+_MAX_BATCH = 4096  # a cancel is heard within a second even on a slow machine
 _FAR_PX = 3.0
 _COUNT_AGAIN = 1.05
 ATTEMPTS = 4
@@ -63,13 +63,13 @@ def fit_in_batches(
     A fit that ends further than ``far_px`` from its start has left the basin it was started in.
     """
     good = np.zeros(len(index), bool)
-    for start in range(0, len(index), _MOST_A_BATCH):
+    for start in range(0, len(index), _MAX_BATCH):
         raise_if_cancelled(cancel)
-        part = slice(start, start + _MOST_A_BATCH)
+        part = slice(start, start + _MAX_BATCH)
         xy = xy_px[index[part]]
         part_G = None if G is None else G[part]
         fits = fitter.fit(xy, w[part], part_G)
-        fits.refuse(fits.ok & fitter.far_from_start(xy, fits, w[part], part_G, far_px), PointStatus.NOT_CONVERGED)
+        fits.reject(fits.ok & fitter.far_from_start(xy, fits, w[part], part_G, far_px), PointStatus.NOT_CONVERGED)
         points.put(index[part], fits)
         good[part] = fits.ok
     return good
@@ -94,16 +94,18 @@ class Attempts:
     left: NDArray[np.int8]
 
     @staticmethod
-    def on(shape: tuple[int, int], sight: Sight | None = None) -> Attempts:
+    def on(shape: tuple[int, int], visibility: Visibility | None = None) -> Attempts:
         """Return the attempts of a grid of (rows, cols) on which nothing was tried."""
         n = shape[0] * shape[1]
-        places = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
-        places[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
+        index_of = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
+        index_of[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
         rows, cols = slice(1, -1), slice(1, -1)
-        neighbours = np.stack([np.roll(places, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1)
-        if sight is not None:
+        neighbours = np.stack(
+            [np.roll(index_of, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1
+        )
+        if visibility is not None:
             for k, (dr, dc) in enumerate(_OFFSETS):
-                neighbours[sight.parted_at(int(dr), int(dc)), k] = -1
+                neighbours[visibility.separated_at(int(dr), int(dc)), k] = -1
         return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
 
 
@@ -115,7 +117,7 @@ def grow(
     xy_px: Float,
     rays: Float,
     usable: Bool,
-    stage: str = "grow",
+    phase: str = "grow",
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> int:
@@ -133,7 +135,7 @@ def grow(
         (n, 2) px, (n, 3) normalised.
     usable
         (n,) which points may be measured.
-    stage, progress, cancel
+    phase, progress, cancel
         Reports and stop.
 
     Notes
@@ -143,24 +145,24 @@ def grow(
     """
     total = int(usable.sum())
     quality = points.quality
-    standing, counted, added = int((quality > 0.0).sum()), 0, 0
-    least, front = 0.0, np.zeros(len(quality), bool)
-    while standing > 0:
+    valid, counted, added = int((quality > 0.0).sum()), 0, 0
+    min_quality, front = 0.0, np.zeros(len(quality), bool)
+    while valid > 0:
         raise_if_cancelled(cancel)
-        progress(stage, standing, total)
-        if standing > _COUNT_AGAIN * counted:  # what is normal for the field changes with its size
-            least, counted = _least_parent(quality), standing
+        progress(phase, valid, total)
+        if valid > _COUNT_AGAIN * counted:  # what is normal for the field changes with its size
+            min_quality, counted = _min_parent_zncc(quality), valid
             front = usable & (quality <= 0.0) & (attempts.left > 0)
         todo = np.flatnonzero(front)
         near = attempts.neighbours[todo]
         score = np.where((near >= 0) & ~attempts.tried[todo], quality[near], -1.0)
-        score[score < least] = -1.0
+        score[score < min_quality] = -1.0
         choice = np.argmax(score, axis=1)
         best = np.take_along_axis(score, choice[:, None], axis=1)[:, 0]
         reachable = best > 0.0
         front[todo[~reachable]] = False  # until a neighbour comes to stand
         if not reachable.any():
-            if standing == counted:
+            if valid == counted:
                 break
             counted = 0
             continue
@@ -189,13 +191,13 @@ def grow(
         attempts.tried[beside, side] = False  # a point that stood there before, and fell, had other values
         front[beside[usable[beside] & (quality[beside] <= 0.0) & (attempts.left[beside] > 0)]] = True
         added += len(new)
-        standing += len(new)
+        valid += len(new)
     return added
 
 
-def _least_parent(quality: Float) -> float:
+def _min_parent_zncc(quality: Float) -> float:
     """Correlation of a point that may hand its values on: not far below the field's own."""
-    standing = quality[quality > 0.0]
-    middle = float(np.median(standing))
-    scatter = MAD_TO_SIGMA * float(np.median(np.abs(standing - middle)))
-    return middle - max(0.15, 8.0 * scatter)
+    valid = quality[quality > 0.0]
+    middle = float(np.median(valid))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(valid - middle)))
+    return middle - max(0.15, 8.0 * sigma)

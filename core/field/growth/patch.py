@@ -35,9 +35,9 @@ def refit_curved(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
-    told = None
+    estimate = None
     if state.fitter.terms == 3:
-        told = plane_error(
+        estimate = plane_error(
             state.points,
             shape=inputs.grid.shape,
             rays=inputs.rays,
@@ -45,8 +45,8 @@ def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
             subset_px=inputs.options.subset_px,
         )
     if inputs.options.patch != "auto":
-        return replace(state, patch=advise(state.patch, told))
+        return replace(state, patch=advise(state.patch, estimate))
     if state.patch.kept:
         return state
-    state = replace(state, patch=choose(state.fitter, state.points, inputs.xy_px, told))
+    state = replace(state, patch=choose(state.fitter, state.points, inputs.xy_px, estimate))
     return refit_curved(inputs, state) if state.patch.patch == "curved" else state

@@ -38,7 +38,7 @@ from core.field.seeding.seeds import (
     seeds_from_matches,
     spread,
     sweep_shape,
-    swept_places,
+    swept_positions,
 )
 from core.matching.fit import no_motion
 from core.progress import raise_if_cancelled
@@ -46,7 +46,7 @@ from core.status import PointStatus
 
 Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 
-_FEWEST_MATCHES = 12
+_MIN_MATCHES = 12
 _SAMPLE_SHARE = 0.7
 _REACH_STEPS = 2.0
 _SEARCHED = 6  # places
@@ -118,7 +118,7 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
         motion = scattered_motion(features[0], features[-2])
         raise_if_cancelled(inputs.cancel)
         shape_now = scattered_shape(pair, *features[-2:])
-    elif len(shape.xy_px) < _FEWEST_MATCHES:
+    elif len(shape.xy_px) < _MIN_MATCHES:
         return 0
 
     def put_seeds(motion: ScatteredMotion | None) -> int:
@@ -175,7 +175,7 @@ def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *
 
 
 def _swept_shape(inputs: FieldInputs, state: GrowthState) -> None:
-    for i in swept_places(inputs.xy_px, _rather_whole(inputs, inputs.usable & ~inputs.repeating)):
+    for i in swept_positions(inputs.xy_px, _rather_whole(inputs, inputs.usable & ~inputs.repeating)):
         raise_if_cancelled(inputs.cancel)
         _put_one(state, i, sweep_shape(state.fitter, inputs.ref1.pixels, inputs.ref2.pixels, inputs.xy_px[i]))
 
@@ -184,7 +184,7 @@ def _searched_motion(inputs: FieldInputs, state: GrowthState) -> None:
     if inputs.known_w is None:
         return
     known = inputs.usable & np.isfinite(inputs.known_w).all(axis=1) & ~inputs.repeating
-    for i in swept_places(inputs.xy_px, _rather_whole(inputs, known))[:_SEARCHED]:
+    for i in swept_positions(inputs.xy_px, _rather_whole(inputs, known))[:_SEARCHED]:
         raise_if_cancelled(inputs.cancel)
         _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
 
@@ -196,13 +196,13 @@ def _put_one(state: GrowthState, i: np.intp, found: PointFits) -> None:
 
 def _rather_whole(inputs: FieldInputs, usable: Bool) -> Bool:
     """Of usable points those that see all of their subset, where there are any: searches compare whole squares."""
-    whole = usable if inputs.sight is None else usable & inputs.sight.whole
+    whole = usable if inputs.visibility is None else usable & inputs.visibility.whole
     return whole if whole.any() else usable
 
 
 def _nearest(inputs: FieldInputs, seeds: tuple[Seed, ...], usable: Bool) -> NDArray[np.intp]:
     reach = max(_REACH_STEPS * inputs.grid.step_px, float(inputs.options.subset_px))
-    return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, sight=inputs.sight)
+    return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, visibility=inputs.visibility)
 
 
 def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:

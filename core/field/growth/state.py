@@ -17,10 +17,10 @@ from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage, different, refuse_stale, same_size
 from core.field.points.patch import PatchChoice, UsedPatch, asked_for
 from core.field.points.result import Field
-from core.field.region.find_visible import with_sight
+from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid, check_region
 from core.field.region.repeats import repeats
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.field.settings import MeasureOptions
 from core.matching.image import ImageData
 from core.progress import CancelToken, Progress, no_progress
@@ -80,15 +80,15 @@ class FieldInputs:
     cancel: CancelToken | None
 
     @property
-    def sight(self) -> Sight | None:
+    def visibility(self) -> Visibility | None:
         """What the points see of their subsets; None: all of it."""
-        return self.grid.sight
+        return self.grid.visibility
 
     @property
     def sigma_limits(self) -> SigmaLimits:
         """How far a point may scatter whose residuals are not noise."""
-        gates = self.options.gates
-        return SigmaLimits(motion_px=gates.largest_sigma_px, depth_px=gates.largest_depth_sigma_px)
+        validity = self.options.validity
+        return SigmaLimits(motion_px=validity.max_sigma_px, depth_px=validity.max_depth_sigma_px)
 
     @cached_property
     def repeating(self) -> Bool:
@@ -129,9 +129,9 @@ def prepare(
     subset_px, kind, blur = options.subset_px, options.interpolation, options.blur
     ref1, ref2 = (MeasureImage(reference[k], f"camera {k + 1}'s image") for k in (0, 1))
     now = () if current is None else tuple(MeasureImage(current[k], f"camera {k + 1}'s image at t") for k in (0, 1))
-    grid = with_sight(grid, subset_px)
-    if grid.sight is not None:
-        grid = replace(grid, allowed=grid.allowed & grid.sight.enough)
+    grid = with_visibility(grid, subset_px)
+    if grid.visibility is not None:
+        grid = replace(grid, allowed=grid.allowed & grid.visibility.enough)
     fits_image = check_region(grid, image_shape=ref1.shape, subset_px=subset_px)
     if now:
         for before, after in zip((ref1, ref2), now, strict=True):
@@ -159,13 +159,13 @@ def prepare(
         cur1=prepared[2] if now else None,
         cur2=prepared[3] if now else None,
         options=options.match_options(),
-        least_zncc=options.least_zncc,
-        sight=grid.sight,
+        min_zncc=options.min_zncc,
+        visibility=grid.visibility,
     )
     compared = None if blur is None else matcher.ref1
     texture = ref1.subset_variance(xy_px, subset_px, compared)
-    if grid.sight is not None:
-        texture = grid.sight.correct_variance(texture, ref1.pixels if compared is None else compared.pixels)
+    if grid.visibility is not None:
+        texture = grid.visibility.correct_variance(texture, ref1.pixels if compared is None else compared.pixels)
     return FieldInputs(
         pair=pair,
         grid=grid,
@@ -224,6 +224,6 @@ def begin(inputs: FieldInputs) -> GrowthState:
 
 def fresh_attempts(inputs: FieldInputs) -> Attempts:
     """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
-    attempts = Attempts.on(inputs.grid.shape, inputs.sight)
+    attempts = Attempts.on(inputs.grid.shape, inputs.visibility)
     attempts.left[inputs.usable & ~inputs.hoped_for] = 1
     return attempts

@@ -25,7 +25,7 @@ MAX_KEYPOINTS = 4000
 """Matching grows with the square; so many find all the seeds that a field needs."""
 _RATIO = 0.85
 _CHUNK = 256
-_LEAST_CONTRAST = 0.01
+_MIN_CONTRAST = 0.01
 _TILE_PX = 832
 _RIM_PX = 24
 _SHARE_MORE = 1.5  # a tile may keep so much more than its share of the keypoints: texture is seldom even
@@ -148,10 +148,10 @@ def _tiles(shape: tuple[int, int]) -> list[Box]:
     return [(x0, y0, x1, y1) for y0, y1 in pairwise(ys) for x0, x1 in pairwise(xs)]
 
 
-def _search(picture: NDArray[np.uint8], core: Box, most: int) -> tuple[Float, Float32, Float]:
+def _search(picture: NDArray[np.uint8], core: Box, max_features: int) -> tuple[Float, Float32, Float]:
     """Keypoints (n, 2) inside ``core``, their descriptors and strengths; what is around it helps the filters."""
     x0, y0, x1, y1 = _with_rim(Picture(picture, core), 1)
-    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=_LEAST_CONTRAST)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=_MIN_CONTRAST)  # type: ignore[attr-defined]
     allowed = np.zeros((y1 - y0, x1 - x0), np.uint8)
     allowed[core[1] - y0 : core[3] - y0, core[0] - x0 : core[2] - x0] = 255
     keypoints, descriptors = sift.detectAndCompute(np.ascontiguousarray(picture[y0:y1, x0:x1]), allowed)
@@ -170,7 +170,7 @@ def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int6
     best = np.empty(n_a, np.int64)
     top = np.empty(n_a, np.float32)
     second = np.empty(n_a, np.float32)
-    most = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # of each column over a chunk of rows
+    max_features = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # of each column over a chunk of rows
     transposed = np.ascontiguousarray(b.descriptors.T)
 
     def compare(first: int, last: int) -> None:
@@ -178,12 +178,12 @@ def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int6
         j = np.argmax(score, axis=1)
         index = np.arange(len(j))
         best[first:last], top[first:last] = j, score[index, j]
-        most[first // _CHUNK] = score.max(axis=0)
+        max_features[first // _CHUNK] = score.max(axis=0)
         score[index, j] = -np.inf
         second[first:last] = score.max(axis=1)
 
     run_ranges(compare, n_a, _CHUNK)
-    mutual = top >= most.max(axis=0)[best]
+    mutual = top >= max_features.max(axis=0)[best]
     # |d1 - d2|^2 = 2 - 2 d1.d2 for unit vectors
     distinct = (1.0 - top) < ratio**2 * (1.0 - second)
     keep = np.flatnonzero(distinct & mutual)

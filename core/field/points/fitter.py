@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.starts import depth_per_px, faces_both_cameras
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.matching.fit import fit_motion, fit_shape
 from core.matching.image import ImageData
 from core.matching.options import MatchOptions
 from core.status import PointStatus
 
-_MOST_EPIPOLAR_PX = 3.0
-_MOST_SHEAR = 4.0
+_MAX_EPIPOLAR_PX = 3.0
+_MAX_SHEAR = 4.0
 
 
 @dataclass(eq=False)
@@ -85,7 +85,7 @@ class PointFits:
         """Return a copy of the points ``index``."""
         return PointFits(**{f.name: getattr(self, f.name)[index].copy() for f in fields(self)})
 
-    def refuse(self, which: Bool, status: PointStatus) -> None:
+    def reject(self, which: Bool, status: PointStatus) -> None:
         """Take the numbers of points away and say why."""
         self.status[which] = status
         for name in ("w", "G", "epipolar_px", "epipolar_sigma_px", "covariance"):
@@ -98,9 +98,9 @@ class Fitter:
 
     Attributes
     ----------
-    least_zncc
+    min_zncc
         Correlation below which no comparison counts as a match, whatever the field looks like.
-    sight
+    visibility
         What the points see of their subsets; None: all of it.
     """
 
@@ -110,8 +110,8 @@ class Fitter:
     cur1: ImageData | None
     cur2: ImageData | None
     options: MatchOptions
-    least_zncc: float
-    sight: Sight | None = None
+    min_zncc: float
+    visibility: Visibility | None = None
 
     @property
     def comparisons(self) -> int:
@@ -138,7 +138,7 @@ class Fitter:
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and refuse those that cannot be right on their own."""
         n = len(xy_px)
-        visible = None if self.sight is None else self.sight.at(xy_px)
+        visible = None if self.visibility is None else self.visibility.at(xy_px)
         w, G = self._terms_of(w), None if G is None else self._terms_of(G)
         if self.cur1 is None or self.cur2 is None:
             s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options, visible)
@@ -159,12 +159,12 @@ class Fitter:
                 m.w, m.G, m.zncc, m.epipolar_px, m.epipolar_sigma_px, m.noise, m.covariance, m.iterations, m.status
             )
         with np.errstate(invalid="ignore"):
-            low = fits.ok & ~(fits.zncc.min(axis=1) >= self.least_zncc)
-            fits.refuse(low, PointStatus.LOW_CORRELATION)
-            off = fits.ok & ~(np.abs(fits.epipolar_px) <= _MOST_EPIPOLAR_PX)
-            fits.refuse(off, PointStatus.EPIPOLAR_MISMATCH)
+            low = fits.ok & ~(fits.zncc.min(axis=1) >= self.min_zncc)
+            fits.reject(low, PointStatus.LOW_CORRELATION)
+            off = fits.ok & ~(np.abs(fits.epipolar_px) <= _MAX_EPIPOLAR_PX)
+            fits.reject(off, PointStatus.EPIPOLAR_MISMATCH)
         ok = np.flatnonzero(fits.ok)
-        fits.refuse(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
+        fits.reject(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
         return fits
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
@@ -198,7 +198,7 @@ class Fitter:
         det = np.linalg.det(affine)
         size = np.linalg.norm(affine, axis=(1, 2)) / np.sqrt(2.0)
         with np.errstate(invalid="ignore"):
-            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < _MOST_SHEAR) & (det > size**2 / _MOST_SHEAR)
+            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < _MAX_SHEAR) & (det > size**2 / _MAX_SHEAR)
         return np.asarray(good)
 
 

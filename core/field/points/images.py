@@ -18,9 +18,9 @@ from core.noise import NoiseModel
 from core.settings import Interpolation
 
 _TILE = 48
-_LEAST_STRUCTURE = 0.2
+_MIN_STRUCTURE = 0.2
 _BAND_PX = 6.0
-_SMALLEST = 32
+_MIN_SIDE_PX = 32
 _BAND_PIXELS = 1_000_000
 
 
@@ -127,7 +127,7 @@ class MeasureImage:
                 x0, y0, x1, y1 = (round(v) for v in box)
                 pixels = pixels[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1]
             low, high = float(pixels.min()), float(pixels.max())
-            self._contrast[box] = low, high, largest_structure(pixels) if low < high else 0.0
+            self._contrast[box] = low, high, max_structure(pixels) if low < high else 0.0
         return self._contrast[box]
 
     def refuse_blank(self, box: tuple[float, float, float, float] | None = None) -> None:
@@ -137,10 +137,10 @@ class MeasureImage:
         remedy = "Check lens cap, light, exposure and that the specimen carries a pattern."
         if low == high:
             raise ImageError(f"{where} shows one grey level, {low:g}, everywhere.", code="image_blank", remedy=remedy)
-        if structure < _LEAST_STRUCTURE:
+        if structure < _MIN_STRUCTURE:
             raise ImageError(
                 f"{where} shows noise only: neighbouring pixels correlate by {structure:.2f} at most, a pattern by "
-                f"{_LEAST_STRUCTURE:g} and more (grey levels {low:g} to {high:g}).",
+                f"{_MIN_STRUCTURE:g} and more (grey levels {low:g} to {high:g}).",
                 code="image_blank",
                 remedy=remedy,
             )
@@ -156,27 +156,27 @@ def features_of(wanted: Sequence[tuple[MeasureImage, Box]], scale: int) -> list[
     return [image._features[box, scale] for image, box in wanted]
 
 
-def largest_structure(pixels: NDArray[Any]) -> float:
+def max_structure(pixels: NDArray[Any]) -> float:
     """Return the largest correlation between neighbouring pixels over tiles of 48 px, slow shading taken out.
 
     White camera noise gives 0 +- 0.02, a pattern that a camera resolves 0.5 and more. Tiles from the middle outwards;
     the search ends with the first one that leaves no doubt.
     """
     tile = min(_TILE, *pixels.shape)
-    places = [
+    corners = [
         (y, x) for y in range(0, pixels.shape[0] - tile + 1, tile) for x in range(0, pixels.shape[1] - tile + 1, tile)
     ]
     middle = ((pixels.shape[0] - tile) / 2, (pixels.shape[1] - tile) / 2)
-    places.sort(key=lambda place: (place[0] - middle[0]) ** 2 + (place[1] - middle[1]) ** 2)
+    corners.sort(key=lambda corner: (corner[0] - middle[0]) ** 2 + (corner[1] - middle[1]) ** 2)
     best = 0.0
-    for y, x in places:
+    for y, x in corners:
         t = pixels[y : y + tile, x : x + tile].astype(np.float32)
         t = t - cv2.GaussianBlur(t, (0, 0), _BAND_PX, borderType=cv2.BORDER_REPLICATE)
         variance = float(np.mean(t * t))
         if variance > 1e-4:
             lag = 0.5 * float(np.mean(t[:, 1:] * t[:, :-1]) + np.mean(t[1:] * t[:-1]))
             best = max(best, lag / variance)
-        if best > 2.0 * _LEAST_STRUCTURE:
+        if best > 2.0 * _MIN_STRUCTURE:
             break
     return best
 
@@ -237,9 +237,9 @@ def check_calibrated_size(name: str, shape: tuple[int, ...], size_px: tuple[int,
 
 
 def _checked(image: NDArray[Any], name: str) -> NDArray[Any]:
-    if image.ndim != 2 or min(image.shape) < _SMALLEST:
+    if image.ndim != 2 or min(image.shape) < _MIN_SIDE_PX:
         raise ImageError(
-            f"{name} has the shape {image.shape}; it must be 2-D and {_SMALLEST} px or more wide and high.",
+            f"{name} has the shape {image.shape}; it must be 2-D and {_MIN_SIDE_PX} px or more wide and high.",
             code="image_shape",
             remedy="Give one channel of grey levels.",
         )

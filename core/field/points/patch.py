@@ -70,6 +70,6 @@ def asked_for(patch: UsedPatch, asked: PatchSetting) -> PatchChoice:
     return PatchChoice(patch=patch, asked=asked, reason=f"{patch}: asked for")
 
 
-def told_um(mm: float) -> str:
+def format_length(mm: float) -> str:
     """Return a length in words, two digits."""
     return f"{1e3 * mm:.2g} um" if mm < 0.1 else f"{mm:.2g} mm"

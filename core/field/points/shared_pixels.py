@@ -35,7 +35,7 @@ class SharedPixels:
         True for patches of the second order.
     smoothing
         What the displacements were smoothed with; None: they are as measured. The correlation is then that of smoothed
-        displacements, in whole windows; that of positions is ``places``'.
+        displacements, in whole windows; that of positions is ``positions``'.
     """
 
     subset_px: float
@@ -55,7 +55,7 @@ class SharedPixels:
         return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "curved", field.smoothing)
 
     @property
-    def places(self) -> SharedPixels:
+    def positions(self) -> SharedPixels:
         """That of the points' positions, which are never smoothed."""
         return self if self.smoothing is None else replace(self, smoothing=None)
 
@@ -73,7 +73,7 @@ class SharedPixels:
         products = weight_products(of.window, of.order)
         return self._smoothed(products, dx_px, dy_px) / self._smoothed(products, 0.0, 0.0)
 
-    def correlation_with_place(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
+    def correlation_with_position(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
         """Return by how much the covariance of a position and a displacement falls off over their points' distance."""
         if self.smoothing is None:
             return self._of_subsets(dx_px, dy_px)
@@ -83,11 +83,11 @@ class SharedPixels:
 
     def factors(self, dx_px: ArrayLike, dy_px: ArrayLike, n: int) -> Float:
         """Return what each element of a covariance of X Y Z (U V W) falls off by over a distance, (..., n, n)."""
-        own = self.places.correlation(dx_px, dy_px)
+        own = self.positions.correlation(dx_px, dy_px)
         out = np.empty((*own.shape, n, n))
         out[...] = own[..., None, None]
         if n > 3 and self.smoothing is not None:
-            mixed = self.correlation_with_place(dx_px, dy_px)[..., None, None]
+            mixed = self.correlation_with_position(dx_px, dy_px)[..., None, None]
             out[..., :3, 3:], out[..., 3:, :3] = mixed, mixed
             out[..., 3:, 3:] = self.correlation(dx_px, dy_px)[..., None, None]
         return out

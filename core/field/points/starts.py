@@ -74,8 +74,8 @@ def depth_per_px(pair: StereoPair, rays: Float, w0: Float) -> Float:
         return np.asarray(step / np.maximum(image_shift_px(pair, rays, w0, w0 + step), 1e-12))
 
 
-def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, least_cosine: float = 0.1) -> np.ndarray:
-    """Return (n,) whether the patch shows its front to both cameras, no steeper than ``least_cosine``.
+def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: float = 0.1) -> np.ndarray:
+    """Return (n,) whether the patch shows its front to both cameras, no steeper than ``min_cosine``.
 
     The plane w0 + w1 X + w2 Y = 1/Z has the camera-1 normal (w1, w2, w0 - w1 Xc - w2 Yc).
     """
@@ -87,4 +87,4 @@ def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, least_cosine:
         view1 = point / np.linalg.norm(point, axis=-1, keepdims=True)
         view2 = (point - centre2) / np.linalg.norm(point - centre2, axis=-1, keepdims=True)
         c1, c2 = np.sum(normal * view1, axis=-1), np.sum(normal * view2, axis=-1)
-        return np.asarray((w[:, 0] > 0) & (c1 > least_cosine) & (c2 > least_cosine))
+        return np.asarray((w[:, 0] > 0) & (c1 > min_cosine) & (c2 > min_cosine))

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Float
-from core.field.region.line_crossings import find_near, look, parted_neighbours
+from core.field.region.line_crossings import find_near, mark_visible, separated_neighbours
 from core.field.region.neighbours import REACH
 from core.field.region.region import PointGrid
-from core.field.region.visibility import AT_ONCE, CHUNK, Sight, over
+from core.field.region.visibility import AT_ONCE, CHUNK, Visibility, over
 from core.matching.arguments import VisiblePixels
 from core.threads import run_ranges
 
@@ -21,13 +21,13 @@ MARGIN_PX = 2.0
 """How near to a cut, or to a mask's black, no pixel counts."""
 
 
-def with_sight(grid: PointGrid, subset_px: int) -> PointGrid:
+def with_visibility(grid: PointGrid, subset_px: int) -> PointGrid:
     """Return the grid with what its points see; the same grid where that is known, or nothing is in the way."""
-    if grid.sight is None and not grid.cuts and grid.white is None:
+    if grid.visibility is None and not grid.cuts and grid.white is None:
         return grid
-    if grid.sight is not None and grid.sight.subset_px == subset_px:
+    if grid.visibility is not None and grid.visibility.subset_px == subset_px:
         return grid
-    return replace(grid, sight=_find(grid, subset_px))
+    return replace(grid, visibility=_find(grid, subset_px))
 
 
 def patches_seen(
@@ -58,9 +58,11 @@ def patches_seen(
     index = np.flatnonzero(near)
     for start in range(0, len(index), at_once):
         some = index[start : start + at_once]
-        places = np.ascontiguousarray(xy[some])
+        centres = np.ascontiguousarray(xy[some])
         patches, counts = np.empty((len(some), width, width), np.uint8), np.empty(len(some), np.int32)
-        run_ranges(over(look, places, width, margin_px, pieces, white, clear, patches, counts), len(some), AT_ONCE)
+        run_ranges(
+            over(mark_visible, centres, width, margin_px, pieces, white, clear, patches, counts), len(some), AT_ONCE
+        )
         yield points[some], patches
 
 
@@ -80,7 +82,7 @@ def _clear_of(white: NDArray[np.uint8], margin_px: float) -> tuple[NDArray[np.ui
     return clear, np.asarray(cv2.integral(1 - white), np.int32)
 
 
-def _find(grid: PointGrid, subset: int) -> Sight:
+def _find(grid: PointGrid, subset: int) -> Visibility:
     pieces, white = _obstacles(grid)
     clear, black_sums = _clear_of(white, MARGIN_PX)
     xy = np.ascontiguousarray(grid.xy_px.reshape(-1, 2))
@@ -96,16 +98,20 @@ def _find(grid: PointGrid, subset: int) -> Sight:
     n_kept = 0
     for start in range(0, len(index), CHUNK):
         some = index[start : start + CHUNK]
-        places = np.ascontiguousarray(xy[some])
+        centres = np.ascontiguousarray(xy[some])
         patches, counts = np.empty((len(some), subset, subset), np.uint8), np.empty(len(some), np.int32)
-        run_ranges(over(look, places, subset, MARGIN_PX, pieces, white, clear, patches, counts), len(some), AT_ONCE)
+        run_ranges(
+            over(mark_visible, centres, subset, MARGIN_PX, pieces, white, clear, patches, counts), len(some), AT_ONCE
+        )
         share[some] = counts / float(subset * subset)
         cut = counts < subset * subset
         of_point[some[cut]] = n_kept + np.arange(int(cut.sum()), dtype=np.int32)
         n_kept += int(cut.sum())
         kept.append(patches[cut])
     patches = np.concatenate(kept) if kept else np.zeros((0, subset, subset), np.uint8)
-    parted = np.zeros(grid.shape, np.uint32)
+    separated = np.zeros(grid.shape, np.uint32)
     x, y = np.ascontiguousarray(grid.x_px), np.ascontiguousarray(grid.y_px)
-    run_ranges(lambda first, last: parted_neighbours(first, last, x, y, REACH, pieces, white, parted), grid.shape[0], 4)
-    return Sight(xy, grid.shape, grid.step_px, pieces, white, VisiblePixels(patches, of_point), share, parted)
+    run_ranges(
+        lambda first, last: separated_neighbours(first, last, x, y, REACH, pieces, white, separated), grid.shape[0], 4
+    )
+    return Visibility(xy, grid.shape, grid.step_px, pieces, white, VisiblePixels(patches, of_point), share, separated)

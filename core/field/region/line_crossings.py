@@ -53,7 +53,7 @@ def stays_white(ax, ay, bx, by, white):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def part(first, last, a, b, pieces, white, out):
+def find_separated(first, last, a, b, pieces, white, out):
     """Fill ``out`` (n,) bool: whether the lines from a to b (n, 2) meet a piece or leave the white."""
     for i in range(first, last):
         out[i] = meets(a[i, 0], a[i, 1], b[i, 0], b[i, 1], pieces) or not stays_white(
@@ -62,7 +62,7 @@ def part(first, last, a, b, pieces, white, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def parted_neighbours(first, last, x, y, reach, pieces, white, out):
+def separated_neighbours(first, last, x, y, reach, pieces, white, out):
     """Fill ``out`` (r, c) uint32: bit k is set where neighbour k of a point cannot be seen from it.
 
     Neighbours in rows and columns from -reach to reach, row by row, the point itself left out.
@@ -143,7 +143,7 @@ def find_near(first, last, xy, subset, margin, pieces, black_sums, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def look(first, last, xy, subset, margin, pieces, white, clear, patches, counts):
+def mark_visible(first, last, xy, subset, margin, pieces, white, clear, patches, counts):
     """Fill ``patches`` (n, subset, subset) uint8: 1 where the point sees the pixel, and the pixel may count.
 
     Parameters

@@ -74,7 +74,7 @@ def _medians(values, network, n, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion, difference, spread, count):
+def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, motion, difference, spread, count):
     """Own value minus the median of the neighbours' predictions, and the predictions' median absolute deviation.
 
     Parameters
@@ -85,8 +85,8 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
         ``sorting_network(24)``.
     ok
         (r, c) bool.
-    parted
-        (r, c) uint32, see ``core.field.region.line_crossings.parted_neighbours``; empty where nothing parts neighbours.
+    separated
+        (r, c) uint32, as :func:`core.field.region.line_crossings.separated_neighbours`; empty without cuts and mask.
     rays, w, G
         (r, c, 3), (r, c, 3 or more), (r, c, 3, 3 or more).
     motion
@@ -122,7 +122,7 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
                             j = c + dc
                             if not ok[r, c] or not ok[i, j]:
                                 continue
-                            if parted.shape[0] > 0 and (parted[r, c] >> np.uint32(place)) & np.uint32(1):
+                            if separated.shape[0] > 0 and (separated[r, c] >> np.uint32(place)) & np.uint32(1):
                                 continue
                             k = c - start
                             n[k] += 1
@@ -155,7 +155,7 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_median(first, last, x, v, triplets, flat_below, residual, least):
+def least_median(first, last, x, v, triplets, flat_below, residual, medians):
     """Find the linear map through three of a place's samples that has the least median residual over all of them.
 
     Parameters
@@ -170,14 +170,14 @@ def least_median(first, last, x, v, triplets, flat_below, residual, least):
         Triplets that span a triangle of less than half this area say nothing about slopes.
     residual
         (m, k) out: of the best map; not finite where there is none.
-    least
+    medians
         (m,) out: its median, inf where there is none.
     """
     samples, dimensions = v.shape[1], v.shape[2]
     r, ordered = np.empty(samples), np.empty(samples)
     half = samples // 2
     for m in range(first, last):
-        least[m] = np.inf
+        medians[m] = np.inf
         for n in range(samples):
             residual[m, n] = np.inf
         for s in range(triplets.shape[0]):
@@ -202,7 +202,7 @@ def least_median(first, last, x, v, triplets, flat_below, residual, least):
                     place -= 1
                 ordered[place] = value
             middle = ordered[half] if samples % 2 == 1 else 0.5 * (ordered[half - 1] + ordered[half])
-            if middle < least[m]:
-                least[m] = middle
+            if middle < medians[m]:
+                medians[m] = middle
                 for n in range(samples):
                     residual[m, n] = r[n]

@@ -15,9 +15,9 @@ from core.field.region.cuts import Cuts
 from core.settings import SUBSET_PX
 
 if TYPE_CHECKING:
-    from core.field.region.visibility import Sight
+    from core.field.region.visibility import Visibility
 
-_MOST_POINTS = 20_000_000
+_MAX_POINTS = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class PointGrid:
         Lines over which nothing reaches, cracks and borders of holes; or None.
     white
         (rows, cols) of camera 1's image, True where the mask lets the surface be seen; None without a mask.
-    sight
-        What the points see of their subsets past cuts and mask, see :func:`core.field.region.find_visible.with_sight`;
-        None as long as it is not found, and where nothing is in the way.
+    visibility
+        Visible pixels of each point's subset, see :func:`core.field.region.find_visible.with_visibility`; None before
+        it is computed, and without cuts and mask.
     """
 
     x_px: Float
@@ -50,7 +50,7 @@ class PointGrid:
     extent_px: tuple[float, float, float, float]
     cuts: Cuts | None = None
     white: Bool | None = None
-    sight: Sight | None = None
+    visibility: Visibility | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -81,9 +81,9 @@ class PointGrid:
             )
         n_x = int(np.floor((x1_px - x0_px) / step_px + 1e-9)) + 1
         n_y = int(np.floor((y1_px - y0_px) / step_px + 1e-9)) + 1
-        if n_x * n_y > _MOST_POINTS:
+        if n_x * n_y > _MAX_POINTS:
             raise RegionError(
-                f"the region holds {n_x} x {n_y} points, more than {_MOST_POINTS:,}.",
+                f"the region holds {n_x} x {n_y} points, more than {_MAX_POINTS:,}.",
                 code="region_too_large",
                 remedy="Give a larger step or a smaller region.",
             )
@@ -158,7 +158,7 @@ class PointGrid:
 
     def _with_cuts(self, more: Cuts) -> PointGrid:
         lines = (*(self.cuts.lines_px if self.cuts else ()), *more.lines_px)
-        return replace(self, cuts=Cuts(lines) if lines else None, sight=None)
+        return replace(self, cuts=Cuts(lines) if lines else None, visibility=None)
 
     def within_mask(self, mask: ArrayLike) -> PointGrid:
         """Keep only the points whose centre lies on the white (non-zero) of a mask the size of camera 1's image.
@@ -173,7 +173,7 @@ class PointGrid:
         off = (col < 0) | (row < 0) | (col >= m.shape[1]) | (row >= m.shape[0])
         white = m[np.clip(row, 0, m.shape[0] - 1), np.clip(col, 0, m.shape[1] - 1)]
         both = m if self.white is None or self.white.shape != m.shape else m & self.white
-        return replace(self, allowed=self.allowed & (white | off), white=both, sight=None)
+        return replace(self, allowed=self.allowed & (white | off), white=both, visibility=None)
 
 
 def check_region(

@@ -18,7 +18,7 @@ from core.robust import spread_indices
 
 _ALIKE = 0.85  # correlation of a square, twice a subset wide, with another place; random speckles reach half of it
 _OWN_PEAK = 0.5  # what hangs together with the square's own place above this is its own peak
-_LEAST_HALF_PX = 12
+_MIN_HALF_PX = 12
 _TRIED = 24
 
 
@@ -47,8 +47,8 @@ def _second_peak(pixels: NDArray[Any], xy_px: Float, subset_px: int) -> float:
     """Highest correlation of the square about a place with another one; -1 where there is no room."""
     rows, cols = pixels.shape
     x, y = (round(float(v)) for v in xy_px)
-    half = min(max(subset_px, _LEAST_HALF_PX), x, y, cols - 1 - x, rows - 1 - y)
-    if half < _LEAST_HALF_PX:
+    half = min(max(subset_px, _MIN_HALF_PX), x, y, cols - 1 - x, rows - 1 - y)
+    if half < _MIN_HALF_PX:
         return -1.0
     reach = half + 2 * subset_px
     left, top = max(x - reach, 0), max(y - reach, 0)

@@ -15,19 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
-from core.field.region.line_crossings import part, variances
+from core.field.region.line_crossings import find_separated, variances
 from core.field.region.neighbours import REACH
 from core.matching.arguments import VisiblePixels
 from core.threads import run_ranges
 
-LEAST_SHARE = 0.25
+MIN_SHARE = 0.25
 """Of a subset's pixels; a point that sees fewer is not measured."""
 AT_ONCE = 256
 CHUNK = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Visibility:
     """What each of the n points of a grid sees.
 
     Attributes
@@ -40,8 +40,8 @@ class Sight:
         Pixels that count, of the points that do not see all of their subset.
     share
         (n,) share of the subset's pixels that count.
-    parted
-        (r, c) uint32, bits as :func:`core.field.region.line_crossings.parted_neighbours`.
+    separated
+        (r, c) uint32, bits as :func:`core.field.region.line_crossings.separated_neighbours`.
     """
 
     xy_px: Float
@@ -51,7 +51,7 @@ class Sight:
     white: NDArray[np.uint8]
     visible: VisiblePixels
     share: Float
-    parted: NDArray[np.uint32]
+    separated: NDArray[np.uint32]
 
     @property
     def subset_px(self) -> int:
@@ -61,7 +61,7 @@ class Sight:
     @property
     def enough(self) -> Bool:
         """(r, c) which points see enough of their subset to be measured."""
-        return np.asarray(self.share >= LEAST_SHARE).reshape(self.shape)
+        return np.asarray(self.share >= MIN_SHARE).reshape(self.shape)
 
     @property
     def whole(self) -> Bool:
@@ -84,19 +84,23 @@ class Sight:
             raise ValueError("a place that is not a point of the grid")
         return VisiblePixels(self.visible.patches, self.visible.of_point[index])
 
-    def apart(self, a_px: Float, b_px: Float) -> Bool:
+    def are_separated(self, a_px: Float, b_px: Float) -> Bool:
         """Return (n,) whether places a and b (n, 2) do not see each other."""
         out = np.zeros(len(a_px), bool)
         a, b = (np.ascontiguousarray(p, dtype=np.float64) for p in (a_px, b_px))
-        run_ranges(lambda first, last: part(first, last, a, b, self.pieces_px, self.white, out), len(out), 4 * AT_ONCE)
+        run_ranges(
+            lambda first, last: find_separated(first, last, a, b, self.pieces_px, self.white, out),
+            len(out),
+            4 * AT_ONCE,
+        )
         return out
 
-    def parted_at(self, dr: int, dc: int) -> Bool:
+    def separated_at(self, dr: int, dc: int) -> Bool:
         """Return (n,) whether the neighbour ``dr`` rows and ``dc`` columns away, up to two, is parted from a point."""
         wide = 2 * REACH + 1
-        place = (dr + REACH) * wide + dc + REACH
-        bit = place - (1 if place > wide * wide // 2 else 0)
-        return np.asarray((self.parted.ravel() >> np.uint32(bit)) & np.uint32(1), dtype=bool)
+        index = (dr + REACH) * wide + dc + REACH
+        bit = index - (1 if index > wide * wide // 2 else 0)
+        return np.asarray((self.separated.ravel() >> np.uint32(bit)) & np.uint32(1), dtype=bool)
 
     def correct_variance(self, variance: Float, image: Float32) -> Float:
         """Return grey-level variances (n,) with those of cut subsets taken over the pixels that count alone."""
@@ -107,8 +111,8 @@ class Sight:
         of = self.visible.of_point[index]
         for start in range(0, len(index), CHUNK):
             some = slice(start, start + CHUNK)
-            chosen, places, out = patches[of[some]], xy[some], own[some]
-            run_ranges(over(variances, image, places, chosen, out), len(out), AT_ONCE)
+            chosen, centres, out = patches[of[some]], xy[some], own[some]
+            run_ranges(over(variances, image, centres, chosen, out), len(out), AT_ONCE)
         result = variance.copy()
         result[index] = own
         return result

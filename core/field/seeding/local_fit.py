@@ -18,7 +18,7 @@ _AT_ONCE = 256
 _WIDER = 4  # times the neighbours are looked through for those that a place sees
 _ENOUGH = 0.7  # of the neighbours wanted
 
-Apart = Callable[[Float, Float], Bool]
+AreSeparated = Callable[[Float, Float], Bool]
 
 
 class LocalFits(NamedTuple):
@@ -46,20 +46,20 @@ class LocalFits(NamedTuple):
 
 
 def robust_local_fits(
-    places: Float,
+    centres: Float,
     points: Float,
     values: Float,
     *,
     neighbours: int = 14,
     tolerance: float,
     seed: int = 0,
-    apart: Apart | None = None,
+    are_separated: AreSeparated | None = None,
 ) -> LocalFits:
     """Fit value = a + B (x - place) to the nearest points by least median of squares, then least squares on inliers.
 
     Parameters
     ----------
-    places
+    centres
         (M, 2) where the fits are wanted.
     points, values
         (N, 2) and (N, d) scattered samples, some of them wrong.
@@ -69,25 +69,25 @@ def robust_local_fits(
         Residual up to which a neighbour counts as an inlier, in the values' unit.
     seed
         Of the random triplets: equal input gives equal output.
-    apart
+    are_separated
         Tells of places (n, 2) and (n, 2) which do not see each other; only samples that a place sees take part.
     """
-    m, d = len(places), values.shape[1]
+    m, d = len(centres), values.shape[1]
     k = min(neighbours, len(points))
     empty = LocalFits(np.full((m, d), np.nan), np.full((m, d, 2), np.nan), np.full(m, np.inf), np.zeros(m), np.zeros(m))
     if k < 4 or m == 0:
         return empty
-    wide = k if apart is None else min(_WIDER * k, len(points))
-    found, index = cKDTree(points).query(places, k=wide)
+    wide = k if are_separated is None else min(_WIDER * k, len(points))
+    found, index = cKDTree(points).query(centres, k=wide)
     distance, seen = np.asarray(found), np.ones(m, bool)
-    if apart is not None:
-        over = apart(np.repeat(places, wide, axis=0), points[index.ravel()]).reshape(m, wide)
+    if are_separated is not None:
+        over = are_separated(np.repeat(centres, wide, axis=0), points[index.ravel()]).reshape(m, wide)
         nearest = np.argsort(over, axis=1, kind="stable")[:, :k]
         distance, index, over = (np.take_along_axis(a, nearest, axis=1) for a in (distance, index, over))
         seen = (~over).sum(axis=1) >= _ENOUGH * k
         # in the place of those that are missing the nearest one again, which says nothing new
         distance, index = np.where(over, distance[:, :1], distance), np.where(over, index[:, :1], index)
-    x = points[index] - places[:, None, :]  # (M, K, 2)
+    x = points[index] - centres[:, None, :]  # (M, K, 2)
     v = values[index]
     scale = np.maximum(distance.max(axis=1), 1e-12)
     A = np.concatenate([np.ones((m, k, 1)), x / scale[:, None, None]], axis=2)

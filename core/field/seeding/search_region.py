@@ -10,8 +10,8 @@ from core.field.points.features import Box
 from core.field.seeding.epipolar_search import DEPTH_SPAN, nominal_depth
 
 _COMFORTABLE_PIXELS = 800_000  # of an image: a few thousand keypoints on a fine texture, in a quarter of a second
-_FEWEST_PIXELS = 100_000  # of the region: some hundred keypoints
-_MOST_PIXELS = 8_000_000  # of an image, first
+_MIN_PIXELS = 100_000  # of the region: some hundred keypoints
+_MAX_PIXELS = 8_000_000  # of an image, first
 _ALONG_A_SIDE = 9
 _DEPTHS = 400
 _MARGIN_PX = 32
@@ -57,8 +57,8 @@ def scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int
     """
     area = [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in boxes]
     comfortable = int(np.ceil(np.sqrt(sum(area) / 2.0 / _COMFORTABLE_PIXELS)))
-    first = min(comfortable, int(np.sqrt(area[0] / _FEWEST_PIXELS)))
-    first = max(first, 1, int(np.ceil(np.sqrt(max(r * c for r, c in shapes) / _MOST_PIXELS))))
+    first = min(comfortable, int(np.sqrt(area[0] / _MIN_PIXELS)))
+    first = max(first, 1, int(np.ceil(np.sqrt(max(r * c for r, c in shapes) / _MAX_PIXELS))))
     out = [first]
     while out[-1] > 1:
         out.append(out[-1] // 2)

@@ -16,7 +16,7 @@ from core.cameras.stereo import StereoPair
 from core.errors import RegionError
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import Starts, depth_per_px
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.field.seeding.epipolar_search import sweep
 from core.field.seeding.scattered_matches import ScatteredMotion, ScatteredShape, combine, motion_starts, shape_starts
 from core.matching.fit import no_motion
@@ -25,7 +25,7 @@ from core.status import PointStatus
 
 _FAR_PX = 4.0
 _POINTS_PER_SEED = 60
-_FEWEST_SEEDS, _MOST_SEEDS = 24, 240
+_MIN_SEEDS, _MAX_SEEDS = 24, 240
 _ROUNDS = 3
 _SWEEPS = 16
 _AMBIGUOUS = 0.9
@@ -75,7 +75,7 @@ def as_seeds(seeds: Sequence[Seed | Sequence[float]] | NDArray[Any]) -> tuple[Se
 
 
 def nearest_points(
-    seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_px: float, sight: Sight | None = None
+    seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_px: float, visibility: Visibility | None = None
 ) -> NDArray[np.intp]:
     """Return the index of the measurable point nearest to each seed, on the seed's own side of cuts.
 
@@ -88,9 +88,9 @@ def nearest_points(
     out = []
     for seed in seeds:
         distance = np.linalg.norm(xy_px[candidates] - np.asarray(seed.xy_px), axis=1)
-        if sight is not None:
+        if visibility is not None:
             place = np.broadcast_to(np.asarray(seed.xy_px, dtype=np.float64), (len(candidates), 2))
-            distance[sight.apart(place, xy_px[candidates])] = np.inf
+            distance[visibility.are_separated(place, xy_px[candidates])] = np.inf
         best = int(np.argmin(distance))
         if distance[best] > reach_px:
             far = f"{distance[best]:.0f} px" if np.isfinite(distance[best]) else "across a crack or a mask's black"
@@ -120,7 +120,7 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
         First, second and third choice of every cell of the region.
     """
     index = np.flatnonzero(usable)
-    count = float(np.clip(len(index) / _POINTS_PER_SEED, _FEWEST_SEEDS, _MOST_SEEDS))
+    count = float(np.clip(len(index) / _POINTS_PER_SEED, _MIN_SEEDS, _MAX_SEEDS))
     span = np.maximum(np.ptp(xy_px[index], axis=0), 1.0)
     # cells by area of usable points, so that thin or holed regions get their share
     cell = np.sqrt(np.prod(span) / count * max(len(index), 1) / max(len(usable), 1))
@@ -143,7 +143,7 @@ def refine(fitter: Fitter, xy_px: Float, starts: Starts, *, far_px: float = _FAR
     """Refine seeds; those that run away from their start are refused."""
     fits = fitter.fit(xy_px, starts.w, starts.G)
     away = fits.ok & fitter.far_from_start(xy_px, fits, starts.w, starts.G, far_px)
-    fits.refuse(away, PointStatus.NOT_CONVERGED)
+    fits.reject(away, PointStatus.NOT_CONVERGED)
     return fits
 
 
@@ -167,8 +167,8 @@ def seeds_from_matches(
     if len(source) < 4:
         return 0
     support = np.asarray(cKDTree(source).query(xy_px, k=min(8, len(source)))[0])[:, -1]
-    if fitter.sight is not None:  # next to a cut only where there is nothing else
-        support = np.where(fitter.sight.whole, support, support + np.ptp(xy_px))
+    if fitter.visibility is not None:  # next to a cut only where there is nothing else
+        support = np.where(fitter.visibility.whole, support, support + np.ptp(xy_px))
     found = 0
     for choice in spread(xy_px, usable & (points.status == PointStatus.NOT_SEEDED), support):
         index = choice
@@ -181,7 +181,7 @@ def seeds_from_matches(
             motion,
             shape_now,
             None if known_w is None else known_w[index],
-            fitter.sight,
+            fitter.visibility,
         )
         finite = np.isfinite(starts.w).all(axis=1)
         if starts.G is not None:
@@ -205,17 +205,17 @@ def starts_at(
     motion: ScatteredMotion | None,
     shape_now: ScatteredShape | None,
     known_w: Float | None,
-    sight: Sight | None = None,
+    visibility: Visibility | None = None,
 ) -> Starts:
     """Return start values at places from the matches that they see, taking the measured shape where there is one."""
-    apart = None if sight is None else sight.apart
-    w = shape_starts(pair, shape, xy_px, apart).w
+    are_separated = None if visibility is None else visibility.are_separated
+    w = shape_starts(pair, shape, xy_px, are_separated).w
     if known_w is not None:
         measured = np.isfinite(known_w).all(axis=1)
         w[measured] = known_w[measured, :3]
     if motion is None or shape_now is None:
         return Starts(w)
-    return motion_starts(pair, w, motion, shape_now, xy_px, apart)
+    return motion_starts(pair, w, motion, shape_now, xy_px, are_separated)
 
 
 def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_px: Float) -> PointFits:
@@ -227,18 +227,18 @@ def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_p
     w, _ = sweep(fitter.pair, image1, image2, xy_px, subset_px=max(fitter.options.subset_px, 25))
     if len(w) == 0:
         return PointFits.empty(1, 1)
-    places = np.broadcast_to(xy_px, (len(w), 2))
-    fits = shape.fit(places, w, None)
+    positions = np.broadcast_to(xy_px, (len(w), 2))
+    fits = shape.fit(positions, w, None)
     quality = fits.quality
     best = int(np.argmax(quality))
     if quality[best] <= 0.0:
         return PointFits.empty(1, 1)
-    ray = fitter.pair.cam1.rays_cam(places).xyz_mm
-    apart = (
+    ray = fitter.pair.cam1.rays_cam(positions).xyz_mm
+    distinct = (
         np.abs(fits.w[:, 0] - fits.w[best, 0]) / depth_per_px(fitter.pair, ray, np.full(len(w), fits.w[best, 0])) > 2.0
     )
     # residual energy 1 - zncc tells candidates apart better than zncc itself
-    if np.any(apart & (1.0 - quality < (1.0 - quality[best]) / _AMBIGUOUS + 0.01)):
+    if np.any(distinct & (1.0 - quality < (1.0 - quality[best]) / _AMBIGUOUS + 0.01)):
         return PointFits.empty(1, 1)
     return fits.take(np.array([best]))
 
@@ -290,7 +290,7 @@ def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
     return chosen.take(np.array([int(np.argmax(chosen.quality))]))
 
 
-def swept_places(xy_px: Float, usable: Bool) -> NDArray[np.intp]:
+def swept_positions(xy_px: Float, usable: Bool) -> NDArray[np.intp]:
     """Choose up to 16 places for the depth search, the region's middle first."""
     index = np.flatnonzero(usable)
     if len(index) <= _SWEEPS:

@@ -188,7 +188,7 @@ def in_step(a: Float, b: Float) -> Float:
     return np.asarray(both * (1.0 + cross / np.maximum(trace, np.finfo(np.float64).tiny))[:, None, None])
 
 
-def place_covariance(G: Float, covariance: Float) -> Float:
+def position_covariance(G: Float, covariance: Float) -> Float:
     """Covariance (n, 2, 2) of where camera 1 sees points at t, normalised, from that of their (w0, G, offset)."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     J = np.zeros((len(G), 2, 3))

@@ -23,7 +23,7 @@ _SURELY = 1.1  # times the noise between the cameras: what is above is not noise
 
 
 @dataclass(frozen=True, eq=False)
-class HandedOn:
+class Propagated:
     """Covariances (n, 2, 2) of n points' places in an image that a leg beginning there inherits.
 
     Attributes
@@ -38,38 +38,38 @@ class HandedOn:
     pattern: Float
 
     @staticmethod
-    def nothing(n: int) -> HandedOn:
+    def nothing(n: int) -> Propagated:
         """Return what the first reference inherits."""
-        return HandedOn(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
+        return Propagated(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
 
-    def at(self, index: NDArray[np.intp]) -> HandedOn:
+    def at(self, index: NDArray[np.intp]) -> Propagated:
         """Return those of some points."""
-        return HandedOn(self.noise[index], self.pattern[index])
+        return Propagated(self.noise[index], self.pattern[index])
 
-    def through(self, J: Float) -> HandedOn:
+    def through(self, J: Float) -> Propagated:
         """Return them in other coordinates, whose derivatives are J (n, 2, 2)."""
         turned = np.swapaxes(J, 1, 2)
-        return HandedOn(J @ self.noise @ turned, J @ self.pattern @ turned)
+        return Propagated(J @ self.noise @ turned, J @ self.pattern @ turned)
 
 
-def handed_on(
+def propagate(
     pair: StereoPair,
-    place_px: Float,
+    position_px: Float,
     offset: Float,
     G: Float,
     own: Float,
-    before: HandedOn,
+    before: Propagated,
     pattern: Float,
     subset_px: int,
     slope_share: float,
-) -> HandedOn:
+) -> Propagated:
     """Return what of the places' covariance at t a leg beginning there inherits, px^2.
 
     Parameters
     ----------
     pair
         The calibrated cameras.
-    place_px, offset
+    position_px, offset
         (n, 2) where camera 1 saw the points at the match's reference, and from the pixel in the middle of the subset to
         there, normalised.
     G
@@ -86,12 +86,12 @@ def handed_on(
     """
     seen, slopes = G[:, :2, 0] / G[:, 2:, 0], image_slopes(G)
     to_px = pair.cam1.lens.image_jacobian(seen)
-    from_px = np.linalg.inv(pair.cam1.lens.image_jacobian(pair.cam1.rays_cam(place_px).xyz_mm[:, :2]))
+    from_px = np.linalg.inv(pair.cam1.lens.image_jacobian(pair.cam1.rays_cam(position_px).xyz_mm[:, :2]))
     now_px = pair.cam1.lens.image_from_normalised(seen).xy
     middle_px = now_px - np.einsum("nij,nj->ni", to_px @ slopes, offset)
     common, samples = common_share(to_px @ slopes @ from_px, np.rint(now_px) - middle_px, subset_px)
     left = np.maximum(0.5 * (1.0 + samples) - common + slope_share, 0.0) * (1.0 - pattern)
-    return HandedOn(
+    return Propagated(
         before.noise + left[:, None, None] * own, in_step(before.pattern, pattern[:, None, None] * own)
     ).through(to_px)
 
@@ -119,7 +119,7 @@ def pattern_share(zncc: Float) -> Float:
     return np.where(np.isfinite(share), np.maximum(share, 0.0), 0.0)
 
 
-def first_handed_on(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> HandedOn:
+def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> Propagated:
     """Return what a leg inherits that begins at a field matched against the first reference itself, px^2."""
     n = len(totals.w)
     C = field.covariance.reshape(n, 6, 6).astype(np.float32).astype(np.float64)
@@ -132,13 +132,13 @@ def first_handed_on(field: Field, pair: StereoPair, totals: Totals, subset_px: i
     J /= P[:, 2, None, None]
     own = J @ mm @ np.swapaxes(J, 1, 2)
     xy = np.stack([field.x_px, field.y_px], axis=-1).reshape(n, 2)
-    return handed_on(
+    return propagate(
         pair,
         xy,
         np.zeros((n, 2)),
         totals.G,
         own,
-        HandedOn.nothing(n),
+        Propagated.nothing(n),
         pattern_share(field.zncc).ravel(),
         subset_px,
         slope_share,

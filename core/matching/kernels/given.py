@@ -144,7 +144,7 @@ class WorkSpace(NamedTuple):
     work: Any
 
 
-class ObservedSpace(NamedTuple):
+class ClusterRobustSpace(NamedTuple):
     """The fit's space and, besides, one block's pixels, the blocks' sums, and what they do to the unknowns."""
 
     fit: WorkSpace
@@ -161,4 +161,4 @@ class FitKernels(NamedTuple):
     point: Any
     space: Any
     observed: Any
-    observed_space: Any
+    cluster_robust_space: Any

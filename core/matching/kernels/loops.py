@@ -104,7 +104,7 @@ def _spline(order: int, rows: list[Any], first: list[Any], tx: Vec, ty: Vec) -> 
     return value
 
 
-def _place(c: list[Vec], x: Vec, y: Vec) -> Vec:
+def _position(c: list[Vec], x: Vec, y: Vec) -> Vec:
     """Cubic polynomial with coefficients in the order of :func:`monomials`."""
     along_x = c[0] + x * (c[1] + x * (c[3] + x * c[6]))
     return along_x + y * ((c[2] + x * (c[4] + x * c[7])) + y * ((c[5] + x * c[8]) + y * c[9]))
@@ -185,9 +185,9 @@ def _comparison(order: int, degree: int) -> Any:
             k_next = cgutils.alloca_once(builder, ir.VectorType(INT, LANES))
             tx_next, ty_next = (cgutils.alloca_once(builder, vector) for _ in range(2))
 
-            def find_place(offset: Any) -> None:
+            def find_position(offset: Any) -> None:
                 x, y = (load(builder, at(builder, ref[r], offset)) for r in (X, Y))
-                xt, yt = _place(warp[:10], x, y), _place(warp[10:20], x, y)
+                xt, yt = _position(warp[:10], x, y), _position(warp[10:20], x, y)
                 xf, yf = xt.floor(), yt.floor()
                 k = builder.add(builder.mul(yf.to_int(), stride, flags=("nsw",)), xf.to_int(), flags=("nsw",))
                 builder.store(k, k_next)
@@ -197,7 +197,7 @@ def _comparison(order: int, degree: int) -> Any:
             def terms(offset: Any) -> list[Vec]:
                 first = _lanes(builder, builder.load(k_next))
                 tx, ty = Vec(builder, builder.load(tx_next)), Vec(builder, builder.load(ty_next))
-                find_place(builder.add(offset, LONG(LANES)))
+                find_position(builder.add(offset, LONG(LANES)))
                 x, y, f, weight, gx, gy = (load(builder, at(builder, row, offset)) for row in ref)
                 d = _spline(order, rows, first, tx, ty) * gain - (warp[21] + f)
                 a = weight * d
@@ -211,7 +211,7 @@ def _comparison(order: int, degree: int) -> Any:
                     *(by * m if m else by for m in columns),
                 ]
 
-            find_place(LONG(0))
+            find_position(LONG(0))
             _sum_up(builder, args[5], 3 + 2 * len(monomials(degree)), terms, data(context, builder, sig, args, 6), 0)
             return context.get_dummy_value()
 

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from core.matching.kernels.cluster_robust import make_cluster_robust
 from core.matching.kernels.given import FitKernels
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
@@ -22,7 +23,6 @@ from core.matching.kernels.noise import (
     share_correction,
     unlike_noise,
 )
-from core.matching.kernels.observed import make_observed
 from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
@@ -225,4 +225,4 @@ def make_motion(degree: int) -> FitKernels:
         share = setting.slope_noise * variance * p / weakest
         return texture_status(status, share, sigma, setting.max_sigma, worst), iterations
 
-    return FitKernels(motion_point, parts.work_space, *make_observed(degree, 3, parts, freeze))
+    return FitKernels(motion_point, parts.work_space, *make_cluster_robust(degree, 3, parts, freeze))

@@ -13,7 +13,7 @@ from core.matching.kernels.naming import inner
 VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
 ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
 UNLIKE = 1.5  # small differences of the views raise residuals by less, and do not pull the solution as noise does
-LEAST_CORRELATION = 0.05  # what is matched at all has several times as much
+MIN_CORRELATION = 0.05  # what is matched at all has several times as much
 MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
 
 # an image's levels; the misfit is the residuals' sum of squares, then the noise of its interpolated grey levels over
@@ -93,8 +93,8 @@ def noise_from_residuals(levels, images, n, unknowns):
 
 @inner
 def best_correlation(levels, images):
-    """Of the comparisons, at least ``LEAST_CORRELATION``."""
-    best = LEAST_CORRELATION
+    """Of the comparisons, at least ``MIN_CORRELATION``."""
+    best = MIN_CORRELATION
     for k in range(images):
         best = max(best, levels[k, ZNCC])
     return best
@@ -116,7 +116,7 @@ def unlike_noise(levels, images, n, unknowns):
     for k in range(images):
         one = _one_variance(levels, k)
         smallest = min(smallest, one)
-        largest = max(largest, one * (best / max(levels[k, ZNCC], LEAST_CORRELATION)) ** 2)
+        largest = max(largest, one * (best / max(levels[k, ZNCC], MIN_CORRELATION)) ** 2)
     return max(largest - UNLIKE * smallest, 0.0) / freedom
 
 

@@ -12,11 +12,11 @@ from core.cameras.stereo import StereoPair
 from core.errors import InputError
 from core.matching.arguments import VisiblePixels, degree_of, given_to_kernels, own, points_of, run_kernel, starts_of
 from core.matching.image import ImageData, prepare
-from core.matching.kernels.drivers import observe_points, observed_space
+from core.matching.kernels.drivers import cluster_robust_points, cluster_robust_space
 from core.matching.options import MatchOptions
 
 
-def observed_covariance(
+def cluster_robust_covariance(
     pair: StereoPair,
     images: Sequence[ArrayLike | ImageData],
     xy_px: ArrayLike,
@@ -71,7 +71,7 @@ def observed_covariance(
     given = given_to_kernels(pair, prepared, xy, unknown_w, options, visible, G=unknown_g, epipolar_px=offsets)
     what, q = ("shape", 2) if G is None else ("motion", 5)
     out = np.full((n, q * q), np.nan)
-    status, _ = run_kernel(observe_points[what][degree], observed_space[what][degree], given, out)
+    status, _ = run_kernel(cluster_robust_points[what][degree], cluster_robust_space[what][degree], given, out)
     known: Bool = status == 0
     out[~known] = np.nan
     return out.reshape(n, q, q), known

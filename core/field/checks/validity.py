@@ -21,7 +21,7 @@ from core.field.points.fitter import PointFits
 from core.field.points.starts import depth_per_px
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
 from core.field.region.trend import smooth_terms
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, spread_indices
 from core.status import PointStatus
 from core.threads import run_ranges
@@ -34,7 +34,7 @@ _TREND_POINTS = 3000  # carry a trend of seven terms: it then scatters by a twen
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateOptions:
+class ValidityOptions:
     """Limits of the checks.
 
     Parameters
@@ -45,34 +45,34 @@ class GateOptions:
         Added to it, so that a noise-free field keeps its second-best points.
     correlation_sigmas
         Allowed excess of log(1 - zncc) over what texture and place predict, in robust standard deviations.
-    correlation_least_factor, correlation_most_factor
+    correlation_min_factor, correlation_max_factor
         1 - zncc up to the first times its expectation is never refused; above the second always.
     neighbour_sigmas
         Allowed disagreement with the neighbours' patches, in robust standard deviations.
     neighbour_floor_px
         Added to it, as a distance in the images: curvature between neighbouring points must fit in.
-    least_cluster
+    min_cluster
         Groups of fewer connected points are not trusted.
-    largest_sigma_px
+    max_sigma_px
         Scatter of a point's place in camera 1, px, as its residuals show it, beyond which a point whose residuals are
         not noise is refused: five times as much is half a pixel.
-    largest_depth_sigma_px
+    max_depth_sigma_px
         The same of what its depth is told by, in camera 2: it counts several times in depth.
     """
 
     epipolar_sigmas: float = 5.0
     epipolar_floor_px: float = 0.005
     correlation_sigmas: float = 6.0
-    correlation_least_factor: float = 1.35
-    correlation_most_factor: float = 12.0
+    correlation_min_factor: float = 1.35
+    correlation_max_factor: float = 12.0
     neighbour_sigmas: float = 6.0
     neighbour_floor_px: float = 0.05
-    least_cluster: int = 4
-    largest_sigma_px: float = 0.1
-    largest_depth_sigma_px: float = 0.05
+    min_cluster: int = 4
+    max_sigma_px: float = 0.1
+    max_depth_sigma_px: float = 0.05
 
 
-def apply_gates(
+def apply_validity_checks(
     points: PointFits,
     *,
     pair: StereoPair,
@@ -80,8 +80,8 @@ def apply_gates(
     xy_px: Float,
     rays: Float,
     texture: Float,
-    options: GateOptions,
-    sight: Sight | None = None,
+    options: ValidityOptions,
+    visibility: Visibility | None = None,
 ) -> int:
     """Refuse points in place; returns how many.
 
@@ -99,24 +99,24 @@ def apply_gates(
         (n,) grey-level variance of camera 1's subset.
     options
         Limits.
-    sight
+    visibility
         Which points see each other; all of them when left out.
     """
     before = int(points.ok.sum())
     few = before < _FEW
     terms = smooth_terms(xy_px)
     if not few:
-        _gate_correlation(points, terms, texture, options)
+        _check_correlation(points, terms, texture, options)
     for _ in range(2):
-        if _gate_neighbours(points, pair, shape, rays, options, sight, few=few) == 0:
+        if _check_neighbours(points, pair, shape, rays, options, visibility, few=few) == 0:
             break
     if not few:
-        _gate_epipolar(points, terms, options)
-        _gate_clusters(points, shape, options, sight)
+        _check_epipolar(points, terms, options)
+        _check_clusters(points, shape, options, visibility)
     return before - int(points.ok.sum())
 
 
-def _gate_correlation(points: PointFits, terms: Float, texture: Float, options: GateOptions) -> None:
+def _check_correlation(points: PointFits, terms: Float, texture: Float, options: ValidityOptions) -> None:
     ok = np.flatnonzero(points.ok)
     if len(ok) < _FEW:
         return
@@ -127,14 +127,14 @@ def _gate_correlation(points: PointFits, terms: Float, texture: Float, options: 
         r, sigma = _robust_residual(trend, y)
         limit = np.clip(
             options.correlation_sigmas * sigma,
-            np.log(options.correlation_least_factor),
-            np.log(options.correlation_most_factor),
+            np.log(options.correlation_min_factor),
+            np.log(options.correlation_max_factor),
         )
         worst = np.maximum(worst, r - limit)
-    points.refuse(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
+    points.reject(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
 
 
-def _gate_epipolar(points: PointFits, terms: Float, options: GateOptions) -> None:
+def _check_epipolar(points: PointFits, terms: Float, options: ValidityOptions) -> None:
     for _ in range(4):
         ok = np.flatnonzero(points.ok)
         if len(ok) < _FEW:
@@ -149,11 +149,11 @@ def _gate_epipolar(points: PointFits, terms: Float, options: GateOptions) -> Non
         bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
         if not bad.any():
             return
-        points.refuse(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
+        points.reject(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
 
 
 def neighbour_disagreement(
-    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, sight: Sight | None = None
+    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, visibility: Visibility | None = None
 ) -> tuple[Float, Float, NDArray[np.int32]]:
     """Return (n, 4) disagreement with the neighbours and its local spread in px, and how many neighbours spoke.
 
@@ -165,11 +165,11 @@ def neighbour_disagreement(
     spread = np.full((rows, cols, N_QUANTITIES), np.nan)
     count = np.zeros((rows, cols), np.int32)
     motion = points.zncc.shape[1] == 3
-    parted = np.zeros((0, 0), np.uint32) if sight is None else sight.parted
+    separated = np.zeros((0, 0), np.uint32) if visibility is None else visibility.separated
     arrays = (
         _NETWORK,
         points.ok.reshape(shape),
-        parted,
+        separated,
         np.ascontiguousarray(rays.reshape(rows, cols, 3)),
         np.ascontiguousarray(points.w.reshape(rows, cols, -1)),
         np.ascontiguousarray(points.G.reshape(rows, cols, 3, -1)),
@@ -189,55 +189,57 @@ def neighbour_disagreement(
     return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
 
 
-def _gate_neighbours(
+def _check_neighbours(
     points: PointFits,
     pair: StereoPair,
     shape: tuple[int, int],
     rays: Float,
-    options: GateOptions,
-    sight: Sight | None,
+    options: ValidityOptions,
+    visibility: Visibility | None,
     *,
     few: bool,
 ) -> int:
-    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, sight)
+    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, visibility)
     ok = points.ok
     bad = np.zeros(len(ok), bool)
-    heard = ok & (count >= 2)
+    used = ok & (count >= 2)
     for q in range(N_QUANTITIES if points.zncc.shape[1] == 3 else 1):
-        d = np.abs(difference[heard, q])
+        d = np.abs(difference[used, q])
         if len(d) == 0:
             continue
         sigma = MAD_TO_SIGMA * float(np.median(d))
-        limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[heard, q]) + options.neighbour_floor_px
-        bad[np.flatnonzero(heard)[d > limit]] = True
+        limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[used, q]) + options.neighbour_floor_px
+        bad[np.flatnonzero(used)[d > limit]] = True
     if not few:
         bad |= ok & (count < 2)  # nothing near it that could confirm it
-    points.refuse(bad, PointStatus.NEIGHBOUR_MISMATCH)
+    points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
     return int(bad.sum())
 
 
-def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions, sight: Sight | None) -> None:
-    if sight is not None:
-        group = _connected(points.ok, shape, sight)
-        points.refuse(points.ok & (np.bincount(group)[group] < options.least_cluster), PointStatus.NEIGHBOUR_MISMATCH)
+def _check_clusters(
+    points: PointFits, shape: tuple[int, int], options: ValidityOptions, visibility: Visibility | None
+) -> None:
+    if visibility is not None:
+        group = _connected(points.ok, shape, visibility)
+        points.reject(points.ok & (np.bincount(group)[group] < options.min_cluster), PointStatus.NEIGHBOUR_MISMATCH)
         return
-    n, labels, facts, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
     if n < 2:
         return
-    size = facts[:, cv2.CC_STAT_AREA].copy()
-    size[0] = options.least_cluster
-    points.refuse((size[labels] < options.least_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
+    size = stats[:, cv2.CC_STAT_AREA].copy()
+    size[0] = options.min_cluster
+    points.reject((size[labels] < options.min_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
 
 
-def _connected(ok: Bool, shape: tuple[int, int], sight: Sight) -> NDArray[np.int32]:
+def _connected(ok: Bool, shape: tuple[int, int], visibility: Visibility) -> NDArray[np.int32]:
     """Label (n,) the groups of points that are connected through neighbours that see each other."""
     rows, cols = shape
-    place = np.arange(rows * cols).reshape(shape)
+    index = np.arange(rows * cols).reshape(shape)
     ends = []
     for dr, dc in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        here = place[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
+        here = index[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
         there = here + dr * cols + dc
-        together = ok[here] & ok[there] & ~sight.parted_at(dr, dc)[here]
+        together = ok[here] & ok[there] & ~visibility.separated_at(dr, dc)[here]
         ends.append(np.stack([here[together], there[together]]))
     a, b = np.concatenate(ends, axis=1)
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))

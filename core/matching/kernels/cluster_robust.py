@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from core.matching.kernels.given import ObservedSpace
+from core.matching.kernels.given import ClusterRobustSpace
 from core.matching.kernels.linear import solve
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
 from core.matching.kernels.naming import kernel
@@ -42,15 +42,15 @@ from core.matching.kernels.vectors import LANES
 from core.matching.kernels.warp import lens_jacobian, set_up_warp
 
 BLOCK_PX = 5.5  # about a good speckle; in smaller blocks less of what hangs together is seen
-FEWEST_BLOCKS, MOST_BLOCKS = 3, 7  # across the subset
+MIN_BLOCKS, MAX_BLOCKS = 3, 7  # across the subset
 
 
 def blocks_across(subset_px: int) -> int:
     """Return into how many blocks a subset is cut each way."""
-    return int(min(max(round(subset_px / BLOCK_PX), FEWEST_BLOCKS), MOST_BLOCKS))
+    return int(min(max(round(subset_px / BLOCK_PX), MIN_BLOCKS), MAX_BLOCKS))
 
 
-def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) -> tuple[Any, Any]:
+def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: Any) -> tuple[Any, Any]:
     """Compile the observed covariance for the fit that ``parts`` and ``freeze`` belong to.
 
     Parameters
@@ -69,11 +69,11 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
     unknowns = (4 if images == 3 else 1) * few + 1
     sum_pixels = make_sum_pixels(degree)
 
-    def work_space(subset: int) -> ObservedSpace:
+    def work_space(subset: int) -> ClusterRobustSpace:
         across = blocks_across(subset)
         widest = -(-subset // across) + 1
         width = (widest * widest + LANES - 1) // LANES * LANES + LANES
-        return ObservedSpace(
+        return ClusterRobustSpace(
             fit=make_space(subset),
             part=np.zeros((N_ROWS, width), np.float32),
             scores=np.empty((images, across * across, n_columns)),
@@ -123,7 +123,7 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
-    def observed_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
+    def cluster_robust_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
         """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status, and 0."""
         subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
         fit_space, part, scores, pull, z, sums = space
@@ -214,4 +214,4 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
             out[i] *= factor_on
         return OK, 0
 
-    return observed_point, work_space
+    return cluster_robust_point, work_space
