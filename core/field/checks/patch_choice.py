@@ -136,8 +136,8 @@ def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: 
     shown = float(np.mean(noise[used])) * 2.0 * np.sqrt(2.0 / len(used))
     bias = format_length(error) if error2 > shown else f"less than {format_length(np.sqrt(error2 + shown))}"
     numbers = (
-        f"plane patches have a bias of {bias} (rms) in {_quantity(plane)} here and {format_length(plane_noise)} of noise "
-        f"besides; curved ones have {format_length(curved_noise)} of noise"
+        f"plane patches have a bias of {bias} (rms) in {_quantity(plane)} here and {format_length(plane_noise)} of "
+        f"noise besides; curved ones have {format_length(curved_noise)} of noise"
     )
     return PatchChoice(
         patch="curved" if curved else plane,
