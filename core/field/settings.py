@@ -1,4 +1,4 @@
-"""How a field is measured: what a user can set."""
+"""Settings of the measurement of a field."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from core.settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class MeasureOptions:
-    """How a field is measured.
+    """Settings of the measurement of a field.
 
     Parameters
     ----------
@@ -32,20 +32,21 @@ class MeasureOptions:
         Width of the square subset.
     patch
         ``stretch`` (default) or the paper's ``rigid``: plane patches. ``curved``: second-order surface and
-        displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever errs less on the field
-        in all; shape and motion are decided apart, and a sequence that went over to curved patches keeps them.
+        displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever has the smaller total
+        error on the field; decided separately for shape and motion. A sequence that changed to curved patches keeps
+        them.
     interpolation
         ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
     min_zncc
-        Correlation below which no comparison is a match. The field's own scatter decides above it.
+        Correlation below which no comparison is a match. Above it the field's own statistics decide.
     validity
-        Limits of the checks that every point must pass.
+        Limits of the validity checks.
     prefilter_px
-        Standard deviation of a Gaussian that all images are blurred with before they are compared, px; 0: none. At
-        most a quarter of the subset. It takes interpolation's bias off sharp texture and costs random error.
+        Standard deviation of a Gaussian that all images are blurred with before they are compared, px; 0: none. At most
+        a quarter of the subset. It removes the interpolation bias of sharp texture and increases the random error.
     noise
-        Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and say how far
-        points scatter. None: from what a match leaves, all pixels alike.
+        Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and give the
+        covariances. None: noise from the residuals of each match, all pixels alike.
     """
 
     subset_px: int = SUBSET_PX.default
@@ -71,7 +72,7 @@ class MeasureOptions:
     def of(
         settings: AnalysisSettings, noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
     ) -> MeasureOptions:
-        """Return the options that an analysis' settings say."""
+        """Return the options of an analysis' settings."""
         return MeasureOptions(
             subset_px=settings.subset_px,
             patch=settings.patch,

@@ -1,13 +1,13 @@
-"""Reference gradients that are best under noise: a Wiener derivative made for the image's own texture.
+"""Reference gradients that are best under noise: a Wiener derivative for the image's own texture.
 
-The matcher takes the derivatives of all comparisons from the reference's gradients, and their noise costs random
-error: a tenth and more in coarse texture. Of all linear filters the one that comes closest to the true derivative,
-``i k S / (S + N)`` for a texture of spectrum S under white noise N, loses least. Its error is uncorrelated with its
-output, so the sum of its squares is at once the sensitivity of the sums to a shift: no noise has to be taken out.
-It is odd, so its noise does not correlate with a pixel's own noise, and no bias follows.
+The matcher takes the derivatives of all comparisons from the reference's gradients, and their noise costs random error:
+a tenth and more in coarse texture. Of all linear filters the one that comes closest to the true derivative, ``i k S /
+(S + N)`` for a texture of spectrum S under white noise N, loses least. Its error is uncorrelated with its output, so
+the sum of its squares is also the sensitivity of the sums to a shift: no noise has to be subtracted. It is odd, so its
+noise does not correlate with a pixel's own noise, and no bias follows.
 
-What the spline between the pixels cannot carry, near the highest frequencies, is counted as noise too, and more than
-it weighs: it shifts all points by one amount that depends on the sub-pixel phase, and no mean takes that out.
+The interpolation error of the spline, near the highest frequencies, is counted as noise too, and with a larger weight:
+it shifts all points by one amount that depends on the sub-pixel phase, and averaging does not remove it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _RINGS = (0.6, 0.8)  # of the Nyquist frequency, both ways: beyond the second, l
 _FALL = 2.0  # by which the sharpest texture's spectrum falls from one ring to the next
 _LEVEL = 1.05  # rings that differ by less show noise alone
 _MAX_NOISE = 0.5  # of the grey levels' variance
-_INTERPOLATION_COUNTS = 100.0  # a third off the mean error in sharp speckle, for 1 % of random error there
+_INTERPOLATION_COUNTS = 100.0  # reduces the bias in sharp speckle by a third, for 1 % of random error there
 _BLANK = 1e-20  # of the squared grey levels: rounding
 _MIN_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
 
@@ -48,11 +48,11 @@ class SlopeFilter:
     along_x, along_y
         (7, 7) taps.
     gain
-        Variance of the filtered gradient per variance of the pixels' noise, mean of both directions.
+        Variance of the filtered gradient over the variance of the pixels' noise, mean of both directions.
     share
         Share of noise in the filtered gradient's squares over the image's texture.
     noise_variance
-        Of a pixel, grey levels squared, as the filter was made for.
+        Of a pixel, grey levels squared, for which the filter was made.
     """
 
     along_x: Float
@@ -83,26 +83,25 @@ def slope_filter(
     blur: Blur | None = None,
     unblurred: NDArray[Any] | None = None,
 ) -> SlopeFilter | None:
-    """Make the filter for an image; None if it shows nothing.
+    """Make the filter for an image; None for an image without texture.
 
     Parameters
     ----------
     image
         (rows, cols) grey levels; tiles of it without texture are left out.
     order
-        Of the spline that carries the other images, 3 or 5.
+        Of the spline that interpolates the other images, 3 or 5.
     noise_variance
         Of a pixel, grey levels squared; from the spectrum's floor when left out. Texture that is sharp enough to reach
-        the floor raises it: the gradients then lose a little, and the covariance stays on the safe side.
+        the floor raises it: the gradients are then slightly worse, and the covariance is not too small.
     blur, unblurred
-        What the image was blurred with, and the image before: its noise is no longer white, and its spectrum shows no
-        floor.
+        The image's blur, and the image before it: its noise is no longer white, and its spectrum has no floor.
 
     Notes
     -----
     The taps h solve the normal equations ``sum_j (R + E)(i - j) h(j) = (d S)(i)``: R the image's autocorrelation, S the
     texture's, E that of the interpolation error, d the derivative. That is the quintic spline's: the exact one would
-    make too much of what is aliased. They are then scaled so that the sum of squares equals the sensitivity.
+    amplify aliased frequencies. They are then scaled so that the sum of squares equals the sensitivity.
     """
     spectra, window = _spectra(image)
     if spectra is None:
@@ -169,7 +168,7 @@ def _spectra(image: NDArray[Any]) -> tuple[Float | None, Float]:
 def _floor(spectra: Float) -> float:
     """Noise variance from the spectrum where both frequencies are highest, median over the tiles.
 
-    White noise is level there, texture still falls: what falls between two rings is taken for texture and carried on.
+    White noise is level there, texture still decreases: the decrease between two rings is extrapolated as texture.
     """
     side = spectra.shape[1]
     frequency = np.minimum.outer(np.abs(np.fft.fftfreq(side)), np.fft.rfftfreq(side)) * 2.0
@@ -179,7 +178,8 @@ def _floor(spectra: Float) -> float:
 
 
 def _interpolation_error(side: int, order: int) -> Float:
-    """What a spline makes wrong of each frequency (side, side // 2 + 1): share of its power, mean over the phase."""
+    """Return the interpolation error of each frequency (side, side // 2 + 1): share of its power, mean over the
+    phase."""
 
     def along(w: Float) -> Float:
         if order == 3:

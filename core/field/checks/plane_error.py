@@ -1,9 +1,9 @@
-"""What plane patches err by because of curvature, told from a field that they measured.
+"""Bias of plane patches on a curved surface, estimated from a field that they measured.
 
-A plane patch takes the average of what it lies on: it is off by half the second derivative times the subset's second
-moment, (h^2 - 1) / 12 px^2 for a subset h wide, along both axes. Inverse depth w and the columns G of the motion are
-linear in the image for planes that move, whatever their tilt, so it is their Laplacian over neighbouring points that
-counts. The neighbours are taken a subset's width away, where their noise is their own.
+A plane patch averages the surface below it: its bias is half the second derivative times the subset's second moment,
+(h^2 - 1) / 12 px^2 for a subset h wide, along both axes. Inverse depth w and the columns G of the motion are linear in
+the image for planes that move, whatever their tilt, so it is their Laplacian over neighbouring points that counts. The
+neighbours are taken a subset's width away, where their noise is their own.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _FAR_SUBSETS = 2.0
 
 
 class PlaneError(NamedTuple):
-    """What a field says of the plane patches that it was measured with.
+    """Bias and noise of the plane patches that a field was measured with.
 
     Attributes
     ----------
     error_mm
-        rms error of position (shape) or displacement (motion), the noise of this estimate taken off.
+        rms bias of position (shape) or displacement (motion), less the noise of this estimate.
     below_mm
-        What it may be at most, two standard deviations of the estimate up.
+        Upper bound of it, two standard deviations of the estimate above.
     noise_mm
         Standard deviation of position or displacement from image noise, rms.
     """
@@ -41,7 +41,7 @@ class PlaneError(NamedTuple):
 def plane_error(
     points: PointFits, *, shape: tuple[int, int], rays: Float, step_px: float, subset_px: int
 ) -> PlaneError | None:
-    """Estimate the plane patches' error; None where too few points have neighbours, or they lie too far away.
+    """Estimate the plane patches' bias.
 
     Parameters
     ----------
@@ -52,7 +52,12 @@ def plane_error(
     rays
         (n, 3) normalised.
     step_px, subset_px
-        Distance of the points and width of the subset.
+        Distance of the points and width of the subset, px.
+
+    Returns
+    -------
+    PlaneError or None
+        None where too few points have neighbours, or the neighbours lie too far away.
     """
     separation = max(1, int(np.ceil(subset_px / step_px)))
     rows, cols = shape
@@ -81,7 +86,7 @@ def plane_error(
     if known.sum() < _MIN_POINTS:
         return None
     square, noise, own = square[known], noise[known], variance.reshape(shape)[inner][known]
-    # two per cent are not heard: single wrong points, and steps at cracks and edges
+    # two per cent are left out: single wrong points, and steps at cracks and edges
     used = np.argsort(square / noise)[: len(square) - int(np.ceil(_TRIMMED * len(square)))]
     error2 = max(float(np.mean(square[used] - noise[used])), 0.0)
     below2 = error2 + 2.0 * float(np.std(square[used])) / np.sqrt(len(used))
@@ -89,7 +94,7 @@ def plane_error(
 
 
 def _laplacian(f: Float, k: int) -> Float:
-    """Sum of the four neighbours ``k`` places away minus four times the middle, without the rim."""
+    """Sum of the four neighbours ``k`` points away minus four times the middle, without the rim."""
     return f[: -2 * k, k:-k] + f[2 * k :, k:-k] + f[k:-k, : -2 * k] + f[k:-k, 2 * k :] - 4.0 * f[k:-k, k:-k]
 
 

@@ -1,8 +1,8 @@
-"""Every point that is shipped is checked again, against what the field itself says a right match looks like.
+"""Validity checks: every point is compared with the statistics of its own field.
 
-Four checks: correlation in each comparison, offset across the epipolar line, agreement with the neighbours' patches,
-and support by other points at all. Limits are multiples of the field's own robust scatter, so they follow noise,
-texture and lens; the floors keep a nearly perfect field from throwing away its second-best points.
+Four checks: correlation in each comparison, epipolar offset, agreement with the neighbours' patches, and the size of
+the cluster that a point belongs to. Limits are multiples of the field's own robust standard deviations, so they follow
+noise, texture and lens; the floors keep the second-best points of a nearly perfect field.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from core.threads import run_ranges
 _FEW = 12
 _NETWORK = sorting_network(24)
 _ROWS_AT_ONCE = 4
-_SETTLED = 0.01  # of the scatter: a robust fit that moves less has converged, far below what a limit of 5 sigma feels
-_TREND_POINTS = 3000  # carry a trend of seven terms: it then scatters by a twentieth of the points' own scatter
+_SETTLED = 0.01  # of the standard deviation: a robust fit that moves less has converged
+_TREND_POINTS = 3000  # for a trend of seven terms: its standard deviation is then a twentieth of the points' own
 
 
 @dataclass(frozen=True, kw_only=True)
 class ValidityOptions:
-    """Limits of the checks.
+    """Limits of the validity checks.
 
     Parameters
     ----------
@@ -44,20 +44,20 @@ class ValidityOptions:
     epipolar_floor_px
         Added to it, so that a noise-free field keeps its second-best points.
     correlation_sigmas
-        Allowed excess of log(1 - zncc) over what texture and place predict, in robust standard deviations.
+        Allowed excess of log(1 - zncc) over its trend with texture and position, in robust standard deviations.
     correlation_min_factor, correlation_max_factor
-        1 - zncc up to the first times its expectation is never refused; above the second always.
+        1 - zncc up to the first times its expectation is never rejected; above the second always.
     neighbour_sigmas
         Allowed disagreement with the neighbours' patches, in robust standard deviations.
     neighbour_floor_px
         Added to it, as a distance in the images: curvature between neighbouring points must fit in.
     min_cluster
-        Groups of fewer connected points are not trusted.
+        Groups of fewer connected points are rejected.
     max_sigma_px
-        Scatter of a point's place in camera 1, px, as its residuals show it, beyond which a point whose residuals are
-        not noise is refused: five times as much is half a pixel.
+        Standard deviation of a point's position in camera 1, px, from its residuals, beyond which a point whose
+        residuals are not noise is rejected: five times as much is half a pixel.
     max_depth_sigma_px
-        The same of what its depth is told by, in camera 2: it counts several times in depth.
+        The same of its position in camera 2, which determines the depth and counts several times there.
     """
 
     epipolar_sigmas: float = 5.0
@@ -83,7 +83,7 @@ def apply_validity_checks(
     options: ValidityOptions,
     visibility: Visibility | None = None,
 ) -> int:
-    """Refuse points in place; returns how many.
+    """Apply all checks, rejecting points in place.
 
     Parameters
     ----------
@@ -100,7 +100,12 @@ def apply_validity_checks(
     options
         Limits.
     visibility
-        Which points see each other; all of them when left out.
+        Which points are neighbours across cuts and mask; None: all.
+
+    Returns
+    -------
+    int
+        Number of points rejected.
     """
     before = int(points.ok.sum())
     few = before < _FEW
@@ -141,11 +146,11 @@ def _check_epipolar(points: PointFits, terms: Float, options: ValidityOptions) -
             return
         e = points.epipolar_px[ok]
         r, sigma = _robust_residual(_at_points(terms, ok), e)
-        # plain and robust scatter about the field's middle too: the figures that a reader recomputes from the file
+        # plain and robust standard deviations about the field's middle too: a reader can recompute these from the file
         about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
         plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
-        scatter = MAD_TO_SIGMA * float(np.median(about_median))
-        middle = (about_median > options.epipolar_sigmas * scatter) & (about_median > options.epipolar_floor_px)
+        sigma_all = MAD_TO_SIGMA * float(np.median(about_median))
+        middle = (about_median > options.epipolar_sigmas * sigma_all) & (about_median > options.epipolar_floor_px)
         bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
         if not bad.any():
             return
@@ -155,9 +160,9 @@ def _check_epipolar(points: PointFits, terms: Float, options: ValidityOptions) -
 def neighbour_disagreement(
     points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, visibility: Visibility | None = None
 ) -> tuple[Float, Float, NDArray[np.int32]]:
-    """Return (n, 4) disagreement with the neighbours and its local spread in px, and how many neighbours spoke.
+    """Return (n, 4) disagreement with the neighbours and its local spread in px, and the number of neighbours compared.
 
-    The four are depth as camera 2 sees it, and displacement along x, y and (as camera 2 sees it) depth.
+    The four are depth, by its effect in camera 2's image, and displacement along x, y and depth, likewise.
     """
     rows, cols = shape
     n = rows * cols
@@ -211,7 +216,7 @@ def _check_neighbours(
         limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[used, q]) + options.neighbour_floor_px
         bad[np.flatnonzero(used)[d > limit]] = True
     if not few:
-        bad |= ok & (count < 2)  # nothing near it that could confirm it
+        bad |= ok & (count < 2)  # isolated points fail the check
     points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
     return int(bad.sum())
 
@@ -232,7 +237,7 @@ def _check_clusters(
 
 
 def _connected(ok: Bool, shape: tuple[int, int], visibility: Visibility) -> NDArray[np.int32]:
-    """Label (n,) the groups of points that are connected through neighbours that see each other."""
+    """Label (n,) the groups of points that are connected through neighbours, none across a cut."""
     rows, cols = shape
     index = np.arange(rows * cols).reshape(shape)
     ends = []
@@ -253,7 +258,7 @@ def _at_points(terms: Float, ok: NDArray[np.intp]) -> Float:
 def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
     """Return residuals about a robust linear fit (Tukey's biweight) and their robust standard deviation.
 
-    Of many points a few thousand carry the fit, spread over all of them by multiples of the golden section.
+    Of many points a few thousand are fitted, spread over all of them by multiples of the golden section.
     """
     n = len(values)
     some = slice(None) if n <= _TREND_POINTS else np.sort(spread_indices(n, _TREND_POINTS))

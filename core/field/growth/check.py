@@ -1,4 +1,4 @@
-"""Checks of the points that stand, and growth into what they emptied."""
+"""Checks of the valid points, and growth into the gaps that they leave."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from core.field.points.fitter import PointFits
 
 
 def check(inputs: FieldInputs, points: PointFits) -> None:
-    """Have every point that stands checked; those that fail are refused."""
+    """Apply the validity checks; points that fail are rejected."""
     apply_validity_checks(
         points,
         pair=inputs.pair,
@@ -28,7 +28,7 @@ def check(inputs: FieldInputs, points: PointFits) -> None:
 
 
 def grow_field(inputs: FieldInputs, state: GrowthState) -> int:
-    """Grow from the points that stand over all usable ones; returns how many were added."""
+    """Grow from the valid points over all usable ones; return the number of points added."""
     return grow(
         state.fitter,
         state.points,
@@ -42,7 +42,7 @@ def grow_field(inputs: FieldInputs, state: GrowthState) -> int:
 
 
 def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
-    """Grow, check, and grow into what the checks emptied."""
+    """Grow, check, and grow into the gaps that the checks leave."""
     for _ in range(3):
         if grow_field(inputs, state) == 0 and state.checked:
             break
@@ -52,7 +52,7 @@ def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 
 def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
-    """Correct the covariances by the residuals; refuse what scatters too far, and what the edges' blur reaches."""
+    """Test the residuals, then reject points whose patch leaves the images or the prefilter's valid area."""
     tested = residual_test(
         state.fitter,
         state.points,
@@ -62,7 +62,7 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         cancel=inputs.cancel,
     )
     if tested.rejected:
-        check(inputs, state.points)  # points that stand alone now have nothing to confirm them
+        check(inputs, state.points)  # isolated points fail the neighbour check
     mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
     if inputs.options.blur is not None:
         reject_near_edges(state.fitter, state.points, inputs.xy_px, inputs.options.blur)

@@ -1,7 +1,7 @@
-"""Growth: from points that stand to their neighbours, best first, in waves that keep the kernels busy.
+"""Growth: from valid points to their neighbours, best first, in waves large enough for the kernels.
 
 A neighbour's patch, extended to the new point's ray, is its start value. A point that fails is tried again from other
-neighbours. Nothing is ever filled in: what does not match stays empty.
+neighbours. No value is interpolated: a point that does not match stays empty.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from core.status import PointStatus
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
 _ALL_AT_ONCE = 512
-_MAX_BATCH = 4096  # a cancel is heard within a second even on a slow machine
+_MAX_BATCH = 4096  # a cancel takes effect within a second even on a slow machine
 _FAR_PX = 3.0
 _COUNT_AGAIN = 1.05
 ATTEMPTS = 4
-"""How often a point is started, each time from another neighbour."""
+"""Starts of a point at most, each from another neighbour."""
 
 
 class FitsPoints(Protocol):
-    """What growth needs of a matcher; :class:`core.field.points.fitter.Fitter` is one."""
+    """The matcher as growth uses it; :class:`core.field.points.fitter.Fitter` is one."""
 
     @property
     def comparisons(self) -> int:
@@ -44,7 +44,7 @@ class FitsPoints(Protocol):
         """Refine points from start values."""
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
-        """Return (n,) whether a fit has left the place it was started at."""
+        """Return (n,) True where a fit ended far from its start."""
 
 
 def fit_in_batches(
@@ -58,7 +58,7 @@ def fit_in_batches(
     far_px: float,
     cancel: CancelToken | None = None,
 ) -> Bool:
-    """Fit the points ``index`` from starts and write down what came; returns which stand.
+    """Fit the points ``index`` from starts and store the results; return (m,) True for the valid ones.
 
     A fit that ends further than ``far_px`` from its start has left the basin it was started in.
     """
@@ -77,16 +77,16 @@ def fit_in_batches(
 
 @dataclass(eq=False)
 class Attempts:
-    """What growth has tried on a grid of n points, so that nothing is tried twice.
+    """Starts already tried on a grid of n points, so that none is repeated.
 
     Attributes
     ----------
     neighbours
         (n, 8) index of each point's neighbours, -1 outside the grid and where a cut lies between.
     tried
-        (n, 8) from which of them the point was started before.
+        (n, 8) True for those from which the point was started before.
     left
-        (n,) how often it may still be started.
+        (n,) number of starts left.
     """
 
     neighbours: NDArray[np.int32]
@@ -95,7 +95,7 @@ class Attempts:
 
     @staticmethod
     def on(shape: tuple[int, int], visibility: Visibility | None = None) -> Attempts:
-        """Return the attempts of a grid of (rows, cols) on which nothing was tried."""
+        """Return the attempts of a grid of (rows, cols) before any start."""
         n = shape[0] * shape[1]
         index_of = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
         index_of[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
@@ -121,7 +121,7 @@ def grow(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> int:
-    """Grow from the points that stand over all usable ones; returns how many were added.
+    """Grow from the valid points over all usable ones.
 
     Parameters
     ----------
@@ -130,18 +130,23 @@ def grow(
     points
         n points of a grid; changed in place.
     attempts
-        What was tried before; changed in place.
+        Starts already tried; changed in place.
     xy_px, rays
         (n, 2) px, (n, 3) normalised.
     usable
-        (n,) which points may be measured.
+        (n,) True where a point may be measured.
     phase, progress, cancel
-        Reports and stop.
+        Name of the phase in progress reports, their receiver, and the means to stop.
+
+    Returns
+    -------
+    int
+        Number of points added.
 
     Notes
     -----
-    A wave looks at the front only: points that are open and may have a standing neighbour. So the work grows with the
-    number of points, not with points times waves.
+    A wave covers the front only: open points that may have a valid neighbour. So the work grows with the number of
+    points, not with points times waves.
     """
     total = int(usable.sum())
     quality = points.quality
@@ -150,7 +155,7 @@ def grow(
     while valid > 0:
         raise_if_cancelled(cancel)
         progress(phase, valid, total)
-        if valid > _COUNT_AGAIN * counted:  # what is normal for the field changes with its size
+        if valid > _COUNT_AGAIN * counted:  # the field's statistics change with its size
             min_quality, counted = _min_parent_zncc(quality), valid
             front = usable & (quality <= 0.0) & (attempts.left > 0)
         todo = np.flatnonzero(front)
@@ -160,7 +165,7 @@ def grow(
         choice = np.argmax(score, axis=1)
         best = np.take_along_axis(score, choice[:, None], axis=1)[:, 0]
         reachable = best > 0.0
-        front[todo[~reachable]] = False  # until a neighbour comes to stand
+        front[todo[~reachable]] = False  # until a neighbour becomes valid
         if not reachable.any():
             if valid == counted:
                 break
@@ -185,10 +190,10 @@ def grow(
         front[todo[good | (attempts.left[todo] <= 0)]] = False
         new = todo[good]
         quality[new] = points.zncc[new].min(axis=1)
-        beside, side = attempts.neighbours[new], np.arange(len(_OFFSETS)) ^ 2  # as the neighbour sees the new point
+        beside, side = attempts.neighbours[new], np.arange(len(_OFFSETS)) ^ 2  # seen from the neighbour
         inside = beside >= 0
         beside, side = beside[inside], np.broadcast_to(side, inside.shape)[inside]
-        attempts.tried[beside, side] = False  # a point that stood there before, and fell, had other values
+        attempts.tried[beside, side] = False  # a point that was valid there before, and was rejected, had other values
         front[beside[usable[beside] & (quality[beside] <= 0.0) & (attempts.left[beside] > 0)]] = True
         added += len(new)
         valid += len(new)
@@ -196,7 +201,7 @@ def grow(
 
 
 def _min_parent_zncc(quality: Float) -> float:
-    """Correlation of a point that may hand its values on: not far below the field's own."""
+    """Smallest correlation of a point whose values start a neighbour: not far below the field's own."""
     valid = quality[quality > 0.0]
     middle = float(np.median(valid))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(valid - middle)))

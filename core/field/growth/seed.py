@@ -1,4 +1,4 @@
-"""The first points of a field: from the last step, from given seeds, from feature matches, or from searches."""
+"""The first points of a field: from the previous step, from given seeds, from feature matches, or from searches."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 _MIN_MATCHES = 12
 _SAMPLE_SHARE = 0.7
 _REACH_STEPS = 2.0
-_SEARCHED = 6  # places
+_SEARCHED = 6  # positions
 
 
 def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> GrowthState:
-    """Put the first points of a shape down."""
+    """Seed a shape."""
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
         _given_shape(inputs, state, as_seeds(seeds))
@@ -66,7 +66,7 @@ def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> 
 def seed_motion(
     inputs: FieldInputs, state: GrowthState, shape: Field, previous: Field | None, seeds: Seeds | None
 ) -> GrowthState:
-    """Put the first points of a motion down: from the last step, where they stood, or from matches."""
+    """Seed a motion: from the previous step, at the reference positions, or from matches."""
     if not inputs.usable.any():
         return state
     state = keep_patch(inputs, state, previous)
@@ -89,7 +89,7 @@ def seed_motion(
 
 
 def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
-    """Seeds from feature matches; how many stand. Large images are reduced, less and less until seeds are found."""
+    """Seed from feature matches of reduced images, reduced less until seeds are found; return their number."""
     if not (inputs.usable & ~inputs.repeating).any():
         return 0
     reach = inputs.options.subset_px + inputs.grid.step_px
@@ -135,7 +135,7 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
 
 
 def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> GrowthState:
-    """Start all points from the last step's values; a sample of them stands already, fitted from these very starts."""
+    """Start all points from the previous step's values; a fitted sample of them is valid already."""
     if state.patch.patch == "curved":
         state = refit_curved(inputs, state)
     points = state.points
@@ -153,13 +153,13 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> Growt
 
 
 def _stayed(inputs: FieldInputs, state: GrowthState) -> bool:
-    """Try whether the surface is about where it was: not on a texture that looks alike a period further on."""
+    """Return True if the surface is about where it was; not tried on a texture that repeats itself."""
     w = inputs.known_w
     return w is not None and _sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)
 
 
 def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False) -> bool:
-    """Fit a spread sample from given starts; True (and the sample stands as seeds) if nearly all of it matches."""
+    """Fit a spread sample from given starts; return True, and keep the sample as seeds, if nearly all of it matches."""
     usable = inputs.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
     if once_only:
         usable &= ~inputs.repeating
@@ -195,7 +195,7 @@ def _put_one(state: GrowthState, i: np.intp, found: PointFits) -> None:
 
 
 def _rather_whole(inputs: FieldInputs, usable: Bool) -> Bool:
-    """Of usable points those that see all of their subset, where there are any: searches compare whole squares."""
+    """Of usable points those with a wholly visible subset, where there are any: searches compare whole squares."""
     whole = usable if inputs.visibility is None else usable & inputs.visibility.whole
     return whole if whole.any() else usable
 
@@ -227,5 +227,5 @@ def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ..
         raise_if_cancelled(inputs.cancel)
         _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
     if not state.points.ok.any():
-        # turned or stretched too far for a template: matches about the seed know how
+        # turned or stretched too far for a template: the matches about the seed give the deformation
         match_seeds(inputs, state)

@@ -1,10 +1,10 @@
 """Feature points of images and their matches: the raw material of automatic seeds.
 
-SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012), matched by the ratio test in both
-directions. Nothing here knows the cameras; the geometry filters come after.
+SIFT (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with RootSIFT descriptors (Arandjelovic and Zisserman 2012,
+doi:10.1109/CVPR.2012.6248018), matched by the ratio test in both directions. The cameras' geometry is applied later.
 
-Images are reduced to what seeds need, and worked on in tiles: all tiles of all images share the threads, and what is
-in memory at a time does not grow with the images.
+Images are reduced as far as seeds allow, and processed in tiles: all tiles of all images share the threads, and the
+memory in use does not grow with the images.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from core.arrays import Float, Float32
 from core.threads import run_ranges
 
 MAX_KEYPOINTS = 4000
-"""Matching grows with the square; so many find all the seeds that a field needs."""
+"""The time of matching grows with the square; this number is enough for the seeds of a field."""
 _RATIO = 0.85
 _CHUNK = 256
 _MIN_CONTRAST = 0.01
@@ -37,7 +37,8 @@ Box = tuple[int, int, int, int]
 class Features:
     """Keypoints of one image: ``xy_px`` (n, 2), unit ``descriptors`` (n, 128) float32.
 
-    ``scale`` says how many times smaller the image was when they were found: they are good to a third of that, in px.
+    ``scale`` is the factor by which the image was reduced when they were found: their standard deviation is a third of
+    it, px.
     """
 
     xy_px: Float
@@ -46,7 +47,7 @@ class Features:
 
 
 class Picture(NamedTuple):
-    """Where to look for features: an image (rows, cols) and a box (x0, y0, x1, y1) of it, half open."""
+    """An image (rows, cols) and the box (x0, y0, x1, y1), half open, in which features are searched for."""
 
     image: NDArray[Any]
     box: Box
@@ -62,7 +63,7 @@ def stretch_to_eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def reduced(image: NDArray[Any], scale: int) -> NDArray[Any]:
-    """Return the means of squares of ``scale`` x ``scale`` pixels, with their fractions; what is left over is cut."""
+    """Return the means of squares of ``scale`` x ``scale`` pixels, with their fractions; a remainder is cut off."""
     if scale == 1:
         return image
     rows, cols = image.shape[0] // scale * scale, image.shape[1] // scale * scale
@@ -149,7 +150,7 @@ def _tiles(shape: tuple[int, int]) -> list[Box]:
 
 
 def _search(picture: NDArray[np.uint8], core: Box, max_features: int) -> tuple[Float, Float32, Float]:
-    """Keypoints (n, 2) inside ``core``, their descriptors and strengths; what is around it helps the filters."""
+    """Keypoints (n, 2) inside ``core``, their descriptors and strengths; the rim around it is for the filters."""
     x0, y0, x1, y1 = _with_rim(Picture(picture, core), 1)
     sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=_MIN_CONTRAST)  # type: ignore[attr-defined]
     allowed = np.zeros((y1 - y0, x1 - x0), np.uint8)

@@ -1,4 +1,4 @@
-"""Images of a measurement: checked once, prepared once, features found once."""
+"""Images of a measurement: checked, prepared and searched for features once."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ _BAND_PIXELS = 1_000_000
 
 
 class MeasureImage:
-    """One image with what was computed from it.
+    """One image and the quantities computed from it.
 
     Parameters
     ----------
     image
         (rows, cols) grey levels uint8, uint16 or float; or an image already prepared.
     name
-        How errors call it.
+        Its name in errors.
     noise
-        The camera's noise in this very image, where nothing else is asked for.
+        The camera's noise in this very image, where no other model is given.
 
     Raises
     ------
@@ -60,7 +60,7 @@ class MeasureImage:
             self.pixels = image.pixels if image.unblurred is None else np.ascontiguousarray(image.unblurred)
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
             if image.blur is None:
-                self.noise = image.noise  # prepared with a model by hand, it keeps it where none is asked for
+                self.noise = image.noise  # prepared with a model by hand, it keeps it where none is given
                 self._prepared[kind, image.noise, None] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
@@ -83,7 +83,7 @@ class MeasureImage:
     def subset_variance(self, xy_px: Float, subset_px: int, blurred: ImageData | None = None) -> Float:
         """Return the grey-level variance (n,) in the square of ``subset_px`` about the pixels nearest to points (n, 2).
 
-        Kept for the last points that were asked for: those of a sequence are the same in every step.
+        The result is kept for the last points given: those of a sequence are the same in every step.
 
         Parameters
         ----------
@@ -117,9 +117,10 @@ class MeasureImage:
         return out
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
-        """Return smallest and largest grey level and the most that neighbouring pixels correlate, in a box or anywhere.
+        """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box or the whole
+        image.
 
-        Found on the first call; zero structure where there is one grey level.
+        Computed on the first call; zero structure where there is one grey level.
         """
         if box not in self._contrast:
             pixels = self.pixels
@@ -131,7 +132,7 @@ class MeasureImage:
         return self._contrast[box]
 
     def refuse_blank(self, box: tuple[float, float, float, float] | None = None) -> None:
-        """Raise ``image_blank`` if nothing but noise is seen in (x0, y0, x1, y1), or anywhere when left out."""
+        """Raise ``image_blank`` if there is only noise in (x0, y0, x1, y1), or in the whole image if left out."""
         low, high, structure = self.contrast(box)
         where = f"{self.name}" if box is None else f"{self.name} in the region"
         remedy = "Check lens cap, light, exposure and that the specimen carries a pattern."
@@ -160,7 +161,7 @@ def max_structure(pixels: NDArray[Any]) -> float:
     """Return the largest correlation between neighbouring pixels over tiles of 48 px, slow shading taken out.
 
     White camera noise gives 0 +- 0.02, a pattern that a camera resolves 0.5 and more. Tiles from the middle outwards;
-    the search ends with the first one that leaves no doubt.
+    the search ends with the first that clearly has a pattern.
     """
     tile = min(_TILE, *pixels.shape)
     corners = [
@@ -192,7 +193,7 @@ def same_size(a: MeasureImage, b: MeasureImage) -> None:
 
 
 def different(a: MeasureImage, b: MeasureImage) -> None:
-    """Raise ``same_image`` if both cameras are said to have taken the very same image."""
+    """Raise ``same_image`` if both cameras' images are equal, grey level by grey level."""
     if _same(a, b):
         raise ImageError(
             f"{a.name} and {b.name} are the same image, grey level by grey level.",
@@ -202,10 +203,10 @@ def different(a: MeasureImage, b: MeasureImage) -> None:
 
 
 def refuse_stale(ref1: MeasureImage, ref2: MeasureImage, now1: MeasureImage, now2: MeasureImage) -> None:
-    """Raise ``stale_image`` if one camera alone has its reference image at t, grey level by grey level.
+    """Raise ``stale_image`` if one camera's current image alone is its reference image, grey level by grey level.
 
     No camera takes the same noise twice: that image was never renewed. Matched with the other camera's it would give a
-    smooth and wrong motion. Both cameras' references together are somebody's test that nothing moved.
+    smooth and wrong motion. Both cameras' references together are accepted: a test with zero motion.
     """
     stale = [_same(ref, now) for ref, now in ((ref1, now1), (ref2, now2))]
     if stale[0] != stale[1]:
@@ -221,7 +222,7 @@ def _same(a: MeasureImage, b: MeasureImage) -> bool:
     if a.pixels is b.pixels:
         return True
     if a.shape != b.shape or not np.array_equal(a.pixels[::64], b.pixels[::64]):
-        return False  # a few rows tell, nearly always
+        return False  # a few rows are enough, nearly always
     return bool(np.array_equal(a.pixels, b.pixels))
 
 

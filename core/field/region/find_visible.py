@@ -1,4 +1,4 @@
-"""How it is found what the points of a grid see: lines from each point, against its cuts and its mask."""
+"""Computation of a grid's visibility: lines from each point, intersected with cuts and mask."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from core.matching.arguments import VisiblePixels
 from core.threads import run_ranges
 
 MARGIN_PX = 2.0
-"""How near to a cut, or to a mask's black, no pixel counts."""
+"""Distance to a cut, or to a mask's black, below which no pixel counts."""
 
 
 def with_visibility(grid: PointGrid, subset_px: int) -> PointGrid:
-    """Return the grid with what its points see; the same grid where that is known, or nothing is in the way."""
+    """Return the grid with its visibility; the same grid where that is known, or without cuts and mask."""
     if grid.visibility is None and not grid.cuts and grid.white is None:
         return grid
     if grid.visibility is not None and grid.visibility.subset_px == subset_px:
@@ -33,18 +33,23 @@ def with_visibility(grid: PointGrid, subset_px: int) -> PointGrid:
 def patches_seen(
     grid: PointGrid, points: NDArray[np.intp], width: int, margin_px: float, at_once: int
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.uint8]]]:
-    """Yield points that do not see all of a square of ``width`` px about them, and what they see of it.
+    """Yield points with a partly invisible square of ``width`` px about them, and the visible pixels of it.
 
     Parameters
     ----------
     grid
         Cuts and mask.
     points
-        Which of its points to look at.
+        Indices of its points to examine.
     width, margin_px
-        Of the square, odd, and how near to a cut or to black no pixel counts.
+        Of the square, odd, and the distance to a cut or to black below which no pixel counts.
     at_once
         Points a yield, at most.
+
+    Yields
+    ------
+    points, patches
+        (k,) indices and (k, width, width) uint8, 1 for a visible pixel.
     """
     pieces, white = _obstacles(grid)
     clear, black_sums = _clear_of(white, margin_px)
@@ -73,10 +78,10 @@ def _obstacles(grid: PointGrid) -> tuple[Float, NDArray[np.uint8]]:
 
 
 def _clear_of(white: NDArray[np.uint8], margin_px: float) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Return what of a mask's white may count, and the integral image of its black."""
+    """Return the part of a mask's white that may count, and the integral image of its black."""
     if not white.size:
         return white, np.zeros((1, 1), np.int32)
-    # as far as a cut is kept clear of, the mask's black is too
+    # the same distance is kept to the mask's black as to a cut
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(margin_px) - 1, 2 * int(margin_px) - 1))
     clear = np.ascontiguousarray(cv2.erode(white, disc, borderType=cv2.BORDER_REPLICATE), np.uint8)
     return clear, np.asarray(cv2.integral(1 - white), np.int32)

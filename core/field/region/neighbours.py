@@ -1,4 +1,4 @@
-"""What a point's neighbours say about it: their own patches, extended to the point's ray. Compiled.
+"""Comparison of a point with its neighbours' patches, extended to the point's ray. Compiled.
 
 Medians of up to 24 neighbours for blocks of points at a time: a sorting network, whose compare-and-exchange steps run
 over the block's points in vector registers. Missing neighbours are infinite, so they sort behind the others. The
@@ -50,7 +50,8 @@ def _sort(keys, network):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _order(keys):
-    """Turn the bits of float32 into int32 that sort alike, or back: those of negative numbers run the other way."""
+    """Turn the bits of float32 into int32 of the same order, or back: those of negative numbers are in reverse
+    order."""
     for s in range(keys.shape[0]):
         for k in range(_BLOCK):
             keys[s, k] ^= (keys[s, k] >> 31) & np.int32(0x7FFFFFFF)
@@ -75,12 +76,12 @@ def _medians(values, network, n, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, motion, difference, spread, count):
-    """Own value minus the median of the neighbours' predictions, and the predictions' median absolute deviation.
+    """Compute own value minus median of the neighbours' predictions, and the predictions' median absolute deviation.
 
     Parameters
     ----------
     first, last
-        Rows to do.
+        Range of rows.
     network
         ``sorting_network(24)``.
     ok
@@ -90,12 +91,12 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
     rays, w, G
         (r, c, 3), (r, c, 3 or more), (r, c, 3, 3 or more).
     motion
-        Whether G holds a motion.
+        True if G holds a motion.
     difference, spread
         (r, c, 4) out: inverse depth relative to itself, then displacement in units of the depth (x, y, z in camera 1).
-        What is not known stays as it was.
+        Elements not known are left unchanged.
     count
-        (r, c) out: how many neighbours spoke.
+        (r, c) out: number of neighbours compared.
     """
     rows, cols = ok.shape
     quantities = 4 if motion else 1
@@ -132,7 +133,7 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
                             wp = w[i, j, 0] + w[i, j, 1] * x + w[i, j, 2] * y
                             values[0, place, k] = wp / w0 - 1.0
                             if motion:
-                                # displacement times w0, so that a depth error alone does not show twice
+                                # displacement times w0, so that a depth error alone does not count twice
                                 scale = w0 / wp
                                 for q in range(3):
                                     now = G[i, j, q, 0] + G[i, j, q, 1] * x + G[i, j, q, 2] * y
@@ -156,18 +157,18 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def least_median(first, last, x, v, triplets, flat_below, residual, medians):
-    """Find the linear map through three of a place's samples that has the least median residual over all of them.
+    """Find the linear map through three of a position's samples with the least median residual over all of them.
 
     Parameters
     ----------
     first, last
-        Places to do.
+        Range of positions.
     x, v
-        (m, k, 2) where the samples lie, and (m, k, d) their values.
+        (m, k, 2) positions of the samples, and (m, k, d) their values.
     triplets
-        (s, 3) which three samples to try.
+        (s, 3) indices of three samples to try.
     flat_below
-        Triplets that span a triangle of less than half this area say nothing about slopes.
+        Triplets that span a triangle of less than half this area give no slopes.
     residual
         (m, k) out: of the best map; not finite where there is none.
     medians

@@ -1,4 +1,4 @@
-"""Robust local linear fits to scattered matches, many places at once."""
+"""Robust local linear fits to scattered matches, about many positions at once."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from core.threads import run_ranges
 _TRIPLETS = 48
 _FLAT = 1e-2
 _AT_ONCE = 256
-_WIDER = 4  # times the neighbours are looked through for those that a place sees
+_WIDER = 4  # times the number of neighbours is searched for those not separated from a position
 _ENOUGH = 0.7  # of the neighbours wanted
 
 AreSeparated = Callable[[Float, Float], Bool]
 
 
 class LocalFits(NamedTuple):
-    """Linear maps about M places.
+    """Linear maps about M positions.
 
     Attributes
     ----------
     value
-        (M, d) the map at the place itself.
+        (M, d) the map at the position itself.
     slope
         (M, d, 2) its derivatives over x and y.
     spread
         (M,) median residual of the neighbours used, in units of the values; inf where no fit was possible.
     inliers
-        (M,) how many neighbours agreed.
+        (M,) number of neighbours that agree.
     distance
-        (M,) how far the neighbours reach.
+        (M,) distance of the farthest neighbour, px.
     """
 
     value: Float
@@ -55,22 +55,23 @@ def robust_local_fits(
     seed: int = 0,
     are_separated: AreSeparated | None = None,
 ) -> LocalFits:
-    """Fit value = a + B (x - place) to the nearest points by least median of squares, then least squares on inliers.
+    """Fit value = a + B (x - centre) to the nearest points by least median of squares, then least squares on inliers.
 
     Parameters
     ----------
     centres
-        (M, 2) where the fits are wanted.
+        (M, 2) positions of the fits.
     points, values
         (N, 2) and (N, d) scattered samples, some of them wrong.
     neighbours
-        How many nearest points take part.
+        Number of nearest points that take part.
     tolerance
         Residual up to which a neighbour counts as an inlier, in the values' unit.
     seed
         Of the random triplets: equal input gives equal output.
     are_separated
-        Tells of places (n, 2) and (n, 2) which do not see each other; only samples that a place sees take part.
+        Function of positions (n, 2) and (n, 2) that returns (n,) True where a cut lies between; samples across one do
+        not take part.
     """
     m, d = len(centres), values.shape[1]
     k = min(neighbours, len(points))
@@ -85,7 +86,7 @@ def robust_local_fits(
         nearest = np.argsort(over, axis=1, kind="stable")[:, :k]
         distance, index, over = (np.take_along_axis(a, nearest, axis=1) for a in (distance, index, over))
         seen = (~over).sum(axis=1) >= _ENOUGH * k
-        # in the place of those that are missing the nearest one again, which says nothing new
+        # the missing ones are replaced by the nearest one, which adds no information
         distance, index = np.where(over, distance[:, :1], distance), np.where(over, index[:, :1], index)
     x = points[index] - centres[:, None, :]  # (M, K, 2)
     v = values[index]
@@ -111,7 +112,7 @@ def robust_local_fits(
 
 
 def consistent(points: Float, values: Float, *, tolerance: float, neighbours: int = 14) -> np.ndarray:
-    """Return (N,) bool: which samples agree with the robust fit of their own neighbourhood."""
+    """Return (N,) True for the samples that agree with the robust fit of their own neighbourhood."""
     if len(points) < 8:
         return np.zeros(len(points), bool)
     fits = robust_local_fits(points, points, values, neighbours=neighbours, tolerance=tolerance)

@@ -35,7 +35,7 @@ class ScatteredShape:
     w0
         (n,) inverse depth, 1/mm.
     scale
-        How many times smaller the images were when the features were found.
+        Factor by which the images were reduced when the features were found.
     """
 
     xy_px: Float
@@ -50,7 +50,7 @@ class ScatteredShape:
 
 @dataclass(frozen=True, eq=False)
 class ScatteredMotion:
-    """Matches between camera 1 at t0 and camera 1 at t that agree with their neighbours; (n, 2) px each."""
+    """Matches between camera 1's reference and current images that agree with their neighbours; (n, 2) px each."""
 
     xy_px: Float
     xy_now_px: Float
@@ -58,7 +58,7 @@ class ScatteredMotion:
 
 
 def scattered_shape(pair: StereoPair, features1: Features, features2: Features) -> ScatteredShape:
-    """Match camera 1 with camera 2 and keep what the geometry and the neighbourhood allow.
+    """Match camera 1 with camera 2 and keep the matches that agree with the geometry and their neighbours.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def scattered_shape(pair: StereoPair, features1: Features, features2: Features) 
 
 
 def scattered_motion(features_ref: Features, features_now: Features) -> ScatteredMotion:
-    """Match one camera's image at t0 with its image at t and keep what agrees with its neighbourhood."""
+    """Match one camera's reference and current images and keep the matches that agree with their neighbours."""
     pairs = match(features_ref, features_now)
     xy, now = features_ref.xy_px[pairs[:, 0]], features_now.xy_px[pairs[:, 1]]
     if len(xy) < _MIN_MATCHES:
@@ -99,7 +99,8 @@ def scattered_motion(features_ref: Features, features_now: Features) -> Scattere
 
 
 def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scale: int) -> ScatteredMotion:
-    """Match stretched copies of camera 1's image at t0 with its image at t; the copy with the most matches counts."""
+    """Match stretched copies of camera 1's reference image with its current image; the copy with most matches
+    counts."""
     tries = [
         scattered_motion(stretched_features(image, box, stretch, scale=scale), features_now) for stretch in stretches()
     ]
@@ -107,7 +108,7 @@ def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scal
 
 
 def _looser(scale: int) -> float:
-    """By how much more features scatter that were found on a ``scale`` times smaller image."""
+    """Factor of the standard deviation of features found on a ``scale`` times smaller image."""
     return max(1.0, scale / 2.0)
 
 
@@ -119,7 +120,7 @@ def _depth_tolerance(pair: StereoPair, xy1: Float, w0: Float, scale: int) -> flo
 def shape_starts(
     pair: StereoPair, shape: ScatteredShape, xy_px: Float, are_separated: AreSeparated | None = None
 ) -> Starts:
-    """Return ``w`` (n, 3) at places ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree.
+    """Return ``w`` (n, 3) at positions ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree.
 
     ``are_separated``: see :func:`core.field.seeding.local_fit.robust_local_fits`.
     """
@@ -143,9 +144,10 @@ def motion_starts(
     xy_px: Float,
     are_separated: AreSeparated | None = None,
 ) -> Starts:
-    """Return start values at places ``xy_px`` with known shape ``w`` (n, 3), from the matches in time and at t.
+    """Return start values at positions ``xy_px`` with known shape ``w`` (n, 3), from matches in time and between
+    cameras.
 
-    ``are_separated`` as in :func:`shape_starts`, at t0.
+    ``are_separated`` as in :func:`shape_starts`, in the reference image.
     """
     G = np.full((len(xy_px), 3, 3), np.nan)
     if len(motion.xy_px) < 4 or len(shape_now.xy_px) < 4 or len(xy_px) == 0:
@@ -160,20 +162,20 @@ def motion_starts(
 
 
 def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_px: Float, w_now: Float) -> Float:
-    """Return ``G`` (n, 3, 3) from shape at t0, where camera 1 sees the patch at t, and the shape there.
+    """Return ``G`` (n, 3, 3) from the reference shape, the patch's current position in camera 1, and the shape there.
 
     Parameters
     ----------
     pair
         The calibrated cameras.
     w
-        (n, 3) shape at t0.
+        (n, 3) reference shape.
     xy_px, xy_now_px
-        (n, 2) the point in camera 1 at t0 and at t.
+        (n, 2) the point in camera 1's reference and current images.
     affine_px
-        (n, 2, 2) derivative of camera 1's image at t over its image at t0.
+        (n, 2, 2) derivative of camera 1's current image over its reference image.
     w_now
-        (n, 3) shape at t about ``xy_now_px``.
+        (n, 3) current shape about ``xy_now_px``.
     """
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
     now = pair.cam1.rays_cam(xy_now_px).xyz_mm
@@ -182,7 +184,7 @@ def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_p
     usable = np.isfinite(J_now).all(axis=(1, 2)) & np.isfinite(affine_px).all(axis=(1, 2))
     A = np.full_like(J, np.nan)
     A[usable] = np.linalg.solve(J_now[usable], affine_px[usable] @ J[usable])
-    # the point at t is (now + A X, 1) / w_now(A X); G (1, X, Y) is w(X, Y) times it, to first order
+    # the current point is (now + A X, 1) / w_now(A X); G (1, X, Y) is w(X, Y) times it, to first order
     G = np.empty((len(w), 3, 3))
     G[:, :, 0] = (w[:, :1] / w_now[:, :1]) * now
     for j in range(2):

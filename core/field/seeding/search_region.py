@@ -1,4 +1,4 @@
-"""Where to look for features, and at what size: what camera 2 can see of a region, and how far images may shrink."""
+"""Boxes of the images in which features are searched for, and the scales at which the images are reduced."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def box_around(xy_px: Float, reach_px: float, shape: tuple[int, int]) -> Box:
 
 
 def seen_by_camera2(pair: StereoPair, box: Box, shape2: tuple[int, int]) -> Box:
-    """Return where camera 2, of (rows, cols), can see what lies in camera 1's box, at any depth that is searched."""
+    """Return the box of camera 2's image (rows, cols) that can show camera 1's box, at any depth that is searched."""
     rows, cols = shape2
     whole = (0, 0, cols, rows)
     x0, y0, x1, y1 = box
@@ -46,12 +46,12 @@ def seen_by_camera2(pair: StereoPair, box: Box, shape2: tuple[int, int]) -> Box:
 
 
 def scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int]]) -> list[int]:
-    """Return by how much to reduce the images, to be tried one after the other; the last is 1.
+    """Return the factors by which the images are reduced, to be tried one after the other; the last is 1.
 
     Parameters
     ----------
     boxes
-        Where features are looked for in camera 1's and camera 2's reference.
+        Boxes in which features are searched for, of camera 1's and camera 2's reference images.
     shapes
         Rows and columns of both cameras' images.
     """

@@ -33,7 +33,7 @@ _AMBIGUOUS = 0.9
 
 @dataclass(frozen=True)
 class Seed:
-    """A place that the user names.
+    """A seed point that the user gives.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Seed:
     xy2_px
         The same point in camera 2's reference image, where known.
     xy_now_px, xy2_now_px
-        The same point in camera 1's and camera 2's image at t, where known (both or neither).
+        The same point in camera 1's and camera 2's current image, where known (both or neither).
     """
 
     xy_px: tuple[float, float]
@@ -105,14 +105,14 @@ def nearest_points(
 
 
 def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.intp]]:
-    """Choose places for seeds all over the region.
+    """Choose seed points all over the region.
 
     Parameters
     ----------
     xy_px, usable
         (n, 2), (n,) the field's points.
     support_px
-        (n,) how far the feature matches about a point reach; small is good.
+        (n,) px, distance of the feature matches about a point; small is good.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
     index = np.flatnonzero(usable)
     count = float(np.clip(len(index) / _POINTS_PER_SEED, _MIN_SEEDS, _MAX_SEEDS))
     span = np.maximum(np.ptp(xy_px[index], axis=0), 1.0)
-    # cells by area of usable points, so that thin or holed regions get their share
+    # cells by area of usable points, so that thin regions and regions with holes get their share
     cell = np.sqrt(np.prod(span) / count * max(len(index), 1) / max(len(usable), 1))
     place = np.floor((xy_px[index] - xy_px[index].min(axis=0)) / max(cell, 1.0)).astype(np.int64)
     key = place[:, 0] * 1_000_003 + place[:, 1]
@@ -140,7 +140,7 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
 
 
 def refine(fitter: Fitter, xy_px: Float, starts: Starts, *, far_px: float = _FAR_PX) -> PointFits:
-    """Refine seeds; those that run away from their start are refused."""
+    """Refine seeds; those that end far from their start are rejected."""
     fits = fitter.fit(xy_px, starts.w, starts.G)
     away = fits.ok & fitter.far_from_start(xy_px, fits, starts.w, starts.G, far_px)
     fits.reject(away, PointStatus.NOT_CONVERGED)
@@ -157,7 +157,7 @@ def seeds_from_matches(
     shape_now: ScatteredShape | None,
     known_w: Float | None,
 ) -> int:
-    """Put refined seeds into ``points``, spread over the region; returns how many stand.
+    """Put refined seeds into ``points``, spread over the region; return the number of valid ones.
 
     ``known_w`` (n, 3 or 6) is the shape where it was measured before (NaN elsewhere).
     """
@@ -207,7 +207,8 @@ def starts_at(
     known_w: Float | None,
     visibility: Visibility | None = None,
 ) -> Starts:
-    """Return start values at places from the matches that they see, taking the measured shape where there is one."""
+    """Return start values at positions from the matches not separated from them, with the measured shape where
+    known."""
     are_separated = None if visibility is None else visibility.are_separated
     w = shape_starts(pair, shape, xy_px, are_separated).w
     if known_w is not None:
@@ -221,7 +222,7 @@ def starts_at(
 def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_px: Float) -> PointFits:
     """Find one point's shape by search along the epipolar line; the best of several candidates after refinement.
 
-    A second candidate that correlates nearly as well means that the texture repeats: then nothing is taken.
+    A second candidate that correlates nearly as well means that the texture repeats: then none is taken.
     """
     shape = fitter.shape_only()
     w, _ = sweep(fitter.pair, image1, image2, xy_px, subset_px=max(fitter.options.subset_px, 25))
@@ -237,14 +238,14 @@ def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_p
     distinct = (
         np.abs(fits.w[:, 0] - fits.w[best, 0]) / depth_per_px(fitter.pair, ray, np.full(len(w), fits.w[best, 0])) > 2.0
     )
-    # residual energy 1 - zncc tells candidates apart better than zncc itself
+    # residual energy 1 - zncc distinguishes candidates better than zncc itself
     if np.any(distinct & (1.0 - quality < (1.0 - quality[best]) / _AMBIGUOUS + 0.01)):
         return PointFits.empty(1, 1)
     return fits.take(np.array([best]))
 
 
 def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: int, candidates: int = 3) -> Float:
-    """Find where camera 1 sees a patch at t, by normalised cross-correlation over the whole image; (m, 2) px."""
+    """Find a patch in camera 1's current image, by normalised cross-correlation over the whole image; (m, 2) px."""
     half = subset_px  # twice the subset: one that moved without turning much
     rows, cols = ref1.shape
     x, y = round(float(xy_px[0])), round(float(xy_px[1]))
@@ -264,9 +265,10 @@ def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: i
 
 
 def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
-    """Find one point's motion from its shape ``w`` (3,): where it stood, then by template and depth search."""
+    """Find one point's motion from its shape ``w`` (3,): at its reference position, then by template and depth
+    search."""
     if fitter.cur1 is None or fitter.cur2 is None:
-        raise ValueError("search_motion needs images at t")
+        raise ValueError("search_motion needs current images")
     place = xy_px[None]
     still = fitter.fit(place, w[None], no_motion(fitter.pair, place))
     tries = [still]
@@ -291,7 +293,7 @@ def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
 
 
 def swept_positions(xy_px: Float, usable: Bool) -> NDArray[np.intp]:
-    """Choose up to 16 places for the depth search, the region's middle first."""
+    """Choose up to 16 points for the depth search, the region's middle first."""
     index = np.flatnonzero(usable)
     if len(index) <= _SWEEPS:
         return index

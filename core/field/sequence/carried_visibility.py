@@ -1,8 +1,8 @@
-"""What a leg's points see of their subsets: what they saw at the first reference, carried along with the surface.
+"""Visibility at a later reference: that of the first reference, carried along with the surface.
 
-A crack opens and turns, and its lips part: lines drawn at the first reference say nothing of where they are later. So
-each pixel of a leg's subset is taken back to the first reference through the point's own motion, and counts if the
-point sees it there.
+A crack opens and turns, and its lips separate: lines drawn at the first reference do not show where they are later. So
+each pixel of a segment's subset is taken back to the first reference through the point's own motion, and is visible if
+it is visible there.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from core.field.region.region import PointGrid
 from core.field.region.visibility import Visibility
 from core.matching.arguments import VisiblePixels
 
-_MAX_WIDTH_RATIO = 4  # times a subset: what a leg's subset may cover of the first reference
+_MAX_WIDTH_RATIO = 4  # times a subset: width that a segment's subset may cover in the first reference
 _AT_ONCE = 512
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentVisibility(Visibility):
-    """What each of the n points sees of its subset in a later image.
+    """Visibility of n points in a later image.
 
     Attributes
     ----------
     first
         The same at the first reference.
     position_px, back
-        (m, 2), (m, 2, 2) of the points that the leg has: where they are in the later image, and the derivative of the
-        first reference's image over the later one.
+        (m, 2), (m, 2, 2) of the points that the segment has: positions in the later image, px, and the derivative of
+        the first reference's image over the later one.
     first_px
-        (m, 2) where they were at the first reference.
+        (m, 2) their positions at the first reference, px.
     """
 
     first: Visibility
@@ -44,27 +44,27 @@ class SegmentVisibility(Visibility):
     first_px: Float
 
     def at(self, xy_px: Float) -> VisiblePixels:
-        """Return what points (m, 2) see, by the pixels that their subsets are centred on.
+        """Return the visible pixels of points (m, 2), given by the pixels that their subsets are centred on.
 
         Raises
         ------
         ValueError
-            If a place is not one of the leg's pixels.
+            If a position is not one of the segment's pixels.
         """
         keys = _keys(self.xy_px)
         order = np.argsort(keys, kind="stable")
         wanted = _keys(xy_px)
         index = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
         if (keys[index] != wanted).any():
-            raise ValueError("a place that is not a pixel of the leg")
+            raise ValueError("a position that is not a pixel of the segment")
         return VisiblePixels(self.visible.patches, self.visible.of_point[index])
 
     def are_separated(self, a_px: Float, b_px: Float) -> Bool:
-        """Return (n,) whether places a and b (n, 2) of the later image do not see each other."""
+        """Return (n,) True where a cut or black lies between positions a and b (n, 2) of the later image."""
         return self.first.are_separated(self._at_first(a_px), self._at_first(b_px))
 
     def _at_first(self, xy_px: Float) -> Float:
-        """Take places (n, 2) back to the first reference with the nearest point."""
+        """Take positions (n, 2) back to the first reference with the nearest point."""
         nearest = np.asarray(cKDTree(self.position_px).query(xy_px)[1])
         away = np.einsum("nij,nj->ni", self.back[nearest], xy_px - self.position_px[nearest])
         return np.asarray(self.first_px[nearest] + away)
@@ -78,16 +78,16 @@ def _keys(xy_px: Float) -> NDArray[np.int64]:
 def carry_visibility(
     first: Visibility, segment_grid: PointGrid, grid: PointGrid, position_px: Float, slopes_px: Float
 ) -> SegmentVisibility:
-    """Return what a leg's points see.
+    """Return the visibility at a segment's reference.
 
     Parameters
     ----------
     first
-        What they saw at the first reference.
+        Visibility at the first reference.
     segment_grid, grid
-        The leg's pixels and the first reference's points, (r, c) both.
+        The segment's pixels and the first reference's points, (r, c) both.
     position_px, slopes_px
-        (n, 2) where camera 1 sees the points in the later image, (n, 2, 2) derivative of that image over the first.
+        (n, 2) px, positions of the points in camera 1's later image; (n, 2, 2) derivative of that image over the first.
     """
     subset_px = first.subset_px
     has = np.flatnonzero(segment_grid.allowed)

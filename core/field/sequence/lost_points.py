@@ -1,4 +1,4 @@
-"""Points lost in an earlier step of a sequence, tried against the older references that show them."""
+"""Points lost in an earlier step of a sequence, tried again against older references."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from core.field.sequence.segment import Segment
 from core.status import PointStatus
 
 OLDER = 2
-"""How many references besides the current one are tried for points that it does not have."""
+"""Number of references besides the current one that are tried for points that it does not have."""
 _BESIDE = 3  # points
 _CONTROLS = 64
 _FAR_PX = 1.0
@@ -41,24 +41,24 @@ def find_again(
     segment_of: Callable[[int], Segment],
     inputs_of: Callable[[Segment], FieldInputs],
 ) -> None:
-    """Try points that the leg does not have against the newest reference that shows them, where a neighbour stands.
+    """Try points that the segment does not have against the newest reference that shows them, beside valid points.
 
-    What is found goes through the checks among all others.
+    Points found again pass the validity checks like all others.
 
     Parameters
     ----------
     segment
-        What the step was matched against.
+        The segment that the step was matched against.
     points, propagated
-        The step's n points, in totals, and what they hand on, px^2; what is found is written there.
+        The step's n points, in totals, and their propagated covariance, px^2; results are written there.
     steps
         (n,) the newest reference that shows each point.
     whole, shape
-        The step against the first reference, whose frame all totals are told in, and the shape measured there.
+        The step against the first reference, in whose frame all totals are stated, and the shape measured there.
     curved
-        Whether the leg's points were measured with curved patches.
+        True if the segment's points were measured with curved patches.
     segment_of, inputs_of
-        The leg that begins at a step, and the same step against that leg.
+        Functions that return the segment that begins at a step, and the inputs of this step against a segment.
     """
     valid = points.ok
     missing = whole.usable & shape.valid.ravel() & ~segment.has & ~valid
@@ -88,7 +88,7 @@ def find_again(
             phase="again",
             cancel=whole.cancel,
         )
-        # an older reference correlates less: by as much as the points beside do that stand in both
+        # an older reference correlates less: by as much as neighbouring points valid against both
         correlation = tried.zncc.copy()
         found = usable & tried.ok
         tried.zncc[found] = 1.0 - np.minimum((1.0 - tried.zncc[found]) * level, 1.0)
@@ -112,16 +112,16 @@ def find_again(
 
 
 def _beside(missing: Bool, valid: Bool, shape: tuple[int, int]) -> Bool:
-    """Return the standing points (n,) within a few steps of missing ones."""
+    """Return (n,) True for valid points within a few grid points of missing ones."""
     disc = np.ones((2 * _BESIDE + 1, 2 * _BESIDE + 1), np.uint8)
     about = cv2.dilate(missing.reshape(shape).astype(np.uint8), disc)
     return np.asarray(valid & (np.asarray(about).ravel() > 0))
 
 
 def _level(fitter: SegmentFitter, points: PointFits, near: NDArray[np.intp], xy_px: Float) -> Float | None:
-    """Return (3,) how much 1 - zncc is now over what it is against an older reference, at points that stand in both.
+    """Return (3,) the ratio of 1 - zncc to that against an older reference, median over points valid against both.
 
-    None where fewer than half of them match the older reference: it then serves for nothing.
+    None where fewer than half of them match the older reference: it then is of no use.
     """
     sample = near[np.linspace(0, len(near) - 1, min(len(near), _CONTROLS)).astype(int)]
     fits = fitter.fit(xy_px[sample], points.w[sample], points.G[sample])
@@ -137,12 +137,12 @@ def _level(fitter: SegmentFitter, points: PointFits, near: NDArray[np.intp], xy_
 
 
 class SegmentFitter:
-    """Fits points of the first reference's grid against a leg's images: totals in, totals out.
+    """Fits points of the first reference's grid against a segment's images: totals in, totals out.
 
     Attributes
     ----------
     own
-        (n,) the points as they were fitted last, about the leg's pixels.
+        (n,) the points as last fitted, about the segment's pixels.
     """
 
     def __init__(self, segment: Segment, fitter: Fitter, grid: PointGrid) -> None:
@@ -154,7 +154,7 @@ class SegmentFitter:
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine totals from totals; as :meth:`core.field.points.fitter.Fitter.fit`."""
         if G is None:
-            raise ValueError("a leg measures motions")
+            raise ValueError("a segment measures motions")
         segment = self._segment
         col, row = np.rint((xy_px - self._corner) / self._step_px).astype(np.int64).T
         index = row * self._cols + col

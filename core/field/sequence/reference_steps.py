@@ -1,7 +1,7 @@
-"""Long sequences: which step's images a step is matched against, and when a later reference takes over.
+"""Long sequences: the choice of the reference step that a step is matched against.
 
-``never``: always the first reference. ``always``: the step before. ``auto``: the last reference as long as it serves;
-where it fails, the step before takes over, if that finds what was lost.
+``never``: always the first reference. ``always``: the step before. ``auto``: the latest reference as long as it serves;
+where it fails, the step before replaces it, if lost points are found again.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ from core.status import PointStatus
 
 Pair = tuple[MeasureImage, MeasureImage]
 
-MAY_BE_LOST = 0.01  # of the points that a reference has: the share that checks may refuse with no fault of its own
-SIGMAS = 3.0  # a loss beyond that share is no chance
-BETTER_SIGMAS = 2.0  # and an update must be better by as much
+MAY_BE_LOST = (
+    0.01  # of the points that a reference has: the share that checks may reject through no fault of the reference
+)
+SIGMAS = 3.0  # a larger loss is significant
+BETTER_SIGMAS = 2.0  # and an update must be better by this much
 _KEPT = OLDER + 1
 _BY_THE_MATCH = (
     PointStatus.NOT_SEEDED,
@@ -59,7 +61,7 @@ class Earlier:
 
 
 class Updating:
-    """Measures a sequence's steps in order. It holds nothing that cannot be made again from images and fields.
+    """Measures a sequence's steps in order. Its state can be computed again from images and fields.
 
     Parameters
     ----------
@@ -70,7 +72,8 @@ class Updating:
     mode
         ``never``, ``auto`` or ``always``.
     images_of, field_of
-        Images and field of an earlier step, by its number. The field as it was measured or as its file gives it back.
+        Functions that return images and field of an earlier step, by its number. The field as measured or as read from
+        its file.
     """
 
     def __init__(
@@ -154,7 +157,7 @@ class Updating:
         return prepare(self._pair, reference, step.images, grid, self._options, progress=progress, cancel=step.cancel)
 
     def _segment(self, step: int) -> Segment:
-        """The leg that begins at a step; those last asked for are kept."""
+        """Return the segment that begins at a step; the latest ones are kept."""
         if step == self._first:
             return self._first_segment()
         if step not in self._segments:
@@ -179,7 +182,7 @@ class Updating:
         return self._reference[0].prepared(options.interpolation, options.noise[0], options.blur).slope_share
 
     def _first_segment(self) -> Segment:
-        """The first reference as a leg, for points that a later one does not have."""
+        """Return the first reference as a segment, for points that a later one does not have."""
         f, n = self._shape, self._grid.x_px.size
         xy = self._grid.xy_px.reshape(n, 2)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -222,7 +225,7 @@ class Updating:
         steps = segment.steps.copy()
         whole = self._inputs(
             self._reference, self._grid, step
-        )  # the first reference's own frame: all totals are told there
+        )  # the first reference's own frame: all totals are stated there
 
         def inputs_of(older: Segment) -> FieldInputs:
             return whole if older.step == self._first else self._inputs((older.image1, older.image2), older.grid, step)
@@ -239,16 +242,16 @@ class Updating:
             inputs_of=inputs_of,
         )
         field = assemble_field(whole, replace(state, points=points), self._shape)
-        place = (*field.shape, 2, 2)
+        blocks = (*field.shape, 2, 2)
         references = References(
-            reference, steps.reshape(field.shape), propagated.noise.reshape(place), propagated.pattern.reshape(place)
+            reference, steps.reshape(field.shape), propagated.noise.reshape(blocks), propagated.pattern.reshape(blocks)
         )
         return replace(field, references=references)
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """What a step is measured from."""
+    """Inputs of one step."""
 
     images: Pair
     earlier: Earlier | None
@@ -258,21 +261,22 @@ class _Step:
 
 
 def _lost(field: Field, before: Bool) -> Bool:
-    """Which points that stood before the matching has lost; not those that left an image."""
+    """Return True for formerly valid points that the matching has lost; not those that left an image."""
     return np.asarray(before & ~field.valid & np.isin(field.status, _BY_THE_MATCH))
 
 
 def _fails(field: Field, before: Field, held: Bool) -> bool:
-    """Whether a reference has lost more of the points it holds than checks refuse by chance, and some in this step."""
+    """Return True if a reference lost more of its points than checks reject by chance, some of them in this step."""
     n = int(held.sum())
     chance = MAY_BE_LOST * n + SIGMAS * np.sqrt(MAY_BE_LOST * n)
     return bool(_lost(field, held).sum() > chance and _lost(field, before.valid).sum() > BETTER_SIGMAS**2)
 
 
 def _finds_it(updated: Field, field: Field, before: Field) -> bool:
-    """Whether an update found half of what was lost in this step, and more than it lost itself.
+    """Return True if an update found half of the points lost in this step, and more than it lost itself.
 
-    McNemar's test: points that stand one way only, compared by the root of their number.
+    McNemar's test (doi:10.1007/BF02295996): points valid against one reference only, compared by the root of their
+    number.
     """
     found, lost = (int(a.sum()) for a in (updated.valid & ~field.valid, field.valid & ~updated.valid))
     enough = 2 * found >= int(_lost(field, before.valid).sum())

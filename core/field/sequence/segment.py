@@ -1,8 +1,8 @@
-"""A leg: the part of a sequence that is matched against one later step's images.
+"""A reference segment: the part of a sequence that is matched against one later step's images.
 
-The material points stay those of the first reference's grid. Camera 1 sees them between the pixels at the leg's
-reference; a leg's subset is centred on the nearest whole pixel, so that no reference is interpolated, and the point is
-the patch evaluated at most half a pixel off its middle.
+The material points stay those of the first reference's grid. In camera 1's image at the segment's reference they lie
+between pixels; a segment's subset is centred on the nearest whole pixel, so that no reference is interpolated, and the
+point is the patch evaluated at most half a pixel off its middle.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class Segment:
     image1, image2
         Its images.
     grid
-        The pixels nearest to where camera 1 sees the points; ``allowed`` says which points the leg has.
+        The pixels nearest to the points in camera 1's image; ``allowed`` is True for the points that the segment has.
     position_px
-        (n, 2) where camera 1 sees them.
+        (n, 2) the points' positions in camera 1's image, px.
     offset
         (n, 2) from the pixel's ray to the point's, normalised.
     totals
@@ -63,11 +63,11 @@ class Segment:
     plane
         (n, 3) inverse depth and slopes about the point's own ray at that step.
     propagated
-        Covariances of the places that the noise of the leg's reference does not cancel, normalised.
+        Covariances of the positions that the noise of the segment's reference does not cancel, normalised.
     shape
-        What the matching needs of the shape at that step.
+        The shape at that step, as far as the matching needs it.
     status
-        (n,) int8: OK, or why the leg does not have a point.
+        (n,) int8: OK, or why the segment does not have a point.
     steps
         (n,) int32: the newest reference that shows each point, of those up to this one.
     slope_share
@@ -90,7 +90,7 @@ class Segment:
 
     @property
     def has(self) -> Bool:
-        """(n,) which points the leg has."""
+        """(n,) True for the points that the segment has."""
         return np.asarray(self.grid.allowed.ravel())
 
     @property
@@ -99,14 +99,15 @@ class Segment:
         return self.grid.xy_px.reshape(-1, 2)
 
     def starts(self, now: Totals) -> tuple[Float, Float]:
-        """Return the leg's unknowns about its pixels that lead to totals of all n points."""
+        """Return the segment's unknowns about its pixels that lead to totals of all n points."""
         G = since(self.totals, now, self.plane)
         return move_w(self.plane, -self.offset), move_matrix(G, -self.offset)
 
     def total(
         self, fits: PointFits, index: NDArray[np.intp], pattern: Float, *, pair: StereoPair, subset_px: int
     ) -> tuple[PointFits, Propagated]:
-        """Return the totals of points ``index`` that a fitter of this leg has measured, and what they hand on, px^2.
+        """Return totals of points ``index`` measured by a fitter of this segment, and their propagated covariance,
+        px^2.
 
         ``pattern`` (m,) is their :func:`pattern_share`.
         """
@@ -128,7 +129,7 @@ class Segment:
         return Totals(self.totals.rays[index], self.totals.w[index], self.totals.G[index])
 
     def _own(self, fits: PointFits, index: NDArray[np.intp]) -> tuple[Float, Float]:
-        """A leg's plane terms (m, 3), (m, 3, 3) about the points' own rays."""
+        """Return the segment's plane terms (m, 3), (m, 3, 3) about the points' own rays."""
         w, G = move_w(fits.w, self.offset[index]), move_matrix(fits.G, self.offset[index])
         return w[:, :3], G[:, :, :3]
 
@@ -145,16 +146,16 @@ def begin_segment(
     slope_share: float,
     first: int,
 ) -> Segment:
-    """Return the leg whose reference is a step that was measured.
+    """Return the segment whose reference is a step that was measured.
 
     Parameters
     ----------
     step, field
-        The step's number and its field, with a motion; as it was measured, or as its file gives it back.
+        The step's number and its field, with a motion; as measured, or as read from its file.
     image1, image2
         The step's images.
     pair, grid, options
-        The cameras, and points (with what they see) and settings of the first reference.
+        The cameras, and points (with their visibility) and settings of the first reference.
     slope_share
         As in :func:`propagate`.
     first
@@ -183,7 +184,7 @@ def begin_segment(
         else:
             propagated_px = Propagated(r.noise_px2.reshape(n, 2, 2), r.pattern_px2.reshape(n, 2, 2))
     middle = np.median(pixel[has], axis=0)
-    # points that the leg does not have lie anywhere inside, where they disturb no scale
+    # points that the segment does not have are put inside, where they disturb no scale
     pixel, position = (np.where(has[:, None], a, middle) for a in (pixel, position))
     rays, own = (pair.cam1.rays_cam(a).xyz_mm for a in (pixel, position))
     J = np.linalg.inv(pair.cam1.lens.image_jacobian(own[:, :2]))
@@ -212,7 +213,7 @@ def begin_segment(
     points.w[has] = move_w(plane, -offset)[has]
     points.status[has] = PointStatus.OK
     flat = assemble(points, pair=pair, grid=segment_grid, fits_image=segment_grid.allowed, shape=None)
-    # a point that stood at that step and is not in the leg lay too near to the image's border
+    # a point valid at that step and not in the segment lay too near to the image's border
     why = np.where(field.valid, PointStatus.OUTSIDE_IMAGE, field.status).ravel()
     status = np.where(has, PointStatus.OK, why).astype(np.int8)
     older = np.full(n, first, np.int32) if field.references is None else field.references.steps.ravel()
@@ -245,9 +246,10 @@ def measure_segment(
     progress: Progress | None,
     cancel: CancelToken | None,
 ) -> GrowthState:
-    """Match a pair of images against a leg's reference; return where that ends, with points about the leg's pixels.
+    """Match a pair of images against a segment's reference; return the final state, about the segment's pixels.
 
-    ``previous`` is the field of the step before, in totals; it gives the start unless it is the leg's own reference.
+    ``previous`` is the field of the step before, in totals; it gives the start unless it is the segment's own
+    reference.
 
     Raises
     ------
@@ -266,7 +268,7 @@ def measure_segment(
 
 
 def _started(segment: Segment, previous: Field, pair: StereoPair) -> Field:
-    """The last step's field about the leg's pixels, as far as a start needs it."""
+    """Return the previous step's field about the segment's pixels, as far as a start needs it."""
     with np.errstate(invalid="ignore", divide="ignore"):
         starts = segment.starts(totals_of(previous, pair))
     w, G = starts

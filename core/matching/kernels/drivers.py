@@ -77,7 +77,8 @@ def _by_fit(of: Callable[[str, FitKernels], Any]) -> dict[str, dict[int, Any]]:
 
 run_points = _by_fit(lambda name, kernels: _entry(f"run_{name}", kernels.point, _STAMP))
 cluster_robust_points = _by_fit(lambda name, kernels: _entry(f"observe_{name}", kernels.observed, _STAMP))
-"""The compiled fits and observed covariances: of a shape or a motion, by the patch's degree (1 plane, 2 curved)."""
+"""The compiled fits and cluster-robust covariances: of a shape or a motion, by the patch's degree (1 plane, 2
+curved)."""
 work_space = _by_fit(lambda _, kernels: kernels.space)
 cluster_robust_space = _by_fit(lambda _, kernels: kernels.cluster_robust_space)
-"""What makes their work space for a subset's width; one call at a time may use it."""
+"""Makers of their work space for a subset's width; one call at a time may use it."""

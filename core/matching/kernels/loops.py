@@ -1,14 +1,14 @@
-"""The loops over a subset's pixels: where the time goes.
+"""The loops over a subset's pixels, which take most of the time.
 
 Written in vectors of eight pixels (:mod:`core.matching.kernels.vectors`), because row loads of four taps are two to
 four times faster than the gathers that a compiler makes of the same loop. One image's comparison is one loop that
-stores nothing: place of the pixel (a cubic polynomial in the offsets within the subset), spline value, residual, and
-its sums with the columns of the Jacobian. The places of the next eight pixels are found while the taps of these eight
-are loaded, so that no load waits for an address. No bounds are tested here:
+stores nothing: position of the pixel (a cubic polynomial in the offsets within the subset), spline value, residual, and
+its sums with the columns of the Jacobian. The positions of the next eight pixels are computed while the taps of these
+eight are loaded, so that no load waits for an address. No bounds are tested here:
 :func:`core.matching.kernels.warp.set_up_warp` proves beforehand that every tap lies inside the padded image.
 
 The reference subset is a (6, width) float32 array with the rows X and Y (offsets from the subset's centre over its half
-width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's place
+width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's position
 along x and y. ``width`` is the number of pixels rounded up to eight, and eight more; the surplus is zero.
 """
 
@@ -27,7 +27,7 @@ from core.matching.kernels.vectors import FLOAT, INT, LANES, LONG, Vec, at, join
 X, Y, F, WEIGHT, GX, GY = range(6)
 N_ROWS = 6
 N_WARP = 22
-"""Ten coefficients of the place along x, ten along y, gain and shift of the grey levels."""
+"""Ten coefficients of the position along x, ten along y, gain and shift of the grey levels."""
 
 
 def monomials(degree: int) -> list[tuple[int, int]]:
@@ -157,7 +157,7 @@ def _comparison(order: int, degree: int) -> Any:
         c
             Padded coefficients, flat float32.
         base
-            int64 flat index of the first tap for place (0, 0).
+            int64 flat index of the first tap for position (0, 0).
         stride
             int64 row length of ``c``.
         warp
@@ -234,7 +234,7 @@ def _powers(x: Vec, y: Vec, degree: int) -> list[Vec | None]:
 
 def _reference_sums(degree: int) -> Any:
     def sum_reference(_typingctx: Any, ref: Any, blocks: Any, mean: Any, out: Any) -> Any:
-        """Take ``mean`` out of the reference's grey levels and sum what the normal equations need.
+        """Subtract ``mean`` from the reference's grey levels and compute the sums for the normal equations.
 
         Parameters
         ----------

@@ -1,11 +1,10 @@
-"""The reference subset: grey levels, gradients, and the sums that the normal equations are made of.
+"""The reference subset: grey levels, gradients, and the sums for the normal equations.
 
-A step of the unknowns displaces the patch, as any image sees it, by ``dx = a . m, dy = b . m`` px in the reference
-image (``m`` the monomials 1, x, y, or those up to second order, of a pixel's place in the subset), and an image's grey
-levels by contrast times ``gx dx + gy dy`` with the *reference's* gradient (gx, gy). So the columns ``gx m_j, gy m_j``,
-which know nothing of any image, make every Jacobian. Terms of higher degree, that perspective adds, are left out of the
-Jacobian (not of the warp): they are some thousandths of the others, and change where Gauss-Newton goes, not where it
-ends.
+A step of the unknowns displaces the patch, in any image, by ``dx = a . m, dy = b . m`` px in the reference image (``m``
+the monomials 1, x, y, or those up to second order, of a pixel's position in the subset), and an image's grey levels by
+contrast times ``gx dx + gy dy`` with the *reference's* gradient (gx, gy). So the columns ``gx m_j, gy m_j``, which
+depend on no other image, make every Jacobian. Terms of higher degree, that perspective adds, are left out of the
+Jacobian (not of the warp): they are some thousandths of the others, and change the path of Gauss-Newton, not its end.
 
 The gradients are expected to be the best estimate of the noise-free texture's: then the Gram matrix of the columns is
 also the sensitivity of their sums to a displacement.
@@ -78,7 +77,7 @@ def _copy(image, top, left, subset, ref, row):
 
 @inner
 def _count_visible(patches, which, subset, weighted, ref):
-    """Take out of the weights what the point's patch does not show; returns how many pixels are left."""
+    """Set the weights of invisible pixels to zero; return the number of pixels left."""
     n = subset * subset
     if which < 0:
         if not weighted:  # the last point may have left its own
@@ -113,7 +112,7 @@ def make_reference(degree: int) -> Any:
 
     @kernel(f"{degree}")
     def set_up_reference(reference, patches, which, lens, x_px, y_px, subset, ref, space):
-        """Copy the subset nearest to (x_px, y_px) and sum it; returns a :class:`Subset`.
+        """Copy the subset nearest to (x_px, y_px) and sum it; return a :class:`Subset`.
 
         Parameters
         ----------
@@ -170,7 +169,7 @@ def make_reference(degree: int) -> Any:
             a, b = sum_g[i] * per_weight, sum_fg[i] * per_f2
             for j in range(n_columns):
                 gram[i, j] -= a * sum_g[j] + b * sum_fg[j]
-        # places -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
+        # positions -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
         u, v = basis[1], basis[2]
         u[1], u[2], v[1], v[2] = half * node_work[16], half * node_work[17], half * node_work[18], half * node_work[19]
         u[0] = (u[1] * place[0] + u[2] * place[1]) / half

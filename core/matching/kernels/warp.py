@@ -124,7 +124,7 @@ def _nodes() -> tuple[np.ndarray, np.ndarray]:
 
 
 NODES, _FIT = _nodes()
-"""(2, 16) places in the subset, -1 to 1, through which each image's warp goes; (10, 16) cubic polynomial from them."""
+"""(2, 16) positions in the subset, -1 to 1, of the nodes of each image's warp; (10, 16) cubic polynomial from them."""
 N_NODES = 16
 
 
@@ -229,7 +229,7 @@ def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
 
 @intrinsic
 def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> Any:
-    """Polynomials of the nodes' places in one image.
+    """Compute the polynomials of the nodes' positions in one image.
 
     Parameters
     ----------
@@ -299,11 +299,11 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
 
 @njit(nogil=True, error_model="numpy")
 def set_up_warp(lens, m, powers, rows, cols, stride, lead, work, p):
-    """Prepare the pixel loop for one image that sees the patch through ``m``.
+    """Prepare the pixel loop for one image, into which ``m`` maps the patch.
 
     The warp from the subset to the image, perspective and both lenses included, is a cubic polynomial through sixteen
-    exact places. For a subset of half width h at focal length f (both px) and tilt t it is good to some
-    h (h / f tan t)^3 / 8: 1e-9 px with the paper's cameras, 1e-5 px with h = 16, f = 1200 and 45 degrees.
+    exact positions. For a subset of half width h at focal length f (both px) and tilt t it is good to some h (h / f tan
+    t)^3 / 8: 1e-9 px with the paper's cameras, 1e-5 px with h = 16, f = 1200 and 45 degrees.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ def set_up_warp(lens, m, powers, rows, cols, stride, lead, work, p):
     work
         (26,) work space.
     p
-        (22,) float32 out; entries 20 and 21 (grey levels) are left alone.
+        (22,) float32 out; entries 20 and 21 (grey levels) are left unchanged.
 
     Returns
     -------
