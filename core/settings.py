@@ -47,7 +47,7 @@ class Range(NamedTuple):
 SUBSET_PX = Range(9, 401, True, 33)
 STEP_PX = Range(1, 1000, False, 10)
 STRAIN_WINDOW = Range(3, 101, True, 9)
-#: no default window: displacements are smoothed only where that is asked for
+#: no default window: displacements are smoothed only on request
 SMOOTHING_WINDOW = Range(3, 51, True, 5)
 #: a wider Gaussian would leave a handful of independent pixels in the subset
 PREFILTER_OF_SUBSET = 0.25
@@ -95,9 +95,9 @@ class Settings(BaseModel):
 
 
 class Region(Settings):
-    """Where points may lie: a rectangle or a polygon, or a mask alone; cracks and holes.
+    """Region of interest: a rectangle or a polygon, or a mask alone; cracks and holes.
 
-    No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
+    No subset, neighbour or start value crosses a crack, a hole's border or the mask's black.
     """
 
     rectangle: Rectangle | None = Field(
@@ -136,7 +136,7 @@ class StrainSettings(Settings):
 
 
 class AnalysisSettings(Settings):
-    """What a measurement depends on besides its images and its calibration."""
+    """Settings of a measurement, besides its images and its calibration."""
 
     region: Region = Field(description="Where points may lie.")
     subset_px: SubsetPx = SUBSET_PX.default
@@ -211,7 +211,7 @@ class NoiseRecord(BaseModel):
 
 
 class StoredRegion(Region):
-    """A region as results keep it; checked against its image when it was made."""
+    """A region as stored in results; checked against its image when it was made."""
 
     rectangle: tuple[float, float, float, float] | None = None
     polygon: list[tuple[float, float]] | None = None
@@ -221,7 +221,7 @@ class StoredRegion(Region):
 
 
 class StoredSettings(AnalysisSettings):
-    """Settings as results keep them: with what stands for the files beside them."""
+    """Settings as stored in results, with records in place of files."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

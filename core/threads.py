@@ -1,8 +1,8 @@
-"""How many threads compute, and the lock around kernels that bring threads of their own.
+"""Number of computing threads, and the lock around kernels with threads of their own.
 
 Kernels that release the GIL are run over ranges by :func:`run_ranges`, on plain threads. numba's own parallel kernels
-(``prange``) are another matter: its ``workqueue`` layer aborts the process when two threads run such kernels at once,
-so whoever calls one holds :data:`kernel_lock` and calls :func:`apply_threads` first.
+(``prange``) are different: its ``workqueue`` layer aborts the process when two threads run such kernels at once, so a
+caller of one holds :data:`kernel_lock` and calls :func:`apply_threads` first.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def available_threads() -> int:
 
 
 def threads() -> int:
-    """Return how many threads compute."""
+    """Return the number of computing threads."""
     return _threads
 
 
@@ -54,7 +54,7 @@ def set_threads(n: int) -> None:
     with _state_lock:
         _threads = n
         if _pool is not None:
-            _pool.shutdown(wait=False)  # what runs in it finishes
+            _pool.shutdown(wait=False)  # running ranges are finished
             _pool = None
 
 
@@ -71,7 +71,7 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, min_size
     Parameters
     ----------
     function
-        What to call.
+        Function of the first and one past the last index.
     n, size
         End of the last range, and length of a range.
     min_size
@@ -95,7 +95,7 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, min_size
         work()
     finally:
         for future in pending:
-            # nothing is left for a helper that has not begun; one that has is waited for, since it writes results
+            # a helper that has not begun has no work left; one that has is waited for, since it writes results
             if not future.cancel():
                 future.exception()
     for future in pending:

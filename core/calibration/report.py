@@ -1,4 +1,4 @@
-"""From the adjustment's minimum to the result: measures, residuals per view, uncertainty, verdict."""
+"""Result of the adjustment: measures, residuals per view, uncertainty, verdict."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""From pieces to whole lines of one family, and to their order.
+"""Joining of pieces to whole lines of one family, and their order.
 
-Pieces that lie on each other's prolongation make a line. Lines of one family cross any other line at places that
-are a projective function of their number, so neighbouring gaps differ little: following the gaps numbers the lines,
-passes over a line that is missing and leaves out what does not belong (scratches, frames, edges).
+Pieces that lie on each other's prolongation make a line. Lines of one family cross any other line at positions that are
+a projective function of their number, so neighbouring gaps differ little: following the gaps numbers the lines, passes
+over a line that is missing and leaves out other structures (scratches, frames, edges).
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ class CoarseLine:
 
 
 def link(pieces: Pieces) -> list[CoarseLine]:
-    """Join pieces that prolong each other: a line grows from its heaviest piece, outwards, by whatever lies on it."""
+    """Join pieces that prolong each other: a line grows from its heaviest piece, outwards, by the pieces that lie on
+    it."""
     n = len(pieces)
     if n < 3:
         return []
@@ -95,7 +96,7 @@ def _against(line: CoarseLine, pieces: Pieces) -> tuple[Float, Float, Float]:
     d = pieces.centre_px - line.centre_px
     t = d @ line.direction
     normal = np.array([-line.direction[1], line.direction[0]])
-    # a parabola is not trusted far beyond its own points
+    # a parabola is not extrapolated far beyond its own points
     inside = np.clip(t, line.span_px[0], line.span_px[1])
     slope = line.bend[1] + 2.0 * line.bend[2] * inside
     expected = line.bend[0] + inside * (line.bend[1] + inside * line.bend[2]) + slope * (t - inside)

@@ -1,7 +1,8 @@
-"""From a binary picture to straight pieces of lines, sorted by direction.
+"""Straight pieces of lines in a binary picture, sorted by direction.
 
-The structure tensor tells each dark pixel's direction and, by its coherence, whether there is one: at a crossing
-there is none, so that lines fall apart into the pieces between crossings. The pieces' directions show the families.
+The structure tensor gives each dark pixel's direction and, by its coherence, a measure of its certainty: at a crossing
+there is no clear direction, so that lines are divided into the pieces between crossings. The pieces' directions show the
+families.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Directions:
 
 
 def directions(picture: LinePicture) -> Directions:
-    """Find which ways the lines of a picture run."""
+    """Find the directions of the lines of a picture."""
     gx = cv2.Scharr(picture.depth, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(picture.depth, cv2.CV_32F, 0, 1)
     sigma = 2.0

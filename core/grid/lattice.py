@@ -1,4 +1,4 @@
-"""From two sets of lines to numbered intersections, or to the reason why not.
+"""Numbered intersections of two sets of lines, or the reason why there are none.
 
 Family a: lines at constant X_sys, crossed walking along X_sys (right and down in the image); family b: lines at
 constant Y_sys.
@@ -23,7 +23,7 @@ _COARSE = ("centre_px", "direction", "bend")
 _MIN_CROSSING_RAD = np.radians(40.0)
 _MIN_LINES = 4
 _MIN_SEEN = 0.4
-_STRAY_END = 0.1  # of the pitch; an end line that is off by more is an edge or a frame
+_STRAY_END = 0.1  # of the pitch; an end line that deviates by more is an edge or a frame
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
     most = (0, 0)
     for p in range(len(found.peaks_rad)):
         for q in range(p + 1, len(found.peaks_rad)):
-            apart = abs(found.peaks_rad[p] - found.peaks_rad[q])
-            if min(apart, np.pi - apart) < _MIN_CROSSING_RAD:
+            angle_rad = abs(found.peaks_rad[p] - found.peaks_rad[q])
+            if min(angle_rad, np.pi - angle_rad) < _MIN_CROSSING_RAD:
                 continue
             lattice, seen, counts = _try_pair(picture, found, found.peaks_rad[p], found.peaks_rad[q])
             most = max(most, counts, key=min)
@@ -179,7 +179,7 @@ def _drop_ends(chain: Chain, other: Chain) -> Chain:
 
 
 def _known_nodes(chain_a: Chain, chain_b: Chain) -> tuple[Float, Float]:
-    """Numbers (n, 2) and places (n, 2) of the intersections of all lines seen."""
+    """Numbers (n, 2) and positions (n, 2) of the intersections of all lines seen."""
     number = np.stack(np.meshgrid(chain_a.number, chain_b.number, indexing="ij"), axis=-1).astype(np.float64)
     return number.reshape(-1, 2), crossings(chain_a.lines, chain_b.lines).reshape(-1, 2)
 

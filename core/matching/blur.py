@@ -163,8 +163,8 @@ def fitted_share(
     half = subset_px // 2
     lag = np.arange(subset_px)
     C = blur.correlation_at(lag[:, None] - lag[None, :])
-    place = np.linspace(-1.0, 1.0, subset_px)
-    x, y = np.meshgrid(place, place)
+    coordinate = np.linspace(-1.0, 1.0, subset_px)
+    x, y = np.meshgrid(coordinate, coordinate)
     terms = [x, y] if degree == 1 else [x, y, x * x, x * y, y * y]
     middle_x, middle_y = (np.unique(np.linspace(half, last - 1 - half, _SAMPLES).astype(int)) for last in (cols, rows))
     exact, mapped = [], []

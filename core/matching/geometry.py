@@ -115,8 +115,8 @@ def principal_curvatures(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> Fl
     operator = _inverse2(first) @ (second * scale[..., None]).reshape(*w.shape[:-1], 2, 2)
     mean = 0.5 * (operator[..., 0, 0] + operator[..., 1, 1])
     det = operator[..., 0, 0] * operator[..., 1, 1] - operator[..., 0, 1] * operator[..., 1, 0]
-    apart = np.sqrt(np.maximum(mean**2 - det, 0.0))
-    return np.stack([mean + apart, mean - apart], axis=-1)
+    half_difference = np.sqrt(np.maximum(mean**2 - det, 0.0))
+    return np.stack([mean + half_difference, mean - half_difference], axis=-1)
 
 
 def plane_from_angles(

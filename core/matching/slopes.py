@@ -126,23 +126,23 @@ def slope_filter(
     N = noise * C
     floor = _MIN_NOISE * float(S[0, 0] - noise)
     S -= N
-    lag = np.arange(-REACH, REACH + 1)
-    y, x = (v.ravel() for v in np.meshgrid(lag, lag, indexing="ij"))
-    apart = y[:, None] - y, x[:, None] - x
-    R = S[apart] + N[apart]
+    offsets = np.arange(-REACH, REACH + 1)
+    y, x = (v.ravel() for v in np.meshgrid(offsets, offsets, indexing="ij"))
+    lag = y[:, None] - y, x[:, None] - x
+    R = S[lag] + N[lag]
     R[np.diag_indices(side**2)] += floor
     slope = derivative(5)
     far = min(len(slope) // 2, len(S) // 2 - 1 - REACH)
     tap = np.arange(-far, far + 1)
     slope = slope[len(slope) // 2 - far : len(slope) // 2 + far + 1]
     wanted = np.stack([S[-y[:, None], tap - x[:, None]] @ slope, S[tap - y[:, None], -x[:, None]] @ slope], axis=-1)
-    taps = np.linalg.solve(R + _INTERPOLATION_COUNTS * E[apart], wanted)
+    taps = np.linalg.solve(R + _INTERPOLATION_COUNTS * E[lag], wanted)
     taps = 0.5 * (taps - taps[::-1])  # odd, but for rounding
     power = np.einsum("ik,ij,jk->k", taps, R, taps)
     if not (power > 0.0).all():
         return None
     taps *= np.einsum("ik,ik->k", taps, wanted) / power
-    gain = float(np.einsum("ik,ij,jk->", taps, C[apart], taps)) / 2.0
+    gain = float(np.einsum("ik,ij,jk->", taps, C[lag], taps)) / 2.0
     power = float(np.einsum("ik,ij,jk->", taps, R, taps)) / 2.0
     along_x, along_y = taps.T.reshape(2, side, side)
     return SlopeFilter(along_x, along_y, gain, gain * noise / power, noise)
@@ -152,9 +152,9 @@ def _spectra(image: NDArray[Any]) -> tuple[Float | None, Float]:
     """Periodograms (tiles, side, side // 2 + 1) of tiles that show texture, white noise at its variance; the window."""
     rows, cols = image.shape
     side = min(_TILE, rows // 2 * 2, cols // 2 * 2)
-    places = [(y, x) for y in range(0, rows - side + 1, side) for x in range(0, cols - side + 1, side)]
-    places = places[:: -(-len(places) // _MAX_TILES)]
-    tiles = np.stack([image[y : y + side, x : x + side] for y, x in places]).astype(np.float64)
+    corners = [(y, x) for y in range(0, rows - side + 1, side) for x in range(0, cols - side + 1, side)]
+    corners = corners[:: -(-len(corners) // _MAX_TILES)]
+    tiles = np.stack([image[y : y + side, x : x + side] for y, x in corners]).astype(np.float64)
     hann = np.hanning(side + 2)[1:-1]
     window = np.outer(hann, hann)
     tiles = (tiles - np.tensordot(tiles, window / window.sum())[:, None, None]) * window

@@ -24,7 +24,7 @@ from core.status import PointStatus
 
 _SAMPLE = 256
 _MIN_POINTS = 30  # of a sample that stands for a field
-_MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent pulls
+_MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent blocks
 _AS_NOISE = (0.8, 1.25)  # ratio of a sample's variance to the reported one: within, nothing is corrected
 _MAX_DISAGREEMENT = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
 _UNUSUAL = 1.5  # residual energy over the field's median

@@ -112,7 +112,7 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
                 for s in range(_NEIGHBOURS):
                     for k in range(_BLOCK):
                         values[q, s, k] = np.inf
-            place = 0
+            slot = 0
             for dr in range(-REACH, REACH + 1):
                 for dc in range(-REACH, REACH + 1):
                     i = r + dr
@@ -123,7 +123,7 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
                             j = c + dc
                             if not ok[r, c] or not ok[i, j]:
                                 continue
-                            if separated.shape[0] > 0 and (separated[r, c] >> np.uint32(place)) & np.uint32(1):
+                            if separated.shape[0] > 0 and (separated[r, c] >> np.uint32(slot)) & np.uint32(1):
                                 continue
                             k = c - start
                             n[k] += 1
@@ -131,15 +131,15 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
                             x = rays[r, c, 0] - rays[i, j, 0]
                             y = rays[r, c, 1] - rays[i, j, 1]
                             wp = w[i, j, 0] + w[i, j, 1] * x + w[i, j, 2] * y
-                            values[0, place, k] = wp / w0 - 1.0
+                            values[0, slot, k] = wp / w0 - 1.0
                             if motion:
                                 # displacement times w0, so that a depth error alone does not count twice
                                 scale = w0 / wp
                                 for q in range(3):
                                     now = G[i, j, q, 0] + G[i, j, q, 1] * x + G[i, j, q, 2] * y
                                     own = G[r, c, q, 0] - rays[r, c, q]
-                                    values[1 + q, place, k] = (now - rays[r, c, q]) * scale - own
-                    place += 1
+                                    values[1 + q, slot, k] = (now - rays[r, c, q]) * scale - own
+                    slot += 1
             for q in range(quantities):
                 v = values[q]
                 _medians(v, network, n, middle)
@@ -197,11 +197,11 @@ def least_median(first, last, x, v, triplets, flat_below, residual, medians):
                     there = v[m, i, q] + a * (v[m, j, q] - v[m, i, q]) + b * (v[m, k, q] - v[m, i, q])
                     total += (there - v[m, n, q]) ** 2
                 r[n] = np.sqrt(total)
-                value, place = r[n], n
-                while place > 0 and ordered[place - 1] > value:
-                    ordered[place] = ordered[place - 1]
-                    place -= 1
-                ordered[place] = value
+                value, slot = r[n], n
+                while slot > 0 and ordered[slot - 1] > value:
+                    ordered[slot] = ordered[slot - 1]
+                    slot -= 1
+                ordered[slot] = value
             middle = ordered[half] if samples % 2 == 1 else 0.5 * (ordered[half - 1] + ordered[half])
             if middle < medians[m]:
                 medians[m] = middle

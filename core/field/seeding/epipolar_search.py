@@ -115,10 +115,10 @@ def sweep(
 def _distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Float, Float]:
     """Best first, without those within three steps of a better one."""
     order = np.argsort(-zncc)
-    place = np.searchsorted(depths, w[:, 0]) if depths[0] < depths[-1] else np.searchsorted(-depths, -w[:, 0])
+    rank = np.searchsorted(depths, w[:, 0]) if depths[0] < depths[-1] else np.searchsorted(-depths, -w[:, 0])
     taken: list[int] = []
     for i in order[: 40 * candidates]:
-        if zncc[i] > 0.0 and all(abs(int(place[i]) - int(place[j])) > 3 for j in taken):
+        if zncc[i] > 0.0 and all(abs(int(rank[i]) - int(rank[j])) > 3 for j in taken):
             taken.append(int(i))
             if len(taken) == candidates:
                 break

@@ -89,8 +89,8 @@ def nearest_points(
     for seed in seeds:
         distance = np.linalg.norm(xy_px[candidates] - np.asarray(seed.xy_px), axis=1)
         if visibility is not None:
-            place = np.broadcast_to(np.asarray(seed.xy_px, dtype=np.float64), (len(candidates), 2))
-            distance[visibility.are_separated(place, xy_px[candidates])] = np.inf
+            position = np.broadcast_to(np.asarray(seed.xy_px, dtype=np.float64), (len(candidates), 2))
+            distance[visibility.are_separated(position, xy_px[candidates])] = np.inf
         best = int(np.argmin(distance))
         if distance[best] > reach_px:
             far = f"{distance[best]:.0f} px" if np.isfinite(distance[best]) else "across a crack or a mask's black"
@@ -124,8 +124,8 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
     span = np.maximum(np.ptp(xy_px[index], axis=0), 1.0)
     # cells by area of usable points, so that thin regions and regions with holes get their share
     cell = np.sqrt(np.prod(span) / count * max(len(index), 1) / max(len(usable), 1))
-    place = np.floor((xy_px[index] - xy_px[index].min(axis=0)) / max(cell, 1.0)).astype(np.int64)
-    key = place[:, 0] * 1_000_003 + place[:, 1]
+    position = np.floor((xy_px[index] - xy_px[index].min(axis=0)) / max(cell, 1.0)).astype(np.int64)
+    key = position[:, 0] * 1_000_003 + position[:, 1]
     order = np.lexsort((support_px[index], key))
     sorted_key = key[order]
     first = np.searchsorted(sorted_key, sorted_key, side="left")
@@ -269,8 +269,8 @@ def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
     search."""
     if fitter.cur1 is None or fitter.cur2 is None:
         raise ValueError("search_motion needs current images")
-    place = xy_px[None]
-    still = fitter.fit(place, w[None], no_motion(fitter.pair, place))
+    position = xy_px[None]
+    still = fitter.fit(position, w[None], no_motion(fitter.pair, position))
     tries = [still]
     for now in template_now(fitter.ref1, fitter.cur1, xy_px, subset_px=fitter.options.subset_px):
         w_now, _ = sweep(
@@ -281,12 +281,12 @@ def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
             G = combine(
                 fitter.pair,
                 np.tile(w, (m, 1)),
-                np.tile(place, (m, 1)),
+                np.tile(position, (m, 1)),
                 np.tile(now, (m, 1)),
                 np.tile(np.eye(2), (m, 1, 1)),
                 w_now,
             )
-            tries.append(fitter.fit(np.tile(place, (m, 1)), np.tile(w, (m, 1)), G))
+            tries.append(fitter.fit(np.tile(position, (m, 1)), np.tile(w, (m, 1)), G))
     best = max(((float(t.quality.max()), i) for i, t in enumerate(tries)), key=lambda item: item[0])[1]
     chosen = tries[best]
     return chosen.take(np.array([int(np.argmax(chosen.quality))]))

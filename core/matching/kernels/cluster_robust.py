@@ -161,7 +161,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
             warp[21] = (levels[k, SHIFT] + offset) / correlation - offset
             coefficients, rows, cols, stride = shown[k]
             base = set_up_warp(
-                lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.places, warp
+                lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.positions, warp
             )
             worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores[k])
         # the contrast of all is assumed to be the best one's: a lower correlation is the image's own noise

@@ -76,7 +76,7 @@ class ReferenceSpace(NamedTuple):
     node_work: Any
     powers: Any
     basis: Any
-    place: Any
+    middle: Any
     sum_g: Any
     sum_fg: Any
     gram: Any
@@ -104,7 +104,7 @@ class WarpSpace(NamedTuple):
     """Work space of one comparison: the warp, positions of its nodes, and sums over the pixels."""
 
     warp: Any
-    places: Any
+    positions: Any
     sums: Any
 
 

@@ -120,7 +120,7 @@ def _lanes(builder: Any, indices: Any) -> list[Any]:
     return scalars
 
 
-def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[Vec]], out: Any, place: int) -> None:
+def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[Vec]], out: Any, slot: int) -> None:
     """Loop over ``count`` blocks; ``terms(offset)`` gives the block's summands; totals go to ``out`` as float64."""
     zero = ir.Constant(ir.VectorType(FLOAT, LANES), [0.0] * LANES)
     sums = [cgutils.alloca_once(builder, zero.type) for _ in range(n_sums)]  # LLVM keeps them in registers
@@ -132,7 +132,7 @@ def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[V
             builder.store((Vec(builder, builder.load(one)) + term).value, one)
     for i, one in enumerate(sums):
         total = builder.fpext(Vec(builder, builder.load(one)).sum(), ir.DoubleType())
-        builder.store(total, at(builder, out, LONG(place + i)))
+        builder.store(total, at(builder, out, LONG(slot + i)))
 
 
 def data(context: Any, builder: Any, sig: Any, args: Any, i: int) -> Any:
@@ -283,7 +283,7 @@ def _reference_sums(degree: int) -> Any:
                 return terms
 
             few, many = len(monomials(degree)), len(monomials(2 * degree))
-            place = 0
+            slot = 0
             for terms, n in (
                 (with_grey, 4 + 2 * few),
                 (columns_alone, 2 * few),
@@ -291,8 +291,8 @@ def _reference_sums(degree: int) -> Any:
                 (products(GX, GY), many),
                 (products(GY, GY), many),
             ):
-                _sum_up(builder, args[1], n, terms, out, place)
-                place += n
+                _sum_up(builder, args[1], n, terms, out, slot)
+                slot += n
             return context.get_dummy_value()
 
         return sig, codegen

@@ -57,10 +57,10 @@ def _spread_over(reach):
 
 
 @inner
-def _mean_cosine(place, along_x, along_y):
-    """Mean of cos(2 pi t) over a subset whose positions extend from ``place`` by up to these px each way."""
+def _mean_cosine(middle, along_x, along_y):
+    """Mean of cos(2 pi t) over a subset whose positions extend from ``middle`` by up to these px each way."""
     spread = _spread_over(along_x) * _spread_over(along_y)
-    return spread * math.cos(2.0 * math.pi * place) if spread != 0.0 else 0.0
+    return spread * math.cos(2.0 * math.pi * middle) if spread != 0.0 else 0.0
 
 
 @inner

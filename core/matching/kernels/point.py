@@ -139,8 +139,8 @@ def make_compare(degree: int) -> Any:
         coefficients, rows, cols, stride = image
         blocks, p, offset, f2 = known
         sum_g, sum_fg = of_reference.sum_g, of_reference.sum_fg
-        warp, places, sums = space
-        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
+        warp, positions, sums = space
+        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, positions, warp)
         if base < 0:
             return False
         warp[20] = levels[GAIN]
@@ -163,7 +163,7 @@ def make_compare(degree: int) -> Any:
         levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
         levels[CONTRAST] = c / gain
         levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
-        half = of_reference.place[2]
+        half = of_reference.middle[2]
         levels[SMOOTHED] = interpolated_noise(warp, half, order)
         levels[DENSITY] = min(max(abs(warp[1] * warp[12] - warp[2] * warp[11]) / (half * half), 0.01), 100.0)
         return True
@@ -209,7 +209,7 @@ def make_point(degree: int, images: int) -> PointKernels:
             node_work=np.empty(22),
             powers=np.empty((few, N_NODES)),
             basis=basis,
-            place=np.empty(3),
+            middle=np.empty(3),
             sum_g=np.empty(n_columns),
             sum_fg=np.empty(n_columns),
             gram=np.empty((n_columns, n_columns)),
@@ -264,7 +264,7 @@ def make_point(degree: int, images: int) -> PointKernels:
 
         ``slopes`` are d(px) / d(ray) of camera 1 at the point.
         """
-        basis, place = of_reference.basis, of_reference.place
+        basis, middle = of_reference.basis, of_reference.middle
         last = each * few
         j11, j12, j21, j22 = slopes
         for k in range(images):
@@ -309,10 +309,10 @@ def make_point(degree: int, images: int) -> PointKernels:
                         for i in range(each + 1):
                             c = at + i if i < each else last
                             d = block[0, i] * b if i < each else block[0, 4] * b * M[k, 2, j]
-                            out[m, c] -= d * place[0]
-                            out[by_x, c] -= d * place[2]
-                            out[few + m, c] -= d * place[1]
-                            out[few + by_y, c] -= d * place[2]
+                            out[m, c] -= d * middle[0]
+                            out[by_x, c] -= d * middle[2]
+                            out[few + m, c] -= d * middle[1]
+                            out[few + by_y, c] -= d * middle[2]
         return True
 
     @kernel(made_for)

@@ -31,9 +31,9 @@ def subset_array(subset: int) -> np.ndarray:
     """Return an array for the reference subset, its rows that all points share filled; the surplus is zero."""
     width = (subset * subset + LANES - 1) // LANES * LANES + LANES
     ref = np.zeros((N_ROWS, width), np.float32)
-    place = np.linspace(-1.0, 1.0, subset)
+    coordinate = np.linspace(-1.0, 1.0, subset)
     n = subset * subset
-    ref[X, :n], ref[Y, :n] = (axis.ravel() for axis in np.meshgrid(place, place))
+    ref[X, :n], ref[Y, :n] = (axis.ravel() for axis in np.meshgrid(coordinate, coordinate))
     ref[WEIGHT, :n] = 1.0
     return ref
 
@@ -126,7 +126,7 @@ def make_reference(degree: int) -> Any:
             A :class:`ReferenceSpace`.
         """
         pixels, grad_x, grad_y, weights = reference
-        raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
+        raw, node_work, powers, basis, middle, sum_g, sum_fg, gram = space
         nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
@@ -136,8 +136,8 @@ def make_reference(degree: int) -> Any:
         xc, yc = undistort(lens, x_px, y_px)
         if not np.isfinite(xc + yc):
             return nothing
-        place[0], place[1], place[2] = left + half - x_px, top + half - y_px, half
-        if not set_up_nodes(lens, place[0], place[1], half, xc, yc, node_work, powers):
+        middle[0], middle[1], middle[2] = left + half - x_px, top + half - y_px, half
+        if not set_up_nodes(lens, middle[0], middle[1], half, xc, yc, node_work, powers):
             return nothing
         _copy(pixels, top, left, subset, ref, np.int64(F))
         _copy(grad_x, top, left, subset, ref, np.int64(GX))
@@ -172,8 +172,8 @@ def make_reference(degree: int) -> Any:
         # positions -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
         u, v = basis[1], basis[2]
         u[1], u[2], v[1], v[2] = half * node_work[16], half * node_work[17], half * node_work[18], half * node_work[19]
-        u[0] = (u[1] * place[0] + u[2] * place[1]) / half
-        v[0] = (v[1] * place[0] + v[2] * place[1]) / half
+        u[0] = (u[1] * middle[0] + u[2] * middle[1]) / half
+        v[0] = (v[1] * middle[0] + v[2] * middle[1]) / half
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])

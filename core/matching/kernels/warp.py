@@ -117,8 +117,8 @@ def undistort(lens, x, y):
 
 
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
-    place = np.array([-1.0, -0.4, 0.4, 1.0])
-    x, y = (a.ravel() for a in np.meshgrid(place, place))
+    position = np.array([-1.0, -0.4, 0.4, 1.0])
+    x, y = (a.ravel() for a in np.meshgrid(position, position))
     columns = np.stack([x**i * y**j for i, j in monomials(3)], axis=1)
     return np.stack([x, y]), np.linalg.pinv(columns)
 
@@ -181,8 +181,8 @@ def _node_rays(_typingctx: Any, q: Any, iterations: Any, powers: Any) -> Any:
             for row, value in enumerate((u * u, u * v, v * v)):
                 store(value, at(builder, out, LONG(N_NODES * (3 + row))))
         reach = (u + xc) * (u + xc) + (v + yc) * (v + yc)
-        for place, value in ((20, error), (21, reach)):
-            builder.store(value.reduce("fmax"), at(builder, pointer, LONG(place)))
+        for position, value in ((20, error), (21, reach)):
+            builder.store(value.reduce("fmax"), at(builder, pointer, LONG(position)))
         return context.get_dummy_value()
 
     return sig, codegen
@@ -282,11 +282,11 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
         p1, p2 = if_seidel(0.0, a[8]), if_seidel(0.0, a[9])
         xd = u * radial + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
         yd = v * radial + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)
-        for row, place in enumerate((a[4] + a[1] * xd + a[3] * yd, a[5] + a[2] * yd)):
+        for row, position in enumerate((a[4] + a[1] * xd + a[3] * yd, a[5] + a[2] * yd)):
             total = None
             for n in range(N_NODES):
                 fit = ir.Constant(ir.VectorType(DOUBLE, 12), [*(float(c) for c in _FIT[:, n]), 0.0, 0.0])
-                term = place.pick([n] * 12) * Vec(builder, fit)
+                term = position.pick([n] * 12) * Vec(builder, fit)
                 total = term if total is None else total + term
             assert total is not None
             store(total, at(builder, out, LONG(12 * row)))
