@@ -1,6 +1,6 @@
-"""Telling that kernels are being compiled: once per machine, for a while, and a user should know why nothing moves.
+"""Report of the compilation of kernels, once per machine: it explains to a user why a start takes longer.
 
-numba says when it compiles; kernels that it finds on disk make no such event.
+numba raises an event when it compiles, none for kernels that it finds on disk.
 """
 
 from __future__ import annotations
@@ -10,30 +10,30 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 COMPILING = "compiling kernels, once per machine, about half a minute"
-"""What to tell a user."""
+"""Text for the user."""
 
 
 @contextlib.contextmanager
-def told_when_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call ``tell`` when the first kernel inside the block is about to be compiled; never if all are on disk.
+def report_compiling(report: Callable[[], None]) -> Iterator[None]:
+    """Call ``report`` when the first kernel inside the block is about to be compiled; never if all are on disk.
 
     Parameters
     ----------
-    tell
+    report
         Called at most once, on the thread that compiles.
     """
-    from numba.core import event  # takes a while to load, and whoever computes needs it anyway
+    from numba.core import event  # slow to load, and needed for any computation
 
     class Listener(event.Listener):
-        told = False
+        reported = False
 
         def on_start(self, event: Any) -> None:  # noqa: ARG002 - numba's own signature
-            if not self.told:
-                self.told = True
-                tell()
+            if not self.reported:
+                self.reported = True
+                report()
 
         def on_end(self, event: Any) -> None:
-            """Nobody waits for the end: the work's own progress shows it."""
+            """Do nothing: the end shows in the work's own progress."""
 
     listener = Listener()
     event.register("numba:compile", listener)  # type: ignore[no-untyped-call]

@@ -1,7 +1,7 @@
 """The exception tree of the whole project.
 
-Every error that a caller can meet carries a stable ``code``, the cause in one sentence with the values that
-disagree, and a remedy. The service sends the same code as problem+json; the command line prints them in one line.
+Every error raised to a caller has a stable ``code``, the cause in one sentence with the values that disagree, and a
+remedy. The service sends the same code as problem+json; the command line prints them in one line.
 
 ::
 
@@ -14,13 +14,13 @@ disagree, and a remedy. The service sends the same code as problem+json; the com
     |   +-- FileFormatError        a file that cannot be read as what it claims to be
     +-- MeasurementError           the computation could not be done
     |   +-- CalibrationError       no usable minimum
-    |   +-- SeedError              no place to start from
+    |   +-- SeedError              no start values found
     |   +-- Cancelled              the caller asked for it
     +-- DeviceError                a camera or stage
     |   +-- CameraError
     |   +-- StageError
     +-- StateError                 right call, wrong moment
-    +-- StorageError               the disk did not keep its promise
+    +-- StorageError               the disk lost or refused data
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class StereorigError(Exception):
     code
         Stable snake_case code; the class's own when left out.
     remedy
-        What the caller can do about it; the class's own when left out.
+        Remedy for the caller; the class's own when left out.
     **context
         Values a program may want (``view="cam1_+0.000mm.tif"``, ``found=10, expected=11``).
     """
@@ -76,7 +76,7 @@ class InputError(StereorigError):
 
 
 class ImageError(InputError):
-    """An image is missing, of the wrong size or type, or shows nothing."""
+    """An image is missing, of the wrong size or type, or has no texture."""
 
     code = "image_unusable"
     remedy = "Check the image file named above."
@@ -124,7 +124,7 @@ class CalibrationError(MeasurementError):
 
 
 class SeedError(MeasurementError):
-    """No place to start the field from."""
+    """No start values were found for the field."""
 
     code = "not_seeded"
     remedy = "Check that both cameras see the same textured surface, or give a seed point."
@@ -164,7 +164,7 @@ class StateError(StereorigError):
 
 
 class StorageError(StereorigError):
-    """The disk did not keep its promise."""
+    """The disk lost or refused data."""
 
     code = "storage_failed"
     remedy = "Check free space and the health of the disk; nothing unsaved was acknowledged."

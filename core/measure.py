@@ -1,6 +1,6 @@
-"""Shape and displacement of a full field: the whole chain from images to a checked result.
+"""Shape and displacement of a full field: from images to a checked result.
 
-The functions that measure; their stages lie in ``core.field``, the point-level matching in ``core.matching``.
+Entry points of the measurement; their phases are in ``core.field``, the point-level matching in ``core.matching``.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ReferencePair:
         field_of: Callable[[int], Field],
         first: int = 0,
     ) -> Updating:
-        """Return what measures the steps of a sequence in order, with later references where they are needed.
+        """Return a measurement of the steps of a sequence in order, with later references where they are needed.
 
         Parameters
         ----------
@@ -116,9 +116,9 @@ def measure_shape(
     options
         Defaults to ``MeasureOptions()``.
     seeds
-        Where to start, (x, y) in camera 1 or ``Seed``; found from feature matches when left out.
+        Seed points, (x, y) in camera 1 or ``Seed``; found from feature matches when left out.
     progress, cancel
-        Reports (stage, points done, points in all), and stop.
+        Receiver of reports (phase, points done, points in all), and the means to stop.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def measure_shape(
     SeedError
         If no start was found.
     Cancelled
-        If the token said so.
+        If the token is set.
     """
     return shape_field(prepare(pair, (image1, image2), None, grid, options, progress=progress, cancel=cancel), seeds)
 
@@ -159,7 +159,7 @@ def measure_motion(
     pair
         The calibrated cameras.
     ref1, ref2, cur1, cur2
-        (rows, cols) both cameras' images at the reference and now, raw or prepared.
+        (rows, cols) both cameras' reference and current images, raw or prepared.
     grid
         Points in camera 1's reference image.
     options

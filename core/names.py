@@ -1,4 +1,4 @@
-"""Names of the two cameras, as files, messages and replies spell them."""
+"""Names of the two cameras, as spelled in files, messages and replies."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A camera's noise, measured from repeated frames of one scene: variance against grey level.
 
-A sensor's noise is the reading's, the same everywhere, and the light's own, whose variance grows with the light:
-``variance = c0 + c1 g`` in grey levels squared, with a small ``c2 g^2`` where the camera bends its output. The model
-weighs a subset's pixels and says how far a match scatters, without a guess from residuals.
+A sensor's noise is read noise, the same everywhere, and shot noise, whose variance grows with the light: ``variance =
+c0 + c1 g`` in grey levels squared, with a small ``c2 g^2`` where the camera's output is not linear. The model weighs a
+subset's pixels and gives the covariance of a match without an estimate from residuals (photon transfer, EMVA 1288).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from numpy.typing import ArrayLike, NDArray
 from core.arrays import Bool, Float, Float32
 from core.errors import ImageError, InputError
 
-LARGEST_SHIFT_PX = 0.1
-"""Frames that moved further from one to the next are no still scene: the first-order correction would not hold."""
-LARGEST_EXCESS = 0.25
-"""Share by which variance at steep places may exceed that at flat ones of the same grey level."""
+MAX_SHIFT_PX = 0.1
+"""Largest motion from one frame to the next: beyond it the first-order correction does not hold."""
+MAX_EXCESS = 0.25
+"""Largest excess of the variance at steep pixels over that at flat ones of the same grey level."""
 
 _BINS = 48
-_FEWEST_PIXELS = 400  # of a bin
-_MOST_PIXELS = 600_000  # looked at in one frame; more tell nothing new
+_MIN_PIXELS = 400  # of a bin
+_MAX_PIXELS = 600_000  # used in one frame; more do not improve the result
 _OUTLIER = 6.0  # sd of a difference
 _CLIPPED_SD = 3.0  # distance from black and white, in sd, below which a level's noise is cut off
 _CLEAR = 0.25  # of the variance at the lowest level seen
-_SURE = 4.0  # sd of a coefficient that is believed
+_SURE = 4.0  # standard deviations of a significant coefficient
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,20 +43,20 @@ class NoiseModel:
     coefficients_sd
         Their standard deviations; 0 for a coefficient that was left out.
     range_grey
-        Where the polynomial holds: the levels seen without clipping, and for a line all the converter's. Beyond it the
+        Range of the polynomial: the levels seen without clipping, and for a line all the converter's. Beyond it the
         nearest end's variance is taken.
     frames
         Number of frames it was measured from.
     levels, variances, variances_sd
-        (k,) what was measured: mean grey level, variance and its standard deviation, bin by bin.
+        (k,) measured mean grey level, variance and its standard deviation, bin by bin.
     misfit
-        Root mean square of (measured - model) / sd over the bins; 1 is pure chance.
+        Root mean square of (measured - model) / sd over the bins; 1 for a perfect model.
     drift
-        Largest relative change of brightness between consecutive frames; taken out.
+        Largest relative change of brightness between consecutive frames; corrected.
     shift_px
-        Largest motion of the image between consecutive frames; taken out to first order.
+        Largest motion of the image between consecutive frames; corrected to first order.
     excess
-        Share by which steep places vary more than flat ones of the same grey level: 0 in a still scene.
+        Excess of the variance of steep pixels over flat ones of the same grey level: 0 in a still scene.
     """
 
     coefficients: tuple[float, float, float]
@@ -92,7 +92,7 @@ class NoiseModel:
         return np.asarray(c0 + g * (c1 + g * c2))
 
     def averaged(self, frames: int, scale: float = 1.0) -> NoiseModel:
-        """Return the model of means over ``frames`` frames whose grey levels were multiplied by ``scale``."""
+        """Return the model of means over ``frames`` frames, with grey levels multiplied by ``scale``."""
         if frames < 1 or not scale > 0.0:
             raise InputError(f"{frames} frames, scale {scale:g}: no mean.", code="option_out_of_range")
         factors = tuple(scale**power / frames for power in (2, 1, 0))
@@ -127,13 +127,13 @@ class NoiseModel:
 
 
 def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = None) -> NoiseModel:
-    """Measure a camera's noise from frames of a scene that stands still.
+    """Measure a camera's noise from frames of a still scene.
 
     Parameters
     ----------
     frames
         Two or more images (rows, cols) of one camera with one setting, in the order in which they were taken. The more
-        grey levels the scene shows, the better; a speckled specimen will do.
+        grey levels the scene has, the better; a speckled specimen is enough.
     full_scale
         Grey level at which the converter ends; from the type of integer images, or the largest value that more than a
         thousandth of the pixels share, when left out.
@@ -153,9 +153,9 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
 
     Notes
     -----
-    Consecutive frames are subtracted, so that slow drift cancels. What a change of brightness and a shift of the whole
-    image make of each difference is taken out by least squares. Half the mean square of the rest, in bins of grey
-    level, is the variance; the polynomial is fitted with the bins' own uncertainties.
+    Consecutive frames are subtracted, so that slow drift cancels. The effects of a change of brightness and of a shift
+    of the whole image on each difference are removed by least squares. Half the mean square of the rest, in bins of
+    grey level, is the variance; the polynomial is fitted with the bins' own uncertainties.
     """
     images = _checked(frames)
     mean: Float = np.asarray(np.mean(images, axis=0, dtype=np.float64))
@@ -170,13 +170,15 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
         rest, gain, moved = _still(b.astype(np.float64) - a, basis, free)
         drift, shift = max(drift, gain), max(shift, moved)
         differences.append(rest.astype(np.float32))
-    if shift > LARGEST_SHIFT_PX:
+    if shift > MAX_SHIFT_PX:
         raise _not_static(f"they move by {shift:.2f} px from one frame to the next")
     square: Float32 = np.float32(0.5) * np.stack(differences) ** 2
     bins = _binned(mean, square, free, steep)
     excess, levels = bins.excess, bins.levels
-    if excess > LARGEST_EXCESS and excess > _SURE * bins.excess_sd:
-        raise _not_static(f"steep places vary by {100 * excess:.0f} % more than flat ones of the same grey level")
+    if excess > MAX_EXCESS and excess > _SURE * bins.excess_sd:
+        raise _not_static(
+            f"pixels on steep slopes vary by {100 * excess:.0f} % more than flat ones of the same grey level"
+        )
     c, sd, misfit = _fit(levels, bins.variances, bins.sds)
     low, high = float(levels[0]), float(levels[-1])
     if c[2] == 0.0:  # a line holds beyond what was seen, as far as it stays clear of zero
@@ -240,9 +242,9 @@ def _checked(frames: Sequence[ArrayLike]) -> list[NDArray[Any]]:
 
 
 def rows_looked_at(shape: tuple[int, ...]) -> slice:
-    """Return which rows of frames of (rows, cols) :func:`measure_noise` uses: a band from the middle of large ones."""
+    """Return the rows of frames (rows, cols) that :func:`measure_noise` uses: a band in the middle of large ones."""
     count = shape[0]
-    height = max(min(count, _MOST_PIXELS // shape[1]), min(count, 16))
+    height = max(min(count, _MAX_PIXELS // shape[1]), min(count, 16))
     top = (count - height) // 2
     return slice(top, top + height)
 
@@ -289,7 +291,7 @@ def _still(difference: Float, basis: Float, free: Bool) -> tuple[Float, float, f
 
 
 class _Bins(NamedTuple):
-    """Mean grey levels, variances and their standard deviations by bins; excess of the steep places and its own."""
+    """Mean grey levels, variances and their standard deviations by bins; excess of the steep pixels and its own standard deviation."""
 
     levels: Float
     variances: Float
@@ -301,7 +303,7 @@ class _Bins(NamedTuple):
 def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> _Bins:
     g, v, s = mean[free], square[:, free], steep[free]
     order = np.argsort(g, kind="stable")
-    count = int(np.clip(len(g) // _FEWEST_PIXELS, 1, _BINS))
+    count = int(np.clip(len(g) // _MIN_PIXELS, 1, _BINS))
     # half the differences share a frame with their neighbour: 1.5 times the variance of independent ones
     repeat = 1.0 if len(v) == 1 else 1.5
     levels, variances, sds, ratio, weight = [], [], [], 0.0, 0.0
@@ -309,7 +311,7 @@ def _binned(mean: Float, square: Float32, free: Bool, steep: Float) -> _Bins:
     for part in np.array_split(order, count):
         values = v[:, part]
         limit = _OUTLIER**2 * max(float(values.mean(dtype=np.float64)), 1e-30)
-        while True:  # what sticks out (a fly, a flash) until nothing does
+        while True:  # outliers (a fly, a flash), until there are none
             kept = values <= limit
             new = _OUTLIER**2 * max(float(values[kept].mean(dtype=np.float64)), 1e-30)
             if new >= 0.99 * limit:
@@ -349,7 +351,9 @@ def _fit(g: Float, v: Float, sd: Float) -> tuple[tuple[float, float, float], tup
             C = np.linalg.inv((A * weight[:, None]).T @ A)
             x = C @ (A * weight[:, None]).T @ v
             model = np.maximum(A @ x, 1e-3 * v.mean())
-            error = sd / np.maximum(v, 1e-12) * model  # the model's own scatter, so that low bins do not pull
+            error = (
+                sd / np.maximum(v, 1e-12) * model
+            )  # the model's own standard deviation, so that low bins have no undue weight
             t = np.abs(v - model) / error
             weight = np.where(t < 3.0, 1.0, 3.0 / np.maximum(t, 1e-12)) / error**2
         misfit = float(np.sqrt(np.mean(np.minimum(t, 1e6) ** 2)))

@@ -1,8 +1,8 @@
-"""How large the features of a surface's pattern are in an image: the width of its autocorrelation's peak.
+"""Speckle size of a surface's pattern in an image: the width of its autocorrelation's peak.
 
-White noise adds to the autocorrelation at zero only, so the peak's height is carried on from its neighbours as a
-Gaussian's; noise does not make features look smaller. What varies over more than a tile (light, vignetting) is taken
-out by a quadratic fitted to each tile.
+White noise adds to the autocorrelation at zero only, so the peak's height is extrapolated from its neighbours as a
+Gaussian's; noise does not reduce the measured size. Variations over more than a tile (light, vignetting) are removed by
+a quadratic fitted to each tile.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from scipy import fft
 from core.arrays import Bool, Float
 
 _TILE_PX = 256
-_MOST_TILES = 64
-_LEAST_SHARE = 0.5  # of a tile that must lie in the region
-_LEAST_PX = 16
+_MAX_TILES = 64
+_MIN_SHARE = 0.5  # of a tile that must lie in the region
+_MIN_PX = 16
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def pattern_size(image: NDArray[np.generic], inside: Bool | None = None) -> Patt
     Returns
     -------
     PatternSize or None
-        None where nothing can be told: a region below 16 px, no contrast, or a peak wider than half a tile.
+        None for a region below 16 px, without contrast, or for a peak wider than half a tile.
     """
     grey = np.asarray(image)
     chosen = np.ones(grey.shape, dtype=bool) if inside is None else np.asarray(inside, dtype=bool)
@@ -66,7 +66,7 @@ def pattern_size(image: NDArray[np.generic], inside: Bool | None = None) -> Patt
     rows, cols = np.flatnonzero(chosen.any(axis=1)), np.flatnonzero(chosen.any(axis=0))
     box = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
     grey, chosen = grey[box], chosen[box]
-    if min(grey.shape) < _LEAST_PX:
+    if min(grey.shape) < _MIN_PX:
         return None
     covariance, count, tiles = _covariance(grey, chosen)
     if tiles == 0:
@@ -86,17 +86,17 @@ def pattern_size(image: NDArray[np.generic], inside: Bool | None = None) -> Patt
 def _covariance(grey: NDArray[np.generic], chosen: Bool) -> tuple[Float, Float, int]:
     """Sums of products at each shift and their counts, over tiles that lie in the region for the most part."""
     starts = [_starts(n) for n in grey.shape]
-    places = [(r, c) for r in starts[0] for c in starts[1]]
-    if len(places) > _MOST_TILES:
-        places = [places[int(k)] for k in np.linspace(0, len(places) - 1, _MOST_TILES)]
+    corners = [(r, c) for r in starts[0] for c in starts[1]]
+    if len(corners) > _MAX_TILES:
+        corners = [corners[int(k)] for k in np.linspace(0, len(corners) - 1, _MAX_TILES)]
     height, width = (min(n, _TILE_PX) for n in grey.shape)
     padded = (fft.next_fast_len(2 * height, real=True), fft.next_fast_len(2 * width, real=True))
     total, count = np.zeros(padded), np.zeros(padded)
     tiles = 0
     # a region that fills no tile is better than none
-    shares = [float(chosen[r : r + height, c : c + width].mean()) for r, c in places]
-    least = min(_LEAST_SHARE, max(shares))
-    for (r, c), share in zip(places, shares, strict=True):
+    shares = [float(chosen[r : r + height, c : c + width].mean()) for r, c in corners]
+    least = min(_MIN_SHARE, max(shares))
+    for (r, c), share in zip(corners, shares, strict=True):
         if share < least or share == 0.0:
             continue
         weight = chosen[r : r + height, c : c + width].astype(np.float64)

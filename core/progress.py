@@ -1,4 +1,4 @@
-"""How long computations tell how far they are, and how they are told to stop."""
+"""Progress reports and cancellation of long computations."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Protocol
 from core.errors import Cancelled
 
 Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total); must return quickly."""
+"""Called with (phase, done, total); must return quickly."""
 
 
 class CancelToken(Protocol):
-    """Anything that can say that the caller has lost interest."""
+    """Token that a caller sets to stop the work."""
 
     @property
     def cancelled(self) -> bool:
@@ -37,11 +37,11 @@ class Cancel:
         self._event.set()
 
 
-def no_progress(stage: str, done: int, total: int) -> None:
-    """Drop the report: the default where nobody listens."""
+def no_progress(phase: str, done: int, total: int) -> None:
+    """Drop the report: the default without a receiver."""
 
 
 def raise_if_cancelled(cancel: CancelToken | None) -> None:
-    """Raise :class:`core.errors.Cancelled` if the token says so."""
+    """Raise :class:`core.errors.Cancelled` if the token is set."""
     if cancel is not None and cancel.cancelled:
         raise Cancelled("the work was cancelled before it was finished.")

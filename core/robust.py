@@ -1,4 +1,4 @@
-"""Robust statistics: scatter told by the median, Tukey's biweight, samples spread over all."""
+"""Robust statistics: standard deviation from the median, Tukey's biweight, spread samples."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ def biweight(squared: Float) -> Float:
 
 
 def spread_indices(n: int, count: int) -> NDArray[np.int64]:
-    """Return ``count`` indices below n, spread over all by multiples of the golden section; some may be equal."""
+    """Return ``count`` indices below n, spread by multiples of the golden section; some may be equal."""
     return (n * (_GOLDEN_SECTION * np.arange(count) % 1.0)).astype(int)

@@ -47,7 +47,7 @@ class Range(NamedTuple):
 SUBSET_PX = Range(9, 401, True, 33)
 STEP_PX = Range(1, 1000, False, 10)
 STRAIN_WINDOW = Range(3, 101, True, 9)
-#: no default window: displacements are smoothed only where that is asked for
+#: no default window: displacements are smoothed only on request
 SMOOTHING_WINDOW = Range(3, 51, True, 5)
 #: a wider Gaussian would leave a handful of independent pixels in the subset
 PREFILTER_OF_SUBSET = 0.25
@@ -73,7 +73,7 @@ SubsetPx = Annotated[
     Whole, Field(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Subset size, odd.", json_schema_extra=ODD)
 ]
 StepPx = Annotated[Whole, Field(ge=STEP_PX.low, le=STEP_PX.high, description="Distance of neighbouring points.")]
-Place = tuple[Pixel, Pixel]
+PixelPosition = tuple[Pixel, Pixel]
 Rectangle = tuple[Pixel, Pixel, Pixel, Pixel]
 
 
@@ -96,22 +96,22 @@ class Settings(BaseModel):
 
 
 class Region(Settings):
-    """Where points may lie: a rectangle or a polygon, or a mask alone; cracks and holes.
+    """Region of interest: a rectangle or a polygon, or a mask alone; cracks and holes.
 
-    No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
+    No subset, neighbour or start value crosses a crack, a hole's border or the mask's black.
     """
 
     rectangle: Rectangle | None = Field(
         None, description="x0, y0, x1, y1 in camera 1's reference image, inclusive.", examples=[[120, 100, 400, 380]]
     )
-    polygon: list[Place] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
-    cracks: list[Annotated[list[Place], Field(min_length=2, max_length=MAX_CORNERS)]] = Field(
+    polygon: list[PixelPosition] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
+    cracks: list[Annotated[list[PixelPosition], Field(min_length=2, max_length=MAX_CORNERS)]] = Field(
         [],
         description="Lines in camera 1's reference image, each the points that it goes through.",
         max_length=MAX_CUTS,
         examples=[[[[150, 240], [260, 238.5], [362, 241]]]],
     )
-    holes: list[Annotated[list[Place], Field(min_length=3, max_length=MAX_CORNERS)]] = Field(
+    holes: list[Annotated[list[PixelPosition], Field(min_length=3, max_length=MAX_CORNERS)]] = Field(
         [],
         description="Corners of polygons in camera 1's reference image inside which nothing is measured.",
         max_length=MAX_CUTS,
@@ -137,7 +137,7 @@ class StrainSettings(Settings):
 
 
 class AnalysisSettings(Settings):
-    """What a measurement depends on besides its images and its calibration."""
+    """Settings of a measurement, besides its images and its calibration."""
 
     region: Region = Field(description="Where points may lie.")
     subset_px: SubsetPx = SUBSET_PX.default
@@ -153,10 +153,10 @@ class AnalysisSettings(Settings):
         0.0,
         description="Sd of a Gaussian that all images are blurred with, px, at most a quarter of subset_px; 0: none.",
     )
-    seeds: Annotated[list[Place], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
+    seeds: Annotated[list[PixelPosition], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
     )
-    seeds_cam2: Annotated[list[Place | None], Field(max_length=MAX_SEEDS)] | None = Field(
+    seeds_cam2: Annotated[list[PixelPosition | None], Field(max_length=MAX_SEEDS)] | None = Field(
         None,
         description="The same points in camera 2's reference image, where known: as many as `seeds`, null where not. "
         "They start the search there; one further than 8 px from its epipolar line is refused.",
@@ -212,7 +212,7 @@ class NoiseRecord(BaseModel):
 
 
 class StoredRegion(Region):
-    """A region as results keep it; checked against its image when it was made."""
+    """A region as stored in results; checked against its image when it was made."""
 
     rectangle: tuple[float, float, float, float] | None = None
     polygon: list[tuple[float, float]] | None = None
@@ -222,7 +222,7 @@ class StoredRegion(Region):
 
 
 class StoredSettings(AnalysisSettings):
-    """Settings as results keep them: with what stands for the files beside them."""
+    """Settings as stored in results, with records in place of files."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

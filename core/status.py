@@ -1,4 +1,4 @@
-"""What can be said about one measurement point."""
+"""Status of a measurement point."""
 
 from __future__ import annotations
 

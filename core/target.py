@@ -15,12 +15,12 @@ import numpy as np
 from core.arrays import Float
 from core.errors import TargetError
 
-_LEAST_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
+_MIN_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridTarget:
-    """What is known of the grid before the first image.
+    """Description of the calibration grid.
 
     Parameters
     ----------
@@ -31,14 +31,14 @@ class GridTarget:
     line_width_mm
         Width of a line.
     node_tolerance_mm
-        The maker's bound on the error of an intersection's place, per axis; 0 for an exact grid.
+        The maker's bound on the error of an intersection's position, per axis; 0 for an exact grid.
     dark_lines
         Dark lines on bright ground, or bright lines on dark ground.
 
     Raises
     ------
     TargetError
-        Code ``target_invalid``, if a number makes no grid.
+        Code ``target_invalid``, if a number is out of range.
     """
 
     pitch_mm: float
@@ -52,8 +52,8 @@ class GridTarget:
         if len(lines) != 2 or any(isinstance(n, bool) or int(n) != n for n in lines):
             raise _invalid(f"lines must be two whole numbers, got {self.lines!r}")
         object.__setattr__(self, "lines", (int(lines[0]), int(lines[1])))
-        if min(self.lines) < _LEAST_LINES:
-            raise _invalid(f"a grid needs at least {_LEAST_LINES} lines each way, got {list(self.lines)}")
+        if min(self.lines) < _MIN_LINES:
+            raise _invalid(f"a grid needs at least {_MIN_LINES} lines each way, got {list(self.lines)}")
         if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
             raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")
         if not (0.0 < self.line_width_mm < 0.5 * self.pitch_mm):
@@ -73,7 +73,7 @@ class GridTarget:
         return self.lines[0] - 2, self.lines[1] - 2
 
     def inner_points_mm(self) -> Float:
-        """Return the nominal places of the inner intersections in the system frame.
+        """Return the nominal positions of the inner intersections in the system frame.
 
         Returns
         -------
@@ -83,7 +83,7 @@ class GridTarget:
         return self._points(1)
 
     def all_points_mm(self) -> Float:
-        """Return the nominal places of all intersections, the outermost ones too, (n_a, n_b, 2) in mm."""
+        """Return the nominal positions of all intersections, the outermost ones too, (n_a, n_b, 2) in mm."""
         return self._points(0)
 
     def _points(self, margin: int) -> Float:

@@ -1,8 +1,8 @@
-"""How many threads compute, and the lock around kernels that bring threads of their own.
+"""Number of computing threads, and the lock around kernels with threads of their own.
 
 Kernels that release the GIL are run over ranges by :func:`run_ranges`, on plain threads. numba's own parallel kernels
-(``prange``) are another matter: its ``workqueue`` layer aborts the process when two threads run such kernels at once,
-so whoever calls one holds :data:`kernel_lock` and calls :func:`apply_threads` first.
+(``prange``) are different: its ``workqueue`` layer aborts the process when two threads run such kernels at once, so a
+caller of one holds :data:`kernel_lock` and calls :func:`apply_threads` first.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def available_threads() -> int:
 
 
 def threads() -> int:
-    """Return how many threads compute."""
+    """Return the number of computing threads."""
     return _threads
 
 
@@ -54,7 +54,7 @@ def set_threads(n: int) -> None:
     with _state_lock:
         _threads = n
         if _pool is not None:
-            _pool.shutdown(wait=False)  # what runs in it finishes
+            _pool.shutdown(wait=False)  # running ranges are finished
             _pool = None
 
 
@@ -63,7 +63,7 @@ def apply_threads() -> None:
     numba.set_num_threads(min(_threads, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
 
 
-def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: int | None = None) -> None:
+def run_ranges(function: Callable[[int, int], None], n: int, size: int, min_size: int | None = None) -> None:
     """Call ``function(first, last)`` over 0 ... n in ranges of ``size``, on all threads; the caller's is one of them.
 
     The first exception is raised again, once all threads have stopped.
@@ -71,14 +71,14 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: i
     Parameters
     ----------
     function
-        What to call.
+        Function of the first and one past the last index.
     n, size
         End of the last range, and length of a range.
-    least
+    min_size
         Length down to which the last ranges shrink, so that all threads end at about the same time; all are of one
         length when left out.
     """
-    cuts = _cuts(n, size, least or size)
+    cuts = _cuts(n, size, min_size or size)
     ranges = iter(pairwise(cuts))
     take = threading.Lock()
 
@@ -95,7 +95,7 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: i
         work()
     finally:
         for future in pending:
-            # nothing is left for a helper that has not begun; one that has is waited for, since it writes results
+            # a helper that has not begun has no work left; one that has is waited for, since it writes results
             if not future.cancel():
                 future.exception()
     for future in pending:
@@ -103,11 +103,11 @@ def run_ranges(function: Callable[[int, int], None], n: int, size: int, least: i
             future.result()
 
 
-def _cuts(n: int, size: int, least: int) -> list[int]:
+def _cuts(n: int, size: int, min_size: int) -> list[int]:
     cuts = [0]
     while cuts[-1] < n:
         left = n - cuts[-1]
-        cuts.append(cuts[-1] + min(left, size, max(least, left // (2 * _threads))))
+        cuts.append(cuts[-1] + min(left, size, max(min_size, left // (2 * _threads))))
     return cuts
 
 

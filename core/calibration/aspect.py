@@ -4,10 +4,10 @@ With the optical axis normal to the grid and lines at about 45 degrees, both dia
 intersections have one physical length; one runs along the columns, the other along the rows. lambda is the ratio of
 their extents in the image, |dY_img| over |dX_img|, whatever the grid's rotation in its plane.
 
-What tilt does: a grid turned by a small angle tau about the rows shows its columns shorter by tau^2 / 2 (1 degree:
-1.5e-4), one turned about the columns makes lambda too large by as much. The diagonals cannot tell. The refinement over
-translated images can: known travel dZ along the axis gives the pinhole distance, and the convergence of the lines then
-gives the tilt.
+Effect of tilt: a grid turned by a small angle tau about the rows shows its columns shorter by tau^2 / 2 (1 degree:
+1.5e-4), one turned about the columns makes lambda too large by as much. The diagonals do not show it. The refinement
+over translated images does: known travel dZ along the axis gives the pinhole distance, and the convergence of the lines
+then gives the tilt.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from core.grid.view import GridView
 from core.target import GridTarget
 
 _BLOCK = 5
-_CENTRE_PRIOR = 0.04  # of the image's width: the image centre is never far from the middle, and hardly matters
+_CENTRE_PRIOR = 0.04  # of the image's width: the image centre is never far from the middle, and has little effect
 _KAPPA_PRIOR = 0.1  # kappa r^2 at the image's corner
 _SIGMA_FLOOR_PX = 1e-4
-_LEAST_MOVED = 3
-_LEAST_SCALE_CHANGE = 1e-3
+_MIN_MOVED = 3
+_MIN_SCALE_CHANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,15 @@ class AspectResult:
     aspect, sigma
         The best value and its standard deviation: the refined one where there is one, else the first.
     first_estimate, first_estimate_sigma
-        Mean over blocks and images of the diagonals' ratio; scatter of the images' means over the root of their number.
+        Mean over blocks and images of the diagonals' ratio; standard deviation of the images' means over the root of
+        their number.
     blocks
         (images, block positions along X_sys, along Y_sys) ratio of each 5 x 5 block.
     refined, refined_sigma
         From the fit over translated images; None from fewer than three without known travel.
     tilt_rad
-        (about the rows, about the columns) of the grid, from that fit; None without it. Without it, lambda is right to
-        half of the tilt's square only.
+        (about the rows, about the columns) of the grid, from that fit; None without it. Without it, lambda has a bias
+        of half of the tilt's square.
     """
 
     aspect: float
@@ -92,17 +93,17 @@ def block_ratios(xy_px: ArrayLike) -> Float:
 
 
 def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None = None) -> AspectResult:
-    """Measure lambda from images of a grid that stands (nearly) normal to the optical axis.
+    """Measure lambda from images of a grid (nearly) normal to the optical axis.
 
     Parameters
     ----------
     views
         Detections of one target by one camera; the paper takes twenty.
     dz_mm
-        Travel of the camera along its axis at each view, away from the target. With travel the estimate is refined by
-        a fit of the whole camera over the translated images, which frees it from the tilt. Without it, and with three
-        views or more, all intersections of all views are fitted with one aspect ratio and one distortion, the axis
-        being normal to the grid: that averages the noise and takes the distortion out, but not the tilt.
+        Travel of the camera along its axis at each view, away from the target. With travel the estimate is refined by a
+        fit of the whole camera over the translated images, which removes the effect of the tilt. Without it, and with
+        three views or more, all intersections of all views are fitted with one aspect ratio and one distortion, the
+        axis being normal to the grid: that averages the noise and removes the effect of distortion, but not of tilt.
 
     Raises
     ------
@@ -125,7 +126,7 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
         span = float(np.median(np.abs(views[0].xy_px[_BLOCK - 1 :, : 1 - _BLOCK] - views[0].xy_px[: 1 - _BLOCK, 4:])))
         first_estimate_sigma = 2.0 * float(np.median(views[0].sigma_px)) / max(span, 1.0)
     if dz_mm is None:
-        if n < _LEAST_MOVED:
+        if n < _MIN_MOVED:
             return AspectResult(first, first_estimate_sigma, first, first_estimate_sigma, blocks, None, None, None)
         value, sigma = _refine_moved(views, first)
         return AspectResult(value, sigma, first, first_estimate_sigma, blocks, value, sigma, None)
@@ -134,7 +135,7 @@ def measure_aspect(views: Sequence[GridView], *, dz_mm: Sequence[float] | None =
         raise CalibrationInputError(f"{n} views need {n} finite positions, got {list(dz_mm)}", code="aspect_views")
     if float(np.ptp(dz)) == 0.0:
         raise CalibrationInputError(
-            f"all views stand at dZ = {dz[0]:g} mm: without travel the tilt stays unknown", code="aspect_views"
+            f"all views are at dZ = {dz[0]:g} mm: without travel the tilt stays unknown", code="aspect_views"
         )
     refined, sigma, tilt = _refine(views, dz, first)
     return AspectResult(refined, sigma, first, first_estimate_sigma, blocks, refined, sigma, tilt)
@@ -229,10 +230,10 @@ def _start(xy: Float, points: Float, dz: Float, aspect: float, size: tuple[int, 
         shift.append(middle / abs(s))
     slope, offset = np.polyfit(dz, np.array(inverse_scale), 1)
     change = abs(slope) * np.ptp(dz) / offset
-    if slope <= 0.0 or change < _LEAST_SCALE_CHANGE:
+    if slope <= 0.0 or change < _MIN_SCALE_CHANGE:
         raise CalibrationInputError(
             f"the grid's scale changes by {slope * np.ptp(dz) / offset:.2e} over {np.ptp(dz):g} mm of travel; it must"
-            f" shrink by {_LEAST_SCALE_CHANGE:g} at least",
+            f" shrink by {_MIN_SCALE_CHANGE:g} at least",
             code="aspect_views",
             remedy="Give dZ in mm, positive away from the target, and travel further.",
         )

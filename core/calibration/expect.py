@@ -1,4 +1,4 @@
-"""What a plan may be expected to leave uncertain: before anything moves, from nominal values alone."""
+"""Expected uncertainty of a planned calibration, from nominal values alone."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ _PER_LINE = {"straight": 2, "parabola": 3}
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a plan may be expected to leave.
+    """Expected uncertainty of a planned calibration.
 
     Attributes
     ----------
     parameters, sigma
         Nominal value and expected standard deviation by name, as in :data:`COVARIANCE_NAMES`.
     volume
-        What the covariance does to points of the target's volume.
+        Uncertainty of points in the target's volume.
     points_mm, sigma_mm
         (9, 3) the middle of the volume, then its corners, and the standard deviation of X, Y, Z there.
     seen
         Of each camera, the share of the inner intersections that the nominal camera sees at the worst position.
     reasons
-        Why :func:`core.calibration.calibrate` would refuse such views; empty where it would not.
+        Reasons for which :func:`core.calibration.calibrate` would refuse such views; empty if it would not.
     """
 
     parameters: dict[str, float]
@@ -77,23 +77,23 @@ def expect(
     roll_deg: float = 0.0,
     line_model: LineModel | None = None,
 ) -> Expectation:
-    """Predict what fitted positions will leave uncertain.
+    """Predict the uncertainty of a calibration from the positions to be fitted.
 
-    The nominal cameras look at the target's centre; the adjustment's own derivatives and priors at the places where
-    they would see the intersections give the covariance.
+    The nominal cameras look at the target's centre; the adjustment's own derivatives and priors at the expected image
+    coordinates of the intersections give the covariance.
 
     Parameters
     ----------
     positions_mm
         dZ of the fitted positions, the same for both cameras.
     target, nominals, options
-        As :func:`core.calibration.calibrate` takes them; held-out positions do not matter.
+        As for :func:`core.calibration.calibrate`; held-out positions have no effect.
     noise_px
-        Standard deviation with which an intersection's coordinate is found.
+        Standard deviation of an intersection's image coordinate.
     roll_deg
         Turn of the grid in the image (alpha of Eq. 1).
     line_model
-        How lines are fitted; whole lines give fewer independent coordinates.
+        Model of the lines; whole lines give fewer independent coordinates.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""From grid images to the calibration: one path for the command line and the service."""
+"""Calibration from grid images, for the command line and the service."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ImageOfTarget:
     Parameters
     ----------
     camera, dz_mm
-        Which camera, and its read-back travel along its own optical axis, positive away from the target.
+        The camera, and its read-back travel along its own optical axis, mm, positive away from the target.
     pixels
         (rows, columns).
     name
@@ -47,7 +47,7 @@ class ImageOfTarget:
 
 @dataclass(frozen=True)
 class CalibrationFromImages:
-    """What was found in the images, in their order, and what came of it."""
+    """The grids detected in the images, in their order, and the calibration from them."""
 
     grids: tuple[GridView, ...]
     result: CalibrationResult
@@ -74,11 +74,11 @@ def calibrate_views(
         See :func:`core.calibration.solve.calibrate`.
     localiser, grid_options
         See :func:`core.grid.detect_grid`. Where node corrections are estimated, the profile localiser takes each
-        intersection from the lines near it: a fit over whole lines smears the nodes' errors into the cameras. On
-        eight simulated 4 um grids the shape error was the same (0.40 um against 0.37), but only then did the
-        covariance tell the truth (true parameters 2 to 3.6 sigma off with straight lines, 0.4 to 1.2 with local).
+        intersection from the lines near it: a fit over whole lines smears the nodes' errors into the cameras. On eight
+        simulated 4 um grids the shape error was the same (0.40 um against 0.37), but only then was the covariance right
+        (errors of the parameters 2 to 3.6 sigma with straight lines, 0.4 to 1.2 with local).
     progress, cancel
-        Stages ``grid`` (one an image) and ``calibration``.
+        Phases ``grid`` (one an image) and ``calibration``.
 
     Raises
     ------

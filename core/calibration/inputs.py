@@ -1,4 +1,4 @@
-"""What a calibration starts from: views of the target, nominal lens data, options."""
+"""Inputs of a calibration: views of the target, nominal lens data, options."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from core.arrays import Bool, Float
 from core.errors import CalibrationInputError
 from core.names import CameraName
 
-_SMALLEST_SPREAD_PX = 5.0  # rms over the narrower direction
+_MIN_SPREAD_PX = 5.0  # rms over the narrower direction
 
 
 class TargetLike(Protocol):
@@ -36,7 +36,7 @@ class TargetLike(Protocol):
 
 @dataclass(frozen=True)
 class NominalCamera:
-    """What is known of a camera before it is calibrated.
+    """Nominal data of a camera before it is calibrated.
 
     Parameters
     ----------
@@ -68,19 +68,19 @@ class CalibrationView:
     Parameters
     ----------
     camera
-        Which camera took it.
+        The camera's name.
     dz_mm
         Its read-back travel along its own optical axis, positive away from the target.
     xy_px
         (n_a, n_b, 2) image positions, first axis along X_sys, second along Y_sys; NaN where one was not found.
     sigma_px
-        Standard deviation per axis that the localiser claims, as a number or (n_a, n_b); None where it claims none.
+        Standard deviation per axis reported by the localiser, as a number or (n_a, n_b); None where it reports none.
         Only ratios matter: the noise level is estimated from the residuals.
     name
         Name used in messages (a file name, for instance).
     correlation
-        Observed coordinates per independent one. A fit over whole lines gives every intersection on a line the
-        line's own error, so that 162 coordinates of 18 straight lines know no more than 36 independent ones.
+        Observed coordinates per independent one. A fit over whole lines gives every intersection on a line the line's
+        own error, so that 162 coordinates of 18 straight lines hold no more information than 36 independent ones.
     """
 
     camera: CameraName
@@ -110,21 +110,21 @@ class CalibrationOptions:
     held_out_mm
         Positions left out of the fit and used for the check.
     hold_out_tolerance_mm
-        How far a read-back position may lie from the value named in ``held_out_mm``.
+        Largest difference of a read-back position from the value given in ``held_out_mm``.
     centre_sigma_px
-        Prior on the image centre. cx and x0 correlate at 0.9998, so that it costs nothing in 3-D and keeps the solver
-        from wandering along the valley.
+        Prior on the image centre. cx and x0 correlate at 0.9998, so that it has no effect in 3-D and keeps the solver
+        from drifting along the valley.
     axis_tilt_sigma_rad
         Prior on the angle between stage axis and optical axis, per direction. The residuals cannot show it (1 mrad
         moves cx by 12 px at the same RBE), so it must be declared; it is carried into the covariance. 0 holds the
         axis fixed.
     estimate_nodes
-        Whether node corrections are unknowns; None means: where the target has a tolerance.
+        True if node corrections are unknowns; None: if the target has a tolerance.
     max_shape_uncertainty
         Largest predicted standard deviation of shape, relative to the target's extent, that is accepted.
     max_centre_sigma_px, max_standoff_sigma
         Largest predicted standard deviation of the image centre, and of the standoff relative to itself. Near the
-        target's plane the shape stays good without any travel; these two show whether the travel tells anything.
+        target's plane the shape stays good without any travel; these two show if the travel is enough.
     max_iterations
         Of the adjustment of both cameras.
     """
@@ -154,12 +154,12 @@ def extent_mm(target: TargetLike) -> float:
 
 
 def is_held_out(dz_mm: float, options: CalibrationOptions) -> bool:
-    """Whether a position is among those left out of the fit."""
+    """Return True if a position is among those left out of the fit."""
     return any(abs(dz_mm - held) <= options.hold_out_tolerance_mm for held in options.held_out_mm)
 
 
 def check_view(view: CalibrationView, target: TargetLike, nominal: NominalCamera) -> None:
-    """Refuse a view whose numbers cannot be used.
+    """Raise an error for a view whose numbers cannot be used.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def check_view(view: CalibrationView, target: TargetLike, nominal: NominalCamera
         )
     width, height = nominal.image_size_px
     xy = view.xy_px[found]
-    if np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)[-1] < _SMALLEST_SPREAD_PX * np.sqrt(len(xy)):
+    if np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)[-1] < _MIN_SPREAD_PX * np.sqrt(len(xy)):
         raise CalibrationInputError(
             f"{view.label} shows the intersections within {np.ptp(xy, axis=0).round(1).tolist()} px, no grid.",
             code="view_degenerate",

@@ -1,4 +1,4 @@
-"""Before the fit: sort and check the views, predict what they can determine, refuse what they cannot."""
+"""Preparation of the fit: sorted and checked views, predicted uncertainty, refusal of insufficient views."""
 
 from __future__ import annotations
 
@@ -96,12 +96,12 @@ def predict_uncertainty(
     node_sigma_mm: float = 0.0,
     noise_px: float = EXPECTED_NOISE_PX,
 ) -> VolumeUncertainty:
-    """Predict the uncertainty that views at these positions will leave, from nominal values and before any fit.
+    """Predict the uncertainty of a calibration with views at these positions, from nominal values and before any fit.
 
     Raises
     ------
     CalibrationError
-        Code ``calibration_singular`` where they determine nothing.
+        Code ``calibration_singular`` where they do not determine the parameters.
     """
     options = options or CalibrationOptions()
     fitted = split_hold_out(sort_views(views, target, nominals), options)
@@ -139,7 +139,7 @@ def predict_or_refuse(
     options: CalibrationOptions,
     node_sigma_mm: float,
 ) -> VolumeUncertainty:
-    """Predict, and refuse views that leave too much open.
+    """Predict the uncertainty, and refuse views for which it is too large.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def predict_or_refuse(
         ``calibration_one_position`` or ``calibration_dz_too_small``, with the predicted uncertainty.
     """
     everything = [v for own in per_camera for v in own]
-    # a declared tilt of the stage axis widens the centre however far the stage travels
+    # a declared tilt of the stage axis increases the centre's uncertainty at any travel
     travel_only = replace(options, axis_tilt_sigma_rad=0.0)
     try:
         predicted = predict_uncertainty(everything, target, nominals, travel_only, node_sigma_mm=node_sigma_mm)

@@ -1,4 +1,4 @@
-"""From the adjustment's minimum to the result: measures, residuals per view, uncertainty, verdict."""
+"""Result of the adjustment: measures, residuals per view, uncertainty, verdict."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from core.calibration.inputs import (
 from core.calibration.prepare import Views
 from core.calibration.result import TEN_OF_BOTH, CalibrationResult, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
-from core.calibration.verdict import checks_made, judge
+from core.calibration.verdict import assess, checks_made
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
 
@@ -69,7 +69,7 @@ def build_result(
     finite = (adjustment.parameters, covariance, adjustment.noise_px, corrections, uncertainty.sigma_mm)
     if not all(np.isfinite(part).all() for part in finite) or not np.isfinite(fitted.mean.rbe_px):
         raise CalibrationError("The adjustment ended at numbers that are not finite.", code="calibration_not_finite")
-    verdict = judge(
+    verdict = assess(
         fitted=fitted,
         held_out=held_out,
         views=results,

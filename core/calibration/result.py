@@ -17,7 +17,7 @@ from core.cameras.stereo import StereoPair
 from core.names import CAMERAS, CameraName
 
 COVARIANCE_NAMES = tuple(f"{camera}.{name}" for camera in CAMERAS for name in TEN_PARAMETER_NAMES)
-TEN_OF_BOTH = np.r_[0:10, 12:22]  # where the ten parameters of both cameras lie among the adjustment's 24
+TEN_OF_BOTH = np.r_[0:10, 12:22]  # indices of the ten parameters of both cameras among the adjustment's 24
 Level = Literal["good", "warning", "failed"]
 
 
@@ -28,7 +28,7 @@ class ViewResult:
     Attributes
     ----------
     camera, dz_mm, name, held_out
-        Which view, and whether it was left out of the fit.
+        The view, and True if it was left out of the fit.
     residual_px
         (n_a, n_b, 2) measured minus projected, NaN where not found; against the nodes the calibration used.
     rbe_px, raz_mm, nsce
@@ -47,7 +47,7 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Good, warning or failed, with the reasons in plain words."""
+    """Good, warning or failed, with the reasons as text."""
 
     level: Level
     reasons: tuple[str, ...]
@@ -55,7 +55,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class CheckDone:
-    """One check that can be made on a calibration: whether it was, and what it said."""
+    """One possible check of a calibration: ``made`` or not, and its finding."""
 
     name: str
     made: bool
@@ -64,7 +64,7 @@ class CheckDone:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Both cameras with everything that is known about them.
+    """Both calibrated cameras, with uncertainty, checks and verdict.
 
     Attributes
     ----------
@@ -91,9 +91,9 @@ class CalibrationResult:
     positions
         Declared against seen positions, per camera.
     checks
-        Which checks were made and which were not.
+        Checks made and not made.
     verdict
-        What to make of it.
+        Automatic assessment, with reasons.
     """
 
     pair: StereoPair

@@ -53,7 +53,7 @@ def calibrate(
 
     References
     ----------
-    Helm, McNeill, Sutton (1996), section 3.2.3, Eqs. (9) to (11), (15) to (17).
+    Helm, McNeill, Sutton (1996), doi:10.1117/1.600624, section 3.2.3, Eqs. (9) to (11), (15) to (17).
     """
     options = options or CalibrationOptions()
     nodes = inner_nodes_mm(target)
@@ -94,8 +94,8 @@ def _fit(
     for c, nominal in enumerate(nominals):
         reference = min(fitted[c], key=lambda v: abs(v.dz_mm))
         gamma = float(np.radians(nominal.angle_deg))
-        # a plane seen from the other side of its normal is nearly as good a start; trying both shows exchanged or
-        # mirrored cameras for what they are
+        # a plane seen from the other side of its normal is nearly as good a start; trying both reveals exchanged or
+        # mirrored cameras
         starts = [start_values(reference, nodes_mm, nominal, g) for g in (gamma, -gamma)]
         parameters[c, :10] = fit_single(observations[c], flat, nominal, starts, centre_sigma_px=options.centre_sigma_px)
     check_angles(

@@ -1,6 +1,7 @@
-"""What the parameters' covariance means in space: the uncertainty of points in the target's volume.
+"""Uncertainty of points in the target's volume, from the parameters' covariance.
 
-Single parameters correlate at 0.9998 and more and nearly cancel in 3-D, so that a calibration is judged here.
+Single parameters correlate at 0.9998 and more and nearly cancel in 3-D, so that a calibration is assessed by points in
+space.
 """
 
 from __future__ import annotations
@@ -26,8 +27,7 @@ class VolumeUncertainty:
     sigma_mm
         (n, 3) standard deviation of each triangulated point's coordinates.
     shape_rms_mm
-        Root mean square over points and coordinates after the common rigid motion is taken out: what is left
-        deforms shapes.
+        Root mean square over points and coordinates without the common rigid motion: the part that deforms shapes.
     relative_shape
         ``shape_rms_mm`` over the target's extent.
     scale
@@ -74,7 +74,7 @@ def volume_points_mm(target: TargetLike) -> Float:
 
 
 def volume_uncertainty(pair: StereoPair, covariance: Float, target: TargetLike) -> VolumeUncertainty:
-    """Carry the (24, 24) covariance of both cameras' parameters to points in the target's volume."""
+    """Propagate the (24, 24) covariance of both cameras' parameters to points in the target's volume."""
     points = volume_points_mm(target)
     G = point_derivatives(pair, points)
     cov = G @ covariance @ np.swapaxes(G, 1, 2)

@@ -1,4 +1,4 @@
-"""What to make of a calibration: the bands, the worst views, what could not be checked."""
+"""Automatic assessment of a calibration: bands of the RBE, the worst views, and checks that were not made."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def band(rbe_px: float) -> Level:
     return "warning" if rbe_px <= USABLE_RBE_PX else "failed"
 
 
-def judge(
+def assess(
     *,
     fitted: CheckMeasures,
     held_out: CheckMeasures | None,
@@ -42,7 +42,7 @@ def judge(
     options: CalibrationOptions,
     centres: Sequence[tuple[Mapping[str, float], tuple[int, int]]] = (),
 ) -> Verdict:
-    """Judge by the held-out RBE of each camera, the predicted uncertainty and the node corrections."""
+    """Assess a calibration by the held-out RBE of each camera, the predicted uncertainty and the node corrections."""
     level: Level = "good"
     reasons: list[str] = []
     if held_out is None:
@@ -51,10 +51,10 @@ def judge(
             f"No position was held out, so that nothing independent confirms the calibration; fitted RBE "
             f"{fitted.mean.rbe_px:.4f} px."
         )
-        judged, word = fitted, "Fitted"
+        measures, word = fitted, "Fitted"
     else:
-        judged, word = held_out, "Held-out"
-    for name, part in zip(CAMERAS, judged.per_camera, strict=True):
+        measures, word = held_out, "Held-out"
+    for name, part in zip(CAMERAS, measures.per_camera, strict=True):
         this = band(part.rbe_px)
         level = worst(level, this)
         limit = GOOD_RBE_PX if this in ("good", "warning") else USABLE_RBE_PX
@@ -76,13 +76,13 @@ def judge(
             f"{1e3 * uncertainty.shape_rms_mm / uncertainty.relative_shape * options.max_shape_uncertainty:.2f} um."
         )
     if node_corrections_mm is not None:
-        largest = float(np.abs(node_corrections_mm).max())
+        correction_mm = float(np.abs(node_corrections_mm).max())
         # a bound is a bound; half as much again leaves room for the estimate's own noise
-        if largest > 1.5 * node_tolerance_mm:
+        if correction_mm > 1.5 * node_tolerance_mm:
             level = worst(level, "warning")
             reasons.append(
-                f"Node corrections reach {1e3 * largest:.1f} um against a tolerance of {1e3 * node_tolerance_mm:.1f} "
-                "um: the target, its tolerance or the aspect ratio may be wrong."
+                f"Node corrections reach {1e3 * correction_mm:.1f} um against a tolerance of "
+                f"{1e3 * node_tolerance_mm:.1f} um: the target, its tolerance or the aspect ratio may be wrong."
             )
     for name, (camera, size) in zip(CAMERAS, centres, strict=False):
         off = np.hypot(camera["cx_px"] - 0.5 * (size[0] - 1), camera["cy_px"] - 0.5 * (size[1] - 1))
@@ -97,7 +97,7 @@ def judge(
 
 
 def checks_made(*, held_out: CheckMeasures | None, options: CalibrationOptions) -> tuple[CheckDone, ...]:
-    """List what was checked and what was not, as the residuals alone can hide a wrong scale or a tilted axis."""
+    """Return the checks made and not made: a wrong scale or a tilted axis does not show in residuals."""
     if held_out is None:
         held = CheckDone("held_out", False, "No position was held out.")
     else:

@@ -1,8 +1,8 @@
-"""The volume in which a calibration was made, and what it leaves uncertain about points inside and outside.
+"""The calibrated volume, and the calibration's covariance of points inside and outside it.
 
 Each camera saw the target's intersections up to some distance from its optical axis and over some range of depths.
-Further out the lens's distortion, further away the pose rests on the model alone. The parameters' covariance tells what
-that costs, as far as the model holds at all.
+Beyond these, distortion and pose are extrapolated by the model. The parameters' covariance gives the uncertainty there,
+as far as the model holds.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from core.calibration.uncertainty import point_derivatives
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 
-_FEWEST_POINTS = 8
+_MIN_POINTS = 8
 _AT_ONCE = 20_000
 _TEN = [*range(10), *range(N_CAMERA, N_CAMERA + 10)]
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedVolume:
-    """Where a pair was calibrated: in each camera's frame a piece of a cone about the optical axis.
+    """Calibrated volume of a pair: in each camera's frame a truncated cone about the optical axis.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class CalibratedVolume:
     covariance: Float | None = None
 
     def contains(self, points_mm: ArrayLike) -> Bool:
-        """Whether both cameras were calibrated where points (..., 3) of the system frame lie; False for NaN."""
+        """Return (...) True for points (..., 3) of the system frame inside both cameras' volumes; False for NaN."""
         points = np.asarray(points_mm, dtype=np.float64)
         inside = np.isfinite(points).all(axis=-1)
         for c, camera in enumerate((self.pair.cam1, self.pair.cam2)):
@@ -58,14 +58,14 @@ class CalibratedVolume:
         return np.asarray(inside)
 
     def covariance_mm2(self, points_mm: Float, displaced_mm: Float | None = None) -> Float:
-        """Covariance that the calibration alone gives points and displacements.
+        """Return the covariance of points and displacements from the calibration alone.
 
         Parameters
         ----------
         points_mm
             (n, 3) points, system frame.
         displaced_mm
-            (n, 3) where they are now.
+            (n, 3) their current positions.
 
         Returns
         -------
@@ -99,7 +99,7 @@ def calibrated_volume(
     pitch_mm: float,
     covariance: Float | None = None,
 ) -> CalibratedVolume | None:
-    """Build the volume from what the cameras saw.
+    """Build the volume from the views.
 
     It ends one pitch beyond the outermost intersection that was seen, and before and behind at as much again as the
     camera travelled.
@@ -122,7 +122,7 @@ def calibrated_volume(
     Returns
     -------
     CalibratedVolume or None
-        None if a camera saw too little at too few distances.
+        None if a camera has too few points or distances.
     """
     nodes = np.asarray(nodes_mm, dtype=np.float64).reshape(-1, 2)
     points = np.column_stack([nodes, np.zeros(len(nodes))])
@@ -132,7 +132,7 @@ def calibrated_volume(
         if not travel > 0.0:
             return None
         seen = np.concatenate([_seen(camera.moved(dz), points, size) for dz in sorted(set(positions))])
-        if len(seen) < _FEWEST_POINTS:
+        if len(seen) < _MIN_POINTS:
             return None
         slope[c] = ((np.hypot(seen[:, 0], seen[:, 1]) + pitch_mm) / seen[:, 2]).max()
         depth[c] = seen[:, 2].min() - travel, seen[:, 2].max() + travel

@@ -1,4 +1,4 @@
-"""A camera of the paper: lens, sensor and place, Eqs. (1) to (8), in both directions.
+"""A camera of the paper: lens, sensor and pose, Eqs. (1) to (8), in both directions.
 
 Frames: ``sys`` is the system frame that the calibration target defines; ``cam`` has its origin in the pinhole, Z along
 the optical axis away from the camera, X along the rows, Y down. ``cam_from_sys`` maps sys points into the camera.
@@ -69,7 +69,7 @@ class RigidTransform:
 
     @staticmethod
     def identity() -> RigidTransform:
-        """Return the transform that changes nothing."""
+        """Return the identity transform."""
         return RigidTransform(np.eye(3), np.zeros(3))
 
 

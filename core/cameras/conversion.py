@@ -1,4 +1,4 @@
-"""One lens model in the terms of another: exactly where they share their terms, else the best fit and its residual."""
+"""Conversion of lens models: exact where they share their terms, else the best fit and its residual."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from core.arrays import Float
 from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 from core.errors import CalibrationError
 
-_ACROSS = 41  # places across the image, each way
+_ACROSS = 41  # positions across the image, each way
 _STEPS = 30
 _SETTLED_PX = 1e-11
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """A lens in other terms.
+    """A lens converted to another model.
 
     Attributes
     ----------
     lens
         The fitted model.
     rms_px, max_px
-        What is left between both, over the whole image.
+        Differences of both models over the whole image.
     pixels_with_ray
-        Share of the image where the original has a ray; elsewhere nothing is fitted.
+        Share of the image where the original has a ray; elsewhere there is no fit.
     """
 
     lens: LensModel
@@ -37,8 +37,8 @@ class LensFit:
     pixels_with_ray: float
 
 
-def image_places(image_size_px: tuple[int, int]) -> Float:
-    """Return a grid of places (n, 2) over an image (width, height), its corners included."""
+def image_positions(image_size_px: tuple[int, int]) -> Float:
+    """Return a grid of positions (n, 2) over an image (width, height), its corners included."""
     width, height = image_size_px
     x, y = np.meshgrid(np.linspace(-0.5, width - 0.5, _ACROSS), np.linspace(-0.5, height - 0.5, _ACROSS))
     return np.stack([x.ravel(), y.ravel()], axis=1)
@@ -56,7 +56,7 @@ def fit_opencv(
     image_size_px
         (width, height) over which they are to agree.
     skew, tangential
-        Whether the form has a skew, and p1 and p2; without them the other terms take up what they can.
+        True if the model has a skew, and p1 and p2; without them the other terms approximate them.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def fit_seidel(lens: LensModel, image_size_px: tuple[int, int]) -> LensFit:
 
 
 def _rays(lens: LensModel, image_size_px: tuple[int, int]) -> tuple[Float, Float, float]:
-    xy = image_places(image_size_px)
+    xy = image_positions(image_size_px)
     rays = lens.normalised_from_image(xy)
     share = float(rays.valid.mean())
     if share < 0.5:
@@ -110,7 +110,7 @@ def _fit(
 ) -> LensFit:
     normalised, xy, share = _rays(lens, image_size_px)
     columns = [start.parameter_names.index(name) for name in free]
-    fitted: Any = start  # which of both does not matter here
+    fitted: Any = start  # the order of both is irrelevant here
     for _ in range(_STEPS):
         mapped = fitted.image_from_normalised(normalised)
         jacobian = fitted.parameter_jacobian(normalised)[..., columns]

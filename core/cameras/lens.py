@@ -41,7 +41,7 @@ class MappedPoints(NamedTuple):
 
 @runtime_checkable
 class LensModel(Protocol):
-    """What every lens model offers.
+    """Interface of the lens models.
 
     >>> lens = SeidelLens(phd_px=12000.0, cx_px=256.0, cy_px=240.0, kappa_per_px2=1e-9, aspect=0.9617)
     >>> lens.image_from_normalised([[0.0, 0.0]]).xy
@@ -232,13 +232,13 @@ class OpenCVLens:
         return MappedPoints(self._image(self._distorted(np.where(valid[..., None], n, np.nan))), valid)
 
     def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
-        """Invert by Newton's method; not valid where it does not come back to the pixel within 1e-9."""
+        """Invert by Newton's method; not valid where it does not return to the pixel within 1e-9."""
         xy = np.asarray(xy_px, dtype=np.float64)
         yd = (xy[..., 1] - self.cy_px) / self.fy_px
         d = np.stack([(xy[..., 0] - self.cx_px - self.skew_px * yd) / self.fx_px, yd], axis=-1)
         n = d.copy()
         r_max = np.sqrt(self._r2_max)
-        with np.errstate(all="ignore"):  # points that run away are refused below
+        with np.errstate(all="ignore"):  # points that diverge are marked invalid below
             for _ in range(_NEWTON_STEPS):
                 residual = self._distorted(n) - d
                 jac = self._distorted_jacobian(n)

@@ -21,7 +21,7 @@ class StereoPair:
 
     @cached_property
     def cam2_from_cam1(self) -> RigidTransform:
-        """The relative pose that the matching works with."""
+        """The relative pose used by the matching."""
         return self.cam2.cam_from_sys @ self.cam1.sys_from_cam
 
     @property
@@ -68,6 +68,7 @@ class StereoPair:
         return SpacePoints(np.where(valid[..., None], mid, np.nan), valid)
 
     def image2_at_depth(self, xy1_px: ArrayLike, z_cam1_mm: ArrayLike) -> Float:
-        """Where camera 2 sees the point on camera 1's ray at depth ``z_cam1_mm``; NaN where it does not."""
+        """Image coordinates in camera 2 of the point on camera 1's ray at depth ``z_cam1_mm``; NaN outside its
+        domain."""
         p = self.cam1.rays_cam(xy1_px).xyz_mm * np.asarray(z_cam1_mm, dtype=np.float64)[..., None]
         return project_cam(self.cam2.lens, self.cam2_from_cam1.apply(p)).xy

@@ -1,1 +1,1 @@
-"""The full field: region, seeds, growth, gates."""
+"""The full field: region, seeds, growth, validity checks."""

@@ -1,7 +1,7 @@
-"""A Gaussian prefilter of all images of a measurement: what may be asked for.
+"""Bounds of the Gaussian prefilter of all images of a measurement.
 
-All images of all steps are blurred alike before gradients and splines are made of them; seeds are looked for in the
-images as they are. What the blur does to noise and covariance stands in ``core.matching.blur``.
+All images of all steps are blurred alike before gradients and splines are made of them; seeds are searched for in the
+images as they are. The effect of the blur on noise and covariance: ``core.matching.blur``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from core.settings import PREFILTER_OF_SUBSET
 
 
 def check_prefilter(prefilter_px: float, subset_px: int) -> None:
-    """Refuse a standard deviation below zero, that is no number, or wider than a quarter of the subset.
+    """Raise an error for a standard deviation that is negative, no number, or above a quarter of the subset.
 
     Raises
     ------

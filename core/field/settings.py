@@ -1,11 +1,11 @@
-"""How a field is measured: what a user can set."""
+"""Settings of the measurement of a field."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 from core.errors import InputError
-from core.field.checks.gates import GateOptions
+from core.field.checks.validity import ValidityOptions
 from core.field.prefilter import check_prefilter
 from core.field.region.region import check_subset
 from core.matching.blur import Blur
@@ -24,7 +24,7 @@ from core.settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class MeasureOptions:
-    """How a field is measured.
+    """Settings of the measurement of a field.
 
     Parameters
     ----------
@@ -32,35 +32,36 @@ class MeasureOptions:
         Width of the square subset.
     patch
         ``stretch`` (default) or the paper's ``rigid``: plane patches. ``curved``: second-order surface and
-        displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever errs less on the field
-        in all; shape and motion are decided apart, and a sequence that went over to curved patches keeps them.
+        displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever has the smaller total
+        error on the field; decided separately for shape and motion. A sequence that changed to curved patches keeps
+        them.
     interpolation
         ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
-    least_zncc
-        Correlation below which no comparison is a match. The field's own scatter decides above it.
-    gates
-        Limits of the checks that every point must pass.
+    min_zncc
+        Correlation below which no comparison is a match. Above it the field's own statistics decide.
+    validity
+        Limits of the validity checks.
     prefilter_px
-        Standard deviation of a Gaussian that all images are blurred with before they are compared, px; 0: none. At
-        most a quarter of the subset. It takes interpolation's bias off sharp texture and costs random error.
+        Standard deviation of a Gaussian that all images are blurred with before they are compared, px; 0: none. At most
+        a quarter of the subset. It removes the interpolation bias of sharp texture and increases the random error.
     noise
-        Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and say how far
-        points scatter. None: from what a match leaves, all pixels alike.
+        Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and give the
+        covariances. None: noise from the residuals of each match, all pixels alike.
     """
 
     subset_px: int = SUBSET_PX.default
     patch: PatchSetting = DEFAULT_PATCH
     interpolation: Interpolation = DEFAULT_INTERPOLATION
-    least_zncc: float = 0.6
-    gates: GateOptions = field(default_factory=GateOptions)
+    min_zncc: float = 0.6
+    validity: ValidityOptions = field(default_factory=ValidityOptions)
     prefilter_px: float = 0.0
     noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)
         check_prefilter(self.prefilter_px, self.subset_px)
-        if not 0.0 < self.least_zncc < 1.0:
-            raise InputError(f"least_zncc is {self.least_zncc}, it must lie in 0 to 1.", code="option_out_of_range")
+        if not 0.0 < self.min_zncc < 1.0:
+            raise InputError(f"min_zncc is {self.min_zncc}, it must lie in 0 to 1.", code="option_out_of_range")
         if self.patch not in PATCH_SETTINGS:
             raise InputError(
                 f"patch is {self.patch!r}, it must be one of {', '.join(PATCH_SETTINGS)}.", code="option_out_of_range"
@@ -71,7 +72,7 @@ class MeasureOptions:
     def of(
         settings: AnalysisSettings, noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
     ) -> MeasureOptions:
-        """Return the options that an analysis' settings say."""
+        """Return the options of an analysis' settings."""
         return MeasureOptions(
             subset_px=settings.subset_px,
             patch=settings.patch,

@@ -1,7 +1,7 @@
 """A displacement smoothed by a polynomial over the window about each point.
 
-It sits between the measurement and what is computed from it: strain and gauges take the smoothed displacement, the next
-step of a sequence starts from the measured one. Positions, rotations and stretches are each point's own and stay.
+Strain and gauges take the smoothed displacement; the next step of a sequence starts from the measured one. Positions,
+rotations and stretches are each point's own and stay.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     """Return the field with its displacement smoothed.
 
     Each valid point takes the value in the middle of a polynomial that is fitted to the displacements of its window by
-    least squares, all points alike. Cuts, holes and edges end a window; where a quadratic over what is left would be
-    noisier than the point itself a plane takes its place, and where that would be too the point keeps its own value. A
-    lost point stays lost.
+    least squares, all points alike. Cuts, holes and edges end a window; where a quadratic over the points left would be
+    noisier than the point itself a plane replaces it, and where that would be too the point keeps its own value.
+    Invalid points stay invalid.
 
     Parameters
     ----------
@@ -40,13 +40,13 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     subset_px
         Width of the subset that the field was measured with.
     order
-        1: planes; 2: quadratics, which leave a curved displacement its height.
+        1: planes; 2: quadratics, which keep the height of a curved displacement.
 
     Returns
     -------
     Field
         With ``smoothing``, and with the covariance of the smoothed displacement and of it with the position: from the
-        window's points, whose errors go together by the pixels that they share.
+        window's points, whose errors correlate by the pixels that they share.
 
     Raises
     ------
@@ -66,8 +66,8 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
         )
     half, step, valid = window // 2, steps_px(field), field.valid
     offsets, _ = window_offsets(half)
-    apart = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
-    rho = SharedPixels.of(field, subset_px).correlation(apart[..., 1] * step[0], apart[..., 0] * step[1])
+    lag = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
+    rho = SharedPixels.of(field, subset_px).correlation(lag[..., 1] * step[0], lag[..., 0] * step[1])
     xy_px = np.stack([field.x_px, field.y_px], axis=-1)
     crossed = ways_cut(valid, xy_px, field.cuts, half)
     whole = ndimage.minimum_filter(valid, size=window, mode="constant", cval=False)
@@ -96,7 +96,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     resolution_px = (window - 1) * step[0] + subset_px
     mm_per_px = _mm_per_px(field, step)
     n_whole = int(whole.sum())
-    told = Smoothing(
+    record = Smoothing(
         window=window,
         order=order,
         step_px=step[0],
@@ -107,7 +107,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
         reduced=int(valid.sum()) - n_whole - n_raw,
         raw=n_raw,
     )
-    return replace(field, uvw_mm=uvw, covariance=covariance, smoothing=told)
+    return replace(field, uvw_mm=uvw, covariance=covariance, smoothing=record)
 
 
 def _held(field: Field) -> Float:
@@ -136,7 +136,7 @@ def _over_whole(held: Float, window: int, order: int, rho: Float) -> Float:
 
 
 def _sums(values: Float, weights: Float, rho: Float) -> Float:
-    """The same (m, 21) over windows of their own, ``values`` (m, n, 21) and ``weights`` (m, n)."""
+    """Sums (m, 21) over windows with weights of their own, ``values`` (m, n, 21) and ``weights`` (m, n)."""
     uvw = np.einsum("mn,mna->ma", weights, values[..., :3] - values[:, :1, :3]) + values[:, 0, :3]
     own = np.einsum("mn,mna->ma", weights * rho[0], values[..., 3:12])
     both = np.einsum("mn,mna->ma", weights * (weights @ rho), values[..., 12:])
@@ -144,7 +144,7 @@ def _sums(values: Float, weights: Float, rho: Float) -> Float:
 
 
 def _reduced_weights(seen: Bool, half: int, order: int, rho: Float) -> tuple[Float, Bool]:
-    """Weights (m, n) of the points that a window sees, and (m,) which windows are left with their middle alone."""
+    """Weights (m, n) of a window's connected points, and (m,) True for windows left with their middle alone."""
     weights = np.zeros(seen.shape)
     weights[:, 0] = 1.0  # the window's middle comes first
     open_ = np.ones(len(seen), bool)
@@ -158,7 +158,7 @@ def _reduced_weights(seen: Bool, half: int, order: int, rho: Float) -> tuple[Flo
 
 
 def _fitted(seen: Bool, half: int, order: int) -> tuple[Float, Bool]:
-    """Weights (m, n) of a fit's value in the middle, and (m,) whether the points carry the fit."""
+    """Weights (m, n) of a fit's value in the middle, and (m,) True where the points determine the fit."""
     A = fit_terms(window_offsets(half)[0], half, order)
     n, terms = A.shape
     normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)
@@ -168,10 +168,10 @@ def _fitted(seen: Bool, half: int, order: int) -> tuple[Float, Bool]:
 
 
 def _mm_per_px(field: Field, step: tuple[float, float]) -> float:
-    """Median length of a pixel on the surface, along rows and columns; NaN where no two neighbours were measured."""
+    """Median length of a pixel on the surface, along rows and columns; NaN where no two neighbours are valid."""
     found = []
-    for axis, apart in ((1, step[0]), (0, step[1])):
-        length = np.linalg.norm(np.diff(field.xyz_mm, axis=axis), axis=-1) / apart
+    for axis, distance_px in ((1, step[0]), (0, step[1])):
+        length = np.linalg.norm(np.diff(field.xyz_mm, axis=axis), axis=-1) / distance_px
         found.append(length[np.isfinite(length)])
     every = np.concatenate(found)
     return float(np.median(every)) if len(every) else float("nan")

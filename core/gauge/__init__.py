@@ -1,1 +1,1 @@
-"""What engineers read off fields: rigid motion, alignment, extensometers, lines, areas; each with its uncertainty."""
+"""Gauges on fields: rigid motion, alignment, extensometers, lines, areas; each with its uncertainty."""

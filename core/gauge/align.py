@@ -29,12 +29,12 @@ class Alignment:
         (3,) o, the new origin in the old frame.
     covariance
         (6, 6) of the frame's own errors from the points it was laid through: small rotations about the new X, Y, Z
-        (rad), and the origin's error along them (mm). The frame is what the user defines by these points, so it is
-        told here and not added to every point's covariance.
+        (rad), and the origin's error along them (mm). The user defines the frame by these points, so it is reported
+        here and not added to every point's covariance.
     residual_rms_mm
         Distance of the points from the plane; 0 for 3-2-1, which goes through its points.
     points
-        How many points defined it.
+        Number of points that defined it.
     """
 
     rotation: Float
@@ -59,7 +59,7 @@ def align_plane(
     shared
         The correlation of neighbouring points.
     chosen
-        (r, c) points that take part; None for all. Failed points never do.
+        (r, c) True for points that take part; None for all. Invalid points never do.
     x_direction
         (3,) in the old frame.
 
@@ -68,7 +68,7 @@ def align_plane(
     MeasurementError
         ``too_few_points`` for fewer than three points or points on one line.
     RegionError
-        ``gauge_unusable`` if the direction stands on the plane.
+        ``gauge_unusable`` if the direction is normal to the plane.
     """
     used = field.valid if chosen is None else field.valid & chosen
     x = field.xyz_mm[used]
@@ -102,25 +102,25 @@ def align_plane(
     gain[used] = np.linalg.solve(H, (A * weight[:, None]).T).T[:, :, None] * R[2]
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
     each = gain @ roots
-    three = np.einsum("rcij,rckj->ik", each, shared.places.summed(field, each))
+    three = np.einsum("rcij,rckj->ik", each, shared.positions.summed(field, each))
     full = np.zeros((6, 6))
-    place = np.ix_([0, 1, 5], [0, 1, 5])
-    full[place] = 0.5 * (three + three.T)
+    position = np.ix_([0, 1, 5], [0, 1, 5])
+    full[position] = 0.5 * (three + three.T)
     rms = float(np.sqrt(np.mean(((x - origin) @ normal) ** 2)))
     return Alignment(R, origin, full, rms, len(x))
 
 
-def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
-    """Lay the frame through six places of the reference: three on the plane, two on the X axis, one at its origin.
+def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
+    """Lay the frame through six positions of the reference: three on the plane, two on the X axis, one at its origin.
 
     Z is the normal of the first three on the side of the old Z; X runs from the fourth to the fifth, laid into the
-    plane; Y = 0 on that line, X = 0 at the sixth, Z = 0 in the plane. A place may be named more than once.
+    plane; Y = 0 on that line, X = 0 at the sixth, Z = 0 in the plane. A position may be given more than once.
 
     Parameters
     ----------
     field
         Any field; its reference positions are used.
-    places_px
+    positions_px
         (6, 2) in camera 1's reference image.
     shared
         The correlation of neighbouring points.
@@ -128,30 +128,30 @@ def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> 
     Raises
     ------
     RegionError
-        ``gauge_outside``; ``gauge_unusable`` for other than six places, three on one line, or two that are one.
+        ``gauge_outside``; ``gauge_unusable`` for other than six positions, three on one line, or two that are one.
     MeasurementError
-        ``too_few_points`` if a place has no measured point about it.
+        ``too_few_points`` if a position has no valid point about it.
     """
-    xy = np.asarray(places_px, dtype=np.float64)
+    xy = np.asarray(positions_px, dtype=np.float64)
     if xy.shape != (6, 2):
         raise RegionError(
-            f"3-2-1 takes six places, got an array of shape {xy.shape}.",
+            f"3-2-1 takes six positions, got an array of shape {xy.shape}.",
             code="gauge_unusable",
-            remedy="Give three places on the plane, two on the line, one at the origin.",
+            remedy="Give three positions on the plane, two on the line, one at the origin.",
         )
-    places = sample(field, xy)
-    if not places.found.all():
-        k = int(np.argmin(places.found))
+    positions = sample(field, xy)
+    if not positions.found.all():
+        k = int(np.argmin(positions.found))
         raise MeasurementError(
-            f"Place {k + 1} of 3-2-1, ({xy[k, 0]:g}, {xy[k, 1]:g}) px, has no measured point about it: "
-            f"{places.missing[k]}.",
+            f"Position {k + 1} of 3-2-1, ({xy[k, 0]:g}, {xy[k, 1]:g}) px, has no measured point about it: "
+            f"{positions.missing[k]}.",
             code="too_few_points",
-            remedy="Choose places where the shape was measured.",
+            remedy="Choose positions where the shape was measured.",
         )
-    x = places.of(field.xyz_mm)
+    x = positions.of(field.xyz_mm)
     R, origin = _three_two_one(x)
     first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
-    blocks = places.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
+    blocks = positions.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
     joint = np.swapaxes(blocks, 1, 2).reshape(18, 18)
     slope = np.empty((6, 18))
     step = 1e-5 * float(np.abs(x - x.mean(axis=0)).max())
@@ -161,7 +161,7 @@ def align_3_2_1(field: Field, places_px: ArrayLike, *, shared: SharedPixels) -> 
             moved = x.copy().ravel()
             moved[k] += sign * step
             R2, o2 = _three_two_one(moved.reshape(6, 3))
-            turn = R @ R2.T  # of the new axes, told along the new axes
+            turn = R @ R2.T  # of the new axes, along the new axes
             ends.append(np.concatenate([[turn[2, 1], turn[0, 2], turn[1, 0]], R @ (o2 - origin)]))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     return Alignment(R, origin, slope @ joint @ slope.T, 0.0, 6)
@@ -173,9 +173,9 @@ def _three_two_one(x: Float) -> tuple[Float, Float]:
     reach = max(float(np.linalg.norm(x[1] - x[0])), float(np.linalg.norm(x[2] - x[0])))
     if size <= _STRAIGHT * reach**2:
         raise RegionError(
-            "The three places of the plane lie on one line.",
+            "The three positions of the plane lie on one line.",
             code="gauge_unusable",
-            remedy="Choose three places that span a plane.",
+            remedy="Choose three positions that span a plane.",
         )
     normal *= (1.0 if normal[2] >= 0.0 else -1.0) / size
     R = _frame(normal, x[4] - x[3])
@@ -188,7 +188,7 @@ def _frame(normal: Float, direction: Float) -> Float:
     size = float(np.linalg.norm(x))
     if not np.isfinite(size) or size <= _STRAIGHT * float(np.linalg.norm(direction)):
         raise RegionError(
-            "The direction of X stands on the plane, or has no length.",
+            "The direction of X is normal to the plane, or has no length.",
             code="gauge_unusable",
             remedy="Give a direction that runs along the plane.",
         )
@@ -199,7 +199,7 @@ def _frame(normal: Float, direction: Float) -> Float:
 def aligned(field: Field, alignment: Alignment) -> Field:
     """Return the field in the new frame: positions, normals, displacements, rotations, covariances.
 
-    Camera quantities (pixels, Eq. (12)'s angles), stretch and curvature belong to the patch and stay.
+    Camera quantities (pixels, Eq. (12)'s angles), stretch and curvature refer to the patch and stay.
     """
     R = alignment.rotation
     n = field.covariance.shape[-1] // 3

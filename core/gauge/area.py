@@ -1,4 +1,4 @@
-"""Statistics over an area, with the uncertainty of the mean that overlapping subsets leave."""
+"""Statistics over an area, with the uncertainty of the mean of overlapping subsets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class AreaStatistics:
     count
         Points with a value.
     points
-        Points of the grid in the area, measured or not.
+        Points of the grid in the area, valid or not.
     mean, sd, minimum, maximum, rms
         Of the values; ``sd`` about the mean, with count - 1. NaN without values.
     mean_sigma
@@ -41,7 +41,7 @@ class AreaStatistics:
 
 
 def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
-    """Return (r, c) which points lie in a polygon (n, 2) of camera 1's reference image, its border included.
+    """Return (r, c) True for points in a polygon (n, 2) of camera 1's reference image, its border included.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
     inside = grid.within_polygon(polygon_px).allowed
     if not inside.any():
         raise RegionError(
-            f"No point of the field lies in the area; its points lie {steps_px(field)[0]:g} px apart from "
+            f"No point of the field lies in the area; its points have a spacing of {steps_px(field)[0]:g} px from "
             f"({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px.",
             code="gauge_outside",
             remedy="Give an area that holds measurement points, in pixels of camera 1's reference image.",
@@ -78,7 +78,7 @@ def area_statistics(
     Parameters
     ----------
     field
-        Gives the grid and which points are valid.
+        Gives the grid and the valid points.
     values
         (r, c) any variable of the field.
     sigma

@@ -1,4 +1,4 @@
-"""Virtual extensometers: the distance of two points of the surface, and what becomes of it."""
+"""Virtual extensometers: the distance of two points of the surface, and its change."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from core.gauge.sampling import Samples, sample
 
 @dataclass(frozen=True)
 class Extensometer:
-    """What a virtual extensometer reads in one step.
+    """Readings of a virtual extensometer in one step.
 
     Attributes
     ----------
     length0_mm
         Distance L0 of its ends at the reference.
     length_mm
-        Distance L now; L0 for a shape.
+        Current distance L; L0 for a shape.
     elongation_mm
         L - L0.
     strain
@@ -32,7 +32,7 @@ class Extensometer:
     true_strain
         ln(L / L0).
     missing
-        Why there are no numbers; empty if there are.
+        Reason for missing numbers; empty if there are numbers.
     """
 
     length0_mm: Reading = MISSING
@@ -44,9 +44,9 @@ class Extensometer:
 
 
 def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: SharedPixels) -> Extensometer:
-    """Read a virtual extensometer between two places of camera 1's reference image.
+    """Read a virtual extensometer between two positions of camera 1's reference image.
 
-    It may span a cut or a hole: only its ends need measured points about them.
+    It may span a cut or a hole: only its ends need valid points about them.
 
     Parameters
     ----------
@@ -60,23 +60,23 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     Raises
     ------
     RegionError
-        ``gauge_outside``; ``gauge_unusable`` if both ends are one place.
+        ``gauge_outside``; ``gauge_unusable`` if both ends coincide.
     """
     ends = np.array([a_px, b_px], dtype=np.float64)
     if np.array_equal(ends[0], ends[1]):
         raise RegionError(
             f"Both ends of the extensometer lie at ({ends[0, 0]:g}, {ends[0, 1]:g}) px.",
             code="gauge_unusable",
-            remedy="Give two different places.",
+            remedy="Give two different positions.",
         )
-    places = sample(field, ends)
-    why = [f"end {k}: {text}" for k, text in zip("ab", places.missing, strict=True) if text]
+    samples = sample(field, ends)
+    why = [f"end {k}: {text}" for k, text in zip("ab", samples.missing, strict=True) if text]
     if why:
         return Extensometer(missing=", ".join(why))
-    cov = _both_ends(places, shared)
+    cov = _both_ends(samples, shared)
     n = cov.shape[0] // 2
-    start = places.of(field.xyz_mm)
-    now = start if field.uvw_mm is None else start + places.of(field.uvw_mm)
+    start = samples.of(field.xyz_mm)
+    now = start if field.uvw_mm is None else start + samples.of(field.uvw_mm)
     along0, along = start[1] - start[0], now[1] - now[0]
     length0, length = float(np.linalg.norm(along0)), float(np.linalg.norm(along))
     rest = np.zeros(n - 3)
@@ -98,7 +98,7 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     )
 
 
-def _both_ends(places: Samples, shared: SharedPixels) -> Float:
+def _both_ends(samples: Samples, shared: SharedPixels) -> Float:
     """(2 n, 2 n) covariance of both ends' positions and displacements."""
-    aa, ab, bb = places.covariance(shared, [0, 0, 1], [0, 1, 1])
+    aa, ab, bb = samples.covariance(shared, [0, 0, 1], [0, 1, 1])
     return np.block([[aa, ab], [ab.T, bb]])

@@ -13,7 +13,7 @@ class Reading(NamedTuple):
     value
         NaN where it is missing.
     sigma
-        Standard uncertainty in the value's unit; NaN where it cannot be told.
+        Standard uncertainty in the value's unit; NaN where it is not known.
     """
 
     value: float

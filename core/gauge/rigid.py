@@ -1,10 +1,10 @@
 """The rigid motion of a field, and the field without it.
 
-A point X that moved by U is seen at X + U = c + d + R (X - c) + r. R and d make the sum of r^T W r least, W the inverse
-of r's covariance; c is the centre of the points used. Where the body deforms, what is left is more than noise; then
-W's covariance is the noise's and a variance alike in all directions, as large as makes up for what is left. Else a body
-that only stretches would be turned until its contraction looks like a tilt, since depth is the noisiest direction. The
-parameters' covariance comes from the points' own and from what overlapping subsets share. It holds the noise only.
+A point X that moved by U is at X + U = c + d + R (X - c) + r. R and d minimise the sum of r^T W r, W the inverse of r's
+covariance; c is the centre of the points used. Where the body deforms, the residual r is more than noise; then r's
+covariance is the noise's plus an isotropic variance that accounts for the residual. Else a body that only stretches
+would be turned until its contraction looks like a tilt, since depth is the noisiest direction. The parameters'
+covariance comes from the points' own and from the pixels that overlapping subsets share. It holds the noise only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
-_FEWEST = 3
+_MIN_POINTS = 3
 _ROUNDS = 50
 _OUTER_ROUNDS = 30
 _EXTRA_SETTLED = 1e-3
@@ -39,7 +39,7 @@ class RigidMotion:
     rotation_vector_rad
         (3,) axis times angle of R, system frame.
     translation_mm
-        (3,) d, how far the centre moved.
+        (3,) d, displacement of the centre.
     centre_mm
         (3,) c.
     covariance
@@ -47,9 +47,9 @@ class RigidMotion:
     small_covariance
         (6, 6) the same with the small rotation that follows R in place of the rotation vector.
     points
-        How many points took part with a weight above zero.
+        Number of points with a weight above zero.
     residual_rms_mm
-        Of r over these points, all three components together: what is left is deformation and noise.
+        Of r over these points, all three components together: deformation and noise.
     noise_ratio
         Root mean square of r in units of its expected noise; 1 for a rigid body with the stated noise.
     """
@@ -68,7 +68,7 @@ class RigidMotion:
 
 
 def skew(v: Float) -> Float:
-    """Return the matrices (..., 3, 3) that make v x."""
+    """Return the matrices (..., 3, 3) of the cross product v x."""
     zero = np.zeros(v.shape[:-1])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
@@ -151,13 +151,13 @@ def rigid_motion(
 
 
 def _residuals(arm: Float, moved: Float, cov: Float, R: Float, d: Float) -> tuple[Float, Float]:
-    """Covariance (n, 3, 3) of the noise of what the motion leaves, and what it leaves (n, 3)."""
+    """Return the covariance (n, 3, 3) of the residuals' noise, and the residuals (n, 3)."""
     M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)  # r's noise is (I - R) dX + dU
     return M @ cov @ M.T, moved - d - arm @ R.T
 
 
 def _deformation(r: Float, noise: Float, weight: Float) -> float:
-    """Variance, alike in all directions, that with the noise makes up what is left; zero where noise explains it."""
+    """Return the isotropic variance that with the noise explains the residuals; zero where noise alone does."""
     from scipy.optimize import brentq  # slow to load, and not every start needs it
 
     spread, axes = np.linalg.eigh(noise)
@@ -175,7 +175,7 @@ def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPix
     """Return the field with the body moved back: U' = R^T (X + U - c - d) + c - X.
 
     Shape, normals and stretch stay; rotations become R^T times theirs. The covariance holds the points' own noise, the
-    fitted motion's, and what both have in common.
+    fitted motion's, and the covariance between both.
     """
     assert field.uvw_mm is not None
     R, valid = motion.rotation, field.valid
@@ -234,10 +234,10 @@ def _vector_slope(v: Float) -> Float:
 
 
 def _check_spread(x: Float) -> None:
-    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) if len(x) >= _FEWEST else np.zeros(2)
+    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) if len(x) >= _MIN_POINTS else np.zeros(2)
     if spread[1] <= _LINE * spread[0]:
         raise MeasurementError(
-            f"{len(x)} points are left, or they lie on one line: no rigid motion can be told from them.",
+            f"{len(x)} points are left, or they lie on one line: they determine no rigid motion.",
             code="too_few_points",
             remedy="Choose three or more valid points that span an area.",
         )

@@ -1,8 +1,9 @@
 """Values between the points of the grid, never over a missing point or a cut.
 
-Between four points along a line a cubic goes through the inner two with the slopes that their neighbours give (Keys,
-1981); quadratics are told exactly. Where one of the 4 x 4 points about a place is missing, its cell's corners serve
-alone: what lies between them is then off by up to an eighth of the curvature times the squared step.
+Between four points along a line a cubic goes through the inner two with the slopes of their neighbours (Keys 1981,
+doi:10.1109/TASSP.1981.1163711); quadratics are reproduced exactly. Where one of the 4 x 4 points about a position is
+missing, its cell's corners alone are used: the error between them is then up to an eighth of the curvature times the
+squared spacing.
 """
 
 from __future__ import annotations
@@ -21,27 +22,27 @@ from core.status import PointStatus
 
 _ON_A_POINT = 1e-9
 _CUT = "cut"
-_ABOUT = np.arange(-1, 3)  # nodes that a place takes along each axis, from the lower corner of its cell
+_ABOUT = np.arange(-1, 3)  # nodes about a position along each axis, from the lower corner of its cell
 _AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Places between points, as weighted sums of the points about them.
+    """Samples at positions between points, as weighted sums of the points about them.
 
     Attributes
     ----------
     field
-        Where they were sampled.
+        The sampled field.
     xy_px
-        (m, 2) the places in camera 1's reference image.
+        (m, 2) the positions in camera 1's reference image.
     index
-        (m, 16) flat indices of the points about each place.
+        (m, 16) flat indices of the points about each position.
     weight
-        (m, 16) their weights, sum 1, most of them zero where the cell's corners serve alone; NaN where the place is
-        missing.
+        (m, 16) their weights, sum 1, most of them zero where the cell's corners alone are used; NaN where the position
+        has no value.
     missing
-        m texts: empty, or why the place has no value: the status of a point that it needs, or ``cut``.
+        m texts: empty, or why the position has no value: the status of a point that it needs, or ``cut``.
     """
 
     field: Field
@@ -52,7 +53,7 @@ class Samples:
 
     @property
     def found(self) -> Bool:
-        """(m,) True where the place has values."""
+        """(m,) True where the position has values."""
         return np.isfinite(self.weight[:, 0])
 
     def of(self, values: Float) -> Float:
@@ -63,19 +64,19 @@ class Samples:
         return np.asarray(np.where(weight == 0.0, 0.0, weight * flat).sum(axis=1))
 
     def covariance(self, shared: SharedPixels, first: ArrayLike, second: ArrayLike) -> Float:
-        """Return the covariance between pairs of places, from the points' own and their subsets' common pixels.
+        """Return the covariance between pairs of positions, from the points' own and their subsets' common pixels.
 
         Parameters
         ----------
         shared
             The correlation of neighbouring points.
         first, second
-            (k,) numbers of the places of each pair; equal ones give the place's own covariance.
+            (k,) indices of the positions of each pair; equal ones give the position's own covariance.
 
         Returns
         -------
         NDArray
-            (k, n, n), mm^2, n = 3 (X, Y, Z) or 6 (and U, V, W); NaN where a place is missing.
+            (k, n, n), mm^2, n = 3 (X, Y, Z) or 6 (and U, V, W); NaN where a position has no value.
         """
         a, b = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
         n = self.field.covariance.shape[-1]
@@ -87,41 +88,44 @@ class Samples:
         out = np.empty((len(a), n, n))
         for k in range(0, len(a), _AT_ONCE):
             i, j = a[k : k + _AT_ONCE], b[k : k + _AT_ONCE]
-            apart = x[i][:, :, None] - x[j][:, None, :], y[i][:, :, None] - y[j][:, None, :]
+            lag = x[i][:, :, None] - x[j][:, None, :], y[i][:, :, None] - y[j][:, None, :]
             w = self.weight[i][:, :, None] * self.weight[j][:, None, :]
             one, two = roots[self.index[i]], roots[self.index[j]]
             if shared.smoothing is None:
-                w *= shared.correlation(*apart)
+                w *= shared.correlation(*lag)
                 second = (w @ two.reshape(len(j), -1, n * n)).reshape(len(j), -1, n, n)
                 out[k : k + _AT_ONCE] = np.einsum("kiab,kicb->kac", one, second, optimize=True)
-            else:  # positions and displacements fall off over other distances
+            else:  # positions and displacements decorrelate over different distances
                 each = np.einsum("kiab,kjcb->kijac", one, two, optimize=True)
-                out[k : k + _AT_ONCE] = np.einsum("kij,kijac,kijac->kac", w, shared.factors(*apart, n), each)
+                out[k : k + _AT_ONCE] = np.einsum("kij,kijac,kijac->kac", w, shared.factors(*lag, n), each)
         return out
 
 
 def sample(field: Field, xy_px: ArrayLike) -> Samples:
-    """Lay places into the grid's cells.
+    """Sample a field between its points.
 
-    A place takes its values from the 4 x 4 points about it, by cubics. Where one of them failed, lies beyond a cut or
-    the grid's edge, the four corners of its cell serve, bilinearly; three if the fourth failed or lies beyond a cut and
-    the place lies inside their triangle; two or one where it lies on the grid's lines. Else it is missing.
+    A position is interpolated from the 4 x 4 points about it, by cubics. Where one of them is invalid, lies beyond a
+    cut or the grid's edge, the four corners of its cell are used, bilinearly; three if the fourth is invalid or lies
+    beyond a cut and the position lies inside their triangle; two or one where it lies on the grid's lines. Else it has
+    no value.
 
     Parameters
     ----------
     field
         Any field on a regular grid, with its cuts.
     xy_px
-        (m, 2) places in camera 1's reference image.
+        (m, 2) positions in camera 1's reference image.
 
     Raises
     ------
     RegionError
-        ``gauge_outside`` for a place outside the grid of points.
+        ``gauge_outside`` for a position outside the grid of points.
     """
     xy = np.atleast_2d(np.asarray(xy_px, dtype=np.float64))
     if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
-        raise RegionError(f"Places are (n, 2) finite pixels, got an array of shape {xy.shape}.", code="gauge_unusable")
+        raise RegionError(
+            f"Positions are (n, 2) finite pixels, got an array of shape {xy.shape}.", code="gauge_unusable"
+        )
     rows, cols = field.shape
     step = steps_px(field)
     origin = np.array([field.x_px[0, 0], field.y_px[0, 0]])
@@ -171,9 +175,9 @@ def sample(field: Field, xy_px: ArrayLike) -> Samples:
 
 
 def _by_cubics(field: Field, xy_px: Float, low: NDArray[np.int64], t: Float) -> tuple[NDArray[np.int64], Float]:
-    """Return (m, 16) flat indices of the points about places and their weights, NaN where one of them is not there.
+    """Return (m, 16) flat indices of the points about positions and their weights, NaN where one of them is missing.
 
-    ``low`` (m, 2) column and row of the cell's first corner, ``t`` (m, 2) how far in the cell the place lies.
+    ``low`` (m, 2) column and row of the cell's first corner, ``t`` (m, 2) position in the cell, 0 to 1.
     """
     rows, cols = field.shape
     at = low[:, None, :] + _ABOUT[:, None]  # (m, 4, 2)

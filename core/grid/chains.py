@@ -1,8 +1,8 @@
-"""From pieces to whole lines of one family, and to their order.
+"""Joining of pieces to whole lines of one family, and their order.
 
-Pieces that lie on each other's prolongation make a line. Lines of one family cross any other line at places that
-are a projective function of their number, so neighbouring gaps differ little: following the gaps numbers the lines,
-passes over a line that is missing and leaves out what does not belong (scratches, frames, edges).
+Pieces that lie on each other's prolongation make a line. Lines of one family cross any other line at positions that are
+a projective function of their number, so neighbouring gaps differ little: following the gaps numbers the lines, passes
+over a line that is missing and leaves out other structures (scratches, frames, edges).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from core.arrays import Bool, Float
 from core.grid.directions import Pieces
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens
-_MOST_ROUNDS = 40
-_MOST_LINES = 150
-_MOST_TURN = 0.15  # rad between a piece and its line
-_LEAST_SHARE = 0.25  # of the longest line's seen length; shorter ones are clutter
+_MAX_ROUNDS = 40
+_MAX_LINES = 150
+_MAX_TURN = 0.15  # rad between a piece and its line
+_MIN_SHARE = 0.25  # of the longest line's seen length; shorter ones are clutter
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ class CoarseLine:
 
 
 def link(pieces: Pieces) -> list[CoarseLine]:
-    """Join pieces that prolong each other: a line grows from its heaviest piece, outwards, by whatever lies on it."""
+    """Join pieces that prolong each other: a line grows from its heaviest piece, outwards, by the pieces that lie on
+    it."""
     n = len(pieces)
     if n < 3:
         return []
@@ -62,17 +63,17 @@ def link(pieces: Pieces) -> list[CoarseLine]:
     typical = float(np.median(pieces.length_px))
     lines: list[CoarseLine] = []
     for seed in np.argsort(-pieces.weight):
-        if free[seed] and len(lines) < _MOST_LINES:
+        if free[seed] and len(lines) < _MAX_LINES:
             members = _grow(pieces, int(seed), free, typical)
             free[members] = False
             lines.append(_fit(pieces.take(members)))
     longest = max(line.seen_px for line in lines)
-    return [line for line in lines if line.seen_px >= _LEAST_SHARE * longest]
+    return [line for line in lines if line.seen_px >= _MIN_SHARE * longest]
 
 
 def _grow(pieces: Pieces, seed: int, free: Bool, typical: float) -> NDArray[np.intp]:
     members = np.array([seed])
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         line = _fit(pieces.take(members))
         t, off, turn = _against(line, pieces)
         beyond = np.maximum(np.maximum(t - line.span_px[1], line.span_px[0] - t), 0.0)
@@ -80,7 +81,7 @@ def _grow(pieces: Pieces, seed: int, free: Bool, typical: float) -> NDArray[np.i
             free
             & (beyond - 0.5 * pieces.length_px < 2.0 * typical)
             & (np.abs(off) < 1.2 + 0.07 * beyond)
-            & (np.abs(turn) < _MOST_TURN)
+            & (np.abs(turn) < _MAX_TURN)
         )
         on_line[seed] = True
         grown = np.flatnonzero(on_line)
@@ -95,7 +96,7 @@ def _against(line: CoarseLine, pieces: Pieces) -> tuple[Float, Float, Float]:
     d = pieces.centre_px - line.centre_px
     t = d @ line.direction
     normal = np.array([-line.direction[1], line.direction[0]])
-    # a parabola is not trusted far beyond its own points
+    # a parabola is not extrapolated far beyond its own points
     inside = np.clip(t, line.span_px[0], line.span_px[1])
     slope = line.bend[1] + 2.0 * line.bend[2] * inside
     expected = line.bend[0] + inside * (line.bend[1] + inside * line.bend[2]) + slope * (t - inside)

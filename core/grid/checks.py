@@ -1,4 +1,4 @@
-"""What makes a grid's index certain, and the refusals where it is not."""
+"""Checks that a grid's index is certain."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from core.target import GridTarget
 
 Cause = Literal["", "dirt", "glare"]
 
-_LEAST_INSIDE_PX = 3.0
-_DEPTH_RANGE = (0.4, 2.2)  # of what the neighbours show
-_LEAST_CERTAIN = 0.25  # standard deviation of a piece's place, as part of the line's width and blur
+_MIN_INSIDE_PX = 3.0
+_DEPTH_RANGE = (0.4, 2.2)  # of the neighbours' mean
+_MIN_CERTAIN = 0.25  # standard deviation of a piece's position, as part of the line's width and blur
 _RMS_RATIO = 3.0
 _GLARING_SHARE = 0.0005  # of the image's pixels, in spots; a glare large enough to hide lines has such a core
 _GLARE_RISE = 0.5  # ground above its neighbours', as part of the lines' depth
 
 
 def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int], options: GridOptions) -> None:
-    """Refuse a lattice that is turned too far, has other counts than the target, or leaves the image.
+    """Raise an error for a lattice that is turned too far, has other counts than the target, or leaves the image.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]
     segments = polylines(lattice.nodes_px)
     if abs(rotation_deg - 45.0) > np.degrees(options.max_rotation_rad):
         raise TargetError(
-            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 tell its axes apart",
+            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 are needed to distinguish its axes",
             code="target_rotated",
             remedy="Turn the grid (or the camera) until its lines run at about 45 degrees to the rows.",
             rotation_deg=rotation_deg,
@@ -81,14 +81,14 @@ def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]
 
 
 def inside(nodes_px: Float, size_px: tuple[int, int]) -> Bool:
-    """Which intersections lie inside the image with room for their lines, (...)."""
-    low = nodes_px >= _LEAST_INSIDE_PX
-    high = nodes_px <= np.array(size_px) - 1.0 - _LEAST_INSIDE_PX
+    """Return (...) True for intersections inside the image with room for their lines."""
+    low = nodes_px >= _MIN_INSIDE_PX
+    high = nodes_px <= np.array(size_px) - 1.0 - _MIN_INSIDE_PX
     return np.asarray((low & high).all(axis=-1))
 
 
 def _could_go_on_outside(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]) -> bool:
-    """Whether the lines that are missing may lie where the image does not see them (whole)."""
+    """Return True if the missing lines may lie outside the image or cross its border."""
     na, nb = lattice.counts
     if not inside(lattice.nodes_px, size_px).all():
         return True
@@ -111,7 +111,7 @@ def polylines(nodes_px: Float) -> list[list[float]]:
 
 
 def saturation_level(image: NDArray[Any]) -> float:
-    """Grey level at which the sensor saturates; infinite where it cannot be told.
+    """Grey level at which the sensor saturates; infinite where it is not known.
 
     A 16-bit file may hold 10, 12, 14 or 16 significant bits: the level is the one at which pixels pile up.
     """
@@ -126,7 +126,7 @@ def saturation_level(image: NDArray[Any]) -> float:
 
 
 def blame_glare(error: TargetError, grey: Float32, saturation: float) -> TargetError:
-    """The same refusal, but named after the glare where saturated pixels can have hidden the lines."""
+    """Return the same error, named after the glare where saturated pixels can have hidden the lines."""
     expected, found = error.context.get("expected"), error.context.get("found")
     too_many = expected is not None and found is not None and sum(found) > sum(expected)
     # what a 5 x 5 px square fits into is no clipped noise
@@ -141,10 +141,10 @@ def blame_glare(error: TargetError, grey: Float32, saturation: float) -> TargetE
     )
 
 
-def judge_pieces(
+def check_pieces(
     table: PieceTable, fits: Float, target: GridTarget, saturation: float
 ) -> tuple[Bool, NDArray[np.str_]]:
-    """Tell good pieces from spoilt ones.
+    """Distinguish good pieces from spoilt ones.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def judge_pieces(
     with np.errstate(invalid="ignore"):
         fits_shape = rms < _RMS_RATIO * np.nanmedian(rms) + 0.02 * np.abs(typical)
         seen = (depth > _DEPTH_RANGE[0] * typical) & (depth < _DEPTH_RANGE[1] * typical)
-        certain = np.sqrt(fits[:, OUT["var_c0"]]) < _LEAST_CERTAIN * (fits[:, OUT["width"]] + fits[:, OUT["blur"]])
+        certain = np.sqrt(fits[:, OUT["var_c0"]]) < _MIN_CERTAIN * (fits[:, OUT["width"]] + fits[:, OUT["blur"]])
         # clipped peaks of the noise do no harm; a level that is itself within the noise of the limit does
         level = fits[:, OUT["ground"]] + (0.0 if target.dark_lines else depth)
         saturated = (fits[:, OUT["brightest"]] >= saturation) & ~(level + rms < saturation)
@@ -171,7 +171,7 @@ def judge_pieces(
 
 
 def _smooth(table: PieceTable, values: Float) -> Float:
-    """Quadratic over the image through the values, blind to outliers (two rounds of clipping), (n,)."""
+    """Quadratic over the image through the values, robust to outliers (two rounds of clipping), (n,)."""
     x, y = table.rows[:, IN["x"]], table.rows[:, IN["y"]]
     u, v = (x - x.mean()) / x.std(), (y - y.mean()) / y.std()
     J = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
@@ -189,7 +189,7 @@ def _smooth(table: PieceTable, values: Float) -> Float:
 
 
 def check_coverage(table: PieceTable, good: Bool, cause: NDArray[np.str_], options: GridOptions) -> None:
-    """Refuse a grid of which too much is spoilt.
+    """Raise an error for a grid of which too much is spoilt.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def check_coverage(table: PieceTable, good: Bool, cause: NDArray[np.str_], optio
 
 
 def check_regular(straight_px: Float, nodes_px: Float, target: GridTarget) -> None:
-    """Refuse numbered lines that are no image of a regular grid.
+    """Raise an error for numbered lines that are no image of a regular grid.
 
     Raises
     ------

@@ -104,7 +104,7 @@ def dark_pixel_lines(
     image
         (rows, columns) grey levels.
     table, fits, good
-        Pieces, their ground and depth, and which of them to use. The pieces' places only bound the search.
+        Pieces, their ground and depth, and True for those to use. The pieces' positions only bound the search.
     dark_lines
         Sign of the contrast.
     share
@@ -146,7 +146,7 @@ def dark_pixel_lines(
             raise np.linalg.LinAlgError(f"line {k} has dark pixels on {np.count_nonzero(mine)} pieces")
         inverse[k] = np.linalg.inv(M[mine].sum(axis=0))
         coefficients[k] = inverse[k] @ g[mine].sum(axis=0)
-    # the pixels' scatter is the line's width, not chance: what is left of the mean of each piece is
+    # the pixels' spread is the line's width, not noise: the residual of each piece's mean is noise
     left = (g - np.einsum("kij,kj->ki", M, coefficients[index]))[seen]
     scatter = float(np.sum((left[:, 0] / N[seen, 0]) ** 2)) / max(int(seen.sum()) - 3 * n_line, 1)
     spread = np.zeros((n_line, 3, 3))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
-from core.grid.checks import blame_glare, check_coverage, check_lattice, check_regular, judge_pieces, saturation_level
+from core.grid.checks import blame_glare, check_coverage, check_lattice, check_pieces, check_regular, saturation_level
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
 from core.grid.directions import directions
 from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
@@ -22,7 +22,7 @@ from core.grid.view import GridOptions, GridView, LineModel, Localiser
 from core.robust import MAD_TO_SIGMA
 from core.target import GridTarget
 
-_OUTLIER = 6.0  # standard deviations at which a line point is a blemish
+_OUTLIER = 6.0  # standard deviations at which a line point is an outlier
 _ROUNDS = 3
 
 
@@ -36,7 +36,7 @@ def detect_grid(
     image
         (rows, columns) gray image, any unsigned, signed or float type, as the camera gave it.
     target
-        What the grid is.
+        Description of the grid.
     localiser
         ``profile``: maximum-likelihood fit of a blurred line's profile. ``paper``: dark pixels weighted by their
         distance from the threshold, and non-oblique parabolas.
@@ -46,7 +46,7 @@ def detect_grid(
     Returns
     -------
     GridView
-        Intersections in pixels, indexed as :class:`GridView` says.
+        Intersections in pixels, indexed as in :class:`GridView`.
 
     Raises
     ------
@@ -61,12 +61,12 @@ def detect_grid(
 
     Notes
     -----
-    A grid without marks looks the same after a turn by 90 or 180 degrees and in a mirror, see :class:`GridView`.
+    A grid without marks looks the same when turned by 90 or 180 degrees or mirrored, see :class:`GridView`.
 
     References
     ----------
     Helm, McNeill, Sutton, "Improved three-dimensional image correlation for surface displacement measurement", Opt.
-    Eng. 35 (1996), section 3.2.2.
+    Eng. 35 (1996), doi:10.1117/1.600624, section 3.2.2.
     """
     opts = GridOptions() if options is None else options
     if localiser not in ("profile", "paper"):
@@ -170,14 +170,14 @@ def _measure(
     blur_px: float | None,
     floor_px: float,
 ) -> _Measured:
-    """Fit the pieces between given intersections, judge them, and fit the lines.
+    """Fit the pieces between given intersections, check them, and fit the lines.
 
-    ``floor_px``: a piece that is off by no more than a few times this is no blemish, however little noise there is.
+    ``floor_px``: a piece with a residual of a few times this at most is no outlier, at any noise.
     """
     node_sigma_px = target.node_tolerance_mm / np.sqrt(3.0) * pitch_px(nodes_px) / target.pitch_mm
     table = piece_table(nodes_px, target, blur_px=blur_px)
     fits = fit_pieces(grey, table.rows, dark_lines=target.dark_lines)
-    good, cause = judge_pieces(table, fits, target, saturation)
+    good, cause = check_pieces(table, fits, target, saturation)
     check_coverage(table, good, cause, options)
     pp = line_points(table, fits)
     size = (grey.shape[1], grey.shape[0])
@@ -187,7 +187,7 @@ def _measure(
             pp.points, counts=target.lines, image_size_px=size, model=model, node_sigma_px=node_sigma_px, used=used
         )
         z = np.abs(fit.residual_px) / np.sqrt(fit.variance_px2 + floor_px**2)
-        # a grid worse than described spreads all points: judge by their own scatter then
+        # a grid worse than described spreads all points: their own standard deviation is the scale then
         limit = _OUTLIER * max(1.0, MAD_TO_SIGMA * float(np.median(z[used])))
         spoilt = np.unique(pp.piece[z > limit])
         fitting = good.copy()

@@ -1,7 +1,8 @@
-"""From a binary picture to straight pieces of lines, sorted by direction.
+"""Straight pieces of lines in a binary picture, sorted by direction.
 
-The structure tensor tells each dark pixel's direction and, by its coherence, whether there is one: at a crossing
-there is none, so that lines fall apart into the pieces between crossings. The pieces' directions show the families.
+The structure tensor gives each dark pixel's direction and, by its coherence, a measure of its certainty: at a crossing
+there is no clear direction, so that lines are divided into the pieces between crossings. The pieces' directions show the
+families.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from core.grid.threshold import LinePicture
 
 _COHERENCE = 0.5
 _FAMILY_REACH_DEG = 22.0
-_MOST_PIECES = 1500  # a family of 20 lines has 380
-_MOST_PEAKS = 5
+_MAX_PIECES = 1500  # a family of 20 lines has 380
+_MAX_PEAKS = 5
 _PEAK_SHARE = 0.08  # of the strongest direction; weaker ones are not half of a grid
 
 
@@ -70,7 +71,7 @@ class Directions:
 
 
 def directions(picture: LinePicture) -> Directions:
-    """Find which ways the lines of a picture run."""
+    """Find the directions of the lines of a picture."""
     gx = cv2.Scharr(picture.depth, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(picture.depth, cv2.CV_32F, 0, 1)
     sigma = 2.0
@@ -85,7 +86,7 @@ def directions(picture: LinePicture) -> Directions:
     counts, _ = np.histogram(along[usable], bins=180, range=(0.0, np.pi), weights=picture.depth[usable])
     smooth = gaussian_filter1d(counts.astype(np.float64), 4.0, mode="wrap")
     is_peak = (smooth == maximum_filter1d(smooth, 21, mode="wrap")) & (smooth > _PEAK_SHARE * smooth.max())
-    order = sorted(np.flatnonzero(is_peak), key=lambda k: -smooth[k])[:_MOST_PEAKS]
+    order = sorted(np.flatnonzero(is_peak), key=lambda k: -smooth[k])[:_MAX_PEAKS]
     return Directions(along, usable, tuple(float(np.radians(k + 0.5)) for k in order))
 
 
@@ -116,8 +117,8 @@ def family_pieces(picture: LinePicture, found: Directions, direction_rad: float)
     off_piece = np.abs(np.mod(angle - direction_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
     keep &= (long_var > 4.0 * cross_var) & (off_piece < np.radians(_FAMILY_REACH_DEG))
     which = np.flatnonzero(keep)
-    if len(which) > _MOST_PIECES:
-        which = which[np.argsort(-sw[which])[:_MOST_PIECES]]
+    if len(which) > _MAX_PIECES:
+        which = which[np.argsort(-sw[which])[:_MAX_PIECES]]
     f = float(picture.factor)
     shift = 0.5 * (f - 1.0)  # a coarse pixel's centre, in full-size pixels
     direction = np.stack([np.cos(angle[which]), np.sin(angle[which])], axis=-1)

@@ -1,4 +1,4 @@
-"""From two sets of lines to numbered intersections, or to the reason why not.
+"""Numbered intersections of two sets of lines, or the reason why there are none.
 
 Family a: lines at constant X_sys, crossed walking along X_sys (right and down in the image); family b: lines at
 constant Y_sys.
@@ -20,10 +20,10 @@ from core.grid.lines import meet_parabolas
 from core.grid.threshold import LinePicture
 
 _COARSE = ("centre_px", "direction", "bend")
-_LEAST_CROSSING_RAD = np.radians(40.0)
-_LEAST_LINES = 4
-_LEAST_SEEN = 0.4
-_STRAY_END = 0.1  # of the pitch; an end line that is off by more is an edge or a frame
+_MIN_CROSSING_RAD = np.radians(40.0)
+_MIN_LINES = 4
+_MIN_SEEN = 0.4
+_STRAY_END = 0.1  # of the pitch; an end line that deviates by more is an edge or a frame
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
     most = (0, 0)
     for p in range(len(found.peaks_rad)):
         for q in range(p + 1, len(found.peaks_rad)):
-            apart = abs(found.peaks_rad[p] - found.peaks_rad[q])
-            if min(apart, np.pi - apart) < _LEAST_CROSSING_RAD:
+            angle_rad = abs(found.peaks_rad[p] - found.peaks_rad[q])
+            if min(angle_rad, np.pi - angle_rad) < _MIN_CROSSING_RAD:
                 continue
             lattice, seen, counts = _try_pair(picture, found, found.peaks_rad[p], found.peaks_rad[q])
             most = max(most, counts, key=min)
@@ -114,7 +114,7 @@ def _try_pair(
         along_y = candidates[1 - int(np.argmin(off))]
     pieces_a = family_pieces(picture, found, along_y)
     pieces_b = family_pieces(picture, found, along_x)
-    if min(len(pieces_a), len(pieces_b)) < _LEAST_LINES:
+    if min(len(pieces_a), len(pieces_b)) < _MIN_LINES:
         return None, 0.0, (0, 0)
     centre = np.median(np.concatenate([pieces_a.centre_px, pieces_b.centre_px]), axis=0)
     # X grows to the right; where its direction is steep, downwards: one rule, since both are positive in (0, 90)
@@ -128,14 +128,14 @@ def _try_pair(
     chain_a = order(link(pieces_a), centre, x_dir)
     chain_b = order(link(pieces_b), centre, y_dir)
     counts = (len(chain_a.lines), len(chain_b.lines))
-    if min(counts) < _LEAST_LINES:
+    if min(counts) < _MIN_LINES:
         return None, 0.0, counts
     chain_a, chain_b = _without_stray_ends(chain_a, chain_b)
     counts = (len(chain_a.lines), len(chain_b.lines))
-    if min(counts) < _LEAST_LINES:
+    if min(counts) < _MIN_LINES:
         return None, 0.0, counts
     lattice = _lattice(chain_a, chain_b)
-    if _seen_share(lattice, chain_a, chain_b) < _LEAST_SEEN:
+    if _seen_share(lattice, chain_a, chain_b) < _MIN_SEEN:
         return None, 0.0, (0, 0)
     seen = sum(line.seen_px for line in chain_a.lines) + sum(line.seen_px for line in chain_b.lines)
     return lattice, seen, counts
@@ -159,7 +159,7 @@ def _without_stray_ends(chain_a: Chain, chain_b: Chain) -> tuple[Chain, Chain]:
 
 def _drop_ends(chain: Chain, other: Chain) -> Chain:
     for end in (0, -1):
-        if len(chain.lines) <= _LEAST_LINES:
+        if len(chain.lines) <= _MIN_LINES:
             break
         keep = np.ones(len(chain.lines), dtype=bool)
         keep[end] = False
@@ -179,7 +179,7 @@ def _drop_ends(chain: Chain, other: Chain) -> Chain:
 
 
 def _known_nodes(chain_a: Chain, chain_b: Chain) -> tuple[Float, Float]:
-    """Numbers (n, 2) and places (n, 2) of the intersections of all lines seen."""
+    """Numbers (n, 2) and positions (n, 2) of the intersections of all lines seen."""
     number = np.stack(np.meshgrid(chain_a.number, chain_b.number, indexing="ij"), axis=-1).astype(np.float64)
     return number.reshape(-1, 2), crossings(chain_a.lines, chain_b.lines).reshape(-1, 2)
 

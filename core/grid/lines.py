@@ -1,10 +1,10 @@
-"""From line points to intersections: three models of what joins the pieces of a line.
+"""Intersections from line points: three models of a line through its pieces.
 
-``straight``: the lines of the grid are straight, and what bends them in the image is one smooth distortion, the
-same for all. In corrected coordinates v = u + sum_m D_m f_m(u) each line is straight; f_m holds Seidel's term for
-any aspect ratio, r^2 u and (x^2 - y^2) u, its shift by a wrong centre, r^2 e_x and r^2 e_y, and, where the lines
-ask for them, higher powers. The condition is linear in D and in each line's two numbers. Terms that map straight
-lines to straight lines cannot be seen and are not needed.
+``straight``: the lines of the grid are straight, and one smooth distortion, the same for all, bends them in the image.
+In corrected coordinates v = u + sum_m D_m f_m(u) each line is straight; f_m holds Seidel's term for any aspect ratio,
+r^2 u and (x^2 - y^2) u, its shift by a wrong centre, r^2 e_x and r^2 e_y, and, where the lines ask for them, higher
+powers. The condition is linear in D and in each line's two numbers. Terms that map straight lines to straight lines
+have no effect and are not needed.
 
 ``parabola``: each line by itself, offset = p0 + p1 t + p2 t^2.
 
@@ -28,7 +28,7 @@ _ALL_TERMS = 10
 # that the lines show, but some combinations they do not show: with lines at exactly 45 degrees, (x^2 - y^2) u turns
 # lines and bends none
 _TERM_PRIOR = np.array([0.5, 0.002, 0.1, 0.02, 0.02, 0.1, 0.1, 0.02, 0.02, 0.002])
-_MISFIT = 1.15  # chi^2 per degree of freedom below which nothing more is asked for
+_MISFIT = 1.15  # chi^2 per degree of freedom below which no more terms are added
 _MORE_TERMS_GAIN = 60.0  # fall of chi^2 that five more terms must bring; five would fall by 5 by chance
 
 
@@ -45,7 +45,7 @@ class LinePoints:
     sigma_px
         (n,) standard deviation across the line, from the image's noise.
     family, line, along
-        (n,) 0 or 1; number of the line; place along the line in units of the pitch.
+        (n,) 0 or 1; number of the line; position along the line in units of the pitch.
     """
 
     xy_px: Float
@@ -138,7 +138,7 @@ def fit_lines(
     Parameters
     ----------
     points
-        Line points; those with ``used`` False get a residual but no say.
+        Line points; those with ``used`` False get a residual but no weight.
     counts
         (n_a, n_b) lines.
     image_size_px
@@ -164,7 +164,7 @@ def fit_lines(
 
 
 def _frames(points: LinePoints, v: Float, counts: tuple[int, int]) -> tuple[Float, Float, Float]:
-    """Per line: a point, its direction and its normal, in whatever coordinates ``v`` are; (n_line, 2) each."""
+    """Per line: a point, its direction and its normal, in the coordinates of ``v``; (n_line, 2) each."""
     n = sum(counts)
     index = _line_index(points, counts)
     origin, direction = np.zeros((n, 2)), np.zeros((n, 2))
@@ -186,7 +186,7 @@ class _Adjusted(NamedTuple):
     """Straight lines and terms of distortion, adjusted together.
 
     The offsets and slopes of the lines across ``direction``, then the terms; residuals, px; the normal equations, and
-    the weighted design; of each line the point, direction and normal that it is told from.
+    the weighted design; of each line the point, direction and normal of its parametrisation.
     """
 
     solution: Float
@@ -290,7 +290,7 @@ def _straight_covariance(
                 rows[r, 2 * k] = 1.0
                 rows[r, 2 * k + 1] = (straight[i, j] - origin[k]) @ direction[k]
                 rows[r, 2 * n_line :] = -normal[k] @ f[i, j]
-            # offsets across both lines -> place, in image coordinates
+            # offsets across both lines -> position, in image coordinates
             to_place = np.linalg.inv(np.stack([normal[a], normal[b]])) @ rows
             out[i, j] = to_place @ covariance @ to_place.T
     return out * distortion.scale_px**2

@@ -1,4 +1,4 @@
-"""The pieces of lines between crossings: where to look for them, and what the fits say of them."""
+"""The pieces of lines between crossings: their search areas, and line points from their fits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PieceTable:
     ----------
     rows
         (n, len(INPUTS)) for :func:`core.grid.profile.fit_pieces`.
-    family, line, place
+    family, line, crossing
         (n,) family, number of the line, and number of the crossing at which the piece begins.
     counts
         (n_a, n_b) lines.
@@ -35,7 +35,7 @@ class PieceTable:
     rows: Float
     family: NDArray[np.intp]
     line: NDArray[np.intp]
-    place: NDArray[np.intp]
+    crossing: NDArray[np.intp]
     counts: tuple[int, int]
 
     def ends_px(self) -> Float:
@@ -61,12 +61,12 @@ def piece_table(nodes_px: Float, target: GridTarget, *, blur_px: float | None) -
         Known blur; None searches across the line first.
     """
     tables = [_family(nodes_px, 0), _family(np.swapaxes(nodes_px, 0, 1), 1)]
-    rows, spacing, family, line, place = (np.concatenate(columns) for columns in zip(*tables, strict=True))
+    rows, spacing, family, line, crossing = (np.concatenate(columns) for columns in zip(*tables, strict=True))
     rows[:, IN["width"]] = np.maximum(spacing * target.line_width_mm / target.pitch_mm, 0.05)
     rows[:, IN["blur"]] = _FIRST_BLUR_PX if blur_px is None else blur_px
     rows[:, IN["search"]] = _SEARCH_SHARE * spacing if blur_px is None else 0.0
     rows[:, IN["room"]] = _STRIP_SHARE * spacing
-    return PieceTable(rows, family, line, place, (nodes_px.shape[0], nodes_px.shape[1]))
+    return PieceTable(rows, family, line, crossing, (nodes_px.shape[0], nodes_px.shape[1]))
 
 
 class _Family(NamedTuple):
@@ -76,7 +76,7 @@ class _Family(NamedTuple):
     spacing: Float
     family: NDArray[np.intp]
     line: NDArray[np.intp]
-    place: NDArray[np.intp]
+    crossing: NDArray[np.intp]
 
 
 def _family(nodes: Float, family: int) -> _Family:
@@ -109,8 +109,8 @@ def _family(nodes: Float, family: int) -> _Family:
     rows[..., IN["half_length"]] = 0.5 * length
     rows[..., IN["bend"]] = bend
     number = np.broadcast_to(np.arange(n_line)[:, None], length.shape).ravel()
-    place = np.broadcast_to(np.arange(n_cross - 1)[None], length.shape).ravel()
-    return _Family(rows.reshape(-1, len(INPUTS)), spacing.ravel(), np.full(number.size, family), number, place)
+    crossing = np.broadcast_to(np.arange(n_cross - 1)[None], length.shape).ravel()
+    return _Family(rows.reshape(-1, len(INPUTS)), spacing.ravel(), np.full(number.size, family), number, crossing)
 
 
 def _bends(nodes: Float) -> Float:
@@ -138,23 +138,23 @@ class PiecePoints:
 def line_points(table: PieceTable, fits: Float) -> PiecePoints:
     """Turn each fitted piece's offset and slope into two line points with independent errors.
 
-    The errors of offset and slope make the offset's error smallest at one place; at equal distances on both sides
-    of it, where the slope's share equals the offset's own, the two errors are not correlated.
+    The errors of offset and slope make the offset's error smallest at one position; at equal distances on both sides of
+    it, where the slope's share equals the offset's own, the two errors are not correlated.
     """
     piece = np.flatnonzero(fits[:, OUT["ok"]] > 0.0)
     f, r = fits[piece], table.rows[piece]
     var0, cov, var1 = f[:, OUT["var_c0"]], f[:, OUT["cov_c01"]], f[:, OUT["var_c1"]]
     at = np.clip(-cov / var1, -r[:, IN["half_length"]], r[:, IN["half_length"]])
     least = np.maximum(var0 - cov**2 / var1, 1e-16)
-    apart = np.minimum(np.sqrt(least / var1), r[:, IN["half_length"]])
+    distance = np.minimum(np.sqrt(least / var1), r[:, IN["half_length"]])
     direction = r[:, [IN["dir_x"], IN["dir_y"]]]
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
     points, along = [], []
     for sign in (-1.0, 1.0):
-        t = at + sign * apart
+        t = at + sign * distance
         off = f[:, OUT["c0"]] + f[:, OUT["c1"]] * t + r[:, IN["bend"]] * t**2
         points.append(r[:, [IN["x"], IN["y"]]] + t[:, None] * direction + off[:, None] * normal)
-        along.append(table.place[piece] + 0.5 + 0.5 * t / r[:, IN["half_length"]])
+        along.append(table.crossing[piece] + 0.5 + 0.5 * t / r[:, IN["half_length"]])
     return PiecePoints(
         LinePoints(
             np.concatenate(points),

@@ -11,8 +11,8 @@ is
 
     I = B + B_t t + B_d d + A P(d - c0 - c1 t)
 
-with distance along the piece t and across it d, from a base parabola. With Gaussian noise, least squares is the
-maximum of the likelihood. P is even, so that width and blur are not correlated with the place c0, c1.
+with distance along the piece t and across it d, from a base parabola. With Gaussian noise, least squares is the maximum
+of the likelihood. P is even, so that width and blur are not correlated with the position c0, c1.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ OUT = {name: k for k, name in enumerate(OUTPUTS)}
 
 _STEPS = 12
 _N = 8  # c0, c1, B, B_t, B_d, A, s, w
-_WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be told from their depth
+_WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be distinguished from their depth
 _WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
-_MOST_BLUR = 8.0
-_LEAST_PIXELS = 20
+_MAX_BLUR = 8.0
+_MIN_PIXELS = 20
 
 
 @njit(cache=True, nogil=True)
@@ -124,7 +124,7 @@ def strip_bounds(piece: Float, half_width: float, rows: int, cols: int) -> tuple
 
 @njit(cache=True, nogil=True)
 def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) -> tuple[bool, float, float]:
-    """Tell whether a pixel lies in the piece's strip, away from both crossings, and its t and d."""
+    """Return True if a pixel lies in the piece's strip, away from both crossings, and its t and d."""
     ex, ey = x - piece[0], y - piece[1]
     t = ex * piece[2] + ey * piece[3]
     d = -ex * piece[3] + ey * piece[2] - piece[5] * t * t
@@ -139,7 +139,8 @@ def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) 
 
 @njit(cache=True, nogil=True)
 def _search(image: Float32, piece: Float, guard: float, sign: float) -> float:
-    """Where the strip's mean profile is deepest within the search range; matched with a box of the line's width."""
+    """Position of the deepest mean profile of the strip within the search range; matched with a box of the line's
+    width."""
     search = piece[16]
     reach = search + 2.0 + piece[14]
     n_bin = 2 * int(np.ceil(2.0 * reach)) + 1
@@ -224,7 +225,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     gs = np.empty(room)
     n = 0
     brightest = -np.inf
-    moved = piece.copy()  # the strip is centred on the line, or its ground would lean
+    moved = piece.copy()  # the strip is centred on the line, or its ground would be tilted
     moved[0] += -piece[3] * c0
     moved[1] += piece[2] * c0
     for y in range(y0, y1):
@@ -236,9 +237,9 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
                 gs[n] = image[y, x]
                 brightest = max(brightest, gs[n])
                 n += 1
-    if n < _LEAST_PIXELS:
+    if n < _MIN_PIXELS:
         return
-    out[7] = gs[:n].mean()  # kept also where the fit fails: it tells glare from dirt
+    out[7] = gs[:n].mean()  # kept also where the fit fails: it distinguishes glare from dirt
     out[14] = brightest
     scale = 1.0 / max(piece[4], 1.0)
     par = np.zeros(_N)
@@ -260,7 +261,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
     par[5] = (line / n_line - par[2]) / max(peak, 0.1)
     N = np.zeros((_N, _N))
-    accepted = np.zeros((_N, _N))  # the normal matrix at ``par``; N may belong to a trial that was refused
+    accepted = np.zeros((_N, _N))  # the normal matrix at ``par``; N may be that of a rejected trial
     g = np.zeros(_N)
     J = np.zeros(_N)
     trial = par.copy()
@@ -309,7 +310,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
         else:
             N[7, 7] = 1.0
             g[7] = 0.0
-        # a hair of damping on the shape keeps the matrix regular when blur or contrast say nothing
+        # slight damping on the shape keeps the matrix regular when blur or contrast are undetermined
         N[6, 6] *= 1.0 + 1e-6
         N[6, 6] += 1e-9
         for i in range(_N):
@@ -329,7 +330,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
         for i in range(_N):
             trial[i] = par[i] + delta[i]
         trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
-        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MOST_BLUR, 2.0 * par[6] + 0.1))
+        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MAX_BLUR, 2.0 * par[6] + 0.1))
         trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
     dof = n - (_N if fit_width else _N - 1)
     variance = best / dof
@@ -376,7 +377,7 @@ def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: 
     pieces
         (n, :data:`INPUTS`) base lines, crossings, start values; pixels, and unit vectors.
     dark_lines
-        Sign of the contrast looked for.
+        Sign of the contrast searched for.
     guard_blurs
         Pixels nearer to a crossing line than half its width and this many blurs are left out.
 

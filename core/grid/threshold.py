@@ -1,9 +1,8 @@
-"""From grey levels to a binary picture of thin lines, whatever the lighting.
+"""A binary picture of thin lines from grey levels, under any lighting.
 
 The paper thresholds the image. Here the threshold acts on the depth of a line below its own ground (above it, for
-bright lines): grey-level closing fills every dark structure thinner than its kernel, and what it filled is the
-depth. Vignetting, one-sided edges and broad dirt leave no depth, so that one threshold (Otsu's) serves the whole
-image.
+bright lines): grey-level closing fills every dark structure thinner than its kernel, and the difference is the depth.
+Vignetting, one-sided edges and broad dirt leave no depth, so that one threshold (Otsu's) is enough for the whole image.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from core.arrays import Bool, Float, Float32
 from core.errors import ImageError
 from core.target import GridTarget
 
-_LEAST_SIDE_PX = 64
+_MIN_SIDE_PX = 64
 # a coarse picture of this many pixels on its short side shows every line of a grid worth measuring
 _COARSE_SIDE_PX = 720.0
 
@@ -31,7 +30,7 @@ class LinePicture:
     Parameters
     ----------
     depth
-        (rows, columns) float32, how far each pixel lies below its ground, in grey levels (never negative).
+        (rows, columns) float32, depth of each pixel below its ground, grey levels (never negative).
     mask
         (rows, columns) depth above the threshold.
     threshold
@@ -60,9 +59,9 @@ def checked_image(image: NDArray[Any]) -> Float32:
     array = np.asarray(image)
     if array.ndim != 2:
         raise ImageError(f"a gray image has two axes, this one has shape {array.shape}", code="image_unsupported")
-    if min(array.shape) < _LEAST_SIDE_PX:
+    if min(array.shape) < _MIN_SIDE_PX:
         raise ImageError(
-            f"the image has {array.shape[1]} x {array.shape[0]} px; a grid needs at least {_LEAST_SIDE_PX} each way",
+            f"the image has {array.shape[1]} x {array.shape[0]} px; a grid needs at least {_MIN_SIDE_PX} each way",
             code="image_unusable",
         )
     if array.dtype.kind not in "uif":
@@ -74,34 +73,34 @@ def checked_image(image: NDArray[Any]) -> Float32:
 
 
 def noise_level(grey: Float32) -> float:
-    """Estimate the noise's standard deviation from second differences, blind to slopes and robust against edges."""
+    """Estimate the noise's standard deviation from second differences, free of slopes and robust against edges."""
     d = grey[:, 2:] - 2.0 * grey[:, 1:-1] + grey[:, :-2]
     d = d[1::2] if d.size > 1_000_000 else d
     return float(np.median(np.abs(d)) / 0.6745 / np.sqrt(6.0))
 
 
 def coarse_factors(size_px: tuple[int, int], target: GridTarget) -> tuple[float, ...]:
-    """Full-size pixels per coarse pixel to try in turn; 0.5 doubles the image for lines that stand close."""
-    widest_pitch = _widest_pitch_px(size_px, target)
+    """Full-size pixels per coarse pixel to try in turn; 0.5 doubles the image for narrow spacings."""
+    max_pitch = _max_pitch_px(size_px, target)
     # a grid worth measuring fills a third of the view at least; coarse pixels no wider than its lines keep them
-    by_width = 0.35 * widest_pitch * target.line_width_mm / target.pitch_mm
+    by_width = 0.35 * max_pitch * target.line_width_mm / target.pitch_mm
     first = float(int(max(1.0, min(round(by_width), round(min(size_px) / _COARSE_SIDE_PX)))))
     return (first, 0.5 * first, 2.0 * first) if first > 1.0 else (1.0, 0.5, 2.0)
 
 
-def _widest_pitch_px(size_px: tuple[int, int], target: GridTarget) -> float:
+def _max_pitch_px(size_px: tuple[int, int], target: GridTarget) -> float:
     return max(size_px) / (min(target.lines) - 1)
 
 
 def line_picture(grey: Float32, target: GridTarget, factor: float) -> LinePicture:
-    """Find what is thinner than the target's lines can be.
+    """Find structures no wider than the target's lines can be.
 
     Parameters
     ----------
     grey
         (rows, columns) as :func:`checked_image` returns it.
     target
-        Tells the ratio of line width to pitch; the pitch in pixels is bounded by the image, since the whole grid must
+        Gives the ratio of line width to pitch; the pitch in pixels is bounded by the image, since the whole grid must
         be seen.
     factor
         Full-size pixels per coarse pixel, see :func:`coarse_factors`.
@@ -117,8 +116,8 @@ def line_picture(grey: Float32, target: GridTarget, factor: float) -> LinePictur
         coarse = np.asarray(cv2.resize(block, size, interpolation=how), dtype=np.float32)
     signed = coarse if target.dark_lines else -coarse
     smooth = cv2.GaussianBlur(signed, (0, 0), 0.8 / min(factor, 1.0))
-    widest_pitch = _widest_pitch_px((width, height), target)
-    widest_line = (target.line_width_mm / target.pitch_mm * widest_pitch + 3.0) / factor
+    max_pitch = _max_pitch_px((width, height), target)
+    widest_line = (target.line_width_mm / target.pitch_mm * max_pitch + 3.0) / factor
     k = 2 * int(np.ceil(widest_line)) + 1
     ground = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
     depth = (ground - smooth).astype(np.float32)
@@ -127,7 +126,7 @@ def line_picture(grey: Float32, target: GridTarget, factor: float) -> LinePictur
 
 
 def _otsu(depth: Float32) -> float:
-    """Otsu's threshold over the depths, on a histogram that a few glints cannot stretch."""
+    """Otsu's threshold over the depths, on a histogram that is robust to a few glints."""
     top = float(np.quantile(depth[::2, ::2], 0.9995))
     if top <= 0.0:
         return 0.0

@@ -1,4 +1,4 @@
-"""What grid detection takes and gives."""
+"""Options and results of grid detection."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ LineModel = Literal["straight", "parabola", "local"]
 
 @dataclass(frozen=True, kw_only=True)
 class GridOptions:
-    """How to look for the grid.
+    """Options of grid detection.
 
     Parameters
     ----------
     line_model
-        What joins a line's pieces. ``straight``: all lines are straight but for one common lens distortion, found
-        from the lines themselves; it averages the maker's node errors best. ``parabola``: one non-oblique parabola
-        a line, as in the paper. ``local``: each intersection from the pieces beside it only, which keeps the node
-        errors visible to an adjustment that solves for them. None takes ``straight`` for the profile localiser,
+        Model of a line through its pieces. ``straight``: all lines are straight but for one common lens distortion,
+        found from the lines themselves; it averages the maker's node errors best. ``parabola``: one non-oblique
+        parabola a line, as in the paper. ``local``: each intersection from the pieces beside it only, which keeps the
+        node errors visible to an adjustment that solves for them. None takes ``straight`` for the profile localiser,
         ``parabola`` for the paper's.
     saturation
         Grey level at which the sensor saturates; None finds it from the type and the image itself.
@@ -33,7 +33,7 @@ class GridOptions:
     max_bad_on_line
         Part of one line's pieces that may be spoilt.
     max_rotation_rad
-        Largest departure of the grid's rotation from 45 degrees: 20 degrees and a little for the estimate's own
+        Largest departure of the grid's rotation from 45 degrees: 20 degrees and an allowance for the estimate's own
         error.
     """
 
@@ -46,12 +46,12 @@ class GridOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class GridView:
-    """The grid as one image shows it.
+    """The grid detected in one image.
 
-    A grid without marks looks the same after a turn by 90 or 180 degrees, and in a mirror: no single image tells
-    them apart. The indices here follow the image (X_sys right and down, Y_sys left and down), so both cameras give
-    the same physical corner the same index as long as both images stand upright. A turned or mirrored image shows
-    itself in the calibration, whose angles then disagree with the nominal rig.
+    A grid without marks looks the same when turned by 90 or 180 degrees or mirrored: no single image distinguishes
+    them. The indices here follow the image (X_sys right and down, Y_sys left and down), so both cameras give the same
+    physical corner the same index as long as both images are upright. A turned or mirrored image is detected in the
+    calibration, whose angles then disagree with the nominal rig.
 
     Parameters
     ----------
@@ -62,11 +62,11 @@ class GridView:
     covariance_px2
         (n_a - 2, n_b - 2, 2, 2) of each intersection, from the image's own noise; without the maker's node errors.
     localiser, line_model
-        How they were found.
+        Localiser and line model used.
     image_size_px
         Columns, rows.
     noise
-        Grey levels, standard deviation of what the line profiles leave.
+        Grey levels, standard deviation of the line profiles' residuals.
     contrast
         Grey levels, median depth of a line of full width against its ground.
     background
@@ -82,7 +82,7 @@ class GridView:
     rotation_rad
         Rotation of the grid in the image, near alpha of Eq. (1).
     fit_rms_px
-        What the line pieces leave across the lines after the line model's fit.
+        Rms residual of the line pieces across the lines after the line model's fit.
     pieces_px
         (n, 2, 2) end points of the line pieces used, for pictures.
     pieces_used
@@ -114,11 +114,11 @@ class GridView:
 
     @property
     def object_points_mm(self) -> Float:
-        """Nominal places of the intersections, (n_a - 2, n_b - 2, 2) X_sys, Y_sys."""
+        """Nominal positions of the intersections, (n_a - 2, n_b - 2, 2) X_sys, Y_sys, mm."""
         return self.target.inner_points_mm()
 
     def overlay(self) -> GridOverlay:
-        """Return what a picture of the detection needs."""
+        """Return the polylines for a picture of the detection."""
         return GridOverlay(
             pieces_px=self.pieces_px,
             pieces_used=self.pieces_used,
@@ -137,7 +137,7 @@ class GridOverlay:
     Parameters
     ----------
     pieces_px, pieces_used
-        (n, 2, 2) line pieces, and whether each was used.
+        (n, 2, 2) line pieces, and (n,) True where used.
     line_a_px, line_b_px
         Polylines (m, 2) of the inner lines of each family.
     origin_px

@@ -1,4 +1,4 @@
-"""What the compiled kernels are called with: checked, contiguous, and of the types that they were compiled for."""
+"""Arguments of the compiled kernels: checked, contiguous, and of the types that they were compiled for."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from core.threads import run_ranges
 Int = NDArray[np.int32]
 
 POINTS_AT_ONCE = 128  # per call of a kernel: some ms, against some 50 us to call it
-FEWEST_AT_ONCE = 16
+MIN_AT_ONCE = 16
 _TINY = 1e-6  # grey levels squared
 
 
 @dataclass(frozen=True, eq=False)
 class VisiblePixels:
-    """Which pixels of a subset count, for the points that do not see all of theirs.
+    """Visible pixels of subsets that are not wholly visible.
 
     Attributes
     ----------
     patches
         (k, subset, subset) uint8 in camera 1's reference image, zero where a pixel does not count.
     of_point
-        (N,) int32 which patch is a point's; -1 where all pixels count.
+        (N,) int32 index of a point's patch; -1 where all pixels count.
     """
 
     patches: NDArray[np.uint8]
@@ -43,7 +43,7 @@ class VisiblePixels:
 
 
 def one_a_thread(make: Callable[[int], Any], subset: int) -> Callable[[], Any]:
-    """Return what gives each thread its own work space, once: one for each range would cost as much as ten points."""
+    """Return a function that gives each thread one work space: one for each range would cost as much as ten points."""
     local = threading.local()
 
     def space() -> Any:
@@ -68,7 +68,7 @@ def degree_of(options: MatchOptions) -> tuple[int, int]:
 
 
 def starts_of(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) -> Float:
-    """Start values with ``terms`` columns; a plane's serve a curved patch, the rest is zero."""
+    """Return start values with ``terms`` columns; a plane's serve a curved patch, the rest is zero."""
     given = np.asarray(values, dtype=np.float64)
     columns = given.shape[-1] if given.ndim else 0
     if given.shape[:-1] != shape or columns not in (3, terms):
@@ -89,7 +89,7 @@ def given_to_kernels(
     G: Float | None = None,
     epipolar_px: Float | None = None,
 ) -> Given:
-    """Return what the kernels are called with, for n points with unknowns ``w`` and, for a motion, ``G``."""
+    """Return the kernels' arguments for n points with unknowns ``w`` and, for a motion, ``G``."""
     n, pose = len(xy), pair.cam2_from_cam1
     patches, which = visible_of(visible, n, options.subset_px)
     return Given(
@@ -110,26 +110,23 @@ def given_to_kernels(
 
 
 def run_kernel(kernel: Any, make_space: Callable[[int], Any], given: Given, out: Float) -> tuple[NDArray[np.int8], Int]:
-    """Run a kernel over all points, on all threads, ``out`` (n, ...) in place; returns status and iterations (n,)."""
+    """Run a kernel over all points, on all threads, ``out`` (n, ...) in place; return status and iterations (n,)."""
     n = len(given.xy)
     status, iterations = np.ones(n, np.int8), np.zeros(n, np.int32)
     space = one_a_thread(make_space, given.setting.subset)
     run_ranges(
-        lambda first, last: kernel(first, last, given, space(), out, status, iterations),
-        n,
-        POINTS_AT_ONCE,
-        FEWEST_AT_ONCE,
+        lambda first, last: kernel(first, last, given, space(), out, status, iterations), n, POINTS_AT_ONCE, MIN_AT_ONCE
     )
     return status, iterations
 
 
 def setting_of(options: MatchOptions, images: list[ImageData]) -> Setting:
-    """Options and what is known of the noise: the images' variances, or all one where any is unknown."""
+    """Return options and noise: the images' variances, or all one where any is unknown."""
     given = [image.noise_variance for image in images]
     variances = [v for v in given if v is not None and v > 0.0]
     known = len(variances) == len(images)
     max_sigma_px, spread = options.max_sigma_px, images[0].spread(options.subset_px, degree_of(options)[0])
-    if spread is not None:  # the kernels take noise for white
+    if spread is not None:  # the kernels assume white noise
         max_sigma_px /= float(np.sqrt(np.median(spread[::4, ::4])))
         variances = variances if known else [assumed_variance(images[0])] * len(images)
         known = True
@@ -154,7 +151,7 @@ def assumed_variance(blurred: ImageData) -> float:
 
 
 def visible_of(visible: VisiblePixels | None, n: int, subset: int) -> tuple[NDArray[np.uint8], Int]:
-    """Return the patches (k, subset, subset) of points that do not see all of theirs, and which is a point's."""
+    """Return the patches (k, subset, subset) of partly visible subsets, and the index of each point's."""
     if visible is None or not (visible.of_point >= 0).any():
         return np.zeros((0, subset, subset), np.uint8), np.full(n, -1, np.int32)
     patches, of_point = np.ascontiguousarray(visible.patches, np.uint8), np.array(visible.of_point, np.int32)
@@ -182,7 +179,7 @@ def flat(image: ImageData) -> ComparedImage:
 
 
 def lens_of(camera: Camera) -> Float:
-    """Return the lens as the kernels know it."""
+    """Return the lens as the kernels use it."""
     return own(camera.lens.kernel_parameters())
 
 

@@ -1,12 +1,12 @@
-"""A Gaussian blur of all images before they are matched, and what it makes of their noise.
+"""A Gaussian blur of all images before they are matched, and its effect on their noise.
 
 White noise comes out of the blur correlated from pixel to pixel. A match is a least-squares fit with gradients g over
 the subset; its right-hand side ``sum g n`` has the variance ``sum_xy g(x) g(y) C(x - y)``, with C the noise's
-autocorrelation, and not ``C(0) sum g^2`` as with white noise. The ratio of both, the ``spread``, is what a covariance
-that took the noise for white lacks.
+autocorrelation, and not ``C(0) sum g^2`` as with white noise. The ratio of both, the ``spread``, is the factor missing
+in a covariance for white noise.
 
-Residuals of blurred images are a bad measure of their noise: most of it is gone, and what is left of the residuals are
-differences of the views, which do not scatter. So the noise is told from the images before the blur.
+Residuals of blurred images are a bad measure of their noise: most of it is removed, and the rest of the residuals are
+differences of the views, which are systematic. So the noise is estimated from the images before the blur.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Blur:
 
     @cached_property
     def gain(self) -> float:
-        """Variance of white noise that the blur leaves."""
+        """Variance of white noise of variance 1 after the blur."""
         return float((self.taps**2).sum() ** 2)
 
     @cached_property
@@ -67,7 +67,7 @@ class Blur:
 
     @property
     def edge_px(self) -> int:
-        """How near to an image's border its mirror image shows."""
+        """Distance from an image's border within which its mirror image has an effect."""
         return int(np.ceil(_EDGE_SD * self.sd_px))
 
     def correlation_at(self, lag: NDArray[np.integer[Any]]) -> Float:
@@ -92,7 +92,7 @@ class Blur:
 
 
 def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) -> Float32:
-    """Return (rows, cols) how much more blurred noise weighs than white noise of its variance, subset by subset.
+    """Return (rows, cols), the ratio of blurred noise's effect to that of white noise of its variance, by subset.
 
     Parameters
     ----------
@@ -106,9 +106,9 @@ def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) ->
     Notes
     -----
     With S the subset, ``sum_{x, y in S} g(x) g(y) C(x - y)`` is taken as ``sum_{x in S} g(x) (C_S * g)(x)``, where C_S
-    is C times the share of the subset's pixels whose partner lies in the subset too. A displacement told from gradients
-    has the covariance ``G^-1 K G^-1``, G the sums of their products and K the same under C; its trace counts against
-    that of ``G^-1``.
+    is C times the share of the subset's pixels whose partner lies in the subset too. A displacement estimated from
+    gradients has the covariance ``G^-1 K G^-1``, G the sums of their products and K the same under C; its trace counts
+    against that of ``G^-1``.
     """
     lag = np.arange(len(blur.correlation)) - len(blur.correlation) // 2
     shared = blur.correlation * np.maximum(1.0 - np.abs(lag) / subset_px, 0.0)
@@ -124,7 +124,7 @@ def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) ->
 
     gx, gy = gradients
     nx, ny = under_noise(gx), under_noise(gy)
-    # a fit is free in the grey levels' mean, so that only what the gradients differ by from theirs counts
+    # a fit is free in the grey levels' mean, so that only the gradients' deviations from their own mean count
     ax, ay, bx, by = mean(gx), mean(gy), mean(nx), mean(ny)
     most = np.float32(shared.sum() ** 2)
     xx, yy, xy = mean(gx * gx) - ax * ax, mean(gy * gy) - ay * ay, mean(gx * gy) - ax * ay
@@ -136,18 +136,17 @@ def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) ->
     coloured = (yy * yy + xy * xy) * kxx + (xx * xx + xy * xy) * kyy - 2.0 * xy * trace * kxy
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = coloured / (trace * det)
-    # where nothing is seen, as much as an even slope would bear
+    # without texture, as for an even slope
     return np.asarray(np.clip(np.where(np.isfinite(ratio), ratio, most), 0.02, most), dtype=np.float32)
 
 
 def fitted_share(
     blur: Blur, pixels: Float32, gradients: tuple[Float32, Float32], subset_px: int, degree: int, spread: Float32
 ) -> float:
-    """Return what a spread is to be multiplied by, since a patch is fitted with more than its displacement.
+    """Return the factor on a spread for a patch that is fitted with more unknowns than its displacement.
 
-    Of a few dozen subsets the gradients are freed of what the fit's other unknowns can take up (contrast and offset,
-    the patch's slopes, and for curved patches its second order), and their spread summed exactly. The mean of the ratio
-    counts.
+    Of a few dozen subsets the gradients are projected off the fit's other unknowns (contrast and offset, the patch's
+    slopes, and for curved patches its second order), and their spread summed exactly. The mean of the ratio counts.
 
     Parameters
     ----------
@@ -164,8 +163,8 @@ def fitted_share(
     half = subset_px // 2
     lag = np.arange(subset_px)
     C = blur.correlation_at(lag[:, None] - lag[None, :])
-    place = np.linspace(-1.0, 1.0, subset_px)
-    x, y = np.meshgrid(place, place)
+    coordinate = np.linspace(-1.0, 1.0, subset_px)
+    x, y = np.meshgrid(coordinate, coordinate)
     terms = [x, y] if degree == 1 else [x, y, x * x, x * y, y * y]
     middle_x, middle_y = (np.unique(np.linspace(half, last - 1 - half, _SAMPLES).astype(int)) for last in (cols, rows))
     exact, mapped = [], []

@@ -2,7 +2,7 @@
 
 The exact prefilter of a B-spline is recursive; on an image that continues as its mirror it equals a convolution whose
 taps fall off by 0.27 (cubic) or 0.43 (quintic) a pixel. Cut where float32 ends, it is three times faster than the
-recursion, works in bands, and holds no lock.
+recursion, works in bands, and releases the GIL.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def prefilter(order: int) -> Float:
 def derivative(order: int) -> Float:
     """Taps (2 r + 1,) that turn grey levels into the spline's derivative at the pixel centres, to be correlated.
 
-    The spline passes through the pixels, so nothing is left to do along the other axis.
+    The spline passes through the pixels, so no filter is needed along the other axis.
     """
     w = 2.0 * np.pi * np.arange(_PERIOD) / _PERIOD
     slope = np.sin(w) if order == 3 else (20.0 * np.sin(w) + 2.0 * np.sin(2.0 * w)) / 24.0

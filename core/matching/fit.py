@@ -52,7 +52,7 @@ class ShapeFit:
     iterations, status
         (N,).
     variance
-        (N,) of the noise that the covariance holds where no model states it.
+        (N,) noise variance assumed in the covariance where no model states it.
     """
 
     w: Float
@@ -75,10 +75,10 @@ class MotionFit:
     w, epipolar_px, epipolar_sigma_px, noise, iterations, status, variance
         As in :class:`ShapeFit`.
     G
-        (N, 3, 3): camera 1 at t sees the patch at ``G (1, X, Y)`` (scale fixed by ``w``); for curved patches (N, 3, 6),
-        at ``G (1, X, Y, X^2, X Y, Y^2)``.
+        (N, 3, 3): the patch in camera 1's current frame is ``G (1, X, Y)`` (scale fixed by ``w``); for curved patches
+        (N, 3, 6), at ``G (1, X, Y, X^2, X Y, Y^2)``.
     zncc
-        (N, 3) correlation with camera 2 at t0, camera 1 at t, camera 2 at t.
+        (N, 3) correlation with camera 2's reference, camera 1's current and camera 2's current image.
     covariance
         (N, 5, 5) of (w0, G00, G10, G20, epipolar offset).
     """
@@ -127,8 +127,8 @@ def fit_shape(
     xy_px
         (N, 2) points in camera 1.
     start
-        (N, 3), or for curved patches (N, 6), start values of ``w``; a point with a start that is not finite comes back
-        as NOT_SEEDED.
+        (N, 3), or for curved patches (N, 6), start values of ``w``; a point with a start that is not finite gets the
+        status NOT_SEEDED.
     options
         Defaults to ``MatchOptions()``.
     visible
@@ -196,9 +196,9 @@ def fit_motion(
     pair
         The calibrated cameras.
     ref1, ref2, cur1, cur2
-        Both cameras' images at t0 and at t, raw or prepared.
+        Both cameras' reference and current images, raw or prepared.
     xy_px
-        (N, 2) points in camera 1 at t0.
+        (N, 2) points in camera 1's reference image.
     start_w
         (N, 3), or for curved patches (N, 6), start values of ``w``.
     start_G
@@ -276,10 +276,9 @@ def _with_blurred_noise(
     options: MatchOptions,
     sharp: Callable[[list[ImageData], MatchOptions], _Fit],
 ) -> _Fit:
-    """Give a fit of blurred images the covariance and the noise that such images have.
+    """Return a fit of blurred images with the covariance and the noise of such images.
 
-    One step from the result on the images before the blur tells their noise, and that a subset which showed noise alone
-    shows nothing.
+    One step from the result on the images before the blur gives their noise, and detects subsets with noise alone.
     """
     blur, spread = images[0].blur, images[0].spread(options.subset_px, degree_of(options)[0])
     assert blur is not None
@@ -288,11 +287,11 @@ def _with_blurred_noise(
     col, row = (np.clip(np.rint(a), 0, last - 1).astype(int) for a, last in zip(xy.T, (cols, rows), strict=True))
     factor = spread[row, col].astype(np.float64)
     before = [image.sharp for image in images]
-    told = sharp([image for image in before if image is not None], replace(options, max_iterations=1))
+    unblurred = sharp([image for image in before if image is not None], replace(options, max_iterations=1))
     if not all(image.noise_variance for image in images):
-        factor *= blur.gain * told.variance / assumed_variance(images[0])
-    unseen = (fit.status == PointStatus.OK) & ~np.isfinite(told.variance)
-    status, noise = np.where(unseen, told.status, fit.status), np.sqrt(blur.gain) * told.noise
+        factor *= blur.gain * unblurred.variance / assumed_variance(images[0])
+    unseen = (fit.status == PointStatus.OK) & ~np.isfinite(unblurred.variance)
+    status, noise = np.where(unseen, unblurred.status, fit.status), np.sqrt(blur.gain) * unblurred.noise
     covariance = fit.covariance * factor[:, None, None]
     return replace(
         fit, status=status, noise=noise, covariance=covariance, epipolar_sigma_px=np.sqrt(covariance[:, -1, -1])

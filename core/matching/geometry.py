@@ -1,4 +1,4 @@
-"""From the matcher's unknowns to lengths and angles, and the covariances that go with them.
+"""Conversion of the matcher's unknowns to lengths and angles, with their covariances.
 
 Camera 1's frame is ``cam1``; results are in the system frame unless a name says otherwise. All arrays run over N
 points; NaN in gives NaN out.
@@ -58,7 +58,7 @@ class MotionGeometry:
 
 
 def shape_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> ShapeGeometry:
-    """Surface points, normals and Eq. (12)'s angles.
+    """Return surface points, normals and the angles of Helm et al., Eq. (12).
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def shape_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> ShapeGeo
 
 
 def principal_curvatures(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> Float:
-    """Principal curvatures (N, 2) of the surface in 1/mm, the larger first; positive where it bulges towards camera 1.
+    """Return principal curvatures (N, 2) of the surface, 1/mm, the larger first; positive where it bulges to camera 1.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ def principal_curvatures(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> Fl
     operator = _inverse2(first) @ (second * scale[..., None]).reshape(*w.shape[:-1], 2, 2)
     mean = 0.5 * (operator[..., 0, 0] + operator[..., 1, 1])
     det = operator[..., 0, 0] * operator[..., 1, 1] - operator[..., 0, 1] * operator[..., 1, 0]
-    apart = np.sqrt(np.maximum(mean**2 - det, 0.0))
-    return np.stack([mean + apart, mean - apart], axis=-1)
+    half_difference = np.sqrt(np.maximum(mean**2 - det, 0.0))
+    return np.stack([mean + half_difference, mean - half_difference], axis=-1)
 
 
 def plane_from_angles(
@@ -131,15 +131,15 @@ def plane_from_angles(
 
 
 def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLike) -> MotionGeometry:
-    """Displacement, rotation and in-plane stretch of the patches.
+    """Return displacement, rotation and in-plane stretch of the patches.
 
     Parameters
     ----------
     pair, xy_px, w
         As in :func:`shape_geometry`.
     G
-        (N, 3, 3) or (N, 3, 6), see :class:`core.matching.MotionFit`. Second-order terms do not show in the middle of
-        the patch, where all of this is told.
+        (N, 3, 3) or (N, 3, 6), see :class:`core.matching.MotionFit`. Second-order terms have no effect in the middle of
+        the patch, where all of this is reported.
     """
     w, G = np.asarray(w, dtype=np.float64)[..., :3], np.asarray(G, dtype=np.float64)[..., :3]
     R = pair.cam1.cam_from_sys.rotation
@@ -164,7 +164,8 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
 
 
 def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance: ArrayLike) -> Float:
-    """Covariance (N, 3, 3) of XYZ in mm^2, system frame, from a shape fit's (N, 2, 2) of (w0, epipolar offset).
+    """Return the covariance (N, 3, 3) of XYZ in mm^2, system frame, from a shape fit's (N, 2, 2) of (w0, epipolar
+    offset).
 
     The pixel is exact by definition, so the point can only move along its ray: the matrix has rank one.
     """
@@ -173,7 +174,7 @@ def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance:
 
 
 def covariance_xyzuvw(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLike, covariance: ArrayLike) -> Float:
-    """Covariance (N, 6, 6) of X Y Z u v w in mm^2, system frame, from a motion fit's (N, 5, 5)."""
+    """Return the covariance (N, 6, 6) of X Y Z u v w in mm^2, system frame, from a motion fit's (N, 5, 5)."""
     w, G = np.asarray(w, dtype=np.float64), np.asarray(G, dtype=np.float64)
     R = pair.cam1.cam_from_sys.rotation
     ray = pair.cam1.rays_cam(xy_px).xyz_mm

@@ -1,4 +1,4 @@
-"""Images prepared for matching: spline coefficients, gradients, and what is known of the noise.
+"""Images prepared for matching: spline coefficients, gradients and noise.
 
 B-spline coefficients are exact to float32 (mirror boundary: the image continues symmetrically about its outermost
 pixel centres), so the spline passes through every pixel.
@@ -28,7 +28,7 @@ PAD = 4
 
 _ONE = np.ones(1)
 _SAMPLE = 4  # every fourth pixel is enough for a mean variance
-_LEVEL_PX = 0.5  # sd of the smoothing before a grey level weighs: more would take edges' levels for one another
+_LEVEL_PX = 0.5  # standard deviation of the smoothing before weights are taken: a larger one mixes levels at edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +41,13 @@ class ImageData:
         (rows + 2 PAD, cols + 2 PAD) float32 B-spline coefficients. float32 rounds them by 6e-8 of their size, some
         1e-5 grey levels of an 8-bit image: a shift of 1e-6 px.
     raw
-        (rows, cols) grey levels as they were given.
+        (rows, cols) grey levels as given.
     order
         3 or 5.
     noise
         The noise model of ``raw``, or None where it is not known.
     blur
-        What ``raw`` was blurred with; None: nothing.
+        Blur of ``raw``; None without one.
     unblurred
         (rows, cols) grey levels before the blur; None without one.
     """
@@ -67,7 +67,7 @@ class ImageData:
 
     @cached_property
     def pixels(self) -> Float32:
-        """(rows, cols) grey levels, float32. Made on the first call: only a reference image needs them."""
+        """(rows, cols) grey levels, float32. Computed on the first call: only a reference image needs them."""
         return np.ascontiguousarray(self.raw, dtype=np.float32)
 
     @cached_property
@@ -81,7 +81,7 @@ class ImageData:
     def weights(self) -> Float32 | None:
         """(rows, cols) float32 inverse variance of the pixels' noise, about 1 in the mean; None where all count alike.
 
-        A pixel's own noise should not weigh it, or bright noise would count less than dark: its next neighbours help.
+        The weight is taken from neighbouring pixels too, so that a pixel's own noise has little effect on its weight.
         """
         if self.noise is None or self.noise_variance is None:
             return None
@@ -97,7 +97,7 @@ class ImageData:
 
     @cached_property
     def slopes(self) -> SlopeFilter | None:
-        """The derivative that is best under this image's noise; None where the image shows nothing."""
+        """The derivative that is best under this image's noise; None for an image without texture."""
         return slope_filter(self.raw, self.order, self.noise_variance, blur=self.blur, unblurred=self.unblurred)
 
     @property
@@ -123,13 +123,13 @@ class ImageData:
 
     @cached_property
     def sharp(self) -> ImageData | None:
-        """The image before its blur, prepared alike; None without one. Its residuals tell the noise."""
+        """The image before its blur, prepared alike; None without one. Its residuals give the noise."""
         if self.unblurred is None:
             return None
         return prepare(self.unblurred, "cubic" if self.order == 3 else "quintic")
 
     def spread(self, subset_px: int, degree: int = 1) -> Float32 | None:
-        """Return (rows, cols) how much more blurred noise weighs than white noise in subsets about each pixel.
+        """Return (rows, cols), the ratio of blurred noise's effect to white noise's in subsets about each pixel.
 
         None without a blur; ``degree`` is 1 for plane and 2 for curved patches.
         """
@@ -154,13 +154,13 @@ def prepare(
     Parameters
     ----------
     image
-        (rows, cols) grey levels, any real type; or an image already prepared, which comes back unchanged.
+        (rows, cols) grey levels, any real type; or an image already prepared, which is returned unchanged.
     interpolation
         ``cubic`` or ``quintic``.
     noise
-        The camera's noise model; pixels then count by their noise, and it says how far a match scatters.
+        The camera's noise model; it weighs the pixels, and gives the covariance of a match.
     blur
-        A Gaussian that the image is blurred with before anything else; None: nothing.
+        A Gaussian that the image is blurred with before anything else; None: no blur.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the matcher can be told."""
+"""Options of the matcher."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class MatchOptions:
         Motion of the subset's corners that may remain unmade when the iteration stops, px. Its own noise is some ten
         times larger at the default.
     max_sigma_px
-        Points whose match is predicted to scatter more than this in any image and direction (standard deviation, px)
-        have too little texture: five times as much, half a pixel, is exceeded once in two million. A texture of stripes
-        fails so too.
+        Points whose match has a larger predicted standard deviation, px, in any image and direction have too little
+        texture: five times as much, half a pixel, is exceeded once in two million. A texture of stripes fails this test
+        too.
     max_step_px
         A Gauss-Newton step that moves a corner of the subset further is cut down to this, px.
     """

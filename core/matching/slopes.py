@@ -1,13 +1,13 @@
-"""Reference gradients that are best under noise: a Wiener derivative made for the image's own texture.
+"""Reference gradients that are best under noise: a Wiener derivative for the image's own texture.
 
-The matcher takes the derivatives of all comparisons from the reference's gradients, and their noise costs random
-error: a tenth and more in coarse texture. Of all linear filters the one that comes closest to the true derivative,
-``i k S / (S + N)`` for a texture of spectrum S under white noise N, loses least. Its error is uncorrelated with its
-output, so the sum of its squares is at once the sensitivity of the sums to a shift: no noise has to be taken out.
-It is odd, so its noise does not correlate with a pixel's own noise, and no bias follows.
+The matcher takes the derivatives of all comparisons from the reference's gradients, and their noise costs random error:
+a tenth and more in coarse texture. Of all linear filters the one that comes closest to the true derivative, ``i k S /
+(S + N)`` for a texture of spectrum S under white noise N, loses least. Its error is uncorrelated with its output, so
+the sum of its squares is also the sensitivity of the sums to a shift: no noise has to be subtracted. It is odd, so its
+noise does not correlate with a pixel's own noise, and no bias follows.
 
-What the spline between the pixels cannot carry, near the highest frequencies, is counted as noise too, and more than
-it weighs: it shifts all points by one amount that depends on the sub-pixel phase, and no mean takes that out.
+The interpolation error of the spline, near the highest frequencies, is counted as noise too, and with a larger weight:
+it shifts all points by one amount that depends on the sub-pixel phase, and averaging does not remove it.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ REACH = 3
 """The filter is 7 x 7; 9 x 9 gains less than 0.05 % of the information."""
 
 _TILE = 128
-_MOST_TILES = 48
-_LEAST_POWER = 0.1  # of a strong tile's grey-level variance: tiles below it show no texture
+_MAX_TILES = 48
+_MIN_POWER = 0.1  # of a strong tile's grey-level variance: tiles below it show no texture
 _RINGS = (0.6, 0.8)  # of the Nyquist frequency, both ways: beyond the second, lenses leave little but noise
 _FALL = 2.0  # by which the sharpest texture's spectrum falls from one ring to the next
 _LEVEL = 1.05  # rings that differ by less show noise alone
-_MOST_NOISE = 0.5  # of the grey levels' variance
-_INTERPOLATION_COUNTS = 100.0  # a third off the mean error in sharp speckle, for 1 % of random error there
+_MAX_NOISE = 0.5  # of the grey levels' variance
+_INTERPOLATION_COUNTS = 100.0  # reduces the bias in sharp speckle by a third, for 1 % of random error there
 _BLANK = 1e-20  # of the squared grey levels: rounding
-_LEAST_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
+_MIN_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +48,11 @@ class SlopeFilter:
     along_x, along_y
         (7, 7) taps.
     gain
-        Variance of the filtered gradient per variance of the pixels' noise, mean of both directions.
+        Variance of the filtered gradient over the variance of the pixels' noise, mean of both directions.
     share
         Share of noise in the filtered gradient's squares over the image's texture.
     noise_variance
-        Of a pixel, grey levels squared, as the filter was made for.
+        Of a pixel, grey levels squared, for which the filter was made.
     """
 
     along_x: Float
@@ -83,26 +83,25 @@ def slope_filter(
     blur: Blur | None = None,
     unblurred: NDArray[Any] | None = None,
 ) -> SlopeFilter | None:
-    """Make the filter for an image; None if it shows nothing.
+    """Make the filter for an image; None for an image without texture.
 
     Parameters
     ----------
     image
         (rows, cols) grey levels; tiles of it without texture are left out.
     order
-        Of the spline that carries the other images, 3 or 5.
+        Of the spline that interpolates the other images, 3 or 5.
     noise_variance
         Of a pixel, grey levels squared; from the spectrum's floor when left out. Texture that is sharp enough to reach
-        the floor raises it: the gradients then lose a little, and the covariance stays on the safe side.
+        the floor raises it: the gradients are then slightly worse, and the covariance is not too small.
     blur, unblurred
-        What the image was blurred with, and the image before: its noise is no longer white, and its spectrum shows no
-        floor.
+        The image's blur, and the image before it: its noise is no longer white, and its spectrum has no floor.
 
     Notes
     -----
     The taps h solve the normal equations ``sum_j (R + E)(i - j) h(j) = (d S)(i)``: R the image's autocorrelation, S the
     texture's, E that of the interpolation error, d the derivative. That is the quintic spline's: the exact one would
-    make too much of what is aliased. They are then scaled so that the sum of squares equals the sensitivity.
+    amplify aliased frequencies. They are then scaled so that the sum of squares equals the sensitivity.
     """
     spectra, window = _spectra(image)
     if spectra is None:
@@ -120,30 +119,30 @@ def slope_filter(
     S = _lags(spectrum) / W  # index 0 is lag 0, negative lags come from the end
     if not S[0, 0] > 0.0:
         return None
-    noise = min(noise, _MOST_NOISE * float(S[0, 0]))
+    noise = min(noise, _MAX_NOISE * float(S[0, 0]))
     colour = np.ones_like(spectrum) if blur is None else blur.spectrum(len(spectrum))
     E = _lags(np.maximum(spectrum - noise * colour, 0.0) * _interpolation_error(len(spectrum), order)) / W
     C = _lags(colour)
     N = noise * C
-    least = _LEAST_NOISE * float(S[0, 0] - noise)
+    floor = _MIN_NOISE * float(S[0, 0] - noise)
     S -= N
-    lag = np.arange(-REACH, REACH + 1)
-    y, x = (v.ravel() for v in np.meshgrid(lag, lag, indexing="ij"))
-    apart = y[:, None] - y, x[:, None] - x
-    R = S[apart] + N[apart]
-    R[np.diag_indices(side**2)] += least
+    offsets = np.arange(-REACH, REACH + 1)
+    y, x = (v.ravel() for v in np.meshgrid(offsets, offsets, indexing="ij"))
+    lag = y[:, None] - y, x[:, None] - x
+    R = S[lag] + N[lag]
+    R[np.diag_indices(side**2)] += floor
     slope = derivative(5)
     far = min(len(slope) // 2, len(S) // 2 - 1 - REACH)
     tap = np.arange(-far, far + 1)
     slope = slope[len(slope) // 2 - far : len(slope) // 2 + far + 1]
     wanted = np.stack([S[-y[:, None], tap - x[:, None]] @ slope, S[tap - y[:, None], -x[:, None]] @ slope], axis=-1)
-    taps = np.linalg.solve(R + _INTERPOLATION_COUNTS * E[apart], wanted)
+    taps = np.linalg.solve(R + _INTERPOLATION_COUNTS * E[lag], wanted)
     taps = 0.5 * (taps - taps[::-1])  # odd, but for rounding
     power = np.einsum("ik,ij,jk->k", taps, R, taps)
     if not (power > 0.0).all():
         return None
     taps *= np.einsum("ik,ik->k", taps, wanted) / power
-    gain = float(np.einsum("ik,ij,jk->", taps, C[apart], taps)) / 2.0
+    gain = float(np.einsum("ik,ij,jk->", taps, C[lag], taps)) / 2.0
     power = float(np.einsum("ik,ij,jk->", taps, R, taps)) / 2.0
     along_x, along_y = taps.T.reshape(2, side, side)
     return SlopeFilter(along_x, along_y, gain, gain * noise / power, noise)
@@ -153,23 +152,23 @@ def _spectra(image: NDArray[Any]) -> tuple[Float | None, Float]:
     """Periodograms (tiles, side, side // 2 + 1) of tiles that show texture, white noise at its variance; the window."""
     rows, cols = image.shape
     side = min(_TILE, rows // 2 * 2, cols // 2 * 2)
-    places = [(y, x) for y in range(0, rows - side + 1, side) for x in range(0, cols - side + 1, side)]
-    places = places[:: -(-len(places) // _MOST_TILES)]
-    tiles = np.stack([image[y : y + side, x : x + side] for y, x in places]).astype(np.float64)
+    corners = [(y, x) for y in range(0, rows - side + 1, side) for x in range(0, cols - side + 1, side)]
+    corners = corners[:: -(-len(corners) // _MAX_TILES)]
+    tiles = np.stack([image[y : y + side, x : x + side] for y, x in corners]).astype(np.float64)
     hann = np.hanning(side + 2)[1:-1]
     window = np.outer(hann, hann)
     tiles = (tiles - np.tensordot(tiles, window / window.sum())[:, None, None]) * window
     power = (tiles**2).mean(axis=(1, 2))
     if not power.max() > _BLANK * float(np.abs(image[::8, ::8]).max()) ** 2:
         return None, window
-    tiles = tiles[power >= _LEAST_POWER * np.quantile(power, 0.9)]
+    tiles = tiles[power >= _MIN_POWER * np.quantile(power, 0.9)]
     return np.abs(fft.rfft2(tiles)) ** 2 / (window**2).sum(), window
 
 
 def _floor(spectra: Float) -> float:
     """Noise variance from the spectrum where both frequencies are highest, median over the tiles.
 
-    White noise is level there, texture still falls: what falls between two rings is taken for texture and carried on.
+    White noise is level there, texture still decreases: the decrease between two rings is extrapolated as texture.
     """
     side = spectra.shape[1]
     frequency = np.minimum.outer(np.abs(np.fft.fftfreq(side)), np.fft.rfftfreq(side)) * 2.0
@@ -179,7 +178,8 @@ def _floor(spectra: Float) -> float:
 
 
 def _interpolation_error(side: int, order: int) -> Float:
-    """What a spline makes wrong of each frequency (side, side // 2 + 1): share of its power, mean over the phase."""
+    """Return the interpolation error of each frequency (side, side // 2 + 1): share of its power, mean over the
+    phase."""
 
     def along(w: Float) -> Float:
         if order == 3:

@@ -1,9 +1,9 @@
-"""Chords for arcs: what a window's fit misses of a surface that bends, and what takes its place.
+"""Curvature correction of strain: the bias of a window's fit on a surface that bends.
 
 Along a surface whose metric is even, the third derivatives of the position have tangential parts that follow from the
-second fundamental form b alone: from d_s d_s (x_s . x_s) = 0 comes x_sss . x_s = -b_ss^2, and so on. A fit of planes
-or quadratics takes them for slope, by the third moments of its weights. With b from quadratics over the window they are
-taken out again. On a surface that keeps its shape they are the same before and after, and cancel.
+second fundamental form b alone: from d_s d_s (x_s . x_s) = 0 comes x_sss . x_s = -b_ss^2, and so on. In a fit of planes
+or quadratics they add to the slope, by the third moments of its weights. With b from quadratics over the window they
+are subtracted. On a surface that keeps its shape they are the same before and after, and cancel.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def third_moments(weights: Float, half: int) -> Float:
 def reduced_moments(weights: Float, seen: Bool, half: int, order: int) -> Float:
     """Return the same (m, 2, 4) of windows that edges, holes or cuts have reduced.
 
-    Planes tell the slope in the middle of the points that a window sees, quadratics that in the window's middle; the
-    moments are about that place, where what the second order does to the slope is none.
+    Planes give the slope in the middle of a window's connected points, quadratics that in the window's middle; the
+    moments are about that position, where the second order has no effect on the slope.
     """
     t, s = np.broadcast_to(window_offsets(half)[0].T.astype(np.float64)[:, None, :], (2, *seen.shape))
     if order == 1:
@@ -56,7 +56,8 @@ def whole_second_derivatives(values: Float, half: int) -> Float:
 
 
 def second_weights(seen: Bool, half: int) -> Float:
-    """Return weights (m, 3, n) of the points that windows see in these derivatives; zero where they carry none."""
+    """Return weights (m, 3, n) of the windows' connected points in these derivatives; zero where they determine
+    none."""
     A = fit_terms(window_offsets(half)[0], half, 2)
     n, terms = A.shape
     normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)
@@ -67,7 +68,7 @@ def second_weights(seen: Bool, half: int) -> Float:
 
 
 def missed_slope(slope: Float, second: Float, moments: Float) -> Float:
-    """Return (n, 3, 2) what the fits took for slope.
+    """Return (n, 3, 2), the bias of the fitted slopes.
 
     Parameters
     ----------

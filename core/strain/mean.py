@@ -1,7 +1,7 @@
-"""How far the mean of a strain over an area is known.
+"""Standard uncertainty of the mean of a strain over an area.
 
 Neighbouring strains share the points of their windows, and these the pixels of their subsets. The mean is one weighted
-sum over the points: each point's weight is what all windows of the area that hold it give it.
+sum over the points: each point's weight is the sum over all windows of the area that hold it.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from core.strain.window import plane_weights
 
 
 def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> Float:
-    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN where no strain is in it.
+    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN for an area without
+    strain.
 
     Parameters
     ----------
     field
         The displacement that the strain was computed from.
     options
-        How it was computed.
+        Options of its computation.
     inside
         (r, c) the area.
     subset_px
@@ -35,9 +36,9 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
 
     Notes
     -----
-    Errors dX_k, dU_k of the points make the slopes of a window off by ``d_a = sum_k c_ak (dX, dU)_k``, and its strain
-    by ``sum_a D_a . d_a``. The mean's error is ``sum_k v_k . (dX, dU)_k`` with v the sum of D over the windows that
-    hold point k, times their weights c; its variance is ``sum_kl v_k S_k rho_kl S_l v_l``, S the roots of the points'
+    Errors dX_k, dU_k of the points change the slopes of a window by ``d_a = sum_k c_ak (dX, dU)_k``, and its strain by
+    ``sum_a D_a . d_a``. The mean's error is ``sum_k v_k . (dX, dU)_k`` with v the sum of D over the windows that hold
+    point k, times their weights c; its variance is ``sum_kl v_k S_k rho_kl S_l v_l``, S the roots of the points'
     covariances.
     """
     from scipy.signal import oaconvolve  # slow to load, and not every start needs it

@@ -1,4 +1,4 @@
-"""How strain is computed: what a user can set."""
+"""Options of the computation of strain."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from core.settings import STRAIN_TENSORS, STRAIN_WINDOW, StrainSettings, StrainT
 
 @dataclass(frozen=True, kw_only=True)
 class StrainOptions:
-    """How strain is computed from a field of displacements.
+    """Options of the computation of strain from a field of displacements.
 
     Parameters
     ----------
     window
-        Points across the square window, odd. The gauge is (window - 1) step + subset wide.
+        Points across the square window, odd. The virtual strain gauge is (window - 1) spacing + subset wide.
     order
         1: the window's positions are fitted by planes; 2: by quadratics. In a whole window both give the same strain,
-        since its quadratic terms do not touch the slope in its middle. In a window that an edge has cut, planes tell
-        the strain in the middle of the points that are left, quadratics that at the point itself, with several times
-        the noise.
+        since its quadratic terms have no effect on the slope in its middle. In a window cut by an edge, planes give the
+        strain in the middle of the points left, quadratics that at the point itself, with several times the noise.
     tensor
         ``green_lagrange`` 1/2 (C - I), ``infinitesimal`` (the symmetric gradient; not free of rotation), or ``hencky``
         1/2 log C.
@@ -31,8 +30,8 @@ class StrainOptions:
         Share of the window's points that must be left where edges, holes or cuts take some away. At a half, windows
         on a straight edge are kept and those in a corner are not.
     most_amplification
-        How many times noisier a cut window's strain may be than a whole window's; beyond it its points lie too much
-        on one side.
+        Largest ratio of the noise of a cut window's strain to a whole window's; beyond it its points lie too much on
+        one side.
 
     Raises
     ------
@@ -48,7 +47,7 @@ class StrainOptions:
 
     @staticmethod
     def of(settings: StrainSettings | None) -> StrainOptions | None:
-        """Return the options that an analysis' settings say; None: no strain."""
+        """Return the options of an analysis' settings; None: no strain."""
         return None if settings is None else StrainOptions(**settings.model_dump())
 
     def __post_init__(self) -> None:

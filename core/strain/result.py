@@ -13,7 +13,7 @@ from core.strain.options import StrainOptions
 
 
 class StrainStatus(IntEnum):
-    """What can be said about the strain at a point; every status but ``OK`` means that it has none."""
+    """Status of the strain at a point; every status but ``OK`` means that there is none."""
 
     OK = 0
     NO_POINT = 1
@@ -39,7 +39,7 @@ class StrainField:
     Attributes
     ----------
     options
-        How it was computed.
+        Options of its computation.
     step_px
         Distance of neighbouring points.
     subset_px
@@ -48,7 +48,7 @@ class StrainField:
         Width of the virtual gauge, (window - 1) step + subset; of displacements that were smoothed over a window of w
         points (w - 1) step more.
     gauge_mm
-        The same on the surface, median of the field; NaN where nothing was computed.
+        The same on the surface, median of the field; NaN where no strain was computed.
     status
         (r, c) int8, :class:`StrainStatus`.
     strain
@@ -56,8 +56,8 @@ class StrainField:
     covariance
         (r, c, 3, 3) of these, from the covariances of the points.
     patch
-        (r, c, 3) exx, eyy, exy that the stretch patch of each point has seen by itself, the same tensor; NaN where the
-        point was not measured, None where patches could not stretch.
+        (r, c, 3) exx, eyy, exy of each point's own stretch patch, the same tensor; NaN where the point is not valid,
+        None for rigid patches.
     """
 
     options: StrainOptions
@@ -116,5 +116,5 @@ class StrainField:
 def principal_of(strain: Float) -> Float:
     """Return the principal values (..., 2), the larger first, of exx, eyy, exy (..., 3)."""
     mean = 0.5 * (strain[..., 0] + strain[..., 1])
-    apart = np.hypot(0.5 * (strain[..., 0] - strain[..., 1]), strain[..., 2])
-    return np.stack([mean + apart, mean - apart], axis=-1)
+    half_difference = np.hypot(0.5 * (strain[..., 0] - strain[..., 1]), strain[..., 2])
+    return np.stack([mean + half_difference, mean - half_difference], axis=-1)

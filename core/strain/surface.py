@@ -18,7 +18,7 @@ from core.strain.window import Slopes, window_slopes
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
-    """Strain at each point, from a fit over the window about it.
+    """Return the strain at each point, from a fit over the window about it.
 
     Reference and deformed positions of the window's points are fitted by the same polynomial in the grid's column and
     row. The slopes of the first give the tangent plane, its frame and the tangents F0 in it; those of the second the
@@ -37,7 +37,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     Returns
     -------
     StrainField
-        With the covariance that follows from the points'; neighbours go together by the pixels that they share.
+        With the covariance that follows from the points'; neighbours correlate by the pixels that they share.
 
     Raises
     ------
@@ -46,9 +46,9 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
 
     Notes
     -----
-    A fit over a window takes chords for arcs. Where the surface keeps its shape this cancels; where it bends from flat
-    to a radius R, planes over a window of half width h would tell h^2 / (10 R^2) too little (a quarter more with 9
-    points in place of a continuum). The windows' curvature says how much it is, and it is taken out.
+    A fit over a window measures chords instead of arcs. Where the surface keeps its shape this cancels; where it bends
+    from flat to a radius R, planes over a window of half width h would have a bias of -h^2 / (10 R^2) (a quarter more
+    with 9 points in place of a continuum). It is computed from the windows' curvature and subtracted.
     """
     options = StrainOptions() if options is None else options
     if field.uvw_mm is None:
@@ -69,7 +69,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     strain[good] = found
     covariance[good] = strain_covariance(frame, gradient, options.tensor, around, spread, found)
     step_px = _step(field)
-    # of smoothed displacements it begins with what went into one of them
+    # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * step_px + shared.reach_px
     return StrainField(
         options=options,
@@ -94,7 +94,7 @@ def surface_slopes(field: Field, options: StrainOptions, shared: SharedPixels) -
     options
         Window, order, limits.
     shared
-        How the points' errors go together.
+        The correlation of neighbouring points' errors.
 
     Returns
     -------
@@ -133,7 +133,7 @@ def _mean_around(covariance: Float, valid: Bool, window: int) -> Float:
 
 
 def _patch_strain(field: Field, options: StrainOptions) -> Float | None:
-    """Strain (r, c, 3) that each patch has seen by itself; None where patches could not stretch."""
+    """Strain (r, c, 3) of each patch itself; None for rigid patches."""
     rigid = field.patch is not None and field.patch.patch == "rigid"
     if rigid or field.stretch is None or field.rotation_rad is None:
         return None

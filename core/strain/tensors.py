@@ -1,4 +1,4 @@
-"""From displacement gradients on the surface to strain tensors, and how their errors follow.
+"""Strain tensors from displacement gradients on the surface, and the propagation of their errors.
 
 ``frame`` (..., 3, 2) holds the unit tangents of the reference surface in its columns, ``gradient`` (..., 3, 2) the
 derivatives of the displacement along them. The deformed tangents are P = frame + gradient and C = P^T P.
@@ -54,9 +54,9 @@ def hencky_of_green(green: Float) -> Float:
     e = principal_of(green)
     with np.errstate(invalid="ignore", divide="ignore"):
         h = 0.5 * np.log1p(2.0 * e)
-        apart = e[..., 0] - e[..., 1]
+        difference = e[..., 0] - e[..., 1]
         # h = a I + b e with the same principal axes; where both principal values meet, b is the derivative
-        slope = np.where(apart > 1e-12, (h[..., 0] - h[..., 1]) / apart, 1.0 / (1.0 + e[..., 0] + e[..., 1]))
+        slope = np.where(difference > 1e-12, (h[..., 0] - h[..., 1]) / difference, 1.0 / (1.0 + e[..., 0] + e[..., 1]))
     rest = 0.5 * (h[..., 0] + h[..., 1]) - slope * 0.5 * (e[..., 0] + e[..., 1])
     return np.stack([slope * green[..., 0] + rest, slope * green[..., 1] + rest, slope * green[..., 2]], axis=-1)
 
@@ -75,15 +75,15 @@ def strain_covariance(
     points
         (n, 6, 6) covariance of X Y Z U V W of the window's points.
     spread
-        (n, 2, 2) sum over pairs of points of c_k rho_kl c_l^T in 1/mm^2, c the weights with which points make the
-        gradient and rho the correlation of their errors.
+        (n, 2, 2) sum over pairs of points of c_k rho_kl c_l^T in 1/mm^2, c the points' weights in the gradient and rho
+        the correlation of their errors.
     strain
         (n, 3) the strain itself.
 
     Notes
     -----
-    An error of the positions makes the tangents off by d_j = sum c_kj (dX, dU)_k, six numbers for each of j = 1, 2.
-    The strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
+    An error of the positions changes the tangents by d_j = sum c_kj (dX, dU)_k, six numbers for each of j = 1, 2. The
+    strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
     """
     A = _pulls(frame, gradient, tensor)
     Q = A @ points @ _transposed(A)
@@ -103,7 +103,7 @@ def strain_covariance(
 
 
 def strain_slopes(frame: Float, gradient: Float, tensor: StrainTensor, per_mm: Float, strain: Float) -> Float:
-    """Return (n, 3, 2, 6) what exx, eyy, exy gain for errors of the slopes of X Y Z U V W over column and row.
+    """Return (n, 3, 2, 6), derivatives of exx, eyy, exy over the slopes of X Y Z U V W over column and row.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _pulls(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
     moved = frame + gradient
     if tensor == "infinitesimal":
         of_motion = frame
-        # E^T dP with P's own basis off by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
+        # E^T dP with P's own basis changed by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
         of_place = frame - frame @ _transposed(_transposed(frame) @ moved)
     else:
         of_motion = moved
@@ -135,9 +135,11 @@ def _hencky_slope(hencky: Float) -> Float:
     """(..., 3, 3) derivative of Hencky strain over Green-Lagrange strain, components exx, eyy, exy."""
     h = principal_of(hencky)
     inverse = np.exp(-2.0 * h)  # 1 / C
-    apart = h[..., 0] - h[..., 1]
+    difference = h[..., 0] - h[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        shear = np.where(apart > 1e-9, 2.0 * apart / (1.0 / inverse[..., 0] - 1.0 / inverse[..., 1]), inverse[..., 0])
+        shear = np.where(
+            difference > 1e-9, 2.0 * difference / (1.0 / inverse[..., 0] - 1.0 / inverse[..., 1]), inverse[..., 0]
+        )
     angle = 0.5 * np.arctan2(2.0 * hencky[..., 2], hencky[..., 0] - hencky[..., 1])
     diagonal = np.stack([inverse[..., 0], inverse[..., 1], shear], axis=-1)
     return np.asarray(_turn(-angle) @ (diagonal[..., None] * _turn(angle)))

@@ -1,8 +1,8 @@
-"""Slopes of positions and displacements over square windows of points, and how noise goes into them.
+"""Slopes of positions and displacements over square windows of points, and the propagation of noise into them.
 
 Parameters of the fits are the points' column and row in the grid. A fit is linear in the data, so that reference and
-deformed positions are fitted by the same weights: what moves rigidly, or stretches evenly, is told exactly, whatever
-the surface's shape.
+deformed positions are fitted by the same weights: rigid motion and even stretch are reproduced exactly, for any shape
+of the surface.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _AT_ONCE = 1024
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Of (r, c) points; what belongs to points whose status is not ``OK`` means nothing.
+    """Slopes at (r, c) points; values of points whose status is not ``OK`` are undefined.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Slopes:
     slope
         (r, c, 6, 2) of X Y Z U V W over column and row, mm a step.
     spread
-        (r, c, 2, 2) sum of c_k rho_kl c_l^T: what the slopes' covariance is in units of a point's.
+        (r, c, 2, 2) sum of c_k rho_kl c_l^T: the slopes' covariance in units of a point's.
     second
         (r, c, 6, 3) second derivatives of X Y Z and of X + U, Y + V, Z + W: over column twice, both, row twice.
     moments
@@ -62,21 +62,21 @@ def window_slopes(
     values
         (r, c, 6) X Y Z U V W, mm.
     valid
-        (r, c) where there are values.
+        (r, c) True where there are values.
     xy_px
         (r, c, 2) the grid, px.
     cuts
-        What no window reaches over.
+        Cuts, which no window crosses.
     options
         Window, order, limits.
     shared
-        How the points' errors go together.
+        The correlation of neighbouring points' errors.
     """
     half = options.window // 2
     offsets, _ = window_offsets(half)
     step = steps_of(xy_px)
-    apart = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
-    rho = shared.correlation(apart[..., 1] * step[0], apart[..., 0] * step[1])
+    lag = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
+    rho = shared.correlation(lag[..., 1] * step[0], lag[..., 0] * step[1])
     whole = ndimage.minimum_filter(valid, size=options.window, mode="constant", cval=False)
     crossed = ways_cut(valid, xy_px, cuts, half)
     whole &= ~crossed.any(axis=-1) if crossed is not None else True
@@ -85,8 +85,8 @@ def window_slopes(
     spread = np.zeros((*valid.shape, 2, 2))
     c = plane_weights(half)
     spread[...] = c @ rho @ c.T
-    places = np.concatenate([values[..., :3], values[..., :3] + values[..., 3:]], axis=-1)
-    second = whole_second_derivatives(places, half)
+    positions = np.concatenate([values[..., :3], values[..., :3] + values[..., 3:]], axis=-1)
+    second = whole_second_derivatives(positions, half)
     moments = np.empty((*valid.shape, 2, 4))
     moments[...] = third_moments(c, half)
     rows, cols = np.nonzero(valid & ~whole)

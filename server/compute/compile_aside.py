@@ -71,8 +71,8 @@ def main() -> int:
     end_with_parent()
     from core.cameras.camera import Camera
     from core.cameras.stereo import StereoPair
+    from core.matching.cluster_robust import cluster_robust_covariance
     from core.matching.fit import fit_motion
-    from core.matching.observed import observed_covariance
     from core.matching.options import MatchOptions
 
     camera = Camera.from_paper(
@@ -94,7 +94,7 @@ def main() -> int:
     fit_motion(pair, picture, picture, picture, picture, xy, start, None, options)
     terms = 6 if options.patch == "curved" else 3
     w, G = np.full((1, terms), np.nan), np.full((1, 3, terms), np.nan)
-    observed_covariance(pair, [picture] * 4, xy, w, G, 0.0, options)
+    cluster_robust_covariance(pair, [picture] * 4, xy, w, G, 0.0, options)
     return 0
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
-from core.compiling import told_when_compiling
+from core.compiling import report_compiling
 from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
@@ -128,7 +128,7 @@ def warm_up(threads: int) -> None:
     seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
     # other patches and the other interpolation compile when first asked for; compiled kernels are kept on disk
     options = MeasureOptions(subset_px=21, patch="stretch")
-    with CompileAside(options.patch) as aside, told_when_compiling(aside.start):
+    with CompileAside(options.patch) as aside, report_compiling(aside.start):
         reference = ReferencePair(pair, left, right)
         shape = reference.shape(grid, options, seeds=seeds)
         aside.wait()

@@ -12,7 +12,7 @@ from server.formats.calibrations.recognise import load_calibration
 from server.results.reader import read_point_positions
 
 
-def image_places(result: Path, calibration: Path, cam: str) -> NDArray[np.float64]:
+def image_positions(result: Path, calibration: Path, cam: str) -> NDArray[np.float64]:
     """Project each point, where it is at that step, into one camera's image.
 
     Parameters

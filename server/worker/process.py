@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from typing import Any
 
-from core.compiling import COMPILING, told_when_compiling
+from core.compiling import COMPILING, report_compiling
 from core.errors import Cancelled
 from server.base.memory import settle
 from server.base.priority import end_with_parent, lower_worker
@@ -106,7 +106,7 @@ def serve(
     if warm_up is not None:
         module, name = warm_up.split(":")
         try:
-            with told_when_compiling(lambda: send(("compiling",))):
+            with report_compiling(lambda: send(("compiling",))):
                 getattr(importlib.import_module(module), name)(threads)
         except Exception:  # noqa: BLE001 - the first task will say what is wrong to somebody who asked
             _log.exception("warming up failed")
@@ -120,7 +120,7 @@ def serve(
             return  # the service is gone
         _current = channel = TaskChannel(send, task_id, cancel)
         try:
-            with told_when_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
+            with report_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
                 result = function(*args, **kwargs)
         except BaseException as error:  # noqa: BLE001 - carried back to the caller
             _reply_error(send, task_id, error)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from core.field.region.cuts import Cuts
-from core.field.region.find_visible import with_sight
+from core.field.region.find_visible import with_visibility
 from core.field.region.line_crossings import squared_distance
 from core.field.region.region import PointGrid
 from core.matching.fit import fit_motion
@@ -164,22 +164,22 @@ def test_threads_change_no_digit() -> None:
 def test_points_away_from_the_line_are_the_same_to_the_digit() -> None:
     """From the same starts: what the kernels do for a point whose subset is whole does not know of the others."""
     grid = bench.grid(step_px=8.0, margin_px=36.0).with_cracks([LINES["straight"]])
-    sight = with_sight(grid, 21).sight
-    assert sight is not None
+    visibility = with_visibility(grid, 21).visibility
+    assert visibility is not None
     xy = grid.xy_px.reshape(-1, 2)
     depth = bench.pair().cam1.cam_from_sys.apply(truth_of(xy))[:, 2]
     w = np.stack([1.0 / depth, np.zeros(len(xy)), np.zeros(len(xy))], axis=-1)
     images = (*reference(), *bench.take("block", 1.0, (0.0, 0.0, 0.01, 0.0, 0.0, 0.0), seed=4))
     options = MatchOptions(subset_px=21)
-    cut = fit_motion(bench.pair(), *images, xy, w, None, options, sight.at(xy))
+    cut = fit_motion(bench.pair(), *images, xy, w, None, options, visibility.at(xy))
     whole = fit_motion(bench.pair(), *images, xy, w, None, options)
-    same = sight.whole
+    same = visibility.whole
     assert 100 < same.sum() < len(xy) - 50
     for name in ("w", "G", "covariance", "zncc", "noise", "iterations", "status"):
         a, b = getattr(cut, name), getattr(whole, name)
         np.testing.assert_array_equal(a[same], b[same])
     # the noise of a cut subset is counted by the pixels that are left: 2 grey levels, as it was made
-    seen = ~same & (cut.status == PointStatus.OK) & (sight.share > 0.3)
+    seen = ~same & (cut.status == PointStatus.OK) & (visibility.share > 0.3)
     assert seen.sum() > 40
     noise, expected = np.mean(cut.noise[seen] ** 2), np.mean(whole.noise[same & (whole.status == 0)] ** 2)
     assert 0.96 < np.sqrt(noise / expected) < 1.04

@@ -280,10 +280,10 @@ def test_a_reference_that_nothing_is_left_of_is_refused() -> None:
     gone = moving_measured("never")[1]
     empty = np.full(gone.shape, PointStatus.LOW_CORRELATION, np.int8)
     field = Field(**{**gone.__dict__, "status": empty})
-    from core.field.sequence.segment import begin_leg
+    from core.field.sequence.segment import begin_segment
 
     with pytest.raises(SeedError, match="step 1"):
-        begin_leg(
+        begin_segment(
             1,
             field,
             images[0],

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from numba import njit
 
-from core.compiling import COMPILING, told_when_compiling
+from core.compiling import COMPILING, report_compiling
 from core.errors import Cancelled, RegionError
 from server.worker.embedded import ComputeWorker
 from server.worker.executor import WorkerDiedError
@@ -126,10 +126,10 @@ def test_compiling_is_told_once_and_loading_never() -> None:
         return x + 1
 
     told: list[int] = []
-    with told_when_compiling(lambda: told.append(1)):
+    with report_compiling(lambda: told.append(1)):
         assert once(1) == 2
         assert once(1.5) == 2.5  # another signature, compiled too
     assert told == [1]
-    with told_when_compiling(lambda: told.append(2)):
+    with report_compiling(lambda: told.append(2)):
         assert once(2) == 3
     assert told == [1]

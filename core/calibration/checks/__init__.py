@@ -1,1 +1,1 @@
-"""Checks of a calibration that do not rest on its own fit."""
+"""Checks of a calibration that are independent of its own fit."""

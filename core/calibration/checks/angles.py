@@ -1,4 +1,4 @@
-"""Do the cameras look at the target from where they are said to stand?"""
+"""Check of the cameras' viewing directions against the nominal ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from core.calibration.inputs import NominalCamera
 from core.cameras.camera import angles_from_rotation
 from core.errors import CalibrationInputError
 
-_FLIP_DEG = 3.0  # how far a flipped camera's alpha may lie from the mirrored one of its partner
+_FLIP_DEG = 3.0  # largest difference of a flipped camera's alpha from the mirrored one of its partner
 
 
 def check_angles(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -> None:

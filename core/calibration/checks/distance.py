@@ -22,11 +22,11 @@ class DistanceCheck:
     measured_mm, known_mm
         The distances.
     ratio
-        Measured over known; a target with another pitch than declared shows up here.
+        Measured over known; not 1 for a target with another pitch than declared.
     sigma_mm
-        What calibration and known value explain together.
+        Standard uncertainty of the difference, from calibration and known value.
     agrees
-        Whether they agree within three sigma.
+        True if they agree within three sigma.
     text
         The finding in one sentence.
     """
@@ -61,7 +61,7 @@ def check_known_distance(
     covariance
         (20, 20) of the calibration; None counts the marks' localisation only.
     localisation_sigma_px, distance_sigma_mm
-        How well the marks were found and how well the distance is known.
+        Standard deviations of the marks' image coordinates and of the known distance.
 
     Raises
     ------

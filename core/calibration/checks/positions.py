@@ -1,8 +1,8 @@
-"""Are the declared stage positions the ones at which the views were taken?
+"""Check of the declared stage positions against the scale of the views.
 
-The grid's image shrinks as 1 / (distance), so each view by itself says how far away it was taken, up to one common
-factor. The reciprocal of the image scale is a straight line over dZ, with the standoff as the ratio of intercept and
-slope; a localiser good to thousandths of a pixel places a view to some micrometres on that line.
+The grid's image shrinks as 1 / (distance), so each view gives its own distance, up to one common factor. The reciprocal
+of the image scale is a straight line over dZ, with the standoff as the ratio of intercept and slope; a localiser good
+to thousandths of a pixel places a view to some micrometres on that line.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from core.calibration.inputs import CalibrationView, NominalCamera
 from core.errors import CalibrationInputError
 
 _UNITS = ((1e3, "micrometres for millimetres"), (25.4, "mils or inches for millimetres"), (10.0, "a factor of ten"))
-_VISIBLE = 1e-4  # travel over standoff that image scales show without doubt
+_VISIBLE = 1e-4  # travel over standoff that image scales show with certainty
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PositionCheck:
     standoff_mm
         Distance at dZ = 0 that the declared positions imply.
     scatter_mm
-        Root mean square of what the straight line leaves, in declared millimetres.
+        Root mean square residual of the straight line, in declared millimetres.
     """
 
     declared_mm: Float
@@ -75,7 +75,7 @@ def seen_distances(views: Sequence[CalibrationView], nodes_mm: Float, aspect: fl
 
 
 def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: NominalCamera) -> PositionCheck:
-    """Compare the declared positions of one camera's views with what the images show.
+    """Compare the declared positions of one camera's views with those seen in the images.
 
     Raises
     ------
@@ -94,14 +94,14 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
     slope, intercept = np.polyfit(dz, distance, 1)
     standoff = float(intercept / slope) if slope != 0.0 else float("inf")
     left = distance - (intercept + slope * dz)
-    scatter = float(np.sqrt(np.mean(left**2)) / abs(slope)) if slope != 0.0 else float("inf")
-    check = PositionCheck(dz, seen, standoff, scatter)
+    rms_mm = float(np.sqrt(np.mean(left**2)) / abs(slope)) if slope != 0.0 else float("inf")
+    check = PositionCheck(dz, seen, standoff, rms_mm)
     shown = ", ".join(f"{d:+.3f} (seen {s:+.3f})" for d, s in zip(dz, seen, strict=True))
     context = {"camera": camera, "declared_mm": dz.tolist(), "seen_mm": seen.tolist()}
 
     visible = max(_VISIBLE * nominal.standoff_mm, 6.0 * noise_mm)
     if max(float(np.ptp(seen)), float(np.ptp(dz))) < visible:
-        return check  # too little travel to say anything; whether it is enough is judged by the predicted uncertainty
+        return check  # too little travel for this check; the predicted uncertainty decides if it is enough
     if float(np.ptp(seen)) < visible:
         raise CalibrationInputError(
             f"{camera}: the images show no travel beyond {visible:.2g} mm, but the positions declared are {shown} mm.",
@@ -120,7 +120,7 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
         )
     in_order = float(np.corrcoef(np.sort(dz), np.sort(distance))[0, 1])
     left_mm = float(np.sqrt(np.mean(left**2))) / at_zero * nominal.standoff_mm
-    if standoff <= 0.0 or (scatter > 0.02 * float(np.ptp(dz)) and left_mm > 4.0 * noise_mm):
+    if standoff <= 0.0 or (rms_mm > 0.02 * float(np.ptp(dz)) and left_mm > 4.0 * noise_mm):
         best = np.sort(dz)[np.argsort(np.argsort(distance))]
         moved = [v.label for v, a, b in zip(views, dz, best, strict=True) if a != b]
         if in_order > 0.999 and moved and in_order > agreement + 1e-3:

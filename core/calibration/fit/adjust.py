@@ -21,7 +21,7 @@ from core.names import CAMERAS
 
 _P = 2 * N_CAMERA
 _NOISE_ROUNDS = 4
-_SMALLEST_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
+_MIN_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Adjustment:
     noise_px
         (2,) estimated standard deviation per coordinate and camera.
     redundancy
-        (2,) observations beyond what the unknowns took, per camera.
+        (2,) observations beyond the unknowns, per camera.
     iterations
         Steps taken.
     """
@@ -68,7 +68,7 @@ class _Normal:
 
 
 def prior_terms(nominals: Sequence[NominalCamera], options: CalibrationOptions) -> tuple[Float, Float]:
-    """Return prior means and weights (1/sigma^2), (24,) each; weight 0 where nothing is known."""
+    """Return prior means and weights (1/sigma^2), (24,) each; weight 0 without a prior."""
     mean, weight = np.zeros((2, N_CAMERA)), np.zeros((2, N_CAMERA))
     for c, nominal in enumerate(nominals):
         mean[c, 1:3] = nominal.centre_px
@@ -79,7 +79,7 @@ def prior_terms(nominals: Sequence[NominalCamera], options: CalibrationOptions) 
 
 
 def free_mask(options: CalibrationOptions) -> Bool:
-    """Which of the 24 parameters are unknowns."""
+    """Return (24,) True for the parameters that are unknowns."""
     free = np.ones((2, N_CAMERA), dtype=bool)
     free[:, 10:] = options.axis_tilt_sigma_rad > 0.0
     return free.ravel()
@@ -149,12 +149,12 @@ def adjust(
         return _assemble(lins, observations, x_, d_, noise_, mean, prior, tau)
 
     noise = np.ones(2)
-    # correlated observations lose more of their scatter to the ten parameters than independent ones do
+    # the ten parameters absorb more of the variance of correlated observations than of independent ones
     lost = 10.0 * (np.array([o.correlation for o in observations]) - 1.0)
     counts = np.array([o.count for o in observations], dtype=np.float64) - lost
     noise = _noise(evaluate(x, d, noise), counts - 10.0)
     if node_sigma_mm > 0.0:
-        # what the nominal grid left over is mostly the nodes' error; start from what a localiser reaches
+        # the nominal grid's residuals are mostly the nodes' errors; start from a localiser's noise
         noise = np.minimum(noise, 0.01)
     iterations = 0
     for _ in range(_NOISE_ROUNDS):
@@ -178,7 +178,7 @@ def adjust(
 
 
 def _noise(normal: _Normal, redundancy: Float) -> Float:
-    return np.maximum(np.sqrt(normal.weighted_squares / np.maximum(redundancy, 1.0)), _SMALLEST_NOISE_PX)
+    return np.maximum(np.sqrt(normal.weighted_squares / np.maximum(redundancy, 1.0)), _MIN_NOISE_PX)
 
 
 def _assemble(

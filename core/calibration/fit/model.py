@@ -28,7 +28,7 @@ class Observations:
     found
         (v, n).
     weight
-        (v, n), mean 1 over what was found; 0 where not found.
+        (v, n), mean 1 over the points found; 0 where not found.
     correlation
         Observed coordinates per independent one.
     """
@@ -94,7 +94,7 @@ class Linearised:
     by_node
         (v, n, 2, 2), px/mm.
     valid
-        Whether every observed point has an image under these parameters.
+        True if every observed point has an image under these parameters.
     """
 
     residual_px: Float

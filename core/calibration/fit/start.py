@@ -1,4 +1,4 @@
-"""Start values from nominal lens data; only alpha and the target's place are read off the image."""
+"""Start values from nominal lens data; only alpha and the target's position are taken from the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Gaussian prefilter at the images' edges: there it lacks neighbours, and mirrors what it has."""
+"""Points near the images' edges, where a Gaussian prefilter lacks neighbours and mirrors the pixels that it has."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from core.status import PointStatus
 
 
 def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], subset_px: int, blur: Blur) -> Bool:
-    """Return (r, c) which points' subsets see nothing of camera 1's image but what was blurred with its own neighbours.
+    """Return (r, c) True where a subset holds only pixels of camera 1's image that were blurred with true neighbours.
 
     Raises
     ------
@@ -35,10 +35,11 @@ def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], su
     return np.asarray(clear)
 
 
-def refuse_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
-    """Give points the status OUTSIDE_IMAGE whose patch comes so near to an image's border that the blur lacks some."""
+def reject_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
+    """Reject points, OUTSIDE_IMAGE, whose patch lies so near to an image's border that the blur lacks neighbours
+    there."""
     ok = np.flatnonzero(points.ok)
     off = leaves_an_image(fitter, xy_px[ok], xy_px[ok], points.take(ok), margin_px=blur.edge_px)
-    gone = np.zeros(len(points.status), bool)
-    gone[ok[off]] = True
-    points.refuse(gone, PointStatus.OUTSIDE_IMAGE)
+    rejected = np.zeros(len(points.status), bool)
+    rejected[ok[off]] = True
+    points.reject(rejected, PointStatus.OUTSIDE_IMAGE)

@@ -1,6 +1,6 @@
-"""Whether the cameras still stand as they were calibrated: the field's offset across the epipolar lines tells.
+"""Check of the calibration by a field's epipolar offset: it shows cameras that were moved since.
 
-A camera that was touched since sees all points off their lines by an offset that varies slowly over the image. A
+A camera that was touched since images all points off their lines by an offset that varies slowly over the image. A
 quadratic surface through the points' offsets has little noise left, so hundredths of a pixel show.
 """
 
@@ -17,19 +17,19 @@ from core.field.region.trend import smooth_terms
 Level = Literal["ok", "warning", "failed"]
 
 WARNING_PX, FAILED_PX = 0.05, 0.1
-_FEWEST_FOR_SURFACE = 60
-_FEWEST = 4
+_MIN_POINTS_FOR_SURFACE = 60
+_MIN_POINTS = 4
 
 
 @dataclass(frozen=True)
 class EpipolarCheck:
-    """A field's offset across the epipolar lines beside the calibration's own.
+    """A field's epipolar offset beside the calibration's own.
 
     Attributes
     ----------
     level
-        ``ok``; ``warning`` from 0.05 px above the calibration's own on; ``failed`` from 0.1 px on: nothing that is made
-        of this field should be reported before the cameras were calibrated again.
+        ``ok``; ``warning`` from 0.05 px above the calibration's own on; ``failed`` from 0.1 px on: no result of this
+        field should be reported before the cameras are calibrated again.
     offset_px
         Root mean square of the smooth part of the offset in camera 2, over the valid points.
     own_px
@@ -44,12 +44,12 @@ class EpipolarCheck:
     reason: str
 
     def document(self) -> dict[str, Any]:
-        """As plain numbers and texts."""
+        """Return the check as plain numbers and texts."""
         return {"level": self.level, "offset_px": self.offset_px, "own_px": self.own_px, "reason": self.reason}
 
 
 def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
-    """Judge a field.
+    """Compare a field's epipolar offset with the calibration's.
 
     Parameters
     ----------
@@ -57,22 +57,22 @@ def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
         As measured.
     rbe_px
         The calibration's reprojection error (RBE), of held-out positions where there are any. It is one image's, both
-        have it, and the offset is told in one: so the calibration's own offset is up to its sum over both.
+        have it, and the offset is stated in one: so the calibration's own offset is up to its sum over both.
 
     Returns
     -------
     EpipolarCheck or None
-        None if too few points stand.
+        None if too few points are valid.
     """
     valid = field.valid & np.isfinite(field.epipolar_px)
     offset = field.epipolar_px[valid]
-    if len(offset) < _FEWEST:
+    if len(offset) < _MIN_POINTS:
         return None
     terms = smooth_terms(np.column_stack([field.x_px[valid], field.y_px[valid]]))
-    design = terms if len(offset) >= _FEWEST_FOR_SURFACE else terms[:, :1]
+    design = terms if len(offset) >= _MIN_POINTS_FOR_SURFACE else terms[:, :1]
     smooth = design @ np.linalg.lstsq(design, offset, rcond=1e-9)[0]
     left = float(np.sum((offset - smooth) ** 2)) / max(len(offset) - design.shape[1], 1)
-    # what noise alone lets a surface of so many terms explain is taken out
+    # less the part that a surface of so many terms explains of noise alone
     square = float(np.mean(smooth**2)) - left * design.shape[1] / len(offset)
     found = float(np.sqrt(max(square, 0.0)))
     own = None if rbe_px is None else 2.0 * rbe_px

@@ -14,16 +14,15 @@ from core.status import PointStatus
 def mark_extrapolated(field: Field, volume: CalibratedVolume | None) -> Field:
     """Return the field with the points that lie, or lay at the reference, outside the calibrated volume marked.
 
-    Their status becomes EXTRAPOLATED, and their covariance gets what the calibration's own covariance adds there.
-    Inside the volume that part is common to neighbouring points and left out; outside it grows without bound.
+    Their status becomes EXTRAPOLATED, and the calibration's own covariance is added to theirs. Inside the volume that
+    part is common to neighbouring points and left out; outside it grows without bound.
 
     Parameters
     ----------
     field
-        As it was measured. A step's starts and the shape that later steps are measured with are taken from the
-        unmarked field.
+        As measured. A step's starts and the shape that later steps are measured with are taken from the unmarked field.
     volume
-        Where the cameras were calibrated; where it is not known, nothing is marked.
+        The calibrated volume; None if not known: nothing is marked.
     """
     if volume is None:
         return field

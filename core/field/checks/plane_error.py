@@ -1,9 +1,9 @@
-"""What plane patches err by because of curvature, told from a field that they measured.
+"""Bias of plane patches on a curved surface, estimated from a field that they measured.
 
-A plane patch takes the average of what it lies on: it is off by half the second derivative times the subset's second
-moment, (h^2 - 1) / 12 px^2 for a subset h wide, along both axes. Inverse depth w and the columns G of the motion are
-linear in the image for planes that move, whatever their tilt, so it is their Laplacian over neighbouring points that
-counts. The neighbours are taken a subset's width away, where their noise is their own.
+A plane patch averages the surface below it: its bias is half the second derivative times the subset's second moment,
+(h^2 - 1) / 12 px^2 for a subset h wide, along both axes. Inverse depth w and the columns G of the motion are linear in
+the image for planes that move, whatever their tilt, so it is their Laplacian over neighbouring points that counts. The
+neighbours are taken a subset's width away, where their noise is their own.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 from core.arrays import Float
 from core.field.points.fitter import PointFits
 
-_FEWEST = 16
-_NOT_HEARD = 0.02
+_MIN_POINTS = 16
+_TRIMMED = 0.02
 _FAR_SUBSETS = 2.0
 
 
 class PlaneError(NamedTuple):
-    """What a field says of the plane patches that it was measured with.
+    """Bias and noise of the plane patches that a field was measured with.
 
     Attributes
     ----------
     error_mm
-        rms error of position (shape) or displacement (motion), the noise of this estimate taken off.
+        rms bias of position (shape) or displacement (motion), less the noise of this estimate.
     below_mm
-        What it may be at most, two standard deviations of the estimate up.
+        Upper bound of it, two standard deviations of the estimate above.
     noise_mm
         Standard deviation of position or displacement from image noise, rms.
     """
@@ -41,7 +41,7 @@ class PlaneError(NamedTuple):
 def plane_error(
     points: PointFits, *, shape: tuple[int, int], rays: Float, step_px: float, subset_px: int
 ) -> PlaneError | None:
-    """Estimate the plane patches' error; None where too few points have neighbours, or they lie too far away.
+    """Estimate the plane patches' bias.
 
     Parameters
     ----------
@@ -52,11 +52,16 @@ def plane_error(
     rays
         (n, 3) normalised.
     step_px, subset_px
-        Distance of the points and width of the subset.
+        Distance of the points and width of the subset, px.
+
+    Returns
+    -------
+    PlaneError or None
+        None where too few points have neighbours, or the neighbours lie too far away.
     """
-    apart = max(1, int(np.ceil(subset_px / step_px)))
+    separation = max(1, int(np.ceil(subset_px / step_px)))
     rows, cols = shape
-    if apart * step_px > _FAR_SUBSETS * subset_px or min(rows, cols) < 2 * apart + 1:
+    if separation * step_px > _FAR_SUBSETS * subset_px or min(rows, cols) < 2 * separation + 1:
         return None
     w, G = points.w[:, 0], points.G[:, :, 0]
     moved = points.zncc.shape[1] == 3
@@ -69,27 +74,27 @@ def plane_error(
     else:
         by_w = -rays / w[:, None] ** 2
         variance = (by_w**2).sum(1) * points.covariance[:, 0, 0]
-    factor = (subset_px**2 - 1) / 24.0 / (apart * step_px) ** 2
-    bend_w, noise = _laplacian(w.reshape(shape), apart), _gathered(variance.reshape(shape), apart) * factor**2
-    inner = (slice(apart, rows - apart), slice(apart, cols - apart))
+    factor = (subset_px**2 - 1) / 24.0 / (separation * step_px) ** 2
+    bend_w, noise = _laplacian(w.reshape(shape), separation), _gathered(variance.reshape(shape), separation) * factor**2
+    inner = (slice(separation, rows - separation), slice(separation, cols - separation))
     off = factor * bend_w[..., None] * by_w.reshape(rows, cols, 3)[inner]
     if moved:
-        bends = np.stack([_laplacian(G[:, i].reshape(shape), apart) for i in range(3)], axis=-1)
+        bends = np.stack([_laplacian(G[:, i].reshape(shape), separation) for i in range(3)], axis=-1)
         off += factor * bends / w.reshape(shape)[inner][..., None]
     square = (off**2).sum(-1)
     known = np.isfinite(square) & (noise > 0.0)
-    if known.sum() < _FEWEST:
+    if known.sum() < _MIN_POINTS:
         return None
     square, noise, own = square[known], noise[known], variance.reshape(shape)[inner][known]
-    # two per cent are not heard: single wrong points, and steps at cracks and edges
-    heard = np.argsort(square / noise)[: len(square) - int(np.ceil(_NOT_HEARD * len(square)))]
-    error2 = max(float(np.mean(square[heard] - noise[heard])), 0.0)
-    below2 = error2 + 2.0 * float(np.std(square[heard])) / np.sqrt(len(heard))
+    # two per cent are left out: single wrong points, and steps at cracks and edges
+    used = np.argsort(square / noise)[: len(square) - int(np.ceil(_TRIMMED * len(square)))]
+    error2 = max(float(np.mean(square[used] - noise[used])), 0.0)
+    below2 = error2 + 2.0 * float(np.std(square[used])) / np.sqrt(len(used))
     return PlaneError(float(np.sqrt(error2)), float(np.sqrt(below2)), float(np.sqrt(np.mean(own))))
 
 
 def _laplacian(f: Float, k: int) -> Float:
-    """Sum of the four neighbours ``k`` places away minus four times the middle, without the rim."""
+    """Sum of the four neighbours ``k`` points away minus four times the middle, without the rim."""
     return f[: -2 * k, k:-k] + f[2 * k :, k:-k] + f[k:-k, : -2 * k] + f[k:-k, 2 * k :] - 4.0 * f[k:-k, k:-k]
 
 

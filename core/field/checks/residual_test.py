@@ -1,9 +1,10 @@
-"""Points judged by their residuals: how far they scatter for reasons other than noise, and which are not to be trusted.
+"""Residual test: the covariances of a field compared with what the residuals of its points show.
 
-The matching takes residuals for white noise. Where the surface or the view changed they are not, and the match scatters
-by several times what it says. A sample of the field tells whether its residuals are what the matching takes them for;
-where they are not, the field's covariances are corrected by what the sample shows. Points whose residuals are larger
-than the field's others, and all points if the sample does not speak with one voice, are judged one by one.
+The matching assumes that residuals are white noise. Where the surface or the view changed they are not, and the
+standard deviation of a match is several times the reported one. On a sample of the field the reported variances are
+compared with cluster-robust ones; where they disagree, the field's covariances are scaled by the ratio. Points whose
+residuals are larger than those of the rest of the field, and all points if the variances of the sample disagree among
+themselves, are tested one by one.
 """
 
 from __future__ import annotations
@@ -16,31 +17,31 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
-from core.matching.observed import observed_covariance
+from core.matching.cluster_robust import cluster_robust_covariance
 from core.progress import CancelToken, raise_if_cancelled
 from core.robust import spread_indices
 from core.status import PointStatus
 
 _SAMPLE = 256
-_FEWEST = 30  # of a sample, to say something of a field
-_MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent pulls
-_AS_NOISE = (0.8, 1.25)  # a sample's variance over the told one: within, nothing needs to be corrected
-_ONE_VOICE = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
+_MIN_POINTS = 30  # of a sample that stands for a field
+_MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent blocks
+_AS_NOISE = (0.8, 1.25)  # ratio of a sample's variance to the reported one: within, nothing is corrected
+_MAX_DISAGREEMENT = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
 _UNUSUAL = 1.5  # residual energy over the field's median
-_MOSTLY_OTHER = 2.0  # a sample's variance over the told one: more than half of it is not noise
+_MOSTLY_NOT_NOISE = 2.0  # ratio of a sample's variance to the reported one: more than half of it is not noise
 _AT_ONCE = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class SigmaLimits:
-    """How far a match may scatter, standard deviation in px.
+    """Largest standard deviations of a match, px.
 
     Attributes
     ----------
     motion_px
-        Of the point's place in camera 1 at t.
+        Of the point's position in camera 1's current image.
     depth_px
-        Of what depth is told by, in camera 2 along and across the epipolar line.
+        Of the position in camera 2, along and across the epipolar line, which determines the depth.
     """
 
     motion_px: float
@@ -48,26 +49,26 @@ class SigmaLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
-    """What came out.
+class TestedResiduals:
+    """Outcome of the residual test of a field.
 
     Attributes
     ----------
     factor
-        (2,) or (5,) what the sample's observed variances of (w0, offset) or (w0, G00, G10, G20, offset) are over the
-        told ones; NaN where there were too few points to say.
+        (2,) or (5,) ratios of the sample's cluster-robust variances of (w0, offset) or (w0, G00, G10, G20, offset) to
+        the reported ones; NaN where there were too few points.
     one_by_one
-        How many points were judged by their own residuals.
-    refused
-        How many of them scatter too far.
+        Number of points tested by their own residuals.
+    rejected
+        Number of points rejected because their standard deviation is too large.
     """
 
     factor: Float
     one_by_one: int
-    refused: int
+    rejected: int
 
 
-def judge(
+def residual_test(
     fitter: Fitter,
     points: PointFits,
     *,
@@ -75,8 +76,8 @@ def judge(
     texture: Float,
     limits: SigmaLimits,
     cancel: CancelToken | None = None,
-) -> Judged:
-    """Correct the covariances of points in place and refuse those that scatter too far.
+) -> TestedResiduals:
+    """Scale the covariances of points in place and reject points whose standard deviation is too large.
 
     Parameters
     ----------
@@ -87,12 +88,17 @@ def judge(
     texture
         (n,) grey-level variance of camera 1's subset.
     limits
-        Scatter beyond which a point with residuals that are not noise is refused.
+        Standard deviations beyond which a point with residuals that are not noise is rejected.
     cancel
         Stops the work.
+
+    Returns
+    -------
+    TestedResiduals
+        Factors and counts.
     """
     q = points.covariance.shape[-1]
-    nothing = Judged(factor=np.full(q, np.nan), one_by_one=0, refused=0)
+    nothing = TestedResiduals(factor=np.full(q, np.nan), one_by_one=0, rejected=0)
     ok = np.flatnonzero(points.ok)
     if len(ok) == 0:
         return nothing
@@ -103,42 +109,43 @@ def judge(
     own = _own_factors(fitter, points, sample, xy_px)
     own = own[np.isfinite(own).all(axis=1)]
     factor = nothing.factor
-    told = np.ones(q)  # the offset's, the last, is no witness: interpolation and images of unlike noise raise it
-    if len(own) >= _FEWEST:
+    correction = np.ones(q)
+    if len(own) >= _MIN_POINTS:
         factor = np.median(own, axis=0) / _MEDIAN_OF_MEAN
-        told = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
-        if fitter.ref1.blur is not None:  # its noise hangs together over more than a block
-            told = np.maximum(told, 1.0)
-        # what all say is less than noise, as of a shape that less noisy images tell, is no reason to doubt
-        one_voice = (np.quantile(own, 0.9, axis=0) < _ONE_VOICE * np.maximum(np.median(own, axis=0), 1.0)).all()
-        if not one_voice or (told[:-1] > _MOSTLY_OTHER).any():
+        correction = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
+        if fitter.ref1.blur is not None:  # its noise is correlated over more than a block
+            correction = np.maximum(correction, 1.0)
+        # variances below the reported ones in all points, as of a shape from less noisy images, are no disagreement
+        agreed = (np.quantile(own, 0.9, axis=0) < _MAX_DISAGREEMENT * np.maximum(np.median(own, axis=0), 1.0)).all()
+        # interpolation and images of unequal noise raise the last, the offset's, which therefore does not count
+        if not agreed or (correction[:-1] > _MOSTLY_NOT_NOISE).any():
             unusual[:] = True
     else:
         unusual[:] = True
     usual, alone = ok[~unusual], ok[unusual]
-    _scale(points, usual, told / np.where(told > 1.0, _shared_texture(points, usual), 1.0))
-    refused = 0
-    if (told[:-1] > 1.0).any():
-        refused = _refuse_far(fitter, points, usual, xy_px, limits)
+    _scale(points, usual, correction / np.where(correction > 1.0, _shared_texture(points, usual), 1.0))
+    rejected = 0
+    if (correction[:-1] > 1.0).any():
+        rejected = _reject_far(fitter, points, usual, xy_px, limits)
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
-        # a single estimate scatters itself: what the field in general shows is the least
-        _scale(points, index, np.fmax(own, told) / _shared_texture(points, index))
-        refused += _refuse_far(fitter, points, index, xy_px, limits)
-    return Judged(factor=factor, one_by_one=len(alone), refused=refused)
+        # a single estimate has an uncertainty of its own: it is not taken below the field's
+        _scale(points, index, np.fmax(own, correction) / _shared_texture(points, index))
+        rejected += _reject_far(fitter, points, index, xy_px, limits)
+    return TestedResiduals(factor=factor, one_by_one=len(alone), rejected=rejected)
 
 
 def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> Float:
-    """(m, q) observed over told variances; NaN where they are not known, as where a match left nothing at all."""
+    """(m, q) ratios of cluster-robust to reported variances; NaN where not known."""
     q = points.covariance.shape[-1]
     if len(index) == 0:
         return np.zeros((0, q))
     images = [fitter.ref1, fitter.ref2]
     if fitter.cur1 is not None and fitter.cur2 is not None:
         images += [fitter.cur1, fitter.cur2]
-    observed, _ = observed_covariance(
+    robust, _ = cluster_robust_covariance(
         fitter.pair,
         images,
         xy_px[index],
@@ -146,16 +153,16 @@ def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_
         points.G[index] if len(images) == 4 else None,
         points.epipolar_px[index],
         fitter.options,
-        None if fitter.sight is None else fitter.sight.at(xy_px[index]),
+        None if fitter.visibility is None else fitter.visibility.at(xy_px[index]),
     )
-    told = _diagonal(points.covariance[index])
-    factors = np.full(told.shape, np.nan)
-    np.divide(_diagonal(observed), told, out=factors, where=told > 0.0)
+    reported = _diagonal(points.covariance[index])
+    factors = np.full(reported.shape, np.nan)
+    np.divide(_diagonal(robust), reported, out=factors, where=reported > 0.0)
     return factors
 
 
 def _shared_texture(points: PointFits, index: NDArray[np.intp]) -> Float:
-    """(m, 1) share of the squared gradients that counts; what a comparison lacks beside the best, its pulls hold."""
+    """(m, 1) share of the squared gradients that the best comparison explains; the rest is in the others' scores."""
     return np.asarray(points.zncc[index].max(axis=1)[:, None] ** 2)
 
 
@@ -165,24 +172,24 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -
     points.epipolar_sigma_px[index] *= root[:, -1]
 
 
-def _refuse_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
+def _reject_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
     motion, depth = _sigma_px(fitter, points, index, xy_px)
     far = ~((motion < limits.motion_px) & (depth < limits.depth_px))
     mask = np.zeros(len(points.status), bool)
     mask[index[far]] = True
-    points.refuse(mask, PointStatus.LOW_CORRELATION)
+    points.reject(mask, PointStatus.LOW_CORRELATION)
     return int(far.sum())
 
 
 def _sigma_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> tuple[Float, Float]:
-    """(m,) standard deviations, px: of the place in camera 1 at t, and the largest of those that depth hangs on."""
+    """(m,) standard deviations, px: of the position in camera 1's current image, and the largest of those of depth."""
     rays = fitter.pair.cam1.rays_cam(xy_px[index]).xyz_mm
     w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index]))
     per_px = depth_per_px(fitter.pair, rays, w)
     depth = np.maximum(sd[:, 0] / per_px, sd[:, -1])
     if sd.shape[1] == 2:
         return np.zeros(len(index)), depth
-    z = points.G[index, 2, 0]  # of the point at t, times w
+    z = points.G[index, 2, 0]  # of the current point, times w
     px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[:, :2]))))
     return np.maximum(sd[:, 1], sd[:, 2]) * px / z, np.maximum(depth, sd[:, 3] * w / z**2 / per_px)
 

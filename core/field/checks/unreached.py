@@ -1,4 +1,4 @@
-"""Points that growth did not reach because their patch lies outside an image: said so, rather than 'not seeded'."""
+"""Status of points that growth did not reach, where their patch leaves an image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _REACH_SUBSETS = 4.0
 
 
 def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) -> None:
-    """Give unreached points the status OUTSIDE_IMAGE where the nearest standing patch, extended, leaves an image.
+    """Give unreached points the status OUTSIDE_IMAGE where the nearest valid patch, extended, leaves an image.
 
     Parameters
     ----------
@@ -23,33 +23,33 @@ def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) 
     points
         (n) points, changed in place.
     xy_px, usable
-        (n, 2) and (n,).
+        (n, 2) px of camera 1, and (n,) True where a point may be measured.
     """
     open_ = np.flatnonzero(usable & (points.status == PointStatus.NOT_SEEDED))
-    standing = np.flatnonzero(points.ok)
-    if len(open_) == 0 or len(standing) == 0:
+    valid = np.flatnonzero(points.ok)
+    if len(open_) == 0 or len(valid) == 0:
         return
     subset = fitter.options.subset_px
-    distance, nearest = cKDTree(xy_px[standing]).query(xy_px[open_])
+    distance, nearest = cKDTree(xy_px[valid]).query(xy_px[open_])
     near = np.asarray(distance) < _REACH_SUBSETS * subset
-    open_, parent = open_[near], standing[np.asarray(nearest)[near]]
+    open_, parent = open_[near], valid[np.asarray(nearest)[near]]
     outside = leaves_an_image(fitter, xy_px[open_], xy_px[parent], points.take(parent))
     points.status[open_[outside]] = PointStatus.OUTSIDE_IMAGE
 
 
 def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: PointFits, margin_px: float = 0.0) -> Bool:
-    """Return (n,) whether subsets about places (n, 2), on patches that stand at other places, leave an image.
+    """Return (n,) True where a subset on the extended patch of another point leaves an image.
 
     Parameters
     ----------
     fitter
         The matcher with its images.
     xy_px, from_px
-        (n, 2) the subsets' centres and the patches' own places.
+        (n, 2) px of camera 1: the subsets' centres and the patches' own.
     patches
-        (n) fits that stand.
+        (n) valid fits.
     margin_px
-        How far inside the images they are to stay.
+        Distance from the images' borders that they must keep.
     """
     outside = np.zeros(len(xy_px), bool)
     half = fitter.options.subset_px // 2
@@ -64,7 +64,8 @@ def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: Point
 
 
 def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float) -> Bool:
-    """Return (n,) whether a point (n, 3) of camera 1's frame leaves an image, or its inner part, at t0 or at t."""
+    """Return (n,) True where a point (n, 3), camera 1's frame, lies outside an image or nearer to its border than
+    allowed."""
     pose, lens1, lens2 = fitter.pair.cam2_from_cam1, fitter.pair.cam1.lens, fitter.pair.cam2.lens
     views = [(pose.apply(before), lens2, fitter.ref2.shape)]
     if now is not None:

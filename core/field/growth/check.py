@@ -1,34 +1,34 @@
-"""Checks of the points that stand, and growth into what they emptied."""
+"""Checks of the valid points, and growth into the gaps that they leave."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from core.field.checks.edges import refuse_near_edges
-from core.field.checks.gates import apply_gates
-from core.field.checks.residual_test import judge
+from core.field.checks.edges import reject_near_edges
+from core.field.checks.residual_test import residual_test
 from core.field.checks.unreached import mark_outside
+from core.field.checks.validity import apply_validity_checks
 from core.field.growth.grow import grow
 from core.field.growth.state import FieldInputs, GrowthState
 from core.field.points.fitter import PointFits
 
 
 def check(inputs: FieldInputs, points: PointFits) -> None:
-    """Have every point that stands checked; those that fail are refused."""
-    apply_gates(
+    """Apply the validity checks; points that fail are rejected."""
+    apply_validity_checks(
         points,
         pair=inputs.pair,
         shape=inputs.grid.shape,
         xy_px=inputs.xy_px,
         rays=inputs.rays,
         texture=inputs.texture,
-        options=inputs.options.gates,
-        sight=inputs.sight,
+        options=inputs.options.validity,
+        visibility=inputs.visibility,
     )
 
 
 def grow_field(inputs: FieldInputs, state: GrowthState) -> int:
-    """Grow from the points that stand over all usable ones; returns how many were added."""
+    """Grow from the valid points over all usable ones; return the number of points added."""
     return grow(
         state.fitter,
         state.points,
@@ -42,7 +42,7 @@ def grow_field(inputs: FieldInputs, state: GrowthState) -> int:
 
 
 def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
-    """Grow, check, and grow into what the checks emptied."""
+    """Grow, check, and grow into the gaps that the checks leave."""
     for _ in range(3):
         if grow_field(inputs, state) == 0 and state.checked:
             break
@@ -52,8 +52,8 @@ def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 
 def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
-    """Correct the covariances by the residuals; refuse what scatters too far, and what the edges' blur reaches."""
-    judged = judge(
+    """Test the residuals, then reject points whose patch leaves the images or the prefilter's valid area."""
+    tested = residual_test(
         state.fitter,
         state.points,
         xy_px=inputs.xy_px,
@@ -61,8 +61,8 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         limits=inputs.sigma_limits,
         cancel=inputs.cancel,
     )
-    if judged.refused:
-        check(inputs, state.points)  # points that stand alone now have nothing to confirm them
+    if tested.rejected:
+        check(inputs, state.points)  # isolated points fail the neighbour check
     mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
     if inputs.options.blur is not None:
-        refuse_near_edges(state.fitter, state.points, inputs.xy_px, inputs.options.blur)
+        reject_near_edges(state.fitter, state.points, inputs.xy_px, inputs.options.blur)

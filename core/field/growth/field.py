@@ -1,4 +1,4 @@
-"""One measurement of a field, stage by stage: seed, grow, check, choose the patch, grow again, assemble."""
+"""One measurement of a field, phase by phase: seed, grow, check, choose the patch, grow again, assemble."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def shape_field(inputs: FieldInputs, seeds: Seeds | None) -> Field:
 
 
 def motion_field(inputs: FieldInputs, shape: Field, previous: Field | None, seeds: Seeds | None) -> Field:
-    """Measure a motion from the last step, from given seeds, or from those that are found."""
+    """Measure a motion from the previous step, from given seeds, or from those that are found."""
     inputs = inputs.on_shape(shape, previous)
     state = seed_motion(inputs, begin(inputs), shape, previous, seeds)
     return assemble_field(inputs, fill_field(inputs, state, automatic=seeds is None, shape=shape), shape)
@@ -45,14 +45,14 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shap
     inputs, state
         With seeds.
     automatic
-        Whether seeds may be looked for where growth did not come.
+        True if seeds may be searched for where growth did not reach.
     shape
-        Of a motion: what was measured before.
+        Of a motion: the shape that was measured before.
 
     Raises
     ------
     SeedError
-        If no point stands.
+        If no point is valid.
     """
     if not state.points.ok.any() and (shape is None or shape.valid.any()):
         raise _no_seed(state.fitter.ref1.noise_variance)
@@ -72,7 +72,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shap
 
 
 def _unreached(inputs: FieldInputs, state: GrowthState) -> float:
-    """Share of the usable points that nothing reached; those lost in an earlier step do not count again."""
+    """Share of the usable points that were not reached; those lost in an earlier step do not count again."""
     untouched = inputs.hoped_for & (state.points.status == PointStatus.NOT_SEEDED)
     return float(untouched.sum()) / max(int(inputs.usable.sum()), 1)
 

@@ -1,7 +1,7 @@
-"""Growth: from points that stand to their neighbours, best first, in waves that keep the kernels busy.
+"""Growth: from valid points to their neighbours, best first, in waves large enough for the kernels.
 
 A neighbour's patch, extended to the new point's ray, is its start value. A point that fails is tried again from other
-neighbours. Nothing is ever filled in: what does not match stays empty.
+neighbours. No value is interpolated: a point that does not match stays empty.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import PointFits
 from core.field.points.starts import move_matrix, move_w
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.robust import MAD_TO_SIGMA
 from core.status import PointStatus
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
 _ALL_AT_ONCE = 512
-_MOST_A_BATCH = 4096  # a cancel is heard within a second even on a slow machine
+_MAX_BATCH = 4096  # a cancel takes effect within a second even on a slow machine
 _FAR_PX = 3.0
 _COUNT_AGAIN = 1.05
 ATTEMPTS = 4
-"""How often a point is started, each time from another neighbour."""
+"""Starts of a point at most, each from another neighbour."""
 
 
 class FitsPoints(Protocol):
-    """What growth needs of a matcher; :class:`core.field.points.fitter.Fitter` is one."""
+    """The matcher as growth uses it; :class:`core.field.points.fitter.Fitter` is one."""
 
     @property
     def comparisons(self) -> int:
@@ -44,7 +44,7 @@ class FitsPoints(Protocol):
         """Refine points from start values."""
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
-        """Return (n,) whether a fit has left the place it was started at."""
+        """Return (n,) True where a fit ended far from its start."""
 
 
 def fit_in_batches(
@@ -58,18 +58,18 @@ def fit_in_batches(
     far_px: float,
     cancel: CancelToken | None = None,
 ) -> Bool:
-    """Fit the points ``index`` from starts and write down what came; returns which stand.
+    """Fit the points ``index`` from starts and store the results; return (m,) True for the valid ones.
 
     A fit that ends further than ``far_px`` from its start has left the basin it was started in.
     """
     good = np.zeros(len(index), bool)
-    for start in range(0, len(index), _MOST_A_BATCH):
+    for start in range(0, len(index), _MAX_BATCH):
         raise_if_cancelled(cancel)
-        part = slice(start, start + _MOST_A_BATCH)
+        part = slice(start, start + _MAX_BATCH)
         xy = xy_px[index[part]]
         part_G = None if G is None else G[part]
         fits = fitter.fit(xy, w[part], part_G)
-        fits.refuse(fits.ok & fitter.far_from_start(xy, fits, w[part], part_G, far_px), PointStatus.NOT_CONVERGED)
+        fits.reject(fits.ok & fitter.far_from_start(xy, fits, w[part], part_G, far_px), PointStatus.NOT_CONVERGED)
         points.put(index[part], fits)
         good[part] = fits.ok
     return good
@@ -77,16 +77,16 @@ def fit_in_batches(
 
 @dataclass(eq=False)
 class Attempts:
-    """What growth has tried on a grid of n points, so that nothing is tried twice.
+    """Starts already tried on a grid of n points, so that none is repeated.
 
     Attributes
     ----------
     neighbours
         (n, 8) index of each point's neighbours, -1 outside the grid and where a cut lies between.
     tried
-        (n, 8) from which of them the point was started before.
+        (n, 8) True for those from which the point was started before.
     left
-        (n,) how often it may still be started.
+        (n,) number of starts left.
     """
 
     neighbours: NDArray[np.int32]
@@ -94,16 +94,18 @@ class Attempts:
     left: NDArray[np.int8]
 
     @staticmethod
-    def on(shape: tuple[int, int], sight: Sight | None = None) -> Attempts:
-        """Return the attempts of a grid of (rows, cols) on which nothing was tried."""
+    def on(shape: tuple[int, int], visibility: Visibility | None = None) -> Attempts:
+        """Return the attempts of a grid of (rows, cols) before any start."""
         n = shape[0] * shape[1]
-        places = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
-        places[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
+        index_of = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
+        index_of[1:-1, 1:-1] = np.arange(n, dtype=np.int32).reshape(shape)
         rows, cols = slice(1, -1), slice(1, -1)
-        neighbours = np.stack([np.roll(places, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1)
-        if sight is not None:
+        neighbours = np.stack(
+            [np.roll(index_of, (-dr, -dc), (0, 1))[rows, cols].ravel() for dr, dc in _OFFSETS], axis=1
+        )
+        if visibility is not None:
             for k, (dr, dc) in enumerate(_OFFSETS):
-                neighbours[sight.parted_at(int(dr), int(dc)), k] = -1
+                neighbours[visibility.separated_at(int(dr), int(dc)), k] = -1
         return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
 
 
@@ -115,11 +117,11 @@ def grow(
     xy_px: Float,
     rays: Float,
     usable: Bool,
-    stage: str = "grow",
+    phase: str = "grow",
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> int:
-    """Grow from the points that stand over all usable ones; returns how many were added.
+    """Grow from the valid points over all usable ones.
 
     Parameters
     ----------
@@ -128,39 +130,44 @@ def grow(
     points
         n points of a grid; changed in place.
     attempts
-        What was tried before; changed in place.
+        Starts already tried; changed in place.
     xy_px, rays
         (n, 2) px, (n, 3) normalised.
     usable
-        (n,) which points may be measured.
-    stage, progress, cancel
-        Reports and stop.
+        (n,) True where a point may be measured.
+    phase, progress, cancel
+        Name of the phase in progress reports, their receiver, and the means to stop.
+
+    Returns
+    -------
+    int
+        Number of points added.
 
     Notes
     -----
-    A wave looks at the front only: points that are open and may have a standing neighbour. So the work grows with the
-    number of points, not with points times waves.
+    A wave covers the front only: open points that may have a valid neighbour. So the work grows with the number of
+    points, not with points times waves.
     """
     total = int(usable.sum())
     quality = points.quality
-    standing, counted, added = int((quality > 0.0).sum()), 0, 0
-    least, front = 0.0, np.zeros(len(quality), bool)
-    while standing > 0:
+    valid, counted, added = int((quality > 0.0).sum()), 0, 0
+    min_quality, front = 0.0, np.zeros(len(quality), bool)
+    while valid > 0:
         raise_if_cancelled(cancel)
-        progress(stage, standing, total)
-        if standing > _COUNT_AGAIN * counted:  # what is normal for the field changes with its size
-            least, counted = _least_parent(quality), standing
+        progress(phase, valid, total)
+        if valid > _COUNT_AGAIN * counted:  # the field's statistics change with its size
+            min_quality, counted = _min_parent_zncc(quality), valid
             front = usable & (quality <= 0.0) & (attempts.left > 0)
         todo = np.flatnonzero(front)
         near = attempts.neighbours[todo]
         score = np.where((near >= 0) & ~attempts.tried[todo], quality[near], -1.0)
-        score[score < least] = -1.0
+        score[score < min_quality] = -1.0
         choice = np.argmax(score, axis=1)
         best = np.take_along_axis(score, choice[:, None], axis=1)[:, 0]
         reachable = best > 0.0
-        front[todo[~reachable]] = False  # until a neighbour comes to stand
+        front[todo[~reachable]] = False  # until a neighbour becomes valid
         if not reachable.any():
-            if standing == counted:
+            if valid == counted:
                 break
             counted = 0
             continue
@@ -183,19 +190,19 @@ def grow(
         front[todo[good | (attempts.left[todo] <= 0)]] = False
         new = todo[good]
         quality[new] = points.zncc[new].min(axis=1)
-        beside, side = attempts.neighbours[new], np.arange(len(_OFFSETS)) ^ 2  # as the neighbour sees the new point
+        beside, side = attempts.neighbours[new], np.arange(len(_OFFSETS)) ^ 2  # seen from the neighbour
         inside = beside >= 0
         beside, side = beside[inside], np.broadcast_to(side, inside.shape)[inside]
-        attempts.tried[beside, side] = False  # a point that stood there before, and fell, had other values
+        attempts.tried[beside, side] = False  # a point that was valid there before, and was rejected, had other values
         front[beside[usable[beside] & (quality[beside] <= 0.0) & (attempts.left[beside] > 0)]] = True
         added += len(new)
-        standing += len(new)
+        valid += len(new)
     return added
 
 
-def _least_parent(quality: Float) -> float:
-    """Correlation of a point that may hand its values on: not far below the field's own."""
-    standing = quality[quality > 0.0]
-    middle = float(np.median(standing))
-    scatter = MAD_TO_SIGMA * float(np.median(np.abs(standing - middle)))
-    return middle - max(0.15, 8.0 * scatter)
+def _min_parent_zncc(quality: Float) -> float:
+    """Smallest correlation of a point whose values start a neighbour: not far below the field's own."""
+    valid = quality[quality > 0.0]
+    middle = float(np.median(valid))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(valid - middle)))
+    return middle - max(0.15, 8.0 * sigma)

@@ -15,7 +15,7 @@ from core.field.points.result import Field
 
 
 def keep_patch(inputs: FieldInputs, state: GrowthState, previous: Field | None) -> GrowthState:
-    """Where a sequence went over to curved patches by itself, it stays with them."""
+    """Keep curved patches where an earlier step of the sequence chose them."""
     choice = None if previous is None or not previous.has_motion else previous.patch
     if inputs.options.patch == "auto" and choice is not None and choice.patch == "curved":
         return replace(state, patch=choice.for_next_step())
@@ -23,7 +23,7 @@ def keep_patch(inputs: FieldInputs, state: GrowthState, previous: Field | None) 
 
 
 def refit_curved(inputs: FieldInputs, state: GrowthState) -> GrowthState:
-    """Measure the points that stand anew with curved patches; the others keep their status and are tried again."""
+    """Measure the valid points anew with curved patches; the others keep their status and are tried again."""
     flat, fitter = state.points, state.fitter.curved()
     index = np.flatnonzero(flat.ok)
     points = fitter.empty(len(flat.status))
@@ -34,10 +34,10 @@ def refit_curved(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 
 def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
-    """Say what plane patches err by here; where auto was asked for, go over to curved ones if that pays."""
-    told = None
+    """Estimate the plane patches' bias; with ``auto``, change to curved ones if their total error is smaller."""
+    estimate = None
     if state.fitter.terms == 3:
-        told = plane_error(
+        estimate = plane_error(
             state.points,
             shape=inputs.grid.shape,
             rays=inputs.rays,
@@ -45,8 +45,8 @@ def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
             subset_px=inputs.options.subset_px,
         )
     if inputs.options.patch != "auto":
-        return replace(state, patch=advise(state.patch, told))
+        return replace(state, patch=advise(state.patch, estimate))
     if state.patch.kept:
         return state
-    state = replace(state, patch=choose(state.fitter, state.points, inputs.xy_px, told))
+    state = replace(state, patch=choose(state.fitter, state.points, inputs.xy_px, estimate))
     return refit_curved(inputs, state) if state.patch.patch == "curved" else state

@@ -1,4 +1,4 @@
-"""The first points of a field: from the last step, from given seeds, from feature matches, or from searches."""
+"""The first points of a field: from the previous step, from given seeds, from feature matches, or from searches."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from core.field.seeding.seeds import (
     seeds_from_matches,
     spread,
     sweep_shape,
-    swept_places,
+    swept_positions,
 )
 from core.matching.fit import no_motion
 from core.progress import raise_if_cancelled
@@ -46,14 +46,14 @@ from core.status import PointStatus
 
 Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 
-_FEWEST_MATCHES = 12
+_MIN_MATCHES = 12
 _SAMPLE_SHARE = 0.7
 _REACH_STEPS = 2.0
-_SEARCHED = 6  # places
+_SEARCHED = 6  # positions
 
 
 def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> GrowthState:
-    """Put the first points of a shape down."""
+    """Seed a shape."""
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
         _given_shape(inputs, state, as_seeds(seeds))
@@ -66,7 +66,7 @@ def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> 
 def seed_motion(
     inputs: FieldInputs, state: GrowthState, shape: Field, previous: Field | None, seeds: Seeds | None
 ) -> GrowthState:
-    """Put the first points of a motion down: from the last step, where they stood, or from matches."""
+    """Seed a motion: from the previous step, at the reference positions, or from matches."""
     if not inputs.usable.any():
         return state
     state = keep_patch(inputs, state, previous)
@@ -89,7 +89,7 @@ def seed_motion(
 
 
 def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
-    """Seeds from feature matches; how many stand. Large images are reduced, less and less until seeds are found."""
+    """Seed from feature matches of reduced images, reduced less until seeds are found; return their number."""
     if not (inputs.usable & ~inputs.repeating).any():
         return 0
     reach = inputs.options.subset_px + inputs.grid.step_px
@@ -118,7 +118,7 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
         motion = scattered_motion(features[0], features[-2])
         raise_if_cancelled(inputs.cancel)
         shape_now = scattered_shape(pair, *features[-2:])
-    elif len(shape.xy_px) < _FEWEST_MATCHES:
+    elif len(shape.xy_px) < _MIN_MATCHES:
         return 0
 
     def put_seeds(motion: ScatteredMotion | None) -> int:
@@ -135,7 +135,7 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
 
 
 def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> GrowthState:
-    """Start all points from the last step's values; a sample of them stands already, fitted from these very starts."""
+    """Start all points from the previous step's values; a fitted sample of them is valid already."""
     if state.patch.patch == "curved":
         state = refit_curved(inputs, state)
     points = state.points
@@ -153,13 +153,13 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> Growt
 
 
 def _stayed(inputs: FieldInputs, state: GrowthState) -> bool:
-    """Try whether the surface is about where it was: not on a texture that looks alike a period further on."""
+    """Return True if the surface is about where it was; not tried on a texture that repeats itself."""
     w = inputs.known_w
     return w is not None and _sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)
 
 
 def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False) -> bool:
-    """Fit a spread sample from given starts; True (and the sample stands as seeds) if nearly all of it matches."""
+    """Fit a spread sample from given starts; return True, and keep the sample as seeds, if nearly all of it matches."""
     usable = inputs.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
     if once_only:
         usable &= ~inputs.repeating
@@ -175,7 +175,7 @@ def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *
 
 
 def _swept_shape(inputs: FieldInputs, state: GrowthState) -> None:
-    for i in swept_places(inputs.xy_px, _rather_whole(inputs, inputs.usable & ~inputs.repeating)):
+    for i in swept_positions(inputs.xy_px, _rather_whole(inputs, inputs.usable & ~inputs.repeating)):
         raise_if_cancelled(inputs.cancel)
         _put_one(state, i, sweep_shape(state.fitter, inputs.ref1.pixels, inputs.ref2.pixels, inputs.xy_px[i]))
 
@@ -184,7 +184,7 @@ def _searched_motion(inputs: FieldInputs, state: GrowthState) -> None:
     if inputs.known_w is None:
         return
     known = inputs.usable & np.isfinite(inputs.known_w).all(axis=1) & ~inputs.repeating
-    for i in swept_places(inputs.xy_px, _rather_whole(inputs, known))[:_SEARCHED]:
+    for i in swept_positions(inputs.xy_px, _rather_whole(inputs, known))[:_SEARCHED]:
         raise_if_cancelled(inputs.cancel)
         _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
 
@@ -195,14 +195,14 @@ def _put_one(state: GrowthState, i: np.intp, found: PointFits) -> None:
 
 
 def _rather_whole(inputs: FieldInputs, usable: Bool) -> Bool:
-    """Of usable points those that see all of their subset, where there are any: searches compare whole squares."""
-    whole = usable if inputs.sight is None else usable & inputs.sight.whole
+    """Of usable points those with a wholly visible subset, where there are any: searches compare whole squares."""
+    whole = usable if inputs.visibility is None else usable & inputs.visibility.whole
     return whole if whole.any() else usable
 
 
 def _nearest(inputs: FieldInputs, seeds: tuple[Seed, ...], usable: Bool) -> NDArray[np.intp]:
     reach = max(_REACH_STEPS * inputs.grid.step_px, float(inputs.options.subset_px))
-    return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, sight=inputs.sight)
+    return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, visibility=inputs.visibility)
 
 
 def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
@@ -227,5 +227,5 @@ def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ..
         raise_if_cancelled(inputs.cancel)
         _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
     if not state.points.ok.any():
-        # turned or stretched too far for a template: matches about the seed know how
+        # turned or stretched too far for a template: the matches about the seed give the deformation
         match_seeds(inputs, state)

@@ -1,4 +1,4 @@
-"""What one measurement of a field is made from, and what its stages hand on from one to the next."""
+"""Inputs of one measurement of a field, and the state that its phases pass on."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage, different, refuse_stale, same_size
 from core.field.points.patch import PatchChoice, UsedPatch, asked_for
 from core.field.points.result import Field
-from core.field.region.find_visible import with_sight
+from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid, check_region
 from core.field.region.repeats import repeats
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.field.settings import MeasureOptions
 from core.matching.image import ImageData
 from core.progress import CancelToken, Progress, no_progress
@@ -32,34 +32,34 @@ SAMPLE_FAR_PX = 3.0
 
 @dataclass(frozen=True, eq=False)
 class FieldInputs:
-    """Images, points and settings of one measurement; nothing of it changes while it runs.
+    """Images, points and settings of one measurement; constant while it runs.
 
     Attributes
     ----------
     pair, options
         Cameras and settings.
     grid
-        The points, with what they see of their subsets.
+        The points, with their visibility.
     ref1, ref2
         Both cameras' images at the reference.
     current
-        Both cameras' images at t; none of a shape.
+        Both cameras' current images; none of a shape.
     matcher
-        The prepared images of all that is compared, with the patch that is tried first.
+        The prepared images, with the patch that is tried first.
     fits_image
-        (r, c) where a point is allowed and its subset lies in the image.
+        (r, c) True where a point is allowed and its subset lies in the image.
     xy_px, rays
         (n, 2) px, (n, 3) normalised: the points in camera 1's image.
     texture
         (n,) grey-level variance of the subsets.
     usable
-        (n,) which points may be measured.
+        (n,) True where a point may be measured.
     hoped_for
-        (n,) where new seeds are worth their time.
+        (n,) True where new seeds are searched for.
     known_w
-        (n, k) the shape that was measured before, NaN where it has no point; None where none was.
+        (n, k) the shape measured before, NaN where it has no point; None without one.
     progress, cancel
-        Reports and stop.
+        Receiver of progress reports, and the means to stop.
     """
 
     pair: StereoPair
@@ -80,25 +80,25 @@ class FieldInputs:
     cancel: CancelToken | None
 
     @property
-    def sight(self) -> Sight | None:
-        """What the points see of their subsets; None: all of it."""
-        return self.grid.sight
+    def visibility(self) -> Visibility | None:
+        """The points' visibility; None: all of every subset."""
+        return self.grid.visibility
 
     @property
     def sigma_limits(self) -> SigmaLimits:
-        """How far a point may scatter whose residuals are not noise."""
-        gates = self.options.gates
-        return SigmaLimits(motion_px=gates.largest_sigma_px, depth_px=gates.largest_depth_sigma_px)
+        """Largest standard deviations of a point whose residuals are not noise."""
+        validity = self.options.validity
+        return SigmaLimits(motion_px=validity.max_sigma_px, depth_px=validity.max_depth_sigma_px)
 
     @cached_property
     def repeating(self) -> Bool:
-        """(n,) where the texture repeats itself, so that no start may be put there."""
+        """(n,) True where the texture repeats itself, so that no seed may lie there."""
         out = np.zeros(len(self.xy_px), bool)
         out[self.usable] = repeats(self.ref1.pixels, self.xy_px[self.usable], subset_px=self.options.subset_px)
         return out
 
     def on_shape(self, shape: Field, previous: Field | None) -> FieldInputs:
-        """Return the inputs of a motion: the points that the shape has; those lost in the last step come second."""
+        """Return the inputs of a motion: the points that the shape has; those lost in the previous step come second."""
         usable = self.usable & shape.valid.ravel()
         return replace(
             self,
@@ -118,7 +118,7 @@ def prepare(
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
 ) -> FieldInputs:
-    """Check and prepare what a field is measured from: a shape, or with current images a motion.
+    """Check and prepare the inputs of a field: a shape, or with current images a motion.
 
     Raises
     ------
@@ -128,10 +128,10 @@ def prepare(
     options = options or MeasureOptions()
     subset_px, kind, blur = options.subset_px, options.interpolation, options.blur
     ref1, ref2 = (MeasureImage(reference[k], f"camera {k + 1}'s image") for k in (0, 1))
-    now = () if current is None else tuple(MeasureImage(current[k], f"camera {k + 1}'s image at t") for k in (0, 1))
-    grid = with_sight(grid, subset_px)
-    if grid.sight is not None:
-        grid = replace(grid, allowed=grid.allowed & grid.sight.enough)
+    now = () if current is None else tuple(MeasureImage(current[k], f"camera {k + 1}'s current image") for k in (0, 1))
+    grid = with_visibility(grid, subset_px)
+    if grid.visibility is not None:
+        grid = replace(grid, allowed=grid.allowed & grid.visibility.enough)
     fits_image = check_region(grid, image_shape=ref1.shape, subset_px=subset_px)
     if now:
         for before, after in zip((ref1, ref2), now, strict=True):
@@ -159,13 +159,13 @@ def prepare(
         cur1=prepared[2] if now else None,
         cur2=prepared[3] if now else None,
         options=options.match_options(),
-        least_zncc=options.least_zncc,
-        sight=grid.sight,
+        min_zncc=options.min_zncc,
+        visibility=grid.visibility,
     )
     compared = None if blur is None else matcher.ref1
     texture = ref1.subset_variance(xy_px, subset_px, compared)
-    if grid.sight is not None:
-        texture = grid.sight.correct_variance(texture, ref1.pixels if compared is None else compared.pixels)
+    if grid.visibility is not None:
+        texture = grid.visibility.correct_variance(texture, ref1.pixels if compared is None else compared.pixels)
     return FieldInputs(
         pair=pair,
         grid=grid,
@@ -188,18 +188,18 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class GrowthState:
-    """Where a measurement stands. A stage returns the state that it leaves; points and attempts it changes in place.
+    """State of a measurement. A phase returns the state that it leaves; points and attempts are changed in place.
 
     Attributes
     ----------
     fitter, patch
-        The matcher with the patch that the points are measured with, and why it is this one.
+        The matcher with the patch that the points are measured with, and the choice of it with its reason.
     points
         The n points as far as they are measured.
     attempts
-        What growth has tried.
+        Starts that growth has tried.
     checked
-        Whether every point that stands went through the gates.
+        True if all valid points have passed the validity checks.
     """
 
     fitter: Fitter
@@ -210,7 +210,7 @@ class GrowthState:
 
 
 def begin(inputs: FieldInputs) -> GrowthState:
-    """Return the state in which no point stands."""
+    """Return the state before any point is valid."""
     asked, matcher = inputs.options.patch, inputs.matcher
     plane: UsedPatch = "plane" if matcher.comparisons == 1 else matcher.options.patch
     return GrowthState(
@@ -223,7 +223,7 @@ def begin(inputs: FieldInputs) -> GrowthState:
 
 
 def fresh_attempts(inputs: FieldInputs) -> Attempts:
-    """Let growth try every point anew; those lost in an earlier step once only, should they have come back."""
-    attempts = Attempts.on(inputs.grid.shape, inputs.sight)
+    """Return attempts that let growth try every point anew; those lost in an earlier step once only."""
+    attempts = Attempts.on(inputs.grid.shape, inputs.visibility)
     attempts.left[inputs.usable & ~inputs.hoped_for] = 1
     return attempts

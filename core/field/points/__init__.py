@@ -1,1 +1,1 @@
-"""One point and many: start values, fits, prepared images, and the field that they become."""
+"""Points: start values, fits, prepared images, and the field assembled from them."""

@@ -1,4 +1,4 @@
-"""From the matcher's unknowns at the points to the field that is shipped."""
+"""Conversion of the matcher's unknowns at the points into a field."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def assemble(
     pair
         The calibrated cameras.
     grid
-        Their places.
+        Their positions.
     fits_image
-        (r, c) where a point is allowed and its subset lies in the image.
+        (r, c) True where a point is allowed and its subset lies in the image.
     shape
         The reference's shape, whose positions every step shows; None for a shape.
     patch
-        What the points were measured with.
+        Patch that the points were measured with.
     """
     rows, cols = grid.shape
     motion = points.zncc.shape[1] == 3
@@ -56,21 +56,21 @@ def assemble(
     index = np.flatnonzero(valid.ravel())
     xy, w, G = grid.xy_px.reshape(-1, 2)[index], points.w[index], points.G[index]
 
-    def scatter(values: Float, *tail: int) -> Float:
+    def spread_over_grid(values: Float, *tail: int) -> Float:
         out = np.full((rows * cols, *tail), np.nan)
         out[index] = values
         return out.reshape(rows, cols, *tail)
 
     with np.errstate(invalid="ignore", divide="ignore"):
         g = shape_geometry(pair, xy, w)
-        xyz = scatter(g.xyz_mm, 3)
+        xyz = spread_over_grid(g.xyz_mm, 3)
         if motion:
             m = motion_geometry(pair, xy, w, G)
-            covariance = scatter(covariance_xyzuvw(pair, xy, w, G, points.covariance[index]), 6, 6)
+            covariance = spread_over_grid(covariance_xyzuvw(pair, xy, w, G, points.covariance[index]), 6, 6)
         else:
-            covariance = scatter(covariance_xyz(pair, xy, w, points.covariance[index]), 3, 3)
+            covariance = spread_over_grid(covariance_xyz(pair, xy, w, points.covariance[index]), 3, 3)
     if shape is not None:
-        # a material point's reference position is the same in every step. Its covariance goes with it; that with the
+        # a material point's reference position is the same in every step. So is its covariance; that with the
         # displacement stays, since the shape alone is the joint estimate plus an error independent of it
         known = valid & shape.valid
         xyz = np.where(known[..., None], shape.xyz_mm, xyz)
@@ -84,20 +84,20 @@ def assemble(
         y_px=grid.y_px,
         status=status,
         xyz_mm=xyz,
-        normal_sys=scatter(g.normal_sys, 3),
-        theta_rad=scatter(g.theta_rad),
-        phi_rad=scatter(g.phi_rad),
-        zp_mm=scatter(g.zp_mm),
-        zncc=scatter(points.zncc[index], points.zncc.shape[1]),
-        epipolar_px=scatter(points.epipolar_px[index]),
+        normal_sys=spread_over_grid(g.normal_sys, 3),
+        theta_rad=spread_over_grid(g.theta_rad),
+        phi_rad=spread_over_grid(g.phi_rad),
+        zp_mm=spread_over_grid(g.zp_mm),
+        zncc=spread_over_grid(points.zncc[index], points.zncc.shape[1]),
+        epipolar_px=spread_over_grid(points.epipolar_px[index]),
         iterations=np.where(valid, points.iterations.reshape(rows, cols), 0).astype(np.int32),
-        noise_grey=scatter(points.noise[index]),
+        noise_grey=spread_over_grid(points.noise[index]),
         covariance=covariance,
-        uvw_mm=scatter(m.uvw_mm, 3) if motion else None,
-        rotation_rad=scatter(m.rotation_rad, 3) if motion else None,
-        stretch=scatter(m.stretch, 3) if motion else None,
-        curvature_per_mm=scatter(principal_curvatures(pair, xy, w), 2) if w.shape[1] == 6 else None,
+        uvw_mm=spread_over_grid(m.uvw_mm, 3) if motion else None,
+        rotation_rad=spread_over_grid(m.rotation_rad, 3) if motion else None,
+        stretch=spread_over_grid(m.stretch, 3) if motion else None,
+        curvature_per_mm=spread_over_grid(principal_curvatures(pair, xy, w), 2) if w.shape[1] == 6 else None,
         patch=patch,
         cuts=grid.cuts,
-        starts=Starts(scatter(w, w.shape[1]), scatter(G, 3, w.shape[1]) if motion else None),
+        starts=Starts(spread_over_grid(w, w.shape[1]), spread_over_grid(G, 3, w.shape[1]) if motion else None),
     )

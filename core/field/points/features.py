@@ -1,10 +1,10 @@
 """Feature points of images and their matches: the raw material of automatic seeds.
 
-SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012), matched by the ratio test in both
-directions. Nothing here knows the cameras; the geometry filters come after.
+SIFT (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with RootSIFT descriptors (Arandjelovic and Zisserman 2012,
+doi:10.1109/CVPR.2012.6248018), matched by the ratio test in both directions. The cameras' geometry is applied later.
 
-Images are reduced to what seeds need, and worked on in tiles: all tiles of all images share the threads, and what is
-in memory at a time does not grow with the images.
+Images are reduced as far as seeds allow, and processed in tiles: all tiles of all images share the threads, and the
+memory in use does not grow with the images.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from core.arrays import Float, Float32
 from core.threads import run_ranges
 
 MAX_KEYPOINTS = 4000
-"""Matching grows with the square; so many find all the seeds that a field needs."""
+"""The time of matching grows with the square; this number is enough for the seeds of a field."""
 _RATIO = 0.85
 _CHUNK = 256
-_LEAST_CONTRAST = 0.01
+_MIN_CONTRAST = 0.01
 _TILE_PX = 832
 _RIM_PX = 24
 _SHARE_MORE = 1.5  # a tile may keep so much more than its share of the keypoints: texture is seldom even
@@ -37,7 +37,8 @@ Box = tuple[int, int, int, int]
 class Features:
     """Keypoints of one image: ``xy_px`` (n, 2), unit ``descriptors`` (n, 128) float32.
 
-    ``scale`` says how many times smaller the image was when they were found: they are good to a third of that, in px.
+    ``scale`` is the factor by which the image was reduced when they were found: their standard deviation is a third of
+    it, px.
     """
 
     xy_px: Float
@@ -46,7 +47,7 @@ class Features:
 
 
 class Picture(NamedTuple):
-    """Where to look for features: an image (rows, cols) and a box (x0, y0, x1, y1) of it, half open."""
+    """An image (rows, cols) and the box (x0, y0, x1, y1), half open, in which features are searched for."""
 
     image: NDArray[Any]
     box: Box
@@ -62,7 +63,7 @@ def stretch_to_eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def reduced(image: NDArray[Any], scale: int) -> NDArray[Any]:
-    """Return the means of squares of ``scale`` x ``scale`` pixels, with their fractions; what is left over is cut."""
+    """Return the means of squares of ``scale`` x ``scale`` pixels, with their fractions; a remainder is cut off."""
     if scale == 1:
         return image
     rows, cols = image.shape[0] // scale * scale, image.shape[1] // scale * scale
@@ -148,10 +149,10 @@ def _tiles(shape: tuple[int, int]) -> list[Box]:
     return [(x0, y0, x1, y1) for y0, y1 in pairwise(ys) for x0, x1 in pairwise(xs)]
 
 
-def _search(picture: NDArray[np.uint8], core: Box, most: int) -> tuple[Float, Float32, Float]:
-    """Keypoints (n, 2) inside ``core``, their descriptors and strengths; what is around it helps the filters."""
+def _search(picture: NDArray[np.uint8], core: Box, max_features: int) -> tuple[Float, Float32, Float]:
+    """Keypoints (n, 2) inside ``core``, their descriptors and strengths; the rim around it is for the filters."""
     x0, y0, x1, y1 = _with_rim(Picture(picture, core), 1)
-    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=_LEAST_CONTRAST)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=_MIN_CONTRAST)  # type: ignore[attr-defined]
     allowed = np.zeros((y1 - y0, x1 - x0), np.uint8)
     allowed[core[1] - y0 : core[3] - y0, core[0] - x0 : core[2] - x0] = 255
     keypoints, descriptors = sift.detectAndCompute(np.ascontiguousarray(picture[y0:y1, x0:x1]), allowed)
@@ -170,7 +171,7 @@ def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int6
     best = np.empty(n_a, np.int64)
     top = np.empty(n_a, np.float32)
     second = np.empty(n_a, np.float32)
-    most = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # of each column over a chunk of rows
+    max_features = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # of each column over a chunk of rows
     transposed = np.ascontiguousarray(b.descriptors.T)
 
     def compare(first: int, last: int) -> None:
@@ -178,12 +179,12 @@ def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int6
         j = np.argmax(score, axis=1)
         index = np.arange(len(j))
         best[first:last], top[first:last] = j, score[index, j]
-        most[first // _CHUNK] = score.max(axis=0)
+        max_features[first // _CHUNK] = score.max(axis=0)
         score[index, j] = -np.inf
         second[first:last] = score.max(axis=1)
 
     run_ranges(compare, n_a, _CHUNK)
-    mutual = top >= most.max(axis=0)[best]
+    mutual = top >= max_features.max(axis=0)[best]
     # |d1 - d2|^2 = 2 - 2 d1.d2 for unit vectors
     distinct = (1.0 - top) < ratio**2 * (1.0 - second)
     keep = np.flatnonzero(distinct & mutual)

@@ -1,4 +1,4 @@
-"""The matcher bound to its images, with the checks that hold for one point alone."""
+"""The matcher bound to its images, with the checks of single points."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.starts import depth_per_px, faces_both_cameras
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.matching.fit import fit_motion, fit_shape
 from core.matching.image import ImageData
 from core.matching.options import MatchOptions
 from core.status import PointStatus
 
-_MOST_EPIPOLAR_PX = 3.0
-_MOST_SHEAR = 4.0
+_MAX_EPIPOLAR_PX = 3.0
+_MAX_SHEAR = 4.0
 
 
 @dataclass(eq=False)
@@ -52,7 +52,7 @@ class PointFits:
 
     @staticmethod
     def empty(n: int, comparisons: int, terms: int = 3) -> PointFits:
-        """Return n points that nothing has reached yet; ``terms`` is 6 for curved patches."""
+        """Return n points not yet reached; ``terms`` is 6 for curved patches."""
         q = 2 if comparisons == 1 else 5
         return PointFits(
             w=np.full((n, terms), np.nan),
@@ -68,7 +68,7 @@ class PointFits:
 
     @property
     def ok(self) -> Bool:
-        """(n,) which points have numbers."""
+        """(n,) True where a point has numbers."""
         return np.asarray(self.status == PointStatus.OK)
 
     @property
@@ -77,7 +77,7 @@ class PointFits:
         return np.where(self.ok, np.nan_to_num(self.zncc, nan=-1.0).min(axis=1), -1.0)
 
     def put(self, index: NDArray[np.intp], other: PointFits) -> None:
-        """Write ``other``'s points to the places ``index``."""
+        """Write ``other``'s points to the indices ``index``."""
         for f in fields(self):
             getattr(self, f.name)[index] = getattr(other, f.name)
 
@@ -85,8 +85,8 @@ class PointFits:
         """Return a copy of the points ``index``."""
         return PointFits(**{f.name: getattr(self, f.name)[index].copy() for f in fields(self)})
 
-    def refuse(self, which: Bool, status: PointStatus) -> None:
-        """Take the numbers of points away and say why."""
+    def reject(self, which: Bool, status: PointStatus) -> None:
+        """Reject points: their numbers become NaN, their status the reason."""
         self.status[which] = status
         for name in ("w", "G", "epipolar_px", "epipolar_sigma_px", "covariance"):
             getattr(self, name)[which] = np.nan
@@ -98,10 +98,10 @@ class Fitter:
 
     Attributes
     ----------
-    least_zncc
-        Correlation below which no comparison counts as a match, whatever the field looks like.
-    sight
-        What the points see of their subsets; None: all of it.
+    min_zncc
+        Correlation below which no comparison counts as a match.
+    visibility
+        The points' visibility; None: all of every subset.
     """
 
     pair: StereoPair
@@ -110,8 +110,8 @@ class Fitter:
     cur1: ImageData | None
     cur2: ImageData | None
     options: MatchOptions
-    least_zncc: float
-    sight: Sight | None = None
+    min_zncc: float
+    visibility: Visibility | None = None
 
     @property
     def comparisons(self) -> int:
@@ -124,7 +124,7 @@ class Fitter:
         return 6 if self.options.patch == "curved" else 3
 
     def empty(self, n: int) -> PointFits:
-        """Return n points that nothing has reached yet."""
+        """Return n points not yet reached."""
         return PointFits.empty(n, self.comparisons, self.terms)
 
     def shape_only(self) -> Fitter:
@@ -136,9 +136,9 @@ class Fitter:
         return replace(self, options=replace(self.options, patch="curved"))
 
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
-        """Refine points from start values and refuse those that cannot be right on their own."""
+        """Refine points from start values and reject those that fail the checks of a single point."""
         n = len(xy_px)
-        visible = None if self.sight is None else self.sight.at(xy_px)
+        visible = None if self.visibility is None else self.visibility.at(xy_px)
         w, G = self._terms_of(w), None if G is None else self._terms_of(G)
         if self.cur1 is None or self.cur2 is None:
             s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options, visible)
@@ -159,16 +159,16 @@ class Fitter:
                 m.w, m.G, m.zncc, m.epipolar_px, m.epipolar_sigma_px, m.noise, m.covariance, m.iterations, m.status
             )
         with np.errstate(invalid="ignore"):
-            low = fits.ok & ~(fits.zncc.min(axis=1) >= self.least_zncc)
-            fits.refuse(low, PointStatus.LOW_CORRELATION)
-            off = fits.ok & ~(np.abs(fits.epipolar_px) <= _MOST_EPIPOLAR_PX)
-            fits.refuse(off, PointStatus.EPIPOLAR_MISMATCH)
+            low = fits.ok & ~(fits.zncc.min(axis=1) >= self.min_zncc)
+            fits.reject(low, PointStatus.LOW_CORRELATION)
+            off = fits.ok & ~(np.abs(fits.epipolar_px) <= _MAX_EPIPOLAR_PX)
+            fits.reject(off, PointStatus.EPIPOLAR_MISMATCH)
         ok = np.flatnonzero(fits.ok)
-        fits.refuse(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
+        fits.reject(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
         return fits
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
-        """Return (n,) whether a fit ended further than ``limit_px`` from its start in any image."""
+        """Return (n,) True where a fit ended further than ``limit_px`` from its start in any image."""
         rays = self.pair.cam1.rays_cam(xy_px).xyz_mm
         with np.errstate(invalid="ignore", divide="ignore"):
             px = np.abs(fits.w[:, 0] - w[:, 0]) / depth_per_px(self.pair, rays, w[:, 0])
@@ -191,14 +191,14 @@ class Fitter:
         good = faces_both_cameras(self.pair, rays, w)
         if self.cur1 is None or len(w) == 0:
             return np.asarray(good)
-        # at t: in front of the camera, not mirrored, and no stretch that a patch could not bear
+        # current: in front of the camera, not mirrored, and no stretch too large for a patch
         depth = G[:, 2, 0]
         columns = G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth[:, None, None])
-        affine = columns / depth[:, None, None]  # camera 1's image at t over its image at t0, normalised
+        affine = columns / depth[:, None, None]  # camera 1's current image over its reference image, normalised
         det = np.linalg.det(affine)
         size = np.linalg.norm(affine, axis=(1, 2)) / np.sqrt(2.0)
         with np.errstate(invalid="ignore"):
-            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < _MOST_SHEAR) & (det > size**2 / _MOST_SHEAR)
+            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < _MAX_SHEAR) & (det > size**2 / _MAX_SHEAR)
         return np.asarray(good)
 
 

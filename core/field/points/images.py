@@ -1,4 +1,4 @@
-"""Images of a measurement: checked once, prepared once, features found once."""
+"""Images of a measurement: checked, prepared and searched for features once."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from core.noise import NoiseModel
 from core.settings import Interpolation
 
 _TILE = 48
-_LEAST_STRUCTURE = 0.2
+_MIN_STRUCTURE = 0.2
 _BAND_PX = 6.0
-_SMALLEST = 32
+_MIN_SIDE_PX = 32
 _BAND_PIXELS = 1_000_000
 
 
 class MeasureImage:
-    """One image with what was computed from it.
+    """One image and the quantities computed from it.
 
     Parameters
     ----------
     image
         (rows, cols) grey levels uint8, uint16 or float; or an image already prepared.
     name
-        How errors call it.
+        Its name in errors.
     noise
-        The camera's noise in this very image, where nothing else is asked for.
+        The camera's noise in this very image, where no other model is given.
 
     Raises
     ------
@@ -60,7 +60,7 @@ class MeasureImage:
             self.pixels = image.pixels if image.unblurred is None else np.ascontiguousarray(image.unblurred)
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
             if image.blur is None:
-                self.noise = image.noise  # prepared with a model by hand, it keeps it where none is asked for
+                self.noise = image.noise  # prepared with a model by hand, it keeps it where none is given
                 self._prepared[kind, image.noise, None] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
@@ -83,7 +83,7 @@ class MeasureImage:
     def subset_variance(self, xy_px: Float, subset_px: int, blurred: ImageData | None = None) -> Float:
         """Return the grey-level variance (n,) in the square of ``subset_px`` about the pixels nearest to points (n, 2).
 
-        Kept for the last points that were asked for: those of a sequence are the same in every step.
+        The result is kept for the last points given: those of a sequence are the same in every step.
 
         Parameters
         ----------
@@ -117,9 +117,10 @@ class MeasureImage:
         return out
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
-        """Return smallest and largest grey level and the most that neighbouring pixels correlate, in a box or anywhere.
+        """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box or the whole
+        image.
 
-        Found on the first call; zero structure where there is one grey level.
+        Computed on the first call; zero structure where there is one grey level.
         """
         if box not in self._contrast:
             pixels = self.pixels
@@ -127,20 +128,20 @@ class MeasureImage:
                 x0, y0, x1, y1 = (round(v) for v in box)
                 pixels = pixels[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1]
             low, high = float(pixels.min()), float(pixels.max())
-            self._contrast[box] = low, high, largest_structure(pixels) if low < high else 0.0
+            self._contrast[box] = low, high, max_structure(pixels) if low < high else 0.0
         return self._contrast[box]
 
     def refuse_blank(self, box: tuple[float, float, float, float] | None = None) -> None:
-        """Raise ``image_blank`` if nothing but noise is seen in (x0, y0, x1, y1), or anywhere when left out."""
+        """Raise ``image_blank`` if there is only noise in (x0, y0, x1, y1), or in the whole image if left out."""
         low, high, structure = self.contrast(box)
         where = f"{self.name}" if box is None else f"{self.name} in the region"
         remedy = "Check lens cap, light, exposure and that the specimen carries a pattern."
         if low == high:
             raise ImageError(f"{where} shows one grey level, {low:g}, everywhere.", code="image_blank", remedy=remedy)
-        if structure < _LEAST_STRUCTURE:
+        if structure < _MIN_STRUCTURE:
             raise ImageError(
                 f"{where} shows noise only: neighbouring pixels correlate by {structure:.2f} at most, a pattern by "
-                f"{_LEAST_STRUCTURE:g} and more (grey levels {low:g} to {high:g}).",
+                f"{_MIN_STRUCTURE:g} and more (grey levels {low:g} to {high:g}).",
                 code="image_blank",
                 remedy=remedy,
             )
@@ -156,27 +157,27 @@ def features_of(wanted: Sequence[tuple[MeasureImage, Box]], scale: int) -> list[
     return [image._features[box, scale] for image, box in wanted]
 
 
-def largest_structure(pixels: NDArray[Any]) -> float:
+def max_structure(pixels: NDArray[Any]) -> float:
     """Return the largest correlation between neighbouring pixels over tiles of 48 px, slow shading taken out.
 
     White camera noise gives 0 +- 0.02, a pattern that a camera resolves 0.5 and more. Tiles from the middle outwards;
-    the search ends with the first one that leaves no doubt.
+    the search ends with the first that clearly has a pattern.
     """
     tile = min(_TILE, *pixels.shape)
-    places = [
+    corners = [
         (y, x) for y in range(0, pixels.shape[0] - tile + 1, tile) for x in range(0, pixels.shape[1] - tile + 1, tile)
     ]
     middle = ((pixels.shape[0] - tile) / 2, (pixels.shape[1] - tile) / 2)
-    places.sort(key=lambda place: (place[0] - middle[0]) ** 2 + (place[1] - middle[1]) ** 2)
+    corners.sort(key=lambda corner: (corner[0] - middle[0]) ** 2 + (corner[1] - middle[1]) ** 2)
     best = 0.0
-    for y, x in places:
+    for y, x in corners:
         t = pixels[y : y + tile, x : x + tile].astype(np.float32)
         t = t - cv2.GaussianBlur(t, (0, 0), _BAND_PX, borderType=cv2.BORDER_REPLICATE)
         variance = float(np.mean(t * t))
         if variance > 1e-4:
             lag = 0.5 * float(np.mean(t[:, 1:] * t[:, :-1]) + np.mean(t[1:] * t[:-1]))
             best = max(best, lag / variance)
-        if best > 2.0 * _LEAST_STRUCTURE:
+        if best > 2.0 * _MIN_STRUCTURE:
             break
     return best
 
@@ -192,7 +193,7 @@ def same_size(a: MeasureImage, b: MeasureImage) -> None:
 
 
 def different(a: MeasureImage, b: MeasureImage) -> None:
-    """Raise ``same_image`` if both cameras are said to have taken the very same image."""
+    """Raise ``same_image`` if both cameras' images are equal, grey level by grey level."""
     if _same(a, b):
         raise ImageError(
             f"{a.name} and {b.name} are the same image, grey level by grey level.",
@@ -202,10 +203,10 @@ def different(a: MeasureImage, b: MeasureImage) -> None:
 
 
 def refuse_stale(ref1: MeasureImage, ref2: MeasureImage, now1: MeasureImage, now2: MeasureImage) -> None:
-    """Raise ``stale_image`` if one camera alone has its reference image at t, grey level by grey level.
+    """Raise ``stale_image`` if one camera's current image alone is its reference image, grey level by grey level.
 
     No camera takes the same noise twice: that image was never renewed. Matched with the other camera's it would give a
-    smooth and wrong motion. Both cameras' references together are somebody's test that nothing moved.
+    smooth and wrong motion. Both cameras' references together are accepted: a test with zero motion.
     """
     stale = [_same(ref, now) for ref, now in ((ref1, now1), (ref2, now2))]
     if stale[0] != stale[1]:
@@ -221,7 +222,7 @@ def _same(a: MeasureImage, b: MeasureImage) -> bool:
     if a.pixels is b.pixels:
         return True
     if a.shape != b.shape or not np.array_equal(a.pixels[::64], b.pixels[::64]):
-        return False  # a few rows tell, nearly always
+        return False  # a few rows are enough, nearly always
     return bool(np.array_equal(a.pixels, b.pixels))
 
 
@@ -237,9 +238,9 @@ def check_calibrated_size(name: str, shape: tuple[int, ...], size_px: tuple[int,
 
 
 def _checked(image: NDArray[Any], name: str) -> NDArray[Any]:
-    if image.ndim != 2 or min(image.shape) < _SMALLEST:
+    if image.ndim != 2 or min(image.shape) < _MIN_SIDE_PX:
         raise ImageError(
-            f"{name} has the shape {image.shape}; it must be 2-D and {_SMALLEST} px or more wide and high.",
+            f"{name} has the shape {image.shape}; it must be 2-D and {_MIN_SIDE_PX} px or more wide and high.",
             code="image_shape",
             remedy="Give one channel of grey levels.",
         )

@@ -1,6 +1,6 @@
-"""What a field says of the patch that it was measured with.
+"""Record of the patch that a field was measured with.
 
-Apart from the choice itself, so that files can be read and written without loading the matching.
+Separate from the choice itself, so that files can be read and written without loading the matching.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ UsedPatch = Literal["plane", "rigid", "stretch", "curved"]
 
 @dataclass(frozen=True, kw_only=True)
 class PatchChoice:
-    """The patch of a field, and why.
+    """The patch of a field, and the reason for it.
 
     Attributes
     ----------
     patch
-        What the field was measured with: ``plane`` (shape) or ``stretch``, ``rigid`` (motion), or ``curved``.
+        The field was measured with it: ``plane`` (shape) or ``stretch``, ``rigid`` (motion), or ``curved``.
     asked
         The setting: one of these, or ``auto``.
     reason
         A sentence for the user.
     sample
-        How many points were fitted both ways; 0 where the field's own curvature told enough.
+        Number of points fitted both ways; 0 where the field's own curvature decided.
     plane_error_mm
-        What plane patches err by because of curvature, rms, noise taken off; of the position for a shape, of the
-        displacement for a motion. None where it is not known, as the next two.
+        Bias of plane patches because of curvature, rms, less noise; of the position for a shape, of the displacement
+        for a motion. None where it is not known, as the next two.
     plane_noise_mm, curved_noise_mm
         Standard deviation of the same from image noise, rms, with plane and with curved patches.
     curved_advised
-        True if plane patches were asked for and curved ones would err less.
+        True if plane patches were asked for and curved ones would have the smaller total error.
     kept
         True if the choice was made in an earlier step of the sequence and kept.
     """
@@ -49,7 +49,7 @@ class PatchChoice:
     kept: bool = False
 
     def document(self) -> dict[str, Any]:
-        """Return the choice in the words of a file."""
+        """Return the choice as it is written to files."""
         return asdict(self)
 
     @staticmethod
@@ -70,6 +70,6 @@ def asked_for(patch: UsedPatch, asked: PatchSetting) -> PatchChoice:
     return PatchChoice(patch=patch, asked=asked, reason=f"{patch}: asked for")
 
 
-def told_um(mm: float) -> str:
-    """Return a length in words, two digits."""
+def format_length(mm: float) -> str:
+    """Return a length as text with its unit, two digits."""
     return f"{1e3 * mm:.2g} um" if mm < 0.1 else f"{mm:.2g} mm"

@@ -17,7 +17,7 @@ from core.status import PointStatus
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """What a step was matched against, where that was not the first reference alone.
+    """References that a step was matched against, where that was not the first one alone.
 
     Attributes
     ----------
@@ -27,9 +27,9 @@ class References:
         (r, c) int32, the same for each point: it may be an older one for a point that was found again. Of a point
         without numbers, the newest reference that shows it.
     noise_px2, pattern_px2
-        (r, c, 2, 2) covariance, px^2, of where camera 1 sees the points in this step, as far as the noise of this
-        step's images does not cancel it if later steps are matched against them: by the cameras' noise, and by changes
-        of the surface's pattern.
+        (r, c, 2, 2) propagated covariance, px^2, of the points' positions in camera 1's image of this step: the part
+        that the noise of this step's images does not cancel if later steps are matched against them, from the cameras'
+        noise and from changes of the surface's pattern.
     """
 
     step: int
@@ -47,7 +47,7 @@ class Field:
     Attributes
     ----------
     x_px, y_px
-        (r, c) where the points lie in camera 1's reference image.
+        (r, c) positions of the points in camera 1's reference image.
     status
         (r, c) int8, :class:`core.status.PointStatus`.
     xyz_mm
@@ -57,14 +57,15 @@ class Field:
     theta_rad, phi_rad, zp_mm
         (r, c) the plane of Eq. (12), camera 1's frame.
     zncc
-        (r, c, k) zero-mean normalised correlation; k = 1 for shape (camera 2 at t0), k = 3 for motion (camera 2 at t0,
-        camera 1 at t, camera 2 at t).
+        (r, c, k) zero-mean normalised correlation; k = 1 for shape (camera 2's reference image), k = 3 for motion
+        (camera 2's reference, camera 1's and camera 2's current image).
     epipolar_px
         (r, c) offset across the epipolar line in camera 2.
     iterations
         (r, c) int32.
     noise_grey
-        (r, c) noise sd in grey levels of the reference image, estimated from the point's own residuals.
+        (r, c) standard deviation of noise, grey levels of the reference image, estimated from the point's own
+        residuals.
     covariance
         (r, c, 3, 3) of X, Y, Z, or (r, c, 6, 6) of X, Y, Z, U, V, W; mm^2, system frame.
     uvw_mm
@@ -77,13 +78,13 @@ class Field:
         (r, c, 2) principal curvatures of the reference's surface, the larger first, positive where it bulges towards
         the cameras; None unless the patches were curved.
     patch
-        What patch the field was measured with, and why; None in a field from an older file.
+        Patch that the field was measured with, and the reason; None in a field from an older file.
     references
-        What the step was matched against; None where that is the first reference, for all points.
+        References that the step was matched against; None where that is the first reference, for all points.
     smoothing
-        How the displacement was smoothed; None: it is as measured.
+        Smoothing of the displacement; None: it is as measured.
     cuts
-        Cracks and borders of holes over which nothing reaches; None where there are none.
+        Cracks and borders of holes, which no subset or neighbour crosses; None where there are none.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
@@ -124,7 +125,7 @@ class Field:
 
     @property
     def valid(self) -> Bool:
-        """(r, c) True where the point has numbers."""
+        """(r, c) True where the point is valid."""
         return np.isin(self.status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
 
     @property

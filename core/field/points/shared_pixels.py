@@ -1,9 +1,9 @@
-"""How the errors of two points of a field go together: subsets that overlap share pixels, and their noise with them.
+"""Correlation of the errors of two points of a field: subsets that overlap share pixels and their noise.
 
 A patch's value at its centre is a weighted sum of its pixels' noise. For a plane patch the weights are even over the
-subset, so that two subsets' errors correlate by the share of pixels that both have. A curved patch fits the second
-order too; its weights at the centre are those of the even Legendre polynomials up to degree 2, larger in the middle and
-negative at the corners, and its errors correlate over less than its subset.
+subset, so that two subsets' errors correlate by the share of common pixels. A curved patch fits the second order too;
+its weights at the centre are those of the even Legendre polynomials up to degree 2, larger in the middle and negative
+at the corners, and its errors correlate over less than its subset.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class SharedPixels:
     curved
         True for patches of the second order.
     smoothing
-        What the displacements were smoothed with; None: they are as measured. The correlation is then that of smoothed
-        displacements, in whole windows; that of positions is ``places``'.
+        Smoothing of the displacements; None: they are as measured. The correlation is then that of smoothed
+        displacements, in whole windows; that of positions is ``positions``'.
     """
 
     subset_px: float
@@ -43,7 +43,7 @@ class SharedPixels:
     smoothing: Smoothing | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a subset without width, ``invalid_input``."""
+        """Raise ``invalid_input`` for a subset without width."""
         if not (np.isfinite(self.subset_px) and self.subset_px >= 1.0):
             raise InputError(
                 f"The subset is {self.subset_px} px wide.", remedy="Give the subset the field was made with."
@@ -51,30 +51,31 @@ class SharedPixels:
 
     @staticmethod
     def of(field: Field, subset_px: float) -> SharedPixels:
-        """Return the correlation that fits a field's patches; plane where the field does not say."""
+        """Return the correlation that fits a field's patches; plane where the field has no record of them."""
         return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "curved", field.smoothing)
 
     @property
-    def places(self) -> SharedPixels:
-        """That of the points' positions, which are never smoothed."""
+    def positions(self) -> SharedPixels:
+        """Correlation of the points' positions, which are never smoothed."""
         return self if self.smoothing is None else replace(self, smoothing=None)
 
     @property
     def reach_px(self) -> float:
-        """How far apart two points' errors may still go together."""
+        """Largest distance of two points whose errors are correlated."""
         more = 0.0 if self.smoothing is None else (self.smoothing.window - 1) * self.smoothing.step_px
         return self.subset_px + more
 
     def correlation(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
-        """Return the correlation coefficient of two points that lie ``dx_px, dy_px`` apart, any shape."""
+        """Return the correlation coefficient of two points at a distance of ``dx_px, dy_px``, any shape."""
         if self.smoothing is None:
             return self._of_subsets(dx_px, dy_px)
         of = self.smoothing
         products = weight_products(of.window, of.order)
         return self._smoothed(products, dx_px, dy_px) / self._smoothed(products, 0.0, 0.0)
 
-    def correlation_with_place(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
-        """Return by how much the covariance of a position and a displacement falls off over their points' distance."""
+    def correlation_with_position(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
+        """Return the decrease of the covariance of a position and a displacement with their points' distance, 1 at
+        zero."""
         if self.smoothing is None:
             return self._of_subsets(dx_px, dy_px)
         of = self.smoothing
@@ -82,12 +83,13 @@ class SharedPixels:
         return self._smoothed(weights, dx_px, dy_px) / self._smoothed(weights, 0.0, 0.0)
 
     def factors(self, dx_px: ArrayLike, dy_px: ArrayLike, n: int) -> Float:
-        """Return what each element of a covariance of X Y Z (U V W) falls off by over a distance, (..., n, n)."""
-        own = self.places.correlation(dx_px, dy_px)
+        """Return (..., n, n), the decrease of each element of a covariance of X Y Z (U V W) with distance, 1 at
+        zero."""
+        own = self.positions.correlation(dx_px, dy_px)
         out = np.empty((*own.shape, n, n))
         out[...] = own[..., None, None]
         if n > 3 and self.smoothing is not None:
-            mixed = self.correlation_with_place(dx_px, dy_px)[..., None, None]
+            mixed = self.correlation_with_position(dx_px, dy_px)[..., None, None]
             out[..., :3, 3:], out[..., 3:, :3] = mixed, mixed
             out[..., 3:, 3:] = self.correlation(dx_px, dy_px)[..., None, None]
         return out

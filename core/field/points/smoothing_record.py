@@ -1,7 +1,7 @@
-"""Smoothing of a displacement: what was asked for, what it did, and what it makes of the points' errors.
+"""Record of the smoothing of a displacement: settings, counts, and its weights.
 
-A smoothed value is a weighted sum of the values of a window. So are its errors, and neighbours share more of them than
-their subsets' pixels.
+A smoothed value is a weighted sum of the values of a window. So is its error, and neighbours have more of it in common
+than their subsets' pixels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Order = Literal[1, 2]
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothing:
-    """How a displacement was smoothed.
+    """Smoothing of a displacement.
 
     Attributes
     ----------
@@ -34,12 +34,12 @@ class Smoothing:
     step_px, subset_px
         Of the field.
     resolution_px
-        Width of what goes into one value, (window - 1) step + subset.
+        Width of the area that one value averages, (window - 1) spacing + subset.
     resolution_mm
-        The same on the surface, median of the field; None where nothing was measured.
+        The same on the surface, median of the field; None where no point is valid.
     whole, reduced, raw
-        How many points have values of whole windows; of windows that edges, holes or cuts have reduced; and their own
-        value, because a fit over what is left would be noisier than it.
+        Numbers of points with values of whole windows; of windows that edges, holes or cuts have reduced; and with
+        their own value, because a fit over the points left would be noisier.
     """
 
     window: int
@@ -53,7 +53,7 @@ class Smoothing:
     raw: int
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the record as plain values."""
         return asdict(self)
 
     @staticmethod
@@ -64,7 +64,7 @@ class Smoothing:
 
 
 def check_smoothing(window: int, order: int = 2) -> None:
-    """Refuse a window or an order that cannot be.
+    """Raise an error for a window or an order out of range.
 
     Raises
     ------
@@ -105,7 +105,8 @@ def weight_square(window: int, order: int) -> Float:
 
 @lru_cache(maxsize=8)
 def weight_products(window: int, order: int) -> Float:
-    """Return (2 window - 1, 2 window - 1) sums over a window's pairs of points so many rows and columns apart."""
+    """Return (2 window - 1, 2 window - 1) sums over a window's pairs of points by their distance in rows and
+    columns."""
     from scipy.signal import correlate  # slow to load, and not every start needs it
 
     square = weight_square(window, order)

@@ -1,10 +1,11 @@
-"""Start values: what a point needs before the matching can refine it, and how they move to another point.
+"""Start values of the matching at a point, and their transfer to another point.
 
-The unknowns are those of the matching: inverse depth and its slopes ``w = (w0, w1, w2)`` over camera 1's normalised
-ray offsets (X, Y) from the point's own ray, and the 3 x 3 matrix ``G`` through which camera 1 sees the patch at t. The
-point on the patch at offset (X, Y) lies at ``(Xc + X, Yc + Y, 1) / w(X, Y)`` at t0 and at ``G (1, X, Y) / w(X, Y)`` at
-t, both in camera 1's frame. Both are linear for a plane patch, so a patch's own unknowns give a neighbour's on the same
-plane exactly. A curved patch has the terms X^2, X Y and Y^2 besides: ``w`` has 6 numbers, ``G`` 3 x 6.
+The unknowns are those of the matching: inverse depth and its slopes ``w = (w0, w1, w2)`` over camera 1's normalised ray
+offsets (X, Y) from the point's own ray, and the 3 x 3 matrix ``G`` that maps the patch to its current position. The
+point on the patch at offset (X, Y) lies at ``(Xc + X, Yc + Y, 1) / w(X, Y)`` in the reference and at ``G (1, X, Y) /
+w(X, Y)`` currently, both in camera 1's frame. Both are linear for a plane patch, so a patch's own unknowns give a
+neighbour's on the same plane exactly. A curved patch has the terms X^2, X Y and Y^2 besides: ``w`` has 6 numbers, ``G``
+3 x 6.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ def move_matrix(G: Float, offset: Float) -> Float:
 
 
 def position_now(w: Float, G: Float) -> Float:
-    """Return where the points are at t, (n, 3) mm in camera 1's frame."""
+    """Return the points' current positions, (n, 3) mm in camera 1's frame."""
     return np.asarray(G[..., :, 0] / w[..., :1])
 
 
 def image_shift_px(pair: StereoPair, rays: Float, w_a: Float, w_b: Float) -> Float:
-    """Return how far (n,) camera 2's image moves, px, when the inverse depth on camera 1's rays goes from a to b."""
+    """Return the shift (n,) of camera 2's image, px, when the inverse depth on camera 1's rays changes from a to b."""
     pose = pair.cam2_from_cam1
     with np.errstate(divide="ignore", invalid="ignore"):
         images = [
@@ -68,14 +69,14 @@ def image_shift_px(pair: StereoPair, rays: Float, w_a: Float, w_b: Float) -> Flo
 
 
 def depth_per_px(pair: StereoPair, rays: Float, w0: Float) -> Float:
-    """Return |d w0| (n,) that moves camera 2's image by one pixel: the scale of every depth gate."""
+    """Return |d w0| (n,) that moves camera 2's image by one pixel: the scale of every limit on depth."""
     step = 1e-6 * np.abs(w0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(step / np.maximum(image_shift_px(pair, rays, w0, w0 + step), 1e-12))
 
 
-def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, least_cosine: float = 0.1) -> np.ndarray:
-    """Return (n,) whether the patch shows its front to both cameras, no steeper than ``least_cosine``.
+def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: float = 0.1) -> np.ndarray:
+    """Return (n,) True where the patch's front faces both cameras, no steeper than ``min_cosine``.
 
     The plane w0 + w1 X + w2 Y = 1/Z has the camera-1 normal (w1, w2, w0 - w1 Xc - w2 Yc).
     """
@@ -87,4 +88,4 @@ def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, least_cosine:
         view1 = point / np.linalg.norm(point, axis=-1, keepdims=True)
         view2 = (point - centre2) / np.linalg.norm(point - centre2, axis=-1, keepdims=True)
         c1, c2 = np.sum(normal * view1, axis=-1), np.sum(normal * view2, axis=-1)
-        return np.asarray((w[:, 0] > 0) & (c1 > least_cosine) & (c2 > least_cosine))
+        return np.asarray((w[:, 0] > 0) & (c1 > min_cosine) & (c2 > min_cosine))

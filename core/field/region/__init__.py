@@ -1,1 +1,1 @@
-"""The region: the grid of points, cuts, what a point can see, its neighbours."""
+"""The region: the grid of points, cuts, visibility, neighbours."""

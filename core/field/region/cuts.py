@@ -1,4 +1,5 @@
-"""Cuts: lines over which nothing may reach. A crack is an open line, a hole's border a closed one."""
+"""Cuts: lines that no subset, neighbour or start value crosses. A crack is an open line, a hole's border a closed
+one."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ _AT_ONCE = 8192
 
 @dataclass(frozen=True, eq=False)
 class Cuts:
-    """Lines in camera 1's reference image that part the surface.
+    """Lines in camera 1's reference image that separate parts of the surface.
 
     Attributes
     ----------
@@ -48,7 +49,7 @@ class Cuts:
 
 
 def crosses(a_px: ArrayLike, b_px: ArrayLike, cuts: Cuts | None) -> Bool:
-    """Return whether the straight lines from ``a_px`` to ``b_px`` meet a cut.
+    """Return True where the straight lines from ``a_px`` to ``b_px`` meet a cut.
 
     Parameters
     ----------
@@ -100,12 +101,12 @@ def _line(line: ArrayLike) -> Float:
 
 
 def as_arrays(cuts: Cuts) -> tuple[Float, NDArray[np.int32]]:
-    """Return all lines' points (n, 2) one after the other, and (n,) which line each belongs to."""
+    """Return all lines' points (n, 2) one after the other, and (n,) the index of each one's line."""
     points = np.concatenate(cuts.lines_px) if cuts else np.zeros((0, 2))
     of_line = np.repeat(np.arange(len(cuts.lines_px)), [len(line) for line in cuts.lines_px]).astype(np.int32)
     return points, of_line
 
 
 def from_arrays(points_px: Float, of_line: NDArray[np.int32]) -> Cuts:
-    """Return the cuts of which :func:`as_arrays` made these."""
+    """Return the cuts from the arrays of :func:`as_arrays`."""
     return Cuts([points_px[of_line == k] for k in np.unique(of_line)])

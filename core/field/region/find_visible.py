@@ -1,4 +1,4 @@
-"""How it is found what the points of a grid see: lines from each point, against its cuts and its mask."""
+"""Computation of a grid's visibility: lines from each point, intersected with cuts and mask."""
 
 from __future__ import annotations
 
@@ -10,41 +10,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Float
-from core.field.region.line_crossings import find_near, look, parted_neighbours
+from core.field.region.line_crossings import find_near, mark_visible, separated_neighbours
 from core.field.region.neighbours import REACH
 from core.field.region.region import PointGrid
-from core.field.region.visibility import AT_ONCE, CHUNK, Sight, over
+from core.field.region.visibility import AT_ONCE, CHUNK, Visibility, over
 from core.matching.arguments import VisiblePixels
 from core.threads import run_ranges
 
 MARGIN_PX = 2.0
-"""How near to a cut, or to a mask's black, no pixel counts."""
+"""Distance to a cut, or to a mask's black, below which no pixel counts."""
 
 
-def with_sight(grid: PointGrid, subset_px: int) -> PointGrid:
-    """Return the grid with what its points see; the same grid where that is known, or nothing is in the way."""
-    if grid.sight is None and not grid.cuts and grid.white is None:
+def with_visibility(grid: PointGrid, subset_px: int) -> PointGrid:
+    """Return the grid with its visibility; the same grid where that is known, or without cuts and mask."""
+    if grid.visibility is None and not grid.cuts and grid.white is None:
         return grid
-    if grid.sight is not None and grid.sight.subset_px == subset_px:
+    if grid.visibility is not None and grid.visibility.subset_px == subset_px:
         return grid
-    return replace(grid, sight=_find(grid, subset_px))
+    return replace(grid, visibility=_find(grid, subset_px))
 
 
 def patches_seen(
     grid: PointGrid, points: NDArray[np.intp], width: int, margin_px: float, at_once: int
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.uint8]]]:
-    """Yield points that do not see all of a square of ``width`` px about them, and what they see of it.
+    """Yield points with a partly invisible square of ``width`` px about them, and the visible pixels of it.
 
     Parameters
     ----------
     grid
         Cuts and mask.
     points
-        Which of its points to look at.
+        Indices of its points to examine.
     width, margin_px
-        Of the square, odd, and how near to a cut or to black no pixel counts.
+        Of the square, odd, and the distance to a cut or to black below which no pixel counts.
     at_once
         Points a yield, at most.
+
+    Yields
+    ------
+    points, patches
+        (k,) indices and (k, width, width) uint8, 1 for a visible pixel.
     """
     pieces, white = _obstacles(grid)
     clear, black_sums = _clear_of(white, margin_px)
@@ -58,9 +63,11 @@ def patches_seen(
     index = np.flatnonzero(near)
     for start in range(0, len(index), at_once):
         some = index[start : start + at_once]
-        places = np.ascontiguousarray(xy[some])
+        centres = np.ascontiguousarray(xy[some])
         patches, counts = np.empty((len(some), width, width), np.uint8), np.empty(len(some), np.int32)
-        run_ranges(over(look, places, width, margin_px, pieces, white, clear, patches, counts), len(some), AT_ONCE)
+        run_ranges(
+            over(mark_visible, centres, width, margin_px, pieces, white, clear, patches, counts), len(some), AT_ONCE
+        )
         yield points[some], patches
 
 
@@ -71,16 +78,16 @@ def _obstacles(grid: PointGrid) -> tuple[Float, NDArray[np.uint8]]:
 
 
 def _clear_of(white: NDArray[np.uint8], margin_px: float) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Return what of a mask's white may count, and the integral image of its black."""
+    """Return the part of a mask's white that may count, and the integral image of its black."""
     if not white.size:
         return white, np.zeros((1, 1), np.int32)
-    # as far as a cut is kept clear of, the mask's black is too
+    # the same distance is kept to the mask's black as to a cut
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(margin_px) - 1, 2 * int(margin_px) - 1))
     clear = np.ascontiguousarray(cv2.erode(white, disc, borderType=cv2.BORDER_REPLICATE), np.uint8)
     return clear, np.asarray(cv2.integral(1 - white), np.int32)
 
 
-def _find(grid: PointGrid, subset: int) -> Sight:
+def _find(grid: PointGrid, subset: int) -> Visibility:
     pieces, white = _obstacles(grid)
     clear, black_sums = _clear_of(white, MARGIN_PX)
     xy = np.ascontiguousarray(grid.xy_px.reshape(-1, 2))
@@ -96,16 +103,20 @@ def _find(grid: PointGrid, subset: int) -> Sight:
     n_kept = 0
     for start in range(0, len(index), CHUNK):
         some = index[start : start + CHUNK]
-        places = np.ascontiguousarray(xy[some])
+        centres = np.ascontiguousarray(xy[some])
         patches, counts = np.empty((len(some), subset, subset), np.uint8), np.empty(len(some), np.int32)
-        run_ranges(over(look, places, subset, MARGIN_PX, pieces, white, clear, patches, counts), len(some), AT_ONCE)
+        run_ranges(
+            over(mark_visible, centres, subset, MARGIN_PX, pieces, white, clear, patches, counts), len(some), AT_ONCE
+        )
         share[some] = counts / float(subset * subset)
         cut = counts < subset * subset
         of_point[some[cut]] = n_kept + np.arange(int(cut.sum()), dtype=np.int32)
         n_kept += int(cut.sum())
         kept.append(patches[cut])
     patches = np.concatenate(kept) if kept else np.zeros((0, subset, subset), np.uint8)
-    parted = np.zeros(grid.shape, np.uint32)
+    separated = np.zeros(grid.shape, np.uint32)
     x, y = np.ascontiguousarray(grid.x_px), np.ascontiguousarray(grid.y_px)
-    run_ranges(lambda first, last: parted_neighbours(first, last, x, y, REACH, pieces, white, parted), grid.shape[0], 4)
-    return Sight(xy, grid.shape, grid.step_px, pieces, white, VisiblePixels(patches, of_point), share, parted)
+    run_ranges(
+        lambda first, last: separated_neighbours(first, last, x, y, REACH, pieces, white, separated), grid.shape[0], 4
+    )
+    return Visibility(xy, grid.shape, grid.step_px, pieces, white, VisiblePixels(patches, of_point), share, separated)

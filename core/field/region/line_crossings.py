@@ -1,4 +1,4 @@
-"""What can be seen from where: lines that meet cuts. Compiled."""
+"""Intersections of straight lines with cuts and masks. Compiled."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def meets(ax, ay, bx, by, pieces):
-    """Whether the line from a to b has a point in common with any of the pieces (m, 4)."""
+    """Return True if the line from a to b has a point in common with any of the pieces (m, 4)."""
     for m in range(pieces.shape[0]):
         cx, cy, dx, dy = pieces[m, 0], pieces[m, 1], pieces[m, 2], pieces[m, 3]
         if max(ax, bx) < min(cx, dx) or max(cx, dx) < min(ax, bx):
@@ -29,16 +29,16 @@ def meets(ax, ay, bx, by, pieces):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cross(first, last, a, b, pieces, out):
-    """Fill ``out`` (n,) bool: whether the lines from a (n, 2) to b (n, 2) meet any of the pieces (m, 4)."""
+    """Fill ``out`` (n,) bool: True where the line from a (n, 2) to b (n, 2) meets any of the pieces (m, 4)."""
     for i in range(first, last):
         out[i] = meets(a[i, 0], a[i, 1], b[i, 0], b[i, 1], pieces)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stays_white(ax, ay, bx, by, white):
-    """Whether the line from a to b stays on the white of a mask (rows, cols), which may be empty: no mask.
+    """Return True if the line from a to b stays on the white of a mask (rows, cols), which may be empty: no mask.
 
-    Looked at every half pixel or closer; what lies off the mask's array counts as white.
+    Sampled every half pixel or closer; pixels off the mask's array count as white.
     """
     rows, cols = white.shape
     if rows == 0:
@@ -53,8 +53,8 @@ def stays_white(ax, ay, bx, by, white):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def part(first, last, a, b, pieces, white, out):
-    """Fill ``out`` (n,) bool: whether the lines from a to b (n, 2) meet a piece or leave the white."""
+def find_separated(first, last, a, b, pieces, white, out):
+    """Fill ``out`` (n,) bool: True where the line from a to b (n, 2) meets a piece or leaves the white."""
     for i in range(first, last):
         out[i] = meets(a[i, 0], a[i, 1], b[i, 0], b[i, 1], pieces) or not stays_white(
             a[i, 0], a[i, 1], b[i, 0], b[i, 1], white
@@ -62,8 +62,8 @@ def part(first, last, a, b, pieces, white, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def parted_neighbours(first, last, x, y, reach, pieces, white, out):
-    """Fill ``out`` (r, c) uint32: bit k is set where neighbour k of a point cannot be seen from it.
+def separated_neighbours(first, last, x, y, reach, pieces, white, out):
+    """Fill ``out`` (r, c) uint32: bit k is set where neighbour k is separated from a point.
 
     Neighbours in rows and columns from -reach to reach, row by row, the point itself left out.
     """
@@ -88,7 +88,7 @@ def parted_neighbours(first, last, x, y, reach, pieces, white, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def passes_box(piece, x0, y0, x1, y1):
-    """Whether a piece (4,) has a point in a box (Liang and Barsky's clipping)."""
+    """Return True if a piece (4,) has a point in a box (Liang and Barsky's clipping, doi:10.1145/357332.357333)."""
     t0, t1 = 0.0, 1.0
     for k in range(2):
         start, along = piece[k], piece[2 + k] - piece[k]
@@ -106,7 +106,7 @@ def passes_box(piece, x0, y0, x1, y1):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def squared_distance(x, y, piece):
-    """Square of the distance of a place from a piece (4,)."""
+    """Return the square of the distance of a point from a piece (4,)."""
     ux, uy = piece[2] - piece[0], piece[3] - piece[1]
     length = ux * ux + uy * uy
     t = ((x - piece[0]) * ux + (y - piece[1]) * uy) / length if length > 0.0 else 0.0
@@ -117,7 +117,7 @@ def squared_distance(x, y, piece):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_near(first, last, xy, subset, margin, pieces, black_sums, out):
-    """Fill ``out`` (n,) bool: whether a piece or black pixels lie in a point's subset, or within ``margin`` px of it.
+    """Fill ``out`` (n,) bool: True where a piece or black pixels lie in a point's subset or within ``margin`` px of it.
 
     ``black_sums`` is the integral image of the mask's black, (rows + 1, cols + 1), or empty.
     """
@@ -143,21 +143,21 @@ def find_near(first, last, xy, subset, margin, pieces, black_sums, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def look(first, last, xy, subset, margin, pieces, white, clear, patches, counts):
-    """Fill ``patches`` (n, subset, subset) uint8: 1 where the point sees the pixel, and the pixel may count.
+def mark_visible(first, last, xy, subset, margin, pieces, white, clear, patches, counts):
+    """Fill ``patches`` (n, subset, subset) uint8: 1 where the pixel is visible from the point and may count.
 
     Parameters
     ----------
     first, last
-        Points to do.
+        Range of points.
     xy
         (n, 2) points.
     subset, margin
-        Width of the subset, and how near to a piece no pixel counts, px.
+        Width of the subset, and distance to a piece below which no pixel counts, px.
     pieces
         (m, 4).
     white, clear
-        The mask's white, along which lines must stay, and what of it may count; both empty without a mask.
+        The mask's white, along which lines must stay, and the part of it that may count; both empty without a mask.
     patches, counts
         Out; counts (n,) int32 the number of ones.
     """

@@ -1,4 +1,4 @@
-"""What a point's neighbours say about it: their own patches, extended to the point's ray. Compiled.
+"""Comparison of a point with its neighbours' patches, extended to the point's ray. Compiled.
 
 Medians of up to 24 neighbours for blocks of points at a time: a sorting network, whose compare-and-exchange steps run
 over the block's points in vector registers. Missing neighbours are infinite, so they sort behind the others. The
@@ -50,7 +50,8 @@ def _sort(keys, network):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _order(keys):
-    """Turn the bits of float32 into int32 that sort alike, or back: those of negative numbers run the other way."""
+    """Turn the bits of float32 into int32 of the same order, or back: those of negative numbers are in reverse
+    order."""
     for s in range(keys.shape[0]):
         for k in range(_BLOCK):
             keys[s, k] ^= (keys[s, k] >> 31) & np.int32(0x7FFFFFFF)
@@ -74,28 +75,28 @@ def _medians(values, network, n, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion, difference, spread, count):
-    """Own value minus the median of the neighbours' predictions, and the predictions' median absolute deviation.
+def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, motion, difference, spread, count):
+    """Compute own value minus median of the neighbours' predictions, and the predictions' median absolute deviation.
 
     Parameters
     ----------
     first, last
-        Rows to do.
+        Range of rows.
     network
         ``sorting_network(24)``.
     ok
         (r, c) bool.
-    parted
-        (r, c) uint32, see ``core.field.region.line_crossings.parted_neighbours``; empty where nothing parts neighbours.
+    separated
+        (r, c) uint32, as :func:`core.field.region.line_crossings.separated_neighbours`; empty without cuts and mask.
     rays, w, G
         (r, c, 3), (r, c, 3 or more), (r, c, 3, 3 or more).
     motion
-        Whether G holds a motion.
+        True if G holds a motion.
     difference, spread
         (r, c, 4) out: inverse depth relative to itself, then displacement in units of the depth (x, y, z in camera 1).
-        What is not known stays as it was.
+        Elements not known are left unchanged.
     count
-        (r, c) out: how many neighbours spoke.
+        (r, c) out: number of neighbours compared.
     """
     rows, cols = ok.shape
     quantities = 4 if motion else 1
@@ -111,7 +112,7 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
                 for s in range(_NEIGHBOURS):
                     for k in range(_BLOCK):
                         values[q, s, k] = np.inf
-            place = 0
+            slot = 0
             for dr in range(-REACH, REACH + 1):
                 for dc in range(-REACH, REACH + 1):
                     i = r + dr
@@ -122,7 +123,7 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
                             j = c + dc
                             if not ok[r, c] or not ok[i, j]:
                                 continue
-                            if parted.shape[0] > 0 and (parted[r, c] >> np.uint32(place)) & np.uint32(1):
+                            if separated.shape[0] > 0 and (separated[r, c] >> np.uint32(slot)) & np.uint32(1):
                                 continue
                             k = c - start
                             n[k] += 1
@@ -130,15 +131,15 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
                             x = rays[r, c, 0] - rays[i, j, 0]
                             y = rays[r, c, 1] - rays[i, j, 1]
                             wp = w[i, j, 0] + w[i, j, 1] * x + w[i, j, 2] * y
-                            values[0, place, k] = wp / w0 - 1.0
+                            values[0, slot, k] = wp / w0 - 1.0
                             if motion:
-                                # displacement times w0, so that a depth error alone does not show twice
+                                # displacement times w0, so that a depth error alone does not count twice
                                 scale = w0 / wp
                                 for q in range(3):
                                     now = G[i, j, q, 0] + G[i, j, q, 1] * x + G[i, j, q, 2] * y
                                     own = G[r, c, q, 0] - rays[r, c, q]
-                                    values[1 + q, place, k] = (now - rays[r, c, q]) * scale - own
-                    place += 1
+                                    values[1 + q, slot, k] = (now - rays[r, c, q]) * scale - own
+                    slot += 1
             for q in range(quantities):
                 v = values[q]
                 _medians(v, network, n, middle)
@@ -155,29 +156,29 @@ def compare_with_neighbours(first, last, network, ok, parted, rays, w, G, motion
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_median(first, last, x, v, triplets, flat_below, residual, least):
-    """Find the linear map through three of a place's samples that has the least median residual over all of them.
+def least_median(first, last, x, v, triplets, flat_below, residual, medians):
+    """Find the linear map through three of a position's samples with the least median residual over all of them.
 
     Parameters
     ----------
     first, last
-        Places to do.
+        Range of positions.
     x, v
-        (m, k, 2) where the samples lie, and (m, k, d) their values.
+        (m, k, 2) positions of the samples, and (m, k, d) their values.
     triplets
-        (s, 3) which three samples to try.
+        (s, 3) indices of three samples to try.
     flat_below
-        Triplets that span a triangle of less than half this area say nothing about slopes.
+        Triplets that span a triangle of less than half this area give no slopes.
     residual
         (m, k) out: of the best map; not finite where there is none.
-    least
+    medians
         (m,) out: its median, inf where there is none.
     """
     samples, dimensions = v.shape[1], v.shape[2]
     r, ordered = np.empty(samples), np.empty(samples)
     half = samples // 2
     for m in range(first, last):
-        least[m] = np.inf
+        medians[m] = np.inf
         for n in range(samples):
             residual[m, n] = np.inf
         for s in range(triplets.shape[0]):
@@ -196,13 +197,13 @@ def least_median(first, last, x, v, triplets, flat_below, residual, least):
                     there = v[m, i, q] + a * (v[m, j, q] - v[m, i, q]) + b * (v[m, k, q] - v[m, i, q])
                     total += (there - v[m, n, q]) ** 2
                 r[n] = np.sqrt(total)
-                value, place = r[n], n
-                while place > 0 and ordered[place - 1] > value:
-                    ordered[place] = ordered[place - 1]
-                    place -= 1
-                ordered[place] = value
+                value, slot = r[n], n
+                while slot > 0 and ordered[slot - 1] > value:
+                    ordered[slot] = ordered[slot - 1]
+                    slot -= 1
+                ordered[slot] = value
             middle = ordered[half] if samples % 2 == 1 else 0.5 * (ordered[half - 1] + ordered[half])
-            if middle < least[m]:
-                least[m] = middle
+            if middle < medians[m]:
+                medians[m] = middle
                 for n in range(samples):
                     residual[m, n] = r[n]

@@ -1,4 +1,4 @@
-"""Where to measure: the grid of points from a rectangle, a polygon, a mask image, or several of them together."""
+"""Region of interest: the grid of points from a rectangle, a polygon, a mask image, or several of them together."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from core.field.region.cuts import Cuts
 from core.settings import SUBSET_PX
 
 if TYPE_CHECKING:
-    from core.field.region.visibility import Sight
+    from core.field.region.visibility import Visibility
 
-_MOST_POINTS = 20_000_000
+_MAX_POINTS = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class PointGrid:
-    """Points on a regular grid of camera 1's reference image, and which of them may be measured.
+    """Points on a regular grid of camera 1's reference image, and those of them that may be measured.
 
     Attributes
     ----------
     x_px, y_px
         (r, c) columns and rows of the points.
     allowed
-        (r, c) True where a point's centre lies in the region and on the mask's white; the others come back as MASKED.
+        (r, c) True where a point's centre lies in the region and on the mask's white; the others get the status MASKED.
     step_px
         Distance of neighbouring points.
     extent_px
-        (x0, y0, x1, y1) of the region that was asked for.
+        (x0, y0, x1, y1) of the region given, px.
     cuts
-        Lines over which nothing reaches, cracks and borders of holes; or None.
+        Cracks and borders of holes, which no subset or neighbour crosses; or None.
     white
-        (rows, cols) of camera 1's image, True where the mask lets the surface be seen; None without a mask.
-    sight
-        What the points see of their subsets past cuts and mask, see :func:`core.field.region.find_visible.with_sight`;
-        None as long as it is not found, and where nothing is in the way.
+        (rows, cols) of camera 1's image, True where the mask is white; None without a mask.
+    visibility
+        Visible pixels of each point's subset, see :func:`core.field.region.find_visible.with_visibility`; None before
+        it is computed, and without cuts and mask.
     """
 
     x_px: Float
@@ -50,7 +50,7 @@ class PointGrid:
     extent_px: tuple[float, float, float, float]
     cuts: Cuts | None = None
     white: Bool | None = None
-    sight: Sight | None = None
+    visibility: Visibility | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -81,9 +81,9 @@ class PointGrid:
             )
         n_x = int(np.floor((x1_px - x0_px) / step_px + 1e-9)) + 1
         n_y = int(np.floor((y1_px - y0_px) / step_px + 1e-9)) + 1
-        if n_x * n_y > _MOST_POINTS:
+        if n_x * n_y > _MAX_POINTS:
             raise RegionError(
-                f"the region holds {n_x} x {n_y} points, more than {_MOST_POINTS:,}.",
+                f"the region holds {n_x} x {n_y} points, more than {_MAX_POINTS:,}.",
                 code="region_too_large",
                 remedy="Give a larger step or a smaller region.",
             )
@@ -131,7 +131,7 @@ class PointGrid:
         return replace(self, allowed=self.allowed & (inside | border))
 
     def with_cracks(self, lines_px: Iterable[ArrayLike]) -> PointGrid:
-        """Add cracks: polylines (n, 2) over which nothing reaches.
+        """Add cracks: polylines (n, 2) that no subset or neighbour crosses.
 
         Raises
         ------
@@ -141,7 +141,7 @@ class PointGrid:
         return self._with_cuts(Cuts(lines_px))
 
     def without_holes(self, polygons_px: Iterable[ArrayLike]) -> PointGrid:
-        """Take the points inside holes (polygons, (n, 2)) away, and let nothing reach over their borders.
+        """Remove the points inside holes (polygons, (n, 2)); their borders are cuts.
 
         Raises
         ------
@@ -158,13 +158,13 @@ class PointGrid:
 
     def _with_cuts(self, more: Cuts) -> PointGrid:
         lines = (*(self.cuts.lines_px if self.cuts else ()), *more.lines_px)
-        return replace(self, cuts=Cuts(lines) if lines else None, sight=None)
+        return replace(self, cuts=Cuts(lines) if lines else None, visibility=None)
 
     def within_mask(self, mask: ArrayLike) -> PointGrid:
         """Keep only the points whose centre lies on the white (non-zero) of a mask the size of camera 1's image.
 
-        Their subsets are cut to the white that the centre sees. Points off the mask's array are left
-        alone: they lie outside the image, and are refused as such.
+        Their subsets are cut to the white visible from the centre. Points off the mask's array are left unchanged: they
+        lie outside the image, and are rejected for that.
         """
         m = np.asarray(mask).astype(bool)
         if m.ndim != 2:
@@ -173,7 +173,7 @@ class PointGrid:
         off = (col < 0) | (row < 0) | (col >= m.shape[1]) | (row >= m.shape[0])
         white = m[np.clip(row, 0, m.shape[0] - 1), np.clip(col, 0, m.shape[1] - 1)]
         both = m if self.white is None or self.white.shape != m.shape else m & self.white
-        return replace(self, allowed=self.allowed & (white | off), white=both, sight=None)
+        return replace(self, allowed=self.allowed & (white | off), white=both, visibility=None)
 
 
 def check_region(
@@ -254,7 +254,7 @@ def check_region(
 
 
 def check_subset(subset_px: int) -> None:
-    """Refuse an even or tiny subset, ``subset_invalid``."""
+    """Raise ``subset_invalid`` for an even or tiny subset."""
     if not SUBSET_PX.holds(subset_px):
         raise RegionError(
             f"the subset is {subset_px} px wide; it must be {SUBSET_PX}.",

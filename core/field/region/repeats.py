@@ -1,7 +1,7 @@
 """Texture that repeats itself: a start on it may be wrong by a period.
 
-Growth from a right start follows such a texture, since neighbours tell which period is meant. A start of its own must
-not be put on it: neither search nor features tell its periods apart, though noise and sampling may pretend to.
+Growth from a right start follows such a texture, since neighbours determine the period. A seed must not lie on it:
+neither search nor features distinguish its periods, though noise and sampling may seem to.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from scipy.spatial import cKDTree
 from core.arrays import Bool, Float
 from core.robust import spread_indices
 
-_ALIKE = 0.85  # correlation of a square, twice a subset wide, with another place; random speckles reach half of it
-_OWN_PEAK = 0.5  # what hangs together with the square's own place above this is its own peak
-_LEAST_HALF_PX = 12
+_ALIKE = 0.85  # correlation of a square, twice a subset wide, with another one; random speckles reach half of it
+_OWN_PEAK = 0.5  # connected to the square's own position above this: its own peak
+_MIN_HALF_PX = 12
 _TRIED = 24
 
 
 def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
-    """Return (n,) where camera 1's texture repeats itself within two subsets.
+    """Return (n,) True where camera 1's texture repeats itself within two subsets.
 
     Parameters
     ----------
     pixels
         (rows, cols) image.
     xy_px
-        (n, 2) places; two dozen spread over them are looked at, each of the others follows the nearest of these.
+        (n, 2) positions; two dozen spread over them are examined, each of the others follows the nearest of these.
     subset_px
         Width of a subset.
     """
@@ -44,11 +44,11 @@ def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
 
 
 def _second_peak(pixels: NDArray[Any], xy_px: Float, subset_px: int) -> float:
-    """Highest correlation of the square about a place with another one; -1 where there is no room."""
+    """Highest correlation of the square about a position with another one; -1 too near to the image's border."""
     rows, cols = pixels.shape
     x, y = (round(float(v)) for v in xy_px)
-    half = min(max(subset_px, _LEAST_HALF_PX), x, y, cols - 1 - x, rows - 1 - y)
-    if half < _LEAST_HALF_PX:
+    half = min(max(subset_px, _MIN_HALF_PX), x, y, cols - 1 - x, rows - 1 - y)
+    if half < _MIN_HALF_PX:
         return -1.0
     reach = half + 2 * subset_px
     left, top = max(x - reach, 0), max(y - reach, 0)

@@ -1,4 +1,4 @@
-"""What varies slowly over a field, as a quadratic surface over the image."""
+"""Slow variation over a field, as a quadratic surface over the image."""
 
 from __future__ import annotations
 

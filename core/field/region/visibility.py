@@ -1,8 +1,8 @@
-"""What the points of a grid see: nothing reaches over a cut or over a mask's black.
+"""Visibility: the pixels of its subset, and the neighbours, that no cut and no black of a mask separates from a point.
 
-A pixel of a subset counts if the straight line from the point to it meets no cut and stays on the white. Pixels next
-to a cut do not count either: there the spline and the gradients of an image take in what lies beyond. Two points are
-neighbours only if they see each other.
+A pixel of a subset counts if the straight line from the point to it meets no cut and stays on the white. Pixels next to
+a cut do not count either: there the spline and the gradients of an image include pixels beyond it. Two points are
+neighbours only if no cut or black lies between them.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
-from core.field.region.line_crossings import part, variances
+from core.field.region.line_crossings import find_separated, variances
 from core.field.region.neighbours import REACH
 from core.matching.arguments import VisiblePixels
 from core.threads import run_ranges
 
-LEAST_SHARE = 0.25
-"""Of a subset's pixels; a point that sees fewer is not measured."""
+MIN_SHARE = 0.25
+"""Of a subset's pixels; a point with a smaller visible share is not measured."""
 AT_ONCE = 256
 CHUNK = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What each of the n points of a grid sees.
+class Visibility:
+    """Visibility of the n points of a grid.
 
     Attributes
     ----------
@@ -37,11 +37,11 @@ class Sight:
     pieces_px, white
         (m, 4) the cuts' straight pieces, and the mask, empty where there is none.
     visible
-        Pixels that count, of the points that do not see all of their subset.
+        Visible pixels of the points with a partly visible subset.
     share
-        (n,) share of the subset's pixels that count.
-    parted
-        (r, c) uint32, bits as :func:`core.field.region.line_crossings.parted_neighbours`.
+        (n,) share of the subset's pixels that are visible.
+    separated
+        (r, c) uint32, bits as :func:`core.field.region.line_crossings.separated_neighbours`.
     """
 
     xy_px: Float
@@ -51,7 +51,7 @@ class Sight:
     white: NDArray[np.uint8]
     visible: VisiblePixels
     share: Float
-    parted: NDArray[np.uint32]
+    separated: NDArray[np.uint32]
 
     @property
     def subset_px(self) -> int:
@@ -60,46 +60,51 @@ class Sight:
 
     @property
     def enough(self) -> Bool:
-        """(r, c) which points see enough of their subset to be measured."""
-        return np.asarray(self.share >= LEAST_SHARE).reshape(self.shape)
+        """(r, c) True where enough of a subset is visible to measure the point."""
+        return np.asarray(self.share >= MIN_SHARE).reshape(self.shape)
 
     @property
     def whole(self) -> Bool:
-        """(n,) which points see all of their subset."""
+        """(n,) True where all of a subset is visible."""
         return np.asarray(self.visible.of_point < 0)
 
     def at(self, xy_px: Float) -> VisiblePixels:
-        """Return what points (m, 2) of the grid see.
+        """Return the visible pixels of points (m, 2) of the grid.
 
         Raises
         ------
         ValueError
-            If a place is not one of the grid's points.
+            If a position is not one of the grid's points.
         """
         rows, cols = self.shape
         col, row = np.rint((xy_px - self.xy_px[0]) / self.step_px).astype(np.int64).T
         inside = (row >= 0) & (col >= 0) & (row < rows) & (col < cols)
         index = np.where(inside, row * cols + col, 0)
         if not inside.all() or np.abs(self.xy_px[index] - xy_px).max(initial=0.0) > 1e-6:
-            raise ValueError("a place that is not a point of the grid")
+            raise ValueError("a position that is not a point of the grid")
         return VisiblePixels(self.visible.patches, self.visible.of_point[index])
 
-    def apart(self, a_px: Float, b_px: Float) -> Bool:
-        """Return (n,) whether places a and b (n, 2) do not see each other."""
+    def are_separated(self, a_px: Float, b_px: Float) -> Bool:
+        """Return (n,) True where a cut or black lies between positions a and b (n, 2)."""
         out = np.zeros(len(a_px), bool)
         a, b = (np.ascontiguousarray(p, dtype=np.float64) for p in (a_px, b_px))
-        run_ranges(lambda first, last: part(first, last, a, b, self.pieces_px, self.white, out), len(out), 4 * AT_ONCE)
+        run_ranges(
+            lambda first, last: find_separated(first, last, a, b, self.pieces_px, self.white, out),
+            len(out),
+            4 * AT_ONCE,
+        )
         return out
 
-    def parted_at(self, dr: int, dc: int) -> Bool:
-        """Return (n,) whether the neighbour ``dr`` rows and ``dc`` columns away, up to two, is parted from a point."""
+    def separated_at(self, dr: int, dc: int) -> Bool:
+        """Return (n,) True where the neighbour ``dr`` rows and ``dc`` columns away, up to two, is separated from a
+        point."""
         wide = 2 * REACH + 1
-        place = (dr + REACH) * wide + dc + REACH
-        bit = place - (1 if place > wide * wide // 2 else 0)
-        return np.asarray((self.parted.ravel() >> np.uint32(bit)) & np.uint32(1), dtype=bool)
+        index = (dr + REACH) * wide + dc + REACH
+        bit = index - (1 if index > wide * wide // 2 else 0)
+        return np.asarray((self.separated.ravel() >> np.uint32(bit)) & np.uint32(1), dtype=bool)
 
     def correct_variance(self, variance: Float, image: Float32) -> Float:
-        """Return grey-level variances (n,) with those of cut subsets taken over the pixels that count alone."""
+        """Return grey-level variances (n,), those of cut subsets over the visible pixels alone."""
         index = np.flatnonzero(~self.whole)
         xy = np.ascontiguousarray(self.xy_px[index])
         own = np.empty(len(index))
@@ -107,8 +112,8 @@ class Sight:
         of = self.visible.of_point[index]
         for start in range(0, len(index), CHUNK):
             some = slice(start, start + CHUNK)
-            chosen, places, out = patches[of[some]], xy[some], own[some]
-            run_ranges(over(variances, image, places, chosen, out), len(out), AT_ONCE)
+            chosen, centres, out = patches[of[some]], xy[some], own[some]
+            run_ranges(over(variances, image, centres, chosen, out), len(out), AT_ONCE)
         result = variance.copy()
         result[index] = own
         return result

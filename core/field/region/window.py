@@ -1,6 +1,6 @@
-"""Square windows of points: which of them a window's middle can see, and the terms of a fit over it.
+"""Square windows of points: the points connected to a window's middle, and the terms of a fit over it.
 
-A window ends at cuts, holes and edges: points that can be reached from its middle only across one do not count.
+A window ends at cuts, holes and edges: points connected to its middle only across one do not count.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from core.field.region.cuts import Cuts, crosses
 
 @lru_cache(maxsize=8)
 def window_offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next towards the centre."""
+    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next towards the
+    centre."""
     side = np.arange(-half, half + 1)
     row, col = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
     ring = np.maximum(np.abs(row), np.abs(col))
@@ -23,7 +24,7 @@ def window_offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
     row, col, ring = row[order], col[order], ring[order]
     number = {(int(r), int(c)): k for k, (r, c) in enumerate(zip(row, col, strict=True))}
     share = np.maximum(ring - 1, 0) / np.maximum(ring, 1)
-    # truncated: of two cells as near the line, the one nearer to the axes
+    # truncated: of two cells equally near the line, the one nearer to the axes
     before_row = np.trunc(row * share + 0.5 * np.sign(row) - 1e-9 * np.sign(row)).astype(int)
     before_col = np.trunc(col * share + 0.5 * np.sign(col) - 1e-9 * np.sign(col)).astype(int)
     before = np.array([number[int(r), int(c)] for r, c in zip(before_row, before_col, strict=True)])
@@ -31,7 +32,7 @@ def window_offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_terms(offsets: np.ndarray, half: int, order: int) -> Float:
-    """(n, 3 or 6) terms of the fit, offsets as shares of the half width."""
+    """Return (n, 3 or 6) terms of the fit, offsets as shares of the half width."""
     y, x = (offsets / half).T
     terms = [np.ones_like(x), x, y]
     if order == 2:
@@ -40,7 +41,7 @@ def fit_terms(offsets: np.ndarray, half: int, order: int) -> Float:
 
 
 def ways_cut(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | None:
-    """(r, c, n) True where the way from a point to one of its window meets a cut; None where there is no cut."""
+    """Return (r, c, n) True where the way from a point to one of its window meets a cut; None without cuts."""
     if not cuts:
         return None
     offsets, _ = window_offsets(half)
@@ -60,9 +61,9 @@ def ways_cut(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | 
 
 
 def points_seen(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
-    """(m, n) which points of the windows can be reached from their centres over valid points alone.
+    """Return (m, n) True for the windows' points that are connected to their centres over valid points alone.
 
-    ``there`` is the padded grid, ``here`` (m,) the centres' flat places in it. The way goes from cell to cell. Over a
+    ``there`` is the padded grid, ``here`` (m,) the centres' flat indices in it. The way goes from cell to cell. Over a
     corner it goes where one of the two cells beside it is valid: an empty line of cells, however it slants, is not
     passed.
     """
@@ -80,7 +81,7 @@ def points_seen(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) 
 
 
 def steps_of(xy_px: Float) -> tuple[float, float]:
-    """Distances of neighbouring columns and rows in px; a single one has no window, and takes the other's."""
+    """Return the distances of neighbouring columns and rows in px; a single one takes the other's."""
     rows, cols = xy_px.shape[:2]
     x = float(xy_px[0, 1, 0] - xy_px[0, 0, 0]) if cols > 1 else 0.0
     y = float(xy_px[1, 0, 1] - xy_px[0, 0, 1]) if rows > 1 else 0.0

@@ -1,7 +1,7 @@
 """Search along the epipolar line: a start for one point where no feature match helps.
 
-For every depth at which camera 2 sees the point, and for a few tilts about the normal that both cameras see best,
-camera 1's subset is compared with camera 2's grey levels by zero-mean normalised correlation.
+For every depth at which the point lies in camera 2's image, and for a few tilts about the bisector of the viewing
+directions, camera 1's subset is compared with camera 2's grey levels by zero-mean normalised correlation.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from core.arrays import Float, Float32
 from core.cameras.stereo import StereoPair
 
 _TILTS_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
-_SAMPLES = 17  # per side: enough to tell matches apart, a quarter of the work of all pixels
+_SAMPLES = 17  # per side: enough to distinguish matches, a quarter of the work of all pixels
 DEPTH_SPAN = 8.0
 """Depths from an eighth of the nominal one to eight times it are searched."""
 _BLOCK = 512
 
 
 def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int], *, step_px: float = 1.0) -> Float:
-    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,) that camera 2 sees, ``step_px`` apart there."""
+    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,) inside camera 2's image, ``step_px`` from one
+    another there."""
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     if not np.isfinite(ray).all():
         return np.zeros(0)
@@ -56,7 +57,7 @@ def sweep(
     subset_px
         Width of the patch that is compared.
     candidates
-        How many distinct places come back.
+        Number of distinct depths returned.
 
     Returns
     -------
@@ -112,12 +113,12 @@ def sweep(
 
 
 def _distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Float, Float]:
-    """Best first, leaving out what lies within three steps of a better one."""
+    """Best first, without those within three steps of a better one."""
     order = np.argsort(-zncc)
-    place = np.searchsorted(depths, w[:, 0]) if depths[0] < depths[-1] else np.searchsorted(-depths, -w[:, 0])
+    rank = np.searchsorted(depths, w[:, 0]) if depths[0] < depths[-1] else np.searchsorted(-depths, -w[:, 0])
     taken: list[int] = []
     for i in order[: 40 * candidates]:
-        if zncc[i] > 0.0 and all(abs(int(place[i]) - int(place[j])) > 3 for j in taken):
+        if zncc[i] > 0.0 and all(abs(int(rank[i]) - int(rank[j])) > 3 for j in taken):
             taken.append(int(i))
             if len(taken) == candidates:
                 break
@@ -125,7 +126,7 @@ def _distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Fl
 
 
 def _tilted(pair: StereoPair, ray: Float, depths: Float) -> list[Float]:
-    """Start values (m, 3) for each tilt about the bisector of the two cameras' lines of sight."""
+    """Start values (m, 3) for each tilt about the bisector of the two cameras' viewing directions."""
     pose = pair.cam2_from_cam1
     centre2 = pose.inverse().translation_mm
     axis = np.cross(centre2, ray)  # normal of the epipolar plane: tilts that change the foreshortening
@@ -148,7 +149,7 @@ def _tilted(pair: StereoPair, ray: Float, depths: Float) -> list[Float]:
 
 
 def nominal_depth(pair: StereoPair) -> float:
-    """Depth in camera 1 where the two optical axes come closest, or ten baselines if they run apart."""
+    """Depth in camera 1 where the two optical axes come closest, or ten baselines if they diverge."""
     back = pair.cam2_from_cam1.inverse()
     c, a = back.translation_mm, back.rotation[:, 2]
     b = a[2]

@@ -1,4 +1,4 @@
-"""Robust local linear fits to scattered matches, many places at once."""
+"""Robust local linear fits to scattered matches, about many positions at once."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from core.threads import run_ranges
 _TRIPLETS = 48
 _FLAT = 1e-2
 _AT_ONCE = 256
-_WIDER = 4  # times the neighbours are looked through for those that a place sees
+_WIDER = 4  # times the number of neighbours is searched for those not separated from a position
 _ENOUGH = 0.7  # of the neighbours wanted
 
-Apart = Callable[[Float, Float], Bool]
+AreSeparated = Callable[[Float, Float], Bool]
 
 
 class LocalFits(NamedTuple):
-    """Linear maps about M places.
+    """Linear maps about M positions.
 
     Attributes
     ----------
     value
-        (M, d) the map at the place itself.
+        (M, d) the map at the position itself.
     slope
         (M, d, 2) its derivatives over x and y.
     spread
         (M,) median residual of the neighbours used, in units of the values; inf where no fit was possible.
     inliers
-        (M,) how many neighbours agreed.
+        (M,) number of neighbours that agree.
     distance
-        (M,) how far the neighbours reach.
+        (M,) distance of the farthest neighbour, px.
     """
 
     value: Float
@@ -46,48 +46,49 @@ class LocalFits(NamedTuple):
 
 
 def robust_local_fits(
-    places: Float,
+    centres: Float,
     points: Float,
     values: Float,
     *,
     neighbours: int = 14,
     tolerance: float,
     seed: int = 0,
-    apart: Apart | None = None,
+    are_separated: AreSeparated | None = None,
 ) -> LocalFits:
-    """Fit value = a + B (x - place) to the nearest points by least median of squares, then least squares on inliers.
+    """Fit value = a + B (x - centre) to the nearest points by least median of squares, then least squares on inliers.
 
     Parameters
     ----------
-    places
-        (M, 2) where the fits are wanted.
+    centres
+        (M, 2) positions of the fits.
     points, values
         (N, 2) and (N, d) scattered samples, some of them wrong.
     neighbours
-        How many nearest points take part.
+        Number of nearest points that take part.
     tolerance
         Residual up to which a neighbour counts as an inlier, in the values' unit.
     seed
         Of the random triplets: equal input gives equal output.
-    apart
-        Tells of places (n, 2) and (n, 2) which do not see each other; only samples that a place sees take part.
+    are_separated
+        Function of positions (n, 2) and (n, 2) that returns (n,) True where a cut lies between; samples across one do
+        not take part.
     """
-    m, d = len(places), values.shape[1]
+    m, d = len(centres), values.shape[1]
     k = min(neighbours, len(points))
     empty = LocalFits(np.full((m, d), np.nan), np.full((m, d, 2), np.nan), np.full(m, np.inf), np.zeros(m), np.zeros(m))
     if k < 4 or m == 0:
         return empty
-    wide = k if apart is None else min(_WIDER * k, len(points))
-    found, index = cKDTree(points).query(places, k=wide)
+    wide = k if are_separated is None else min(_WIDER * k, len(points))
+    found, index = cKDTree(points).query(centres, k=wide)
     distance, seen = np.asarray(found), np.ones(m, bool)
-    if apart is not None:
-        over = apart(np.repeat(places, wide, axis=0), points[index.ravel()]).reshape(m, wide)
+    if are_separated is not None:
+        over = are_separated(np.repeat(centres, wide, axis=0), points[index.ravel()]).reshape(m, wide)
         nearest = np.argsort(over, axis=1, kind="stable")[:, :k]
         distance, index, over = (np.take_along_axis(a, nearest, axis=1) for a in (distance, index, over))
         seen = (~over).sum(axis=1) >= _ENOUGH * k
-        # in the place of those that are missing the nearest one again, which says nothing new
+        # the missing ones are replaced by the nearest one, which adds no information
         distance, index = np.where(over, distance[:, :1], distance), np.where(over, index[:, :1], index)
-    x = points[index] - places[:, None, :]  # (M, K, 2)
+    x = points[index] - centres[:, None, :]  # (M, K, 2)
     v = values[index]
     scale = np.maximum(distance.max(axis=1), 1e-12)
     A = np.concatenate([np.ones((m, k, 1)), x / scale[:, None, None]], axis=2)
@@ -111,7 +112,7 @@ def robust_local_fits(
 
 
 def consistent(points: Float, values: Float, *, tolerance: float, neighbours: int = 14) -> np.ndarray:
-    """Return (N,) bool: which samples agree with the robust fit of their own neighbourhood."""
+    """Return (N,) True for the samples that agree with the robust fit of their own neighbourhood."""
     if len(points) < 8:
         return np.zeros(len(points), bool)
     fits = robust_local_fits(points, points, values, neighbours=neighbours, tolerance=tolerance)

@@ -1,8 +1,8 @@
-"""Better starts for a step of a sequence: what a sample of points did since the last step, the others did too.
+"""Better starts for a step of a sequence, predicted from a sample of points.
 
-A sample spread over the field is fitted from the last step's values. How its unknowns changed is fitted by a smooth
-surface over the image, and all other points start from their last values plus that. They then need half the iterations;
-where the motion is not smooth they start no worse than a step's own motion away, and find their way as before.
+A sample spread over the field is fitted from the previous step's values. The changes of its unknowns are fitted by a
+smooth surface over the image, and all other points start from their previous values plus that. They then need half the
+iterations; where the motion is not smooth, their starts are no worse than without the prediction.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
 _QUADRATIC_FROM, _LINEAR_FROM = 36, 12
 _ROUNDS = 4
-_WORTH = 0.5  # of the sample's own motion may be left unexplained
+_WORTH = 0.5  # share of the sample's own motion that may be left unexplained
 
 
 def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], w_now: Float, G_now: Float) -> Float:
-    """Return start values of G (n, 3, k): the last step's, moved on as the sample moved.
+    """Return start values of G (n, 3, k): the previous step's, moved as the sample moved.
 
     Parameters
     ----------
@@ -31,11 +31,11 @@ def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], 
     xy_px
         (n, 2) all points.
     G
-        (n, 3, k) at the last step, NaN where it is not known.
+        (n, 3, k) at the previous step, NaN where it is not known.
     sample
-        (m,) which points were fitted.
+        (m,) indices of the points that were fitted.
     w_now, G_now
-        (m, 3 or more), (m, 3, k) what they were found to be.
+        (m, 3 or more), (m, 3, k) their fitted unknowns.
     """
     if len(sample) < _LINEAR_FROM:
         return G
@@ -57,7 +57,7 @@ def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], 
 
 
 def _images(pair: StereoPair, w: Float, G: Float) -> Float:
-    """Where both cameras see the points at t, (2, m, 2) px."""
+    """Current image coordinates of the points in both cameras, (2, m, 2) px."""
     here = position_now(w, G)
     there = pair.cam2_from_cam1.apply(here)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -13,15 +13,15 @@ from core.cameras.stereo import StereoPair
 from core.errors import ImageError
 from core.field.points.features import Box, Features, match
 from core.field.points.starts import Starts, depth_per_px
-from core.field.seeding.local_fit import Apart, consistent, robust_local_fits
+from core.field.seeding.local_fit import AreSeparated, consistent, robust_local_fits
 from core.field.seeding.stretched import stretched_features, stretches
 
 EPIPOLAR_PX = 1.5
 """Distance from the epipolar line up to which a feature match can be right, on images of up to half their size."""
 _DEPTH_TOLERANCE_PX = 1.5
 _MOTION_TOLERANCE_PX = 2.0
-_FEWEST = 12
-_SWAP_FEWEST = 25
+_MIN_MATCHES = 12
+_MIN_SWAP_MATCHES = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class ScatteredShape:
     w0
         (n,) inverse depth, 1/mm.
     scale
-        How many times smaller the images were when the features were found.
+        Factor by which the images were reduced when the features were found.
     """
 
     xy_px: Float
@@ -50,7 +50,7 @@ class ScatteredShape:
 
 @dataclass(frozen=True, eq=False)
 class ScatteredMotion:
-    """Matches between camera 1 at t0 and camera 1 at t that agree with their neighbours; (n, 2) px each."""
+    """Matches between camera 1's reference and current images that agree with their neighbours; (n, 2) px each."""
 
     xy_px: Float
     xy_now_px: Float
@@ -58,7 +58,7 @@ class ScatteredMotion:
 
 
 def scattered_shape(pair: StereoPair, features1: Features, features2: Features) -> ScatteredShape:
-    """Match camera 1 with camera 2 and keep what the geometry and the neighbourhood allow.
+    """Match camera 1 with camera 2 and keep the matches that agree with the geometry and their neighbours.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def scattered_shape(pair: StereoPair, features1: Features, features2: Features) 
     with np.errstate(invalid="ignore"):
         front = points.valid & (depth > 0.0) & (depth2 > 0.0)
     xy1, w0 = xy1[front], 1.0 / depth[front]
-    if len(xy1) < _FEWEST:
+    if len(xy1) < _MIN_MATCHES:
         return ScatteredShape(xy1[:0], w0[:0])
     tolerance = _depth_tolerance(pair, xy1, w0, scale)
     right = consistent(xy1, w0[:, None], tolerance=2.0 * tolerance)
@@ -88,10 +88,10 @@ def scattered_shape(pair: StereoPair, features1: Features, features2: Features) 
 
 
 def scattered_motion(features_ref: Features, features_now: Features) -> ScatteredMotion:
-    """Match one camera's image at t0 with its image at t and keep what agrees with its neighbourhood."""
+    """Match one camera's reference and current images and keep the matches that agree with their neighbours."""
     pairs = match(features_ref, features_now)
     xy, now = features_ref.xy_px[pairs[:, 0]], features_now.xy_px[pairs[:, 1]]
-    if len(xy) < _FEWEST:
+    if len(xy) < _MIN_MATCHES:
         return ScatteredMotion(xy[:0], now[:0])
     scale = max(features_ref.scale, features_now.scale)
     right = consistent(xy, now, tolerance=2.0 * _MOTION_TOLERANCE_PX * _looser(scale))
@@ -99,7 +99,8 @@ def scattered_motion(features_ref: Features, features_now: Features) -> Scattere
 
 
 def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scale: int) -> ScatteredMotion:
-    """Match stretched copies of camera 1's image at t0 with its image at t; the copy with the most matches counts."""
+    """Match stretched copies of camera 1's reference image with its current image; the copy with most matches
+    counts."""
     tries = [
         scattered_motion(stretched_features(image, box, stretch, scale=scale), features_now) for stretch in stretches()
     ]
@@ -107,7 +108,7 @@ def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scal
 
 
 def _looser(scale: int) -> float:
-    """By how much more features scatter that were found on a ``scale`` times smaller image."""
+    """Factor of the standard deviation of features found on a ``scale`` times smaller image."""
     return max(1.0, scale / 2.0)
 
 
@@ -116,16 +117,18 @@ def _depth_tolerance(pair: StereoPair, xy1: Float, w0: Float, scale: int) -> flo
     return _DEPTH_TOLERANCE_PX * _looser(scale) * per_px
 
 
-def shape_starts(pair: StereoPair, shape: ScatteredShape, xy_px: Float, apart: Apart | None = None) -> Starts:
-    """Return ``w`` (n, 3) at places ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree.
+def shape_starts(
+    pair: StereoPair, shape: ScatteredShape, xy_px: Float, are_separated: AreSeparated | None = None
+) -> Starts:
+    """Return ``w`` (n, 3) at positions ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree.
 
-    ``apart`` says which places do not see each other, see :func:`core.field.seeding.local_fit.robust_local_fits`.
+    ``are_separated``: see :func:`core.field.seeding.local_fit.robust_local_fits`.
     """
     w = np.full((len(xy_px), 3), np.nan)
     if len(shape.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w)
     tolerance = _depth_tolerance(pair, shape.xy_px, shape.w0, shape.scale)
-    fits = robust_local_fits(xy_px, shape.xy_px, shape.w0[:, None], tolerance=tolerance, apart=apart)
+    fits = robust_local_fits(xy_px, shape.xy_px, shape.w0[:, None], tolerance=tolerance, are_separated=are_separated)
     centre = pair.cam1.rays_cam(xy_px).xyz_mm
     per_norm = pair.cam1.lens.image_jacobian(centre[:, :2])
     w[:, 0] = fits.value[:, 0]
@@ -139,17 +142,18 @@ def motion_starts(
     motion: ScatteredMotion,
     shape_now: ScatteredShape,
     xy_px: Float,
-    apart: Apart | None = None,
+    are_separated: AreSeparated | None = None,
 ) -> Starts:
-    """Return start values at places ``xy_px`` with known shape ``w`` (n, 3), from the matches in time and at t.
+    """Return start values at positions ``xy_px`` with known shape ``w`` (n, 3), from matches in time and between
+    cameras.
 
-    ``apart`` as in :func:`shape_starts`, at t0.
+    ``are_separated`` as in :func:`shape_starts`, in the reference image.
     """
     G = np.full((len(xy_px), 3, 3), np.nan)
     if len(motion.xy_px) < 4 or len(shape_now.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w, G)
     tolerance = _MOTION_TOLERANCE_PX * _looser(motion.scale)
-    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=tolerance, apart=apart)
+    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=tolerance, are_separated=are_separated)
     known = np.isfinite(fits.value).all(axis=1)
     if known.any():
         w_now = shape_starts(pair, shape_now, fits.value[known]).w
@@ -158,20 +162,20 @@ def motion_starts(
 
 
 def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_px: Float, w_now: Float) -> Float:
-    """Return ``G`` (n, 3, 3) from shape at t0, where camera 1 sees the patch at t, and the shape there.
+    """Return ``G`` (n, 3, 3) from the reference shape, the patch's current position in camera 1, and the shape there.
 
     Parameters
     ----------
     pair
         The calibrated cameras.
     w
-        (n, 3) shape at t0.
+        (n, 3) reference shape.
     xy_px, xy_now_px
-        (n, 2) the point in camera 1 at t0 and at t.
+        (n, 2) the point in camera 1's reference and current images.
     affine_px
-        (n, 2, 2) derivative of camera 1's image at t over its image at t0.
+        (n, 2, 2) derivative of camera 1's current image over its reference image.
     w_now
-        (n, 3) shape at t about ``xy_now_px``.
+        (n, 3) current shape about ``xy_now_px``.
     """
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
     now = pair.cam1.rays_cam(xy_now_px).xyz_mm
@@ -180,7 +184,7 @@ def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_p
     usable = np.isfinite(J_now).all(axis=(1, 2)) & np.isfinite(affine_px).all(axis=(1, 2))
     A = np.full_like(J, np.nan)
     A[usable] = np.linalg.solve(J_now[usable], affine_px[usable] @ J[usable])
-    # the point at t is (now + A X, 1) / w_now(A X); G (1, X, Y) is w(X, Y) times it, to first order
+    # the current point is (now + A X, 1) / w_now(A X); G (1, X, Y) is w(X, Y) times it, to first order
     G = np.empty((len(w), 3, 3))
     G[:, :, 0] = (w[:, :1] / w_now[:, :1]) * now
     for j in range(2):
@@ -193,7 +197,7 @@ def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_p
 def refuse_swapped(pair: StereoPair, xy1: Float, xy2: Float, near: Bool, *, limit_px: float = EPIPOLAR_PX) -> None:
     """Raise ``cameras_swapped`` if matches (n, 2) fit the cameras clearly better with exchanged roles."""
     n = len(xy1)
-    if n < _SWAP_FEWEST or near.mean() > 0.6:
+    if n < _MIN_SWAP_MATCHES or near.mean() > 0.6:
         return
     swapped = _on_line(pair, xy2, xy1, limit_px)
     if swapped.mean() > 0.7 and swapped.sum() > 1.5 * near.sum():

@@ -1,4 +1,4 @@
-"""Where to look for features, and at what size: what camera 2 can see of a region, and how far images may shrink."""
+"""Boxes of the images in which features are searched for, and the scales at which the images are reduced."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from core.field.points.features import Box
 from core.field.seeding.epipolar_search import DEPTH_SPAN, nominal_depth
 
 _COMFORTABLE_PIXELS = 800_000  # of an image: a few thousand keypoints on a fine texture, in a quarter of a second
-_FEWEST_PIXELS = 100_000  # of the region: some hundred keypoints
-_MOST_PIXELS = 8_000_000  # of an image, first
+_MIN_PIXELS = 100_000  # of the region: some hundred keypoints
+_MAX_PIXELS = 8_000_000  # of an image, first
 _ALONG_A_SIDE = 9
 _DEPTHS = 400
 _MARGIN_PX = 32
@@ -26,7 +26,7 @@ def box_around(xy_px: Float, reach_px: float, shape: tuple[int, int]) -> Box:
 
 
 def seen_by_camera2(pair: StereoPair, box: Box, shape2: tuple[int, int]) -> Box:
-    """Return where camera 2, of (rows, cols), can see what lies in camera 1's box, at any depth that is searched."""
+    """Return the box of camera 2's image (rows, cols) that can show camera 1's box, at any depth that is searched."""
     rows, cols = shape2
     whole = (0, 0, cols, rows)
     x0, y0, x1, y1 = box
@@ -46,19 +46,19 @@ def seen_by_camera2(pair: StereoPair, box: Box, shape2: tuple[int, int]) -> Box:
 
 
 def scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int]]) -> list[int]:
-    """Return by how much to reduce the images, to be tried one after the other; the last is 1.
+    """Return the factors by which the images are reduced, to be tried one after the other; the last is 1.
 
     Parameters
     ----------
     boxes
-        Where features are looked for in camera 1's and camera 2's reference.
+        Boxes in which features are searched for, of camera 1's and camera 2's reference images.
     shapes
         Rows and columns of both cameras' images.
     """
     area = [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in boxes]
     comfortable = int(np.ceil(np.sqrt(sum(area) / 2.0 / _COMFORTABLE_PIXELS)))
-    first = min(comfortable, int(np.sqrt(area[0] / _FEWEST_PIXELS)))
-    first = max(first, 1, int(np.ceil(np.sqrt(max(r * c for r, c in shapes) / _MOST_PIXELS))))
+    first = min(comfortable, int(np.sqrt(area[0] / _MIN_PIXELS)))
+    first = max(first, 1, int(np.ceil(np.sqrt(max(r * c for r, c in shapes) / _MAX_PIXELS))))
     out = [first]
     while out[-1] > 1:
         out.append(out[-1] // 2)

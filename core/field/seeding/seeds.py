@@ -16,7 +16,7 @@ from core.cameras.stereo import StereoPair
 from core.errors import RegionError
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import Starts, depth_per_px
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.field.seeding.epipolar_search import sweep
 from core.field.seeding.scattered_matches import ScatteredMotion, ScatteredShape, combine, motion_starts, shape_starts
 from core.matching.fit import no_motion
@@ -25,7 +25,7 @@ from core.status import PointStatus
 
 _FAR_PX = 4.0
 _POINTS_PER_SEED = 60
-_FEWEST_SEEDS, _MOST_SEEDS = 24, 240
+_MIN_SEEDS, _MAX_SEEDS = 24, 240
 _ROUNDS = 3
 _SWEEPS = 16
 _AMBIGUOUS = 0.9
@@ -33,7 +33,7 @@ _AMBIGUOUS = 0.9
 
 @dataclass(frozen=True)
 class Seed:
-    """A place that the user names.
+    """A seed point that the user gives.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Seed:
     xy2_px
         The same point in camera 2's reference image, where known.
     xy_now_px, xy2_now_px
-        The same point in camera 1's and camera 2's image at t, where known (both or neither).
+        The same point in camera 1's and camera 2's current image, where known (both or neither).
     """
 
     xy_px: tuple[float, float]
@@ -75,7 +75,7 @@ def as_seeds(seeds: Sequence[Seed | Sequence[float]] | NDArray[Any]) -> tuple[Se
 
 
 def nearest_points(
-    seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_px: float, sight: Sight | None = None
+    seeds: Sequence[Seed], xy_px: Float, usable: Bool, *, reach_px: float, visibility: Visibility | None = None
 ) -> NDArray[np.intp]:
     """Return the index of the measurable point nearest to each seed, on the seed's own side of cuts.
 
@@ -88,9 +88,9 @@ def nearest_points(
     out = []
     for seed in seeds:
         distance = np.linalg.norm(xy_px[candidates] - np.asarray(seed.xy_px), axis=1)
-        if sight is not None:
-            place = np.broadcast_to(np.asarray(seed.xy_px, dtype=np.float64), (len(candidates), 2))
-            distance[sight.apart(place, xy_px[candidates])] = np.inf
+        if visibility is not None:
+            position = np.broadcast_to(np.asarray(seed.xy_px, dtype=np.float64), (len(candidates), 2))
+            distance[visibility.are_separated(position, xy_px[candidates])] = np.inf
         best = int(np.argmin(distance))
         if distance[best] > reach_px:
             far = f"{distance[best]:.0f} px" if np.isfinite(distance[best]) else "across a crack or a mask's black"
@@ -105,14 +105,14 @@ def nearest_points(
 
 
 def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.intp]]:
-    """Choose places for seeds all over the region.
+    """Choose seed points all over the region.
 
     Parameters
     ----------
     xy_px, usable
         (n, 2), (n,) the field's points.
     support_px
-        (n,) how far the feature matches about a point reach; small is good.
+        (n,) px, distance of the feature matches about a point; small is good.
 
     Returns
     -------
@@ -120,12 +120,12 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
         First, second and third choice of every cell of the region.
     """
     index = np.flatnonzero(usable)
-    count = float(np.clip(len(index) / _POINTS_PER_SEED, _FEWEST_SEEDS, _MOST_SEEDS))
+    count = float(np.clip(len(index) / _POINTS_PER_SEED, _MIN_SEEDS, _MAX_SEEDS))
     span = np.maximum(np.ptp(xy_px[index], axis=0), 1.0)
-    # cells by area of usable points, so that thin or holed regions get their share
+    # cells by area of usable points, so that thin regions and regions with holes get their share
     cell = np.sqrt(np.prod(span) / count * max(len(index), 1) / max(len(usable), 1))
-    place = np.floor((xy_px[index] - xy_px[index].min(axis=0)) / max(cell, 1.0)).astype(np.int64)
-    key = place[:, 0] * 1_000_003 + place[:, 1]
+    position = np.floor((xy_px[index] - xy_px[index].min(axis=0)) / max(cell, 1.0)).astype(np.int64)
+    key = position[:, 0] * 1_000_003 + position[:, 1]
     order = np.lexsort((support_px[index], key))
     sorted_key = key[order]
     first = np.searchsorted(sorted_key, sorted_key, side="left")
@@ -140,10 +140,10 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
 
 
 def refine(fitter: Fitter, xy_px: Float, starts: Starts, *, far_px: float = _FAR_PX) -> PointFits:
-    """Refine seeds; those that run away from their start are refused."""
+    """Refine seeds; those that end far from their start are rejected."""
     fits = fitter.fit(xy_px, starts.w, starts.G)
     away = fits.ok & fitter.far_from_start(xy_px, fits, starts.w, starts.G, far_px)
-    fits.refuse(away, PointStatus.NOT_CONVERGED)
+    fits.reject(away, PointStatus.NOT_CONVERGED)
     return fits
 
 
@@ -157,7 +157,7 @@ def seeds_from_matches(
     shape_now: ScatteredShape | None,
     known_w: Float | None,
 ) -> int:
-    """Put refined seeds into ``points``, spread over the region; returns how many stand.
+    """Put refined seeds into ``points``, spread over the region; return the number of valid ones.
 
     ``known_w`` (n, 3 or 6) is the shape where it was measured before (NaN elsewhere).
     """
@@ -167,8 +167,8 @@ def seeds_from_matches(
     if len(source) < 4:
         return 0
     support = np.asarray(cKDTree(source).query(xy_px, k=min(8, len(source)))[0])[:, -1]
-    if fitter.sight is not None:  # next to a cut only where there is nothing else
-        support = np.where(fitter.sight.whole, support, support + np.ptp(xy_px))
+    if fitter.visibility is not None:  # next to a cut only where there is nothing else
+        support = np.where(fitter.visibility.whole, support, support + np.ptp(xy_px))
     found = 0
     for choice in spread(xy_px, usable & (points.status == PointStatus.NOT_SEEDED), support):
         index = choice
@@ -181,7 +181,7 @@ def seeds_from_matches(
             motion,
             shape_now,
             None if known_w is None else known_w[index],
-            fitter.sight,
+            fitter.visibility,
         )
         finite = np.isfinite(starts.w).all(axis=1)
         if starts.G is not None:
@@ -205,46 +205,47 @@ def starts_at(
     motion: ScatteredMotion | None,
     shape_now: ScatteredShape | None,
     known_w: Float | None,
-    sight: Sight | None = None,
+    visibility: Visibility | None = None,
 ) -> Starts:
-    """Return start values at places from the matches that they see, taking the measured shape where there is one."""
-    apart = None if sight is None else sight.apart
-    w = shape_starts(pair, shape, xy_px, apart).w
+    """Return start values at positions from the matches not separated from them, with the measured shape where
+    known."""
+    are_separated = None if visibility is None else visibility.are_separated
+    w = shape_starts(pair, shape, xy_px, are_separated).w
     if known_w is not None:
         measured = np.isfinite(known_w).all(axis=1)
         w[measured] = known_w[measured, :3]
     if motion is None or shape_now is None:
         return Starts(w)
-    return motion_starts(pair, w, motion, shape_now, xy_px, apart)
+    return motion_starts(pair, w, motion, shape_now, xy_px, are_separated)
 
 
 def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_px: Float) -> PointFits:
     """Find one point's shape by search along the epipolar line; the best of several candidates after refinement.
 
-    A second candidate that correlates nearly as well means that the texture repeats: then nothing is taken.
+    A second candidate that correlates nearly as well means that the texture repeats: then none is taken.
     """
     shape = fitter.shape_only()
     w, _ = sweep(fitter.pair, image1, image2, xy_px, subset_px=max(fitter.options.subset_px, 25))
     if len(w) == 0:
         return PointFits.empty(1, 1)
-    places = np.broadcast_to(xy_px, (len(w), 2))
-    fits = shape.fit(places, w, None)
+    positions = np.broadcast_to(xy_px, (len(w), 2))
+    fits = shape.fit(positions, w, None)
     quality = fits.quality
     best = int(np.argmax(quality))
     if quality[best] <= 0.0:
         return PointFits.empty(1, 1)
-    ray = fitter.pair.cam1.rays_cam(places).xyz_mm
-    apart = (
+    ray = fitter.pair.cam1.rays_cam(positions).xyz_mm
+    distinct = (
         np.abs(fits.w[:, 0] - fits.w[best, 0]) / depth_per_px(fitter.pair, ray, np.full(len(w), fits.w[best, 0])) > 2.0
     )
-    # residual energy 1 - zncc tells candidates apart better than zncc itself
-    if np.any(apart & (1.0 - quality < (1.0 - quality[best]) / _AMBIGUOUS + 0.01)):
+    # residual energy 1 - zncc distinguishes candidates better than zncc itself
+    if np.any(distinct & (1.0 - quality < (1.0 - quality[best]) / _AMBIGUOUS + 0.01)):
         return PointFits.empty(1, 1)
     return fits.take(np.array([best]))
 
 
 def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: int, candidates: int = 3) -> Float:
-    """Find where camera 1 sees a patch at t, by normalised cross-correlation over the whole image; (m, 2) px."""
+    """Find a patch in camera 1's current image, by normalised cross-correlation over the whole image; (m, 2) px."""
     half = subset_px  # twice the subset: one that moved without turning much
     rows, cols = ref1.shape
     x, y = round(float(xy_px[0])), round(float(xy_px[1]))
@@ -264,11 +265,12 @@ def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: i
 
 
 def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
-    """Find one point's motion from its shape ``w`` (3,): where it stood, then by template and depth search."""
+    """Find one point's motion from its shape ``w`` (3,): at its reference position, then by template and depth
+    search."""
     if fitter.cur1 is None or fitter.cur2 is None:
-        raise ValueError("search_motion needs images at t")
-    place = xy_px[None]
-    still = fitter.fit(place, w[None], no_motion(fitter.pair, place))
+        raise ValueError("search_motion needs current images")
+    position = xy_px[None]
+    still = fitter.fit(position, w[None], no_motion(fitter.pair, position))
     tries = [still]
     for now in template_now(fitter.ref1, fitter.cur1, xy_px, subset_px=fitter.options.subset_px):
         w_now, _ = sweep(
@@ -279,19 +281,19 @@ def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
             G = combine(
                 fitter.pair,
                 np.tile(w, (m, 1)),
-                np.tile(place, (m, 1)),
+                np.tile(position, (m, 1)),
                 np.tile(now, (m, 1)),
                 np.tile(np.eye(2), (m, 1, 1)),
                 w_now,
             )
-            tries.append(fitter.fit(np.tile(place, (m, 1)), np.tile(w, (m, 1)), G))
+            tries.append(fitter.fit(np.tile(position, (m, 1)), np.tile(w, (m, 1)), G))
     best = max(((float(t.quality.max()), i) for i, t in enumerate(tries)), key=lambda item: item[0])[1]
     chosen = tries[best]
     return chosen.take(np.array([int(np.argmax(chosen.quality))]))
 
 
-def swept_places(xy_px: Float, usable: Bool) -> NDArray[np.intp]:
-    """Choose up to 16 places for the depth search, the region's middle first."""
+def swept_positions(xy_px: Float, usable: Bool) -> NDArray[np.intp]:
+    """Choose up to 16 points for the depth search, the region's middle first."""
     index = np.flatnonzero(usable)
     if len(index) <= _SWEEPS:
         return index

@@ -1,7 +1,8 @@
-"""Keypoints of an image as if it were stretched: for matches over strains and tilts that SIFT does not bridge.
+"""Keypoints of stretched copies of an image, for matches over strains and tilts too large for SIFT.
 
 SIFT finds a point again at any scale and angle, but not under a stretch of one direction by more than a third or so. A
-few stretched copies of the reference (after Morel and Yu 2009, ASIFT) bring one of them near enough.
+few stretched copies of the reference (after Morel and Yu 2009, ASIFT, doi:10.1137/080732730) bring one of them near
+enough.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 from core.arrays import Float
 from core.field.points.features import Box, Features, detect, reduced, with_rim
 
-_RATIO = 1.75  # of the axes: what is off by half of it or twice it is still matched
+_RATIO = 1.75  # of the axes: half of it or twice it is still matched
 _DIRECTIONS = 4
 
 
 def stretches() -> list[Float]:
-    """Stretches (2, 2) in four directions, each keeping areas."""
+    """Return stretches (2, 2) in four directions, each keeping areas."""
     long = np.sqrt(_RATIO)
     out = []
     for k in range(_DIRECTIONS):
@@ -31,7 +32,7 @@ def stretches() -> list[Float]:
 
 
 def stretched_features(image: NDArray[Any], box: Box, stretch: Float, *, scale: int = 1) -> Features:
-    """Return the keypoints (at their places in ``image``) that its stretched copy has in ``box``.
+    """Return the keypoints (at their positions in ``image``) that its stretched copy has in ``box``.
 
     Parameters
     ----------

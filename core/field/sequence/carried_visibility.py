@@ -1,8 +1,8 @@
-"""What a leg's points see of their subsets: what they saw at the first reference, carried along with the surface.
+"""Visibility at a later reference: that of the first reference, carried along with the surface.
 
-A crack opens and turns, and its lips part: lines drawn at the first reference say nothing of where they are later. So
-each pixel of a leg's subset is taken back to the first reference through the point's own motion, and counts if the
-point sees it there.
+A crack opens and turns, and its lips separate: lines drawn at the first reference do not show where they are later. So
+each pixel of a segment's subset is taken back to the first reference through the point's own motion, and is visible if
+it is visible there.
 """
 
 from __future__ import annotations
@@ -16,57 +16,57 @@ from scipy.spatial import cKDTree
 from core.arrays import Bool, Float
 from core.field.region.find_visible import MARGIN_PX, patches_seen
 from core.field.region.region import PointGrid
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.matching.arguments import VisiblePixels
 
-_WIDEST = 4  # times a subset: what a leg's subset may cover of the first reference
+_MAX_WIDTH_RATIO = 4  # times a subset: width that a segment's subset may cover in the first reference
 _AT_ONCE = 512
 
 
 @dataclass(frozen=True, eq=False)
-class LegSight(Sight):
-    """What each of the n points sees of its subset in a later image.
+class SegmentVisibility(Visibility):
+    """Visibility of n points in a later image.
 
     Attributes
     ----------
     first
         The same at the first reference.
-    place_px, back
-        (m, 2), (m, 2, 2) of the points that the leg has: where they are in the later image, and the derivative of the
-        first reference's image over the later one.
+    position_px, back
+        (m, 2), (m, 2, 2) of the points that the segment has: positions in the later image, px, and the derivative of
+        the first reference's image over the later one.
     first_px
-        (m, 2) where they were at the first reference.
+        (m, 2) their positions at the first reference, px.
     """
 
-    first: Sight
-    place_px: Float
+    first: Visibility
+    position_px: Float
     back: Float
     first_px: Float
 
     def at(self, xy_px: Float) -> VisiblePixels:
-        """Return what points (m, 2) see, by the pixels that their subsets are centred on.
+        """Return the visible pixels of points (m, 2), given by the pixels that their subsets are centred on.
 
         Raises
         ------
         ValueError
-            If a place is not one of the leg's pixels.
+            If a position is not one of the segment's pixels.
         """
         keys = _keys(self.xy_px)
         order = np.argsort(keys, kind="stable")
         wanted = _keys(xy_px)
         index = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
         if (keys[index] != wanted).any():
-            raise ValueError("a place that is not a pixel of the leg")
+            raise ValueError("a position that is not a pixel of the segment")
         return VisiblePixels(self.visible.patches, self.visible.of_point[index])
 
-    def apart(self, a_px: Float, b_px: Float) -> Bool:
-        """Return (n,) whether places a and b (n, 2) of the later image do not see each other."""
-        return self.first.apart(self._at_first(a_px), self._at_first(b_px))
+    def are_separated(self, a_px: Float, b_px: Float) -> Bool:
+        """Return (n,) True where a cut or black lies between positions a and b (n, 2) of the later image."""
+        return self.first.are_separated(self._at_first(a_px), self._at_first(b_px))
 
     def _at_first(self, xy_px: Float) -> Float:
-        """Take places (n, 2) back to the first reference with the nearest point."""
-        nearest = np.asarray(cKDTree(self.place_px).query(xy_px)[1])
-        away = np.einsum("nij,nj->ni", self.back[nearest], xy_px - self.place_px[nearest])
+        """Take positions (n, 2) back to the first reference with the nearest point."""
+        nearest = np.asarray(cKDTree(self.position_px).query(xy_px)[1])
+        away = np.einsum("nij,nj->ni", self.back[nearest], xy_px - self.position_px[nearest])
         return np.asarray(self.first_px[nearest] + away)
 
 
@@ -75,25 +75,27 @@ def _keys(xy_px: Float) -> NDArray[np.int64]:
     return np.asarray(y * 1_000_003 + x)
 
 
-def carry_sight(first: Sight, leg_grid: PointGrid, grid: PointGrid, place_px: Float, slopes_px: Float) -> LegSight:
-    """Return what a leg's points see.
+def carry_visibility(
+    first: Visibility, segment_grid: PointGrid, grid: PointGrid, position_px: Float, slopes_px: Float
+) -> SegmentVisibility:
+    """Return the visibility at a segment's reference.
 
     Parameters
     ----------
     first
-        What they saw at the first reference.
-    leg_grid, grid
-        The leg's pixels and the first reference's points, (r, c) both.
-    place_px, slopes_px
-        (n, 2) where camera 1 sees the points in the later image, (n, 2, 2) derivative of that image over the first.
+        Visibility at the first reference.
+    segment_grid, grid
+        The segment's pixels and the first reference's points, (r, c) both.
+    position_px, slopes_px
+        (n, 2) px, positions of the points in camera 1's later image; (n, 2, 2) derivative of that image over the first.
     """
     subset_px = first.subset_px
-    has = np.flatnonzero(leg_grid.allowed)
+    has = np.flatnonzero(segment_grid.allowed)
     back = np.full(slopes_px.shape, np.nan)
     back[has] = np.linalg.inv(slopes_px[has])
-    pixel, xy = leg_grid.xy_px.reshape(-1, 2), grid.xy_px.reshape(-1, 2)
+    pixel, xy = segment_grid.xy_px.reshape(-1, 2), grid.xy_px.reshape(-1, 2)
     reach = np.abs(back[has]).sum(axis=2).max() if len(has) else 1.0
-    wide = 2 * int(np.ceil(0.5 * subset_px * min(max(float(reach), 1.0), _WIDEST))) + 3
+    wide = 2 * int(np.ceil(0.5 * subset_px * min(max(float(reach), 1.0), _MAX_WIDTH_RATIO))) + 3
     margin = MARGIN_PX * max(1.0, float(np.median(np.linalg.norm(back[has], 2, axis=(1, 2)))) if len(has) else 1.0)
     n = len(pixel)
     share, of_point = np.ones(n), np.full(n, -1, np.int32)
@@ -102,7 +104,7 @@ def carry_sight(first: Sight, leg_grid: PointGrid, grid: PointGrid, place_px: Fl
     v, u = (a.ravel() for a in np.meshgrid(offsets, offsets, indexing="ij"))
     square = np.stack([u, v], axis=-1).astype(np.float64)
     for index, seen in patches_seen(grid, has, wide, margin, _AT_ONCE):
-        d = square + (pixel[index] - place_px[index])[:, None]
+        d = square + (pixel[index] - position_px[index])[:, None]
         at = xy[index][:, None] + np.einsum("nij,nkj->nki", back[index], d)
         corner = np.floor(xy[index] - 0.5 * (wide - 1) + 0.5)
         col, row = np.moveaxis(np.floor(at + 0.5) - corner[:, None], -1, 0).astype(np.int64)
@@ -115,17 +117,17 @@ def carry_sight(first: Sight, leg_grid: PointGrid, grid: PointGrid, place_px: Fl
         of_point[index[cut]] = sum(map(len, kept)) + np.arange(int(cut.sum()), dtype=np.int32)
         kept.append(found[cut].reshape(-1, subset_px, subset_px).astype(np.uint8))
     patches = np.concatenate(kept) if kept else np.zeros((0, subset_px, subset_px), np.uint8)
-    return LegSight(
+    return SegmentVisibility(
         xy_px=pixel,
-        shape=leg_grid.shape,
-        step_px=leg_grid.step_px,
+        shape=segment_grid.shape,
+        step_px=segment_grid.step_px,
         pieces_px=first.pieces_px,
         white=first.white,
         visible=VisiblePixels(patches, of_point),
         share=share,
-        parted=first.parted,
+        separated=first.separated,
         first=first,
-        place_px=place_px[has],
+        position_px=position_px[has],
         back=back[has],
         first_px=xy[has],
     )

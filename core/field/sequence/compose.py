@@ -1,12 +1,13 @@
-"""Motions one after the other: totals since the first reference from a motion that began at a later step.
+"""Composition of motions: totals since the first reference from a motion that began at a later step.
 
-A leg is matched against a later step's images. Its unknowns are those of the matching, about camera 1's rays at that
-step: inverse depth ``w'`` and the matrix ``G'``. With ``D`` the derivative of camera 1's image at the leg's reference
-over its image at step 0 and ``T'`` that of the point at t over the image at the leg's reference, the total has
+A segment is matched against a later step's images. Its unknowns are those of the matching, about camera 1's rays at
+that step: inverse depth ``w'`` and the matrix ``G'``. With ``D`` the derivative of camera 1's image at the segment's
+reference over its image at step 0 and ``T'`` that of the current point over the image at the segment's reference, the
+total has
 
     P = G'_0 / w'_0,    G_0 = w_0 P,    G_j = w_j P + w_0 T' D_j
 
-which is exact for plane patches, and for curved ones in the middle of the patch, where everything is told.
+which is exact for plane patches, and for curved ones in the middle of the patch, where all values are reported.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _STRIPS = 32
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """Where n points are at a step, with their patches, from the first reference on.
+    """Total motion of n points and their patches since the first reference.
 
     Attributes
     ----------
@@ -47,7 +48,7 @@ class Totals:
 
     @property
     def seen(self) -> Float:
-        """(n, 2) where camera 1 sees the points at the step, normalised."""
+        """(n, 2) the points' positions in camera 1's image at the step, normalised."""
         return np.asarray(self.G[:, :2, 0] / self.G[:, 2:, 0])
 
     @property
@@ -64,18 +65,19 @@ class Totals:
 
 
 def image_slopes(G: Float) -> Float:
-    """Derivative (n, 2, 2) of camera 1's image at t over its image at the reference, in the middle of the patches."""
+    """Return (n, 2, 2), derivative of camera 1's current image over its reference image, in the middle of the
+    patches."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     return np.asarray((G[:, :2, 1:3] - seen[:, :, None] * G[:, 2:, 1:3]) / G[:, 2, 0, None, None])
 
 
 def point_slopes(w: Float, G: Float) -> Float:
-    """Derivative (n, 3, 2) of the point at t, camera 1's frame, over camera 1's image at the reference."""
+    """Return (n, 3, 2), derivative of the current point, camera 1's frame, over camera 1's reference image."""
     return np.asarray((G[:, :, 1:3] - G[:, :, :1] * (w[:, None, 1:3] / w[:, :1, None])) / w[:, :1, None])
 
 
 def totals_of(field: Field, pair: StereoPair) -> Totals:
-    """Return the totals that a field's numbers tell, NaN where it has none; the same from memory and from its file."""
+    """Return the totals of a field, NaN where it has none; the same from memory and from its file."""
     if field.uvw_mm is None or field.rotation_rad is None or field.stretch is None:
         raise ValueError("a shape has no motion")
     n = field.x_px.size
@@ -106,19 +108,20 @@ def totals_of(field: Field, pair: StereoPair) -> Totals:
 
 
 def _rotations(vectors: Float) -> Float:
-    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    """Return rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
     K = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
     K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -z, y, -x
     K -= np.swapaxes(K, 1, 2)
     half = 0.5 * angle
-    # sin(a) / a and (1 - cos(a)) / a^2, whole at zero
+    # sin(a) / a and (1 - cos(a)) / a^2, finite at zero
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(half / np.pi) ** 2 * K @ K)
 
 
 def follow(start: Totals, w: Float, G: Float) -> Totals:
-    """Return the totals (n) after a leg with the unknowns ``w`` (n, 3), ``G`` (n, 3, 3) about the points' own rays."""
+    """Return the totals (n) after a segment with the unknowns ``w`` (n, 3), ``G`` (n, 3, 3) about the points' own
+    rays."""
     P = G[:, :, 0] / w[:, :1]
     tangents = point_slopes(w, G) @ start.image_slopes
     first = start.w[:, :1] * P
@@ -127,9 +130,9 @@ def follow(start: Totals, w: Float, G: Float) -> Totals:
 
 
 def since(start: Totals, now: Totals, plane: Float) -> Float:
-    """Return the leg's ``G`` (n, 3, 3) that leads from one state to a later one; the inverse of :func:`follow`.
+    """Return the segment's ``G`` (n, 3, 3) that leads from one state to a later one; the inverse of :func:`follow`.
 
-    ``plane`` (n, 3) are the leg's ``w`` about the points' own rays.
+    ``plane`` (n, 3) is the segment's ``w`` about the points' own rays.
     """
     P = now.now_cam1_mm
     tangents = point_slopes(now.w, now.G) @ _inverse(start.image_slopes)
@@ -151,18 +154,18 @@ def follow_covariance(start: Totals, w: Float, G: Float, covariance: Float, adde
     Parameters
     ----------
     start
-        Totals at the leg's reference.
+        Totals at the segment's reference.
     w, G, covariance
-        (n, 3), (n, 3, 3), (n, 5, 5) of the leg, about the points' own rays.
+        (n, 3), (n, 3, 3), (n, 5, 5) of the segment, about the points' own rays.
     added
-        (n, 2, 2) covariance of the points' place in camera 1's image at t that comes besides, normalised.
+        (n, 2, 2) covariance to be added to that of the points' positions in camera 1's current image, normalised.
 
     Notes
     -----
-    The noise of the leg's reference image has moved the point's place one way when it was found there, and moves the
-    leg's answer the other way: what is left is that of the first reference's image, as if the leg had begun there. So
-    the leg's own covariance is carried over, depth on the ray for depth on the ray, and only what does not cancel is
-    added, along the surface.
+    The noise of the segment's reference image has moved the point's position one way when it was found there, and moves
+    the segment's result the other way: the noise of the first reference's image remains, as if the segment had begun
+    there. So the segment's own covariance is taken over, depth on the ray for depth on the ray, and only the part that
+    does not cancel is added, along the surface.
     """
     P = G[:, :, 0] / w[:, :1]
     here = np.concatenate([start.seen, np.ones((len(w), 1))], axis=1)
@@ -181,15 +184,16 @@ def follow_covariance(start: Totals, w: Float, G: Float, covariance: Float, adde
 
 
 def in_step(a: Float, b: Float) -> Float:
-    """Covariance (n, 2, 2) of the sum of two errors that go the same way: their amplitudes add."""
+    """Return the covariance (n, 2, 2) of the sum of two fully correlated errors: their amplitudes add."""
     both = a + b
     trace = np.trace(both, axis1=1, axis2=2)
     cross = 2.0 * np.sqrt(np.maximum(np.trace(a, axis1=1, axis2=2) * np.trace(b, axis1=1, axis2=2), 0.0))
     return np.asarray(both * (1.0 + cross / np.maximum(trace, np.finfo(np.float64).tiny))[:, None, None])
 
 
-def place_covariance(G: Float, covariance: Float) -> Float:
-    """Covariance (n, 2, 2) of where camera 1 sees points at t, normalised, from that of their (w0, G, offset)."""
+def position_covariance(G: Float, covariance: Float) -> Float:
+    """Return the covariance (n, 2, 2) of positions in camera 1's current image, normalised, from that of (w0, G,
+    offset)."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     J = np.zeros((len(G), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0
@@ -199,7 +203,7 @@ def place_covariance(G: Float, covariance: Float) -> Float:
 
 
 def common_share(slopes_px: Float, offset_px: Float, subset_px: int) -> tuple[Float, Float]:
-    """Return what two matches share that meet in one image, one ending there and one beginning: (n,), (n,).
+    """Return the common noise of two matches that meet in one image, one ending there and one beginning: (n,), (n,).
 
     Parameters
     ----------

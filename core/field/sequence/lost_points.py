@@ -1,4 +1,4 @@
-"""Points lost in an earlier step of a sequence, tried against the older references that show them."""
+"""Points lost in an earlier step of a sequence, tried again against older references."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.field.checks.residual_test import judge
+from core.field.checks.residual_test import residual_test
 from core.field.growth.check import check
 from core.field.growth.grow import Attempts, grow
 from core.field.growth.state import FieldInputs
@@ -18,64 +18,64 @@ from core.field.points.result import Field
 from core.field.points.starts import move_matrix, move_w
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals, since
-from core.field.sequence.propagated import HandedOn, pattern_share
-from core.field.sequence.segment import Leg
+from core.field.sequence.propagated import Propagated, pattern_share
+from core.field.sequence.segment import Segment
 from core.status import PointStatus
 
 OLDER = 2
-"""How many references besides the current one are tried for points that it does not have."""
+"""Number of references besides the current one that are tried for points that it does not have."""
 _BESIDE = 3  # points
 _CONTROLS = 64
 _FAR_PX = 1.0
 
 
 def find_again(
-    leg: Leg,
+    segment: Segment,
     points: PointFits,
-    handed: HandedOn,
+    propagated: Propagated,
     steps: NDArray[np.int32],
     *,
     whole: FieldInputs,
     shape: Field,
     curved: bool,
-    leg_of: Callable[[int], Leg],
-    inputs_of: Callable[[Leg], FieldInputs],
+    segment_of: Callable[[int], Segment],
+    inputs_of: Callable[[Segment], FieldInputs],
 ) -> None:
-    """Try points that the leg does not have against the newest reference that shows them, where a neighbour stands.
+    """Try points that the segment does not have against the newest reference that shows them, beside valid points.
 
-    What is found goes through the checks among all others.
+    Points found again pass the validity checks like all others.
 
     Parameters
     ----------
-    leg
-        What the step was matched against.
-    points, handed
-        The step's n points, in totals, and what they hand on, px^2; what is found is written there.
+    segment
+        The segment that the step was matched against.
+    points, propagated
+        The step's n points, in totals, and their propagated covariance, px^2; results are written there.
     steps
         (n,) the newest reference that shows each point.
     whole, shape
-        The step against the first reference, whose frame all totals are told in, and the shape measured there.
+        The step against the first reference, in whose frame all totals are stated, and the shape measured there.
     curved
-        Whether the leg's points were measured with curved patches.
-    leg_of, inputs_of
-        The leg that begins at a step, and the same step against that leg.
+        True if the segment's points were measured with curved patches.
+    segment_of, inputs_of
+        Functions that return the segment that begins at a step, and the inputs of this step against a segment.
     """
-    standing = points.ok
-    missing = whole.usable & shape.valid.ravel() & ~leg.has & ~standing
+    valid = points.ok
+    missing = whole.usable & shape.valid.ravel() & ~segment.has & ~valid
     values, counts = np.unique(steps[missing], return_counts=True)
     for used in values[np.argsort(-counts)][:OLDER]:
-        older = leg_of(int(used))
+        older = segment_of(int(used))
         usable = missing & (steps == used) & older.has
-        near = _beside(usable, standing & older.has, whole.grid.shape)
+        near = _beside(usable, valid & older.has, whole.grid.shape)
         if not near.any():
             continue
         inputs = inputs_of(older)
         matcher = inputs.matcher.curved() if curved else inputs.matcher
-        fitter = LegFitter(older, matcher, whole.grid)
+        fitter = SegmentFitter(older, matcher, whole.grid)
         level = _level(fitter, points, np.flatnonzero(near), whole.xy_px)
         if level is None:
             continue
-        attempts = Attempts.on(whole.grid.shape, whole.sight)
+        attempts = Attempts.on(whole.grid.shape, whole.visibility)
         attempts.left[:] = usable
         tried = points.take(np.arange(len(steps)))
         grow(
@@ -85,21 +85,21 @@ def find_again(
             xy_px=whole.xy_px,
             rays=whole.rays,
             usable=usable,
-            stage="again",
+            phase="again",
             cancel=whole.cancel,
         )
-        # an older reference correlates less: by as much as the points beside do that stand in both
+        # an older reference correlates less: by as much as neighbouring points valid against both
         correlation = tried.zncc.copy()
         found = usable & tried.ok
         tried.zncc[found] = 1.0 - np.minimum((1.0 - tried.zncc[found]) * level, 1.0)
         check(whole, tried)
         tried.zncc[:] = correlation
         own = fitter.own
-        own.refuse(own.ok & ~(usable & tried.ok), PointStatus.NEIGHBOUR_MISMATCH)
-        judge(
+        own.reject(own.ok & ~(usable & tried.ok), PointStatus.NEIGHBOUR_MISMATCH)
+        residual_test(
             matcher, own, xy_px=older.pixel_px, texture=inputs.texture, limits=whole.sigma_limits, cancel=whole.cancel
         )
-        tried.refuse(usable & tried.ok & ~own.ok, PointStatus.LOW_CORRELATION)
+        tried.reject(usable & tried.ok & ~own.ok, PointStatus.LOW_CORRELATION)
         index = np.flatnonzero(usable)
         points.put(index, tried.take(index))
         good = np.flatnonzero(usable & own.ok)
@@ -108,24 +108,24 @@ def find_again(
             fits, good, pattern_share(fits.zncc), pair=whole.pair, subset_px=whole.options.subset_px
         )
         points.put(good, totals)
-        handed.noise[good], handed.pattern[good] = known.noise, known.pattern
+        propagated.noise[good], propagated.pattern[good] = known.noise, known.pattern
 
 
-def _beside(missing: Bool, standing: Bool, shape: tuple[int, int]) -> Bool:
-    """Return the standing points (n,) within a few steps of missing ones."""
+def _beside(missing: Bool, valid: Bool, shape: tuple[int, int]) -> Bool:
+    """Return (n,) True for valid points within a few grid points of missing ones."""
     disc = np.ones((2 * _BESIDE + 1, 2 * _BESIDE + 1), np.uint8)
     about = cv2.dilate(missing.reshape(shape).astype(np.uint8), disc)
-    return np.asarray(standing & (np.asarray(about).ravel() > 0))
+    return np.asarray(valid & (np.asarray(about).ravel() > 0))
 
 
-def _level(fitter: LegFitter, points: PointFits, near: NDArray[np.intp], xy_px: Float) -> Float | None:
-    """Return (3,) how much 1 - zncc is now over what it is against an older reference, at points that stand in both.
+def _level(fitter: SegmentFitter, points: PointFits, near: NDArray[np.intp], xy_px: Float) -> Float | None:
+    """Return (3,) the ratio of 1 - zncc to that against an older reference, median over points valid against both.
 
-    None where fewer than half of them match the older reference: it then serves for nothing.
+    None where fewer than half of them match the older reference: it then is of no use.
     """
     sample = near[np.linspace(0, len(near) - 1, min(len(near), _CONTROLS)).astype(int)]
     fits = fitter.fit(xy_px[sample], points.w[sample], points.G[sample])
-    fits.refuse(
+    fits.reject(
         fits.ok & fitter.far_from_start(xy_px[sample], fits, points.w[sample], points.G[sample], _FAR_PX),
         PointStatus.NOT_CONVERGED,
     )
@@ -136,17 +136,17 @@ def _level(fitter: LegFitter, points: PointFits, near: NDArray[np.intp], xy_px: 
     return np.asarray(np.median(now, axis=0) / np.median(then, axis=0))
 
 
-class LegFitter:
-    """Fits points of the first reference's grid against a leg's images: totals in, totals out.
+class SegmentFitter:
+    """Fits points of the first reference's grid against a segment's images: totals in, totals out.
 
     Attributes
     ----------
     own
-        (n,) the points as they were fitted last, about the leg's pixels.
+        (n,) the points as last fitted, about the segment's pixels.
     """
 
-    def __init__(self, leg: Leg, fitter: Fitter, grid: PointGrid) -> None:
-        self._leg, self._fitter, self._subset_px = leg, fitter, fitter.options.subset_px
+    def __init__(self, segment: Segment, fitter: Fitter, grid: PointGrid) -> None:
+        self._segment, self._fitter, self._subset_px = segment, fitter, fitter.options.subset_px
         self.own = fitter.empty(grid.x_px.size)
         self._corner, self._step_px, self._cols = grid.xy_px[0, 0], grid.step_px, grid.shape[1]
         self.comparisons, self.terms = 3, 3
@@ -154,16 +154,18 @@ class LegFitter:
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine totals from totals; as :meth:`core.field.points.fitter.Fitter.fit`."""
         if G is None:
-            raise ValueError("a leg measures motions")
-        leg = self._leg
+            raise ValueError("a segment measures motions")
+        segment = self._segment
         col, row = np.rint((xy_px - self._corner) / self._step_px).astype(np.int64).T
         index = row * self._cols + col
-        start = Totals(leg.totals.rays[index], leg.totals.w[index], leg.totals.G[index])
-        own = since(start, Totals(start.rays, w, G), leg.plane[index])
-        offset = leg.offset[index]
-        fits = self._fitter.fit(leg.pixel_px[index], move_w(leg.plane[index], -offset), move_matrix(own, -offset))
+        start = Totals(segment.totals.rays[index], segment.totals.w[index], segment.totals.G[index])
+        own = since(start, Totals(start.rays, w, G), segment.plane[index])
+        offset = segment.offset[index]
+        fits = self._fitter.fit(
+            segment.pixel_px[index], move_w(segment.plane[index], -offset), move_matrix(own, -offset)
+        )
         self.own.put(index, fits)
-        return leg.total(fits, index, np.zeros(len(index)), pair=self._fitter.pair, subset_px=self._subset_px)[0]
+        return segment.total(fits, index, np.zeros(len(index)), pair=self._fitter.pair, subset_px=self._subset_px)[0]
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
         """As :meth:`core.field.points.fitter.Fitter.far_from_start`."""

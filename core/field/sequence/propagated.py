@@ -1,8 +1,8 @@
-"""What a leg of a sequence inherits of the error of the legs before it.
+"""Propagation of errors from one reference segment of a sequence to the next.
 
-The noise of the image in which one leg ends and the next begins moves the point one way, then the other, and cancels.
-What does not cancel goes on: the pixels that the two subsets do not share, the noise of the gradients, and a pattern
-that changed.
+The noise of the image in which one segment ends and the next begins moves the point one way, then the other, and
+cancels. These parts do not cancel: the pixels that the two subsets do not share, the noise of the gradients, and
+changes of the pattern.
 """
 
 from __future__ import annotations
@@ -19,79 +19,80 @@ from core.field.points.result import Field
 from core.field.sequence.compose import Totals, common_share, image_slopes, in_step
 
 _SMOOTHED = 5  # points across, over which the noise of a field is averaged
-_SURELY = 1.1  # times the noise between the cameras: what is above is not noise
+_SURELY = 1.1  # times the noise between the cameras: any more is not noise
 
 
 @dataclass(frozen=True, eq=False)
-class HandedOn:
-    """Covariances (n, 2, 2) of n points' places in an image that a leg beginning there inherits.
+class Propagated:
+    """Covariances (n, 2, 2) of n points' positions in an image, propagated to a segment that begins there.
 
     Attributes
     ----------
     noise
-        Of errors that are independent from leg to leg.
+        Of errors that are independent from segment to segment.
     pattern
-        Of errors by a changed pattern, which go the same way in each leg.
+        Of errors by a changed pattern, which are fully correlated from segment to segment.
     """
 
     noise: Float
     pattern: Float
 
     @staticmethod
-    def nothing(n: int) -> HandedOn:
-        """Return what the first reference inherits."""
-        return HandedOn(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
+    def nothing(n: int) -> Propagated:
+        """Return the propagated covariance of the first reference, zero."""
+        return Propagated(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
 
-    def at(self, index: NDArray[np.intp]) -> HandedOn:
-        """Return those of some points."""
-        return HandedOn(self.noise[index], self.pattern[index])
+    def at(self, index: NDArray[np.intp]) -> Propagated:
+        """Return the covariances of some points."""
+        return Propagated(self.noise[index], self.pattern[index])
 
-    def through(self, J: Float) -> HandedOn:
-        """Return them in other coordinates, whose derivatives are J (n, 2, 2)."""
+    def through(self, J: Float) -> Propagated:
+        """Return the covariances in other coordinates, whose derivatives are J (n, 2, 2)."""
         turned = np.swapaxes(J, 1, 2)
-        return HandedOn(J @ self.noise @ turned, J @ self.pattern @ turned)
+        return Propagated(J @ self.noise @ turned, J @ self.pattern @ turned)
 
 
-def handed_on(
+def propagate(
     pair: StereoPair,
-    place_px: Float,
+    position_px: Float,
     offset: Float,
     G: Float,
     own: Float,
-    before: HandedOn,
+    before: Propagated,
     pattern: Float,
     subset_px: int,
     slope_share: float,
-) -> HandedOn:
-    """Return what of the places' covariance at t a leg beginning there inherits, px^2.
+) -> Propagated:
+    """Return the covariance of the current positions that is propagated to a segment beginning there, px^2.
 
     Parameters
     ----------
     pair
         The calibrated cameras.
-    place_px, offset
-        (n, 2) where camera 1 saw the points at the match's reference, and from the pixel in the middle of the subset to
-        there, normalised.
+    position_px, offset
+        (n, 2) the points' positions in camera 1's image at the match's reference, px, and the offset from the pixel in
+        the middle of the subset to there, normalised.
     G
         (n, 3, 3) of the match, about the points' own rays.
     own, before
-        (n, 2, 2) covariance of the places at t by the match, and what it has inherited, carried on; normalised.
+        (n, 2, 2) covariance of the current positions by the match, and the one propagated to it, in current
+        coordinates; normalised.
     pattern
         (n,) share of the variance that is a change of the surface's pattern. It adds up; the rest is camera noise,
-        which the next leg's reference takes back.
+        which cancels in the next segment.
     subset_px
         Width of the subset.
     slope_share
-        Share of noise in the squares of the reference's gradients: each leg has its own.
+        Share of noise in the squares of the reference's gradients: each segment has its own.
     """
     seen, slopes = G[:, :2, 0] / G[:, 2:, 0], image_slopes(G)
     to_px = pair.cam1.lens.image_jacobian(seen)
-    from_px = np.linalg.inv(pair.cam1.lens.image_jacobian(pair.cam1.rays_cam(place_px).xyz_mm[:, :2]))
+    from_px = np.linalg.inv(pair.cam1.lens.image_jacobian(pair.cam1.rays_cam(position_px).xyz_mm[:, :2]))
     now_px = pair.cam1.lens.image_from_normalised(seen).xy
     middle_px = now_px - np.einsum("nij,nj->ni", to_px @ slopes, offset)
     common, samples = common_share(to_px @ slopes @ from_px, np.rint(now_px) - middle_px, subset_px)
     left = np.maximum(0.5 * (1.0 + samples) - common + slope_share, 0.0) * (1.0 - pattern)
-    return HandedOn(
+    return Propagated(
         before.noise + left[:, None, None] * own, in_step(before.pattern, pattern[:, None, None] * own)
     ).through(to_px)
 
@@ -106,7 +107,7 @@ def pattern_share(zncc: Float) -> Float:
 
     Notes
     -----
-    The two cameras' images of one instant differ by noise and view; what two images of one camera differ by beyond that
+    The two cameras' images of one instant differ by noise and view; any larger difference of two images of one camera
     is not noise.
     """
     lost = 1.0 - np.asarray(zncc[..., :2], dtype=np.float32).astype(np.float64)
@@ -119,8 +120,9 @@ def pattern_share(zncc: Float) -> Float:
     return np.where(np.isfinite(share), np.maximum(share, 0.0), 0.0)
 
 
-def first_handed_on(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> HandedOn:
-    """Return what a leg inherits that begins at a field matched against the first reference itself, px^2."""
+def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> Propagated:
+    """Return the covariance propagated to a segment that begins at a field matched against the first reference,
+    px^2."""
     n = len(totals.w)
     C = field.covariance.reshape(n, 6, 6).astype(np.float32).astype(np.float64)
     R = pair.cam1.cam_from_sys.rotation
@@ -132,13 +134,13 @@ def first_handed_on(field: Field, pair: StereoPair, totals: Totals, subset_px: i
     J /= P[:, 2, None, None]
     own = J @ mm @ np.swapaxes(J, 1, 2)
     xy = np.stack([field.x_px, field.y_px], axis=-1).reshape(n, 2)
-    return handed_on(
+    return propagate(
         pair,
         xy,
         np.zeros((n, 2)),
         totals.G,
         own,
-        HandedOn.nothing(n),
+        Propagated.nothing(n),
         pattern_share(field.zncc).ravel(),
         subset_px,
         slope_share,

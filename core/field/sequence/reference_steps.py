@@ -1,7 +1,7 @@
-"""Long sequences: which step's images a step is matched against, and when a later reference takes over.
+"""Long sequences: the choice of the reference step that a step is matched against.
 
-``never``: always the first reference. ``always``: the step before. ``auto``: the last reference as long as it serves;
-where it fails, the step before takes over, if that finds what was lost.
+``never``: always the first reference. ``always``: the step before. ``auto``: the latest reference as long as it serves;
+where it fails, the step before replaces it, if lost points are found again.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from core.field.growth.seed import Seeds
 from core.field.growth.state import FieldInputs, prepare
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field, References
-from core.field.region.find_visible import with_sight
+from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals
 from core.field.sequence.lost_points import OLDER, find_again
-from core.field.sequence.propagated import HandedOn, pattern_share
-from core.field.sequence.segment import Leg, begin_leg, measure_leg
+from core.field.sequence.propagated import Propagated, pattern_share
+from core.field.sequence.segment import Segment, begin_segment, measure_segment
 from core.field.settings import MeasureOptions
 from core.matching.fit import no_motion
 from core.matching.geometry import plane_from_angles
@@ -35,9 +35,11 @@ from core.status import PointStatus
 
 Pair = tuple[MeasureImage, MeasureImage]
 
-MAY_BE_LOST = 0.01  # of the points that a reference has: the share that checks may refuse with no fault of its own
-SIGMAS = 3.0  # a loss beyond that share is no chance
-BETTER_SIGMAS = 2.0  # and an update must be better by as much
+MAY_BE_LOST = (
+    0.01  # of the points that a reference has: the share that checks may reject through no fault of the reference
+)
+SIGMAS = 3.0  # a larger loss is significant
+BETTER_SIGMAS = 2.0  # and an update must be better by this much
 _KEPT = OLDER + 1
 _BY_THE_MATCH = (
     PointStatus.NOT_SEEDED,
@@ -59,7 +61,7 @@ class Earlier:
 
 
 class Updating:
-    """Measures a sequence's steps in order. It holds nothing that cannot be made again from images and fields.
+    """Measures a sequence's steps in order. Its state can be computed again from images and fields.
 
     Parameters
     ----------
@@ -70,7 +72,8 @@ class Updating:
     mode
         ``never``, ``auto`` or ``always``.
     images_of, field_of
-        Images and field of an earlier step, by its number. The field as it was measured or as its file gives it back.
+        Functions that return images and field of an earlier step, by its number. The field as measured or as read from
+        its file.
     """
 
     def __init__(
@@ -87,10 +90,10 @@ class Updating:
         first: int = 0,
     ) -> None:
         self._pair, self._reference, self._shape, self._options = pair, reference, shape, options
-        self._grid = with_sight(grid, options.subset_px)
+        self._grid = with_visibility(grid, options.subset_px)
         self._mode, self._first = mode, first
         self._images_of, self._field_of = images_of, field_of
-        self._legs: OrderedDict[int, Leg] = OrderedDict()
+        self._segments: OrderedDict[int, Segment] = OrderedDict()
 
     def measure(
         self,
@@ -138,12 +141,12 @@ class Updating:
         return updated if _finds_it(updated, field, earlier.field) else field
 
     def _held_by(self, step: int) -> Bool:
-        return self._shape.valid if step == self._first else self._leg(step).has.reshape(self._grid.shape)
+        return self._shape.valid if step == self._first else self._segment(step).has.reshape(self._grid.shape)
 
     def _against(self, reference: int, step: _Step) -> Field:
         if reference == self._first:
             return self._total(step)
-        return self._by_leg(reference, step)
+        return self._by_segment(reference, step)
 
     def _total(self, step: _Step) -> Field:
         inputs = self._inputs(self._reference, self._grid, step, step.progress)
@@ -153,12 +156,12 @@ class Updating:
     def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
         return prepare(self._pair, reference, step.images, grid, self._options, progress=progress, cancel=step.cancel)
 
-    def _leg(self, step: int) -> Leg:
-        """The leg that begins at a step; those last asked for are kept."""
+    def _segment(self, step: int) -> Segment:
+        """Return the segment that begins at a step; the latest ones are kept."""
         if step == self._first:
-            return self._first_leg()
-        if step not in self._legs:
-            self._legs[step] = begin_leg(
+            return self._first_segment()
+        if step not in self._segments:
+            self._segments[step] = begin_segment(
                 step,
                 self._field_of(step),
                 *self._images_of(step),
@@ -168,44 +171,44 @@ class Updating:
                 slope_share=self._slope_share,
                 first=self._first,
             )
-            while len(self._legs) > _KEPT:
-                self._legs.popitem(last=False)
-        self._legs.move_to_end(step)
-        return self._legs[step]
+            while len(self._segments) > _KEPT:
+                self._segments.popitem(last=False)
+        self._segments.move_to_end(step)
+        return self._segments[step]
 
     @property
     def _slope_share(self) -> float:
         options = self._options
         return self._reference[0].prepared(options.interpolation, options.noise[0], options.blur).slope_share
 
-    def _first_leg(self) -> Leg:
-        """The first reference as a leg, for points that a later one does not have."""
+    def _first_segment(self) -> Segment:
+        """Return the first reference as a segment, for points that a later one does not have."""
         f, n = self._shape, self._grid.x_px.size
         xy = self._grid.xy_px.reshape(n, 2)
         with np.errstate(invalid="ignore", divide="ignore"):
             w = plane_from_angles(self._pair, xy, f.theta_rad.ravel(), f.phi_rad.ravel(), f.zp_mm.ravel())
         has = f.valid & np.isfinite(w).all(axis=1).reshape(f.shape)
-        return Leg(
+        return Segment(
             step=self._first,
             image1=self._reference[0],
             image2=self._reference[1],
             grid=replace(self._grid, allowed=has),
-            place_px=xy,
+            position_px=xy,
             offset=np.zeros((n, 2)),
             totals=Totals(self._pair.cam1.rays_cam(xy).xyz_mm, w, no_motion(self._pair, xy)),
             plane=w,
-            inherited=HandedOn.nothing(n),
+            propagated=Propagated.nothing(n),
             shape=f,
             status=f.status.ravel(),
             steps=np.full(n, self._first, np.int32),
             slope_share=self._slope_share,
         )
 
-    def _by_leg(self, reference: int, step: _Step) -> Field:
+    def _by_segment(self, reference: int, step: _Step) -> Field:
         assert step.earlier is not None
-        leg = self._leg(reference)
-        state = measure_leg(
-            leg,
+        segment = self._segment(reference)
+        state = measure_segment(
+            segment,
             *step.images,
             pair=self._pair,
             options=self._options,
@@ -214,41 +217,41 @@ class Updating:
             progress=step.progress,
             cancel=step.cancel,
         )
-        n, subset = len(leg.has), self._options.subset_px
+        n, subset = len(segment.has), self._options.subset_px
         zncc = np.where(state.points.ok[:, None], state.points.zncc, np.nan)
         share = pattern_share(zncc.reshape(*self._grid.shape, 3)).ravel()
-        points, handed = leg.total(state.points, np.arange(n), share, pair=self._pair, subset_px=subset)
-        points.status[~leg.has] = leg.status[~leg.has]
-        steps = leg.steps.copy()
+        points, propagated = segment.total(state.points, np.arange(n), share, pair=self._pair, subset_px=subset)
+        points.status[~segment.has] = segment.status[~segment.has]
+        steps = segment.steps.copy()
         whole = self._inputs(
             self._reference, self._grid, step
-        )  # the first reference's own frame: all totals are told there
+        )  # the first reference's own frame: all totals are stated there
 
-        def inputs_of(older: Leg) -> FieldInputs:
+        def inputs_of(older: Segment) -> FieldInputs:
             return whole if older.step == self._first else self._inputs((older.image1, older.image2), older.grid, step)
 
         find_again(
-            leg,
+            segment,
             points,
-            handed,
+            propagated,
             steps,
             whole=whole,
             shape=self._shape,
             curved=state.fitter.terms == 6,
-            leg_of=self._leg,
+            segment_of=self._segment,
             inputs_of=inputs_of,
         )
         field = assemble_field(whole, replace(state, points=points), self._shape)
-        place = (*field.shape, 2, 2)
+        blocks = (*field.shape, 2, 2)
         references = References(
-            reference, steps.reshape(field.shape), handed.noise.reshape(place), handed.pattern.reshape(place)
+            reference, steps.reshape(field.shape), propagated.noise.reshape(blocks), propagated.pattern.reshape(blocks)
         )
         return replace(field, references=references)
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """What a step is measured from."""
+    """Inputs of one step."""
 
     images: Pair
     earlier: Earlier | None
@@ -258,22 +261,23 @@ class _Step:
 
 
 def _lost(field: Field, before: Bool) -> Bool:
-    """Which points that stood before the matching has lost; not those that left an image."""
+    """Return True for formerly valid points that the matching has lost; not those that left an image."""
     return np.asarray(before & ~field.valid & np.isin(field.status, _BY_THE_MATCH))
 
 
 def _fails(field: Field, before: Field, held: Bool) -> bool:
-    """Whether a reference has lost more of the points it holds than checks refuse by chance, and some in this step."""
+    """Return True if a reference lost more of its points than checks reject by chance, some of them in this step."""
     n = int(held.sum())
     chance = MAY_BE_LOST * n + SIGMAS * np.sqrt(MAY_BE_LOST * n)
     return bool(_lost(field, held).sum() > chance and _lost(field, before.valid).sum() > BETTER_SIGMAS**2)
 
 
 def _finds_it(updated: Field, field: Field, before: Field) -> bool:
-    """Whether an update found half of what was lost in this step, and more than it lost itself.
+    """Return True if an update found half of the points lost in this step, and more than it lost itself.
 
-    McNemar's test: points that stand one way only, compared by the root of their number.
+    McNemar's test (doi:10.1007/BF02295996): points valid against one reference only, compared by the root of their
+    number.
     """
-    found, gone = (int(a.sum()) for a in (updated.valid & ~field.valid, field.valid & ~updated.valid))
+    found, lost = (int(a.sum()) for a in (updated.valid & ~field.valid, field.valid & ~updated.valid))
     enough = 2 * found >= int(_lost(field, before.valid).sum())
-    return bool(enough and found - gone > BETTER_SIGMAS * np.sqrt(found + gone))
+    return bool(enough and found - lost > BETTER_SIGMAS * np.sqrt(found + lost))

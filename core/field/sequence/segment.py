@@ -1,8 +1,8 @@
-"""A leg: the part of a sequence that is matched against one later step's images.
+"""A reference segment: the part of a sequence that is matched against one later step's images.
 
-The material points stay those of the first reference's grid. Camera 1 sees them between the pixels at the leg's
-reference; a leg's subset is centred on the nearest whole pixel, so that no reference is interpolated, and the point is
-the patch evaluated at most half a pixel off its middle.
+The material points stay those of the first reference's grid. In camera 1's image at the segment's reference they lie
+between pixels; a segment's subset is centred on the nearest whole pixel, so that no reference is interpolated, and the
+point is the patch evaluated at most half a pixel off its middle.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.points.starts import Starts, move_matrix, move_w
 from core.field.region.region import PointGrid
-from core.field.sequence.carried_visibility import carry_sight
+from core.field.sequence.carried_visibility import carry_visibility
 from core.field.sequence.compose import (
     Totals,
     follow,
     follow_covariance,
     image_slopes,
     in_step,
-    place_covariance,
+    position_covariance,
     since,
     totals_of,
 )
-from core.field.sequence.propagated import HandedOn, first_handed_on, handed_on
+from core.field.sequence.propagated import Propagated, first_propagated, propagate
 from core.field.settings import MeasureOptions
 from core.progress import CancelToken, Progress
 from core.status import PointStatus
 
 
 @dataclass(frozen=True, eq=False)
-class Leg:
+class Segment:
     """The state of n points at the step whose images they are matched against.
 
     Attributes
@@ -53,36 +53,36 @@ class Leg:
     image1, image2
         Its images.
     grid
-        The pixels nearest to where camera 1 sees the points; ``allowed`` says which points the leg has.
-    place_px
-        (n, 2) where camera 1 sees them.
+        The pixels nearest to the points in camera 1's image; ``allowed`` is True for the points that the segment has.
+    position_px
+        (n, 2) the points' positions in camera 1's image, px.
     offset
         (n, 2) from the pixel's ray to the point's, normalised.
     totals
         Their totals at that step.
     plane
         (n, 3) inverse depth and slopes about the point's own ray at that step.
-    inherited
-        Covariances of the places that the noise of the leg's reference does not cancel, normalised.
+    propagated
+        Covariances of the positions that the noise of the segment's reference does not cancel, normalised.
     shape
-        What the matching needs of the shape at that step.
+        The shape at that step, as far as the matching needs it.
     status
-        (n,) int8: OK, or why the leg does not have a point.
+        (n,) int8: OK, or why the segment does not have a point.
     steps
         (n,) int32: the newest reference that shows each point, of those up to this one.
     slope_share
-        As in :func:`handed_on`.
+        As in :func:`propagate`.
     """
 
     step: int
     image1: MeasureImage
     image2: MeasureImage
     grid: PointGrid
-    place_px: Float
+    position_px: Float
     offset: Float
     totals: Totals
     plane: Float
-    inherited: HandedOn
+    propagated: Propagated
     shape: Field
     status: NDArray[np.int8]
     steps: NDArray[np.int32]
@@ -90,7 +90,7 @@ class Leg:
 
     @property
     def has(self) -> Bool:
-        """(n,) which points the leg has."""
+        """(n,) True for the points that the segment has."""
         return np.asarray(self.grid.allowed.ravel())
 
     @property
@@ -99,14 +99,15 @@ class Leg:
         return self.grid.xy_px.reshape(-1, 2)
 
     def starts(self, now: Totals) -> tuple[Float, Float]:
-        """Return the leg's unknowns about its pixels that lead to totals of all n points."""
+        """Return the segment's unknowns about its pixels that lead to totals of all n points."""
         G = since(self.totals, now, self.plane)
         return move_w(self.plane, -self.offset), move_matrix(G, -self.offset)
 
     def total(
         self, fits: PointFits, index: NDArray[np.intp], pattern: Float, *, pair: StereoPair, subset_px: int
-    ) -> tuple[PointFits, HandedOn]:
-        """Return the totals of points ``index`` that a fitter of this leg has measured, and what they hand on, px^2.
+    ) -> tuple[PointFits, Propagated]:
+        """Return totals of points ``index`` measured by a fitter of this segment, and their propagated covariance,
+        px^2.
 
         ``pattern`` (m,) is their :func:`pattern_share`.
         """
@@ -114,26 +115,26 @@ class Leg:
         w, G = self._own(fits, index)
         with np.errstate(invalid="ignore", divide="ignore"):
             after = follow(start, w, G)
-            slopes, own = image_slopes(G), place_covariance(G, fits.covariance)
-            known = self.inherited.at(index).through(slopes)
+            slopes, own = image_slopes(G), position_covariance(G, fits.covariance)
+            known = self.propagated.at(index).through(slopes)
             changed = pattern[:, None, None] * own
             together = in_step(known.pattern, changed)
             covariance = follow_covariance(start, w, G, fits.covariance, known.noise + together - changed)
-            handed = handed_on(
-                pair, self.place_px[index], self.offset[index], G, own, known, pattern, subset_px, self.slope_share
+            propagated = propagate(
+                pair, self.position_px[index], self.offset[index], G, own, known, pattern, subset_px, self.slope_share
             )
-        return replace(fits, w=after.w.copy(), G=after.G, covariance=covariance), handed
+        return replace(fits, w=after.w.copy(), G=after.G, covariance=covariance), propagated
 
     def _at(self, index: NDArray[np.intp]) -> Totals:
         return Totals(self.totals.rays[index], self.totals.w[index], self.totals.G[index])
 
     def _own(self, fits: PointFits, index: NDArray[np.intp]) -> tuple[Float, Float]:
-        """A leg's plane terms (m, 3), (m, 3, 3) about the points' own rays."""
+        """Return the segment's plane terms (m, 3), (m, 3, 3) about the points' own rays."""
         w, G = move_w(fits.w, self.offset[index]), move_matrix(fits.G, self.offset[index])
         return w[:, :3], G[:, :, :3]
 
 
-def begin_leg(
+def begin_segment(
     step: int,
     field: Field,
     image1: MeasureImage,
@@ -144,19 +145,19 @@ def begin_leg(
     options: MeasureOptions,
     slope_share: float,
     first: int,
-) -> Leg:
-    """Return the leg whose reference is a step that was measured.
+) -> Segment:
+    """Return the segment whose reference is a step that was measured.
 
     Parameters
     ----------
     step, field
-        The step's number and its field, with a motion; as it was measured, or as its file gives it back.
+        The step's number and its field, with a motion; as measured, or as read from its file.
     image1, image2
         The step's images.
     pair, grid, options
-        The cameras, and points (with what they see) and settings of the first reference.
+        The cameras, and points (with their visibility) and settings of the first reference.
     slope_share
-        As in :func:`handed_on`.
+        As in :func:`propagate`.
     first
         Number of the first reference.
 
@@ -169,9 +170,9 @@ def begin_leg(
     n = len(totals.w)
     subset = options.subset_px
     with np.errstate(invalid="ignore", divide="ignore"):
-        place = pair.cam1.lens.image_from_normalised(totals.seen).xy
-        has = field.valid.ravel() & np.isfinite(place).all(axis=1) & np.isfinite(totals.G).all(axis=(1, 2))
-        pixel = np.rint(place)
+        position = pair.cam1.lens.image_from_normalised(totals.seen).xy
+        has = field.valid.ravel() & np.isfinite(position).all(axis=1) & np.isfinite(totals.G).all(axis=(1, 2))
+        pixel = np.rint(position)
         half = subset // 2
         rows, cols = image1.shape
         has &= ((pixel >= half) & (pixel <= np.array([cols, rows]) - 1 - half)).all(axis=1)
@@ -179,51 +180,53 @@ def begin_leg(
             raise SeedError(f"no point of step {step} is left to match a later step against.")
         r = field.references
         if r is None:
-            inherited_px = first_handed_on(field, pair, totals, subset, slope_share)
+            propagated_px = first_propagated(field, pair, totals, subset, slope_share)
         else:
-            inherited_px = HandedOn(r.noise_px2.reshape(n, 2, 2), r.pattern_px2.reshape(n, 2, 2))
+            propagated_px = Propagated(r.noise_px2.reshape(n, 2, 2), r.pattern_px2.reshape(n, 2, 2))
     middle = np.median(pixel[has], axis=0)
-    # points that the leg does not have lie anywhere inside, where they disturb no scale
-    pixel, place = (np.where(has[:, None], a, middle) for a in (pixel, place))
-    rays, own = (pair.cam1.rays_cam(a).xyz_mm for a in (pixel, place))
+    # points that the segment does not have are put inside, where they disturb no scale
+    pixel, position = (np.where(has[:, None], a, middle) for a in (pixel, position))
+    rays, own = (pair.cam1.rays_cam(a).xyz_mm for a in (pixel, position))
     J = np.linalg.inv(pair.cam1.lens.image_jacobian(own[:, :2]))
     with np.errstate(invalid="ignore", divide="ignore"):
-        inherited = inherited_px.through(np.asarray(J))
+        propagated = propagated_px.through(np.asarray(J))
         steep = totals.plane
         plane = np.concatenate([np.sum(steep * own, axis=1)[:, None], steep[:, :2]], axis=1)
         slopes_px = (
             np.linalg.inv(J) @ totals.image_slopes @ np.linalg.inv(pair.cam1.lens.image_jacobian(totals.rays[:, :2]))
         )
     offset = own[:, :2] - rays[:, :2]
-    has &= np.isfinite(plane).all(axis=1) & np.isfinite(inherited.noise + inherited.pattern).all(axis=(1, 2))
+    has &= np.isfinite(plane).all(axis=1) & np.isfinite(propagated.noise + propagated.pattern).all(axis=(1, 2))
     spread = float(np.median(np.sqrt(np.abs(np.linalg.det(slopes_px[has])))))
-    leg_grid = PointGrid(
+    segment_grid = PointGrid(
         x_px=pixel[:, 0].reshape(grid.shape),
         y_px=pixel[:, 1].reshape(grid.shape),
         allowed=has.reshape(grid.shape),
         step_px=max(grid.step_px * spread, 1.0),
         extent_px=(0.0, 0.0, cols - 1.0, rows - 1.0),
     )
-    if grid.sight is not None:
-        leg_grid = replace(leg_grid, sight=carry_sight(grid.sight, leg_grid, grid, place, slopes_px))
+    if grid.visibility is not None:
+        segment_grid = replace(
+            segment_grid, visibility=carry_visibility(grid.visibility, segment_grid, grid, position, slopes_px)
+        )
     points = PointFits.empty(n, 1)
     points.w[has] = move_w(plane, -offset)[has]
     points.status[has] = PointStatus.OK
-    flat = assemble(points, pair=pair, grid=leg_grid, fits_image=leg_grid.allowed, shape=None)
-    # a point that stood at that step and is not in the leg lay too near to the image's border
+    flat = assemble(points, pair=pair, grid=segment_grid, fits_image=segment_grid.allowed, shape=None)
+    # a point valid at that step and not in the segment lay too near to the image's border
     why = np.where(field.valid, PointStatus.OUTSIDE_IMAGE, field.status).ravel()
     status = np.where(has, PointStatus.OK, why).astype(np.int8)
     older = np.full(n, first, np.int32) if field.references is None else field.references.steps.ravel()
-    return Leg(
+    return Segment(
         step=step,
         image1=image1,
         image2=image2,
-        grid=leg_grid,
-        place_px=place,
+        grid=segment_grid,
+        position_px=position,
         offset=offset,
         totals=totals,
         plane=plane,
-        inherited=inherited,
+        propagated=propagated,
         shape=flat,
         status=status,
         steps=np.where(has, step, older).astype(np.int32),
@@ -231,8 +234,8 @@ def begin_leg(
     )
 
 
-def measure_leg(
-    leg: Leg,
+def measure_segment(
+    segment: Segment,
     cur1: MeasureImage,
     cur2: MeasureImage,
     *,
@@ -243,37 +246,38 @@ def measure_leg(
     progress: Progress | None,
     cancel: CancelToken | None,
 ) -> GrowthState:
-    """Match a pair of images against a leg's reference; return where that ends, with points about the leg's pixels.
+    """Match a pair of images against a segment's reference; return the final state, about the segment's pixels.
 
-    ``previous`` is the field of the step before, in totals; it gives the start unless it is the leg's own reference.
+    ``previous`` is the field of the step before, in totals; it gives the start unless it is the segment's own
+    reference.
 
     Raises
     ------
     SeedError, ImageError, Cancelled
         As :func:`core.measure.measure_motion`.
     """
-    images = (leg.image1, leg.image2), (cur1, cur2)
+    images = (segment.image1, segment.image2), (cur1, cur2)
     try:
-        inputs = prepare(pair, *images, leg.grid, options, progress=progress, cancel=cancel)
+        inputs = prepare(pair, *images, segment.grid, options, progress=progress, cancel=cancel)
     except RegionError as error:
-        raise SeedError(f"no point of step {leg.step} is left to match a later step against.") from error
-    start = None if previous_step == leg.step else _started(leg, previous, pair)
-    inputs = inputs.on_shape(leg.shape, start)
-    state = seed_motion(inputs, keep_patch(inputs, begin(inputs), previous), leg.shape, start, None)
-    return fill_field(inputs, state, automatic=True, shape=leg.shape)
+        raise SeedError(f"no point of step {segment.step} is left to match a later step against.") from error
+    start = None if previous_step == segment.step else _started(segment, previous, pair)
+    inputs = inputs.on_shape(segment.shape, start)
+    state = seed_motion(inputs, keep_patch(inputs, begin(inputs), previous), segment.shape, start, None)
+    return fill_field(inputs, state, automatic=True, shape=segment.shape)
 
 
-def _started(leg: Leg, previous: Field, pair: StereoPair) -> Field:
-    """The last step's field about the leg's pixels, as far as a start needs it."""
+def _started(segment: Segment, previous: Field, pair: StereoPair) -> Field:
+    """Return the previous step's field about the segment's pixels, as far as a start needs it."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        starts = leg.starts(totals_of(previous, pair))
+        starts = segment.starts(totals_of(previous, pair))
     w, G = starts
-    known = previous.valid & leg.grid.allowed
+    known = previous.valid & segment.grid.allowed
     known &= np.isfinite(G).all(axis=(1, 2)).reshape(known.shape)
     status = np.where(known, PointStatus.OK, np.where(previous.valid, PointStatus.MASKED, previous.status))
     shape = previous.shape
     return replace(
-        leg.shape,
+        segment.shape,
         status=status.astype(np.int8),
         uvw_mm=np.where(known[..., None], 0.0, np.nan),
         patch=previous.patch,

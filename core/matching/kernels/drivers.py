@@ -36,7 +36,7 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
     def run(first, last, given, space, out, status, iterations):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        # taken apart before the loop: in it numba would count references at each attribute
+        # unpacked before the loop: in it numba would count references at each attribute
         reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting = given
         for i in range(first, last):
             status[i], iterations[i] = _point(
@@ -76,8 +76,9 @@ def _by_fit(of: Callable[[str, FitKernels], Any]) -> dict[str, dict[int, Any]]:
 
 
 run_points = _by_fit(lambda name, kernels: _entry(f"run_{name}", kernels.point, _STAMP))
-observe_points = _by_fit(lambda name, kernels: _entry(f"observe_{name}", kernels.observed, _STAMP))
-"""The compiled fits and observed covariances: of a shape or a motion, by the patch's degree (1 plane, 2 curved)."""
+cluster_robust_points = _by_fit(lambda name, kernels: _entry(f"observe_{name}", kernels.observed, _STAMP))
+"""The compiled fits and cluster-robust covariances: of a shape or a motion, by the patch's degree (1 plane, 2
+curved)."""
 work_space = _by_fit(lambda _, kernels: kernels.space)
-observed_space = _by_fit(lambda _, kernels: kernels.observed_space)
-"""What makes their work space for a subset's width; one call at a time may use it."""
+cluster_robust_space = _by_fit(lambda _, kernels: kernels.cluster_robust_space)
+"""Makers of their work space for a subset's width; one call at a time may use it."""

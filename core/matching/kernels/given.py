@@ -1,4 +1,4 @@
-"""What the kernels are called with, what they work in and what they return: named tuples, which numba knows."""
+"""Arguments, work spaces and results of the kernels: named tuples, which numba supports."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ComparedImage(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Options, and what is known of the noise: the images' variances, or all one where any is unknown."""
+    """Options and noise: the images' variances, or all one where any is unknown."""
 
     subset: int
     order: int
@@ -42,9 +42,10 @@ class Setting(NamedTuple):
 class Given(NamedTuple):
     """Images, cameras, n points and settings.
 
-    ``patches`` (k, subset, subset) uint8 are zero where a pixel does not count, ``which`` (n,) says which of them is a
-    point's, -1 = none. Images compared with the reference: camera 2 at t0 and, for a motion, both cameras at t.
-    ``xy`` (n, 2) px; ``w`` (n, M), ``G`` (n, 3, M) starts, or with ``e`` (n,) px the results whose covariance is asked.
+    ``patches`` (k, subset, subset) uint8 are zero where a pixel does not count, ``which`` (n,) is the index of a
+    point's, -1 = none. Images compared with the reference: camera 2's reference and, for a motion, both cameras'
+    current images. ``xy`` (n, 2) px; ``w`` (n, M), ``G`` (n, 3, M) starts, or with ``e`` (n,) px the results whose
+    covariance is computed.
     """
 
     reference: ReferenceImage
@@ -63,19 +64,19 @@ class Given(NamedTuple):
 
 
 class ReferenceSpace(NamedTuple):
-    """Of the reference subset: work space, and what :func:`set_up_reference` finds.
+    """Work space of the reference subset, and results of :func:`set_up_reference`.
 
     Raw sums, a vector for the nodes; then node monomials (M, 16), the change of basis (M, M) from monomials of a
-    pixel's place to those of its ray, the middle of the subset's pixels from the point and half its width (3,) px, the
-    sum of each column (2 M,), of f times it (2 M,), and the Gram matrix (2 M, 2 M); gain and offset are projected out
-    of the last two.
+    pixel's position to those of its ray, the middle of the subset's pixels from the point and half its width (3,) px,
+    the sum of each column (2 M,), of f times it (2 M,), and the Gram matrix (2 M, 2 M); gain and offset are projected
+    out of the last two.
     """
 
     raw: Any
     node_work: Any
     powers: Any
     basis: Any
-    place: Any
+    middle: Any
     sum_g: Any
     sum_fg: Any
     gram: Any
@@ -84,9 +85,9 @@ class ReferenceSpace(NamedTuple):
 class Subset(NamedTuple):
     """A point's subset in the reference.
 
-    Whether it lies in the image and the lens model's domain, the point's ray ``xc, yc``, the weights' sum ``p``, the
-    mean of f that is left, the sum of squares of f about it, the differences of neighbours against it (1 for white
-    noise), and how many pixels count.
+    ``inside``: True if it lies in the image and the lens model's domain; the point's ray ``xc, yc``, the weights' sum
+    ``p``, the remaining mean of f, the sum of squares of f about it, the differences of neighbours against it (1 for
+    white noise), and the number of pixels that count.
     """
 
     inside: bool
@@ -100,17 +101,17 @@ class Subset(NamedTuple):
 
 
 class WarpSpace(NamedTuple):
-    """Of one comparison: the warp, places for its nodes, and sums over the pixels."""
+    """Work space of one comparison: the warp, positions of its nodes, and sums over the pixels."""
 
     warp: Any
-    places: Any
+    positions: Any
     sums: Any
 
 
 class Equations(NamedTuple):
-    """Normal equations and what they are made of; four of what there is one of for each image, products take pairs.
+    """Normal equations and their parts; four elements for three images, since products take pairs.
 
-    Weights (4, 4); what an image's matrix makes of a unit of each unknown; columns; the Gram matrix times them; the
+    Weights (4, 4); effect of a unit of each unknown on an image's matrix; columns; the Gram matrix times them; the
     same, weighted; the normal equations, then their factor.
     """
 
@@ -123,9 +124,9 @@ class Equations(NamedTuple):
 
 
 class WorkSpace(NamedTuple):
-    """Everything that a thread needs for one point after another, so that no point allocates.
+    """Work space of a thread for one point after another, so that no point allocates.
 
-    Kernels take it apart at once: numba counts references at each attribute.
+    Kernels unpack it at once: numba counts references at each attribute.
     """
 
     ref: Any
@@ -144,8 +145,8 @@ class WorkSpace(NamedTuple):
     work: Any
 
 
-class ObservedSpace(NamedTuple):
-    """The fit's space and, besides, one block's pixels, the blocks' sums, and what they do to the unknowns."""
+class ClusterRobustSpace(NamedTuple):
+    """The fit's space and one block's pixels, the blocks' sums, and their effect on the unknowns."""
 
     fit: WorkSpace
     part: Any
@@ -156,9 +157,9 @@ class ObservedSpace(NamedTuple):
 
 
 class FitKernels(NamedTuple):
-    """A compiled fit and its observed covariance, of one point each, and what makes their work spaces."""
+    """A compiled fit and its cluster-robust covariance, of one point each, and the makers of their work spaces."""
 
     point: Any
     space: Any
     observed: Any
-    observed_space: Any
+    cluster_robust_space: Any

@@ -89,7 +89,7 @@ def make_factor(row: int) -> Any:
 
     @intrinsic
     def eliminate(_typingctx: Any, a: Any, i: Any) -> Any:
-        """Row i less what the rows above explain: ``a[i, :] -= a[j, i] a[j, :]`` for all j < i."""
+        """Subtract the rows above from row i: ``a[i, :] -= a[j, i] a[j, :]`` for all j < i."""
         sig = types.void(a, i)
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -127,7 +127,7 @@ def make_factor(row: int) -> Any:
         """Cholesky factor U, ``a = U^T U``, of the leading (n, n) in place; reads and fills the upper triangle.
 
         The diagonal gets its inverse. False if not positive definite; the test is relative to each diagonal entry, so
-        it does not depend on the unknowns' units. Entries below the diagonal are left with rubbish.
+        it does not depend on the unknowns' units. Entries below the diagonal are undefined.
         """
         for i in range(n):
             original = a[i, i]

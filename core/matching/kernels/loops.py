@@ -1,14 +1,14 @@
-"""The loops over a subset's pixels: where the time goes.
+"""The loops over a subset's pixels, which take most of the time.
 
 Written in vectors of eight pixels (:mod:`core.matching.kernels.vectors`), because row loads of four taps are two to
 four times faster than the gathers that a compiler makes of the same loop. One image's comparison is one loop that
-stores nothing: place of the pixel (a cubic polynomial in the offsets within the subset), spline value, residual, and
-its sums with the columns of the Jacobian. The places of the next eight pixels are found while the taps of these eight
-are loaded, so that no load waits for an address. No bounds are tested here:
+stores nothing: position of the pixel (a cubic polynomial in the offsets within the subset), spline value, residual, and
+its sums with the columns of the Jacobian. The positions of the next eight pixels are computed while the taps of these
+eight are loaded, so that no load waits for an address. No bounds are tested here:
 :func:`core.matching.kernels.warp.set_up_warp` proves beforehand that every tap lies inside the padded image.
 
 The reference subset is a (6, width) float32 array with the rows X and Y (offsets from the subset's centre over its half
-width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's place
+width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's position
 along x and y. ``width`` is the number of pixels rounded up to eight, and eight more; the surplus is zero.
 """
 
@@ -27,7 +27,7 @@ from core.matching.kernels.vectors import FLOAT, INT, LANES, LONG, Vec, at, join
 X, Y, F, WEIGHT, GX, GY = range(6)
 N_ROWS = 6
 N_WARP = 22
-"""Ten coefficients of the place along x, ten along y, gain and shift of the grey levels."""
+"""Ten coefficients of the position along x, ten along y, gain and shift of the grey levels."""
 
 
 def monomials(degree: int) -> list[tuple[int, int]]:
@@ -104,7 +104,7 @@ def _spline(order: int, rows: list[Any], first: list[Any], tx: Vec, ty: Vec) -> 
     return value
 
 
-def _place(c: list[Vec], x: Vec, y: Vec) -> Vec:
+def _position(c: list[Vec], x: Vec, y: Vec) -> Vec:
     """Cubic polynomial with coefficients in the order of :func:`monomials`."""
     along_x = c[0] + x * (c[1] + x * (c[3] + x * c[6]))
     return along_x + y * ((c[2] + x * (c[4] + x * c[7])) + y * ((c[5] + x * c[8]) + y * c[9]))
@@ -120,7 +120,7 @@ def _lanes(builder: Any, indices: Any) -> list[Any]:
     return scalars
 
 
-def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[Vec]], out: Any, place: int) -> None:
+def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[Vec]], out: Any, slot: int) -> None:
     """Loop over ``count`` blocks; ``terms(offset)`` gives the block's summands; totals go to ``out`` as float64."""
     zero = ir.Constant(ir.VectorType(FLOAT, LANES), [0.0] * LANES)
     sums = [cgutils.alloca_once(builder, zero.type) for _ in range(n_sums)]  # LLVM keeps them in registers
@@ -132,7 +132,7 @@ def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[V
             builder.store((Vec(builder, builder.load(one)) + term).value, one)
     for i, one in enumerate(sums):
         total = builder.fpext(Vec(builder, builder.load(one)).sum(), ir.DoubleType())
-        builder.store(total, at(builder, out, LONG(place + i)))
+        builder.store(total, at(builder, out, LONG(slot + i)))
 
 
 def data(context: Any, builder: Any, sig: Any, args: Any, i: int) -> Any:
@@ -157,7 +157,7 @@ def _comparison(order: int, degree: int) -> Any:
         c
             Padded coefficients, flat float32.
         base
-            int64 flat index of the first tap for place (0, 0).
+            int64 flat index of the first tap for position (0, 0).
         stride
             int64 row length of ``c``.
         warp
@@ -185,9 +185,9 @@ def _comparison(order: int, degree: int) -> Any:
             k_next = cgutils.alloca_once(builder, ir.VectorType(INT, LANES))
             tx_next, ty_next = (cgutils.alloca_once(builder, vector) for _ in range(2))
 
-            def find_place(offset: Any) -> None:
+            def find_position(offset: Any) -> None:
                 x, y = (load(builder, at(builder, ref[r], offset)) for r in (X, Y))
-                xt, yt = _place(warp[:10], x, y), _place(warp[10:20], x, y)
+                xt, yt = _position(warp[:10], x, y), _position(warp[10:20], x, y)
                 xf, yf = xt.floor(), yt.floor()
                 k = builder.add(builder.mul(yf.to_int(), stride, flags=("nsw",)), xf.to_int(), flags=("nsw",))
                 builder.store(k, k_next)
@@ -197,7 +197,7 @@ def _comparison(order: int, degree: int) -> Any:
             def terms(offset: Any) -> list[Vec]:
                 first = _lanes(builder, builder.load(k_next))
                 tx, ty = Vec(builder, builder.load(tx_next)), Vec(builder, builder.load(ty_next))
-                find_place(builder.add(offset, LONG(LANES)))
+                find_position(builder.add(offset, LONG(LANES)))
                 x, y, f, weight, gx, gy = (load(builder, at(builder, row, offset)) for row in ref)
                 d = _spline(order, rows, first, tx, ty) * gain - (warp[21] + f)
                 a = weight * d
@@ -211,7 +211,7 @@ def _comparison(order: int, degree: int) -> Any:
                     *(by * m if m else by for m in columns),
                 ]
 
-            find_place(LONG(0))
+            find_position(LONG(0))
             _sum_up(builder, args[5], 3 + 2 * len(monomials(degree)), terms, data(context, builder, sig, args, 6), 0)
             return context.get_dummy_value()
 
@@ -234,7 +234,7 @@ def _powers(x: Vec, y: Vec, degree: int) -> list[Vec | None]:
 
 def _reference_sums(degree: int) -> Any:
     def sum_reference(_typingctx: Any, ref: Any, blocks: Any, mean: Any, out: Any) -> Any:
-        """Take ``mean`` out of the reference's grey levels and sum what the normal equations need.
+        """Subtract ``mean`` from the reference's grey levels and compute the sums for the normal equations.
 
         Parameters
         ----------
@@ -283,7 +283,7 @@ def _reference_sums(degree: int) -> Any:
                 return terms
 
             few, many = len(monomials(degree)), len(monomials(2 * degree))
-            place = 0
+            slot = 0
             for terms, n in (
                 (with_grey, 4 + 2 * few),
                 (columns_alone, 2 * few),
@@ -291,8 +291,8 @@ def _reference_sums(degree: int) -> Any:
                 (products(GX, GY), many),
                 (products(GY, GY), many),
             ):
-                _sum_up(builder, args[1], n, terms, out, place)
-                place += n
+                _sum_up(builder, args[1], n, terms, out, slot)
+                slot += n
             return context.get_dummy_value()
 
         return sig, codegen

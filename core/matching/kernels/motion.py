@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from core.matching.kernels.cluster_robust import make_cluster_robust
 from core.matching.kernels.given import FitKernels
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
@@ -22,7 +23,6 @@ from core.matching.kernels.noise import (
     share_correction,
     unlike_noise,
 )
-from core.matching.kernels.observed import make_observed
 from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
@@ -46,7 +46,7 @@ from core.matching.kernels.warp import lens_jacobian
 def n_motion_out(terms: int) -> int:
     """Numbers a point: ``terms`` of w, 3 x ``terms`` of G, e, zncc (3), noise, covariance (25) of (w0, G0, e).
 
-    Last the variance that the covariance holds where the noise is not known.
+    Last the variance assumed in the covariance where the noise is not known.
     """
     return 4 * terms + 31
 
@@ -219,10 +219,10 @@ def make_motion(degree: int) -> FitKernels:
         factor_on *= 1.0 if setting.known_noise else variance + above
         for i in range(25):
             covariance[i] *= factor_on
-        # px: along and across camera 2's epipolar line, and both ways in camera 1 at t
+        # px: along and across camera 2's epipolar line, and both ways in camera 1's current image
         sigma = max(math.sqrt(covariance[0]) * along, math.sqrt(covariance[24]))
         sigma = max(sigma, math.sqrt(max(covariance[6], covariance[12])) * lens1[1] / G[2, 0])
         share = setting.slope_noise * variance * p / weakest
         return texture_status(status, share, sigma, setting.max_sigma, worst), iterations
 
-    return FitKernels(motion_point, parts.work_space, *make_observed(degree, 3, parts, freeze))
+    return FitKernels(motion_point, parts.work_space, *make_cluster_robust(degree, 3, parts, freeze))

@@ -11,10 +11,12 @@ from core.matching.kernels.naming import inner
 # White noise of variance 1 behind a spline, at fraction t between pixels, along one axis: a + b cos(2 pi t), the first
 # two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
 VALUE_NOISE = ((0.8742, 0.1213), (0.9180, 0.0818))  # cubic, quintic
-ALIKE_SD = 3.0  # comparisons whose residuals are this alike have noise alone in them
-UNLIKE = 1.5  # small differences of the views raise residuals by less, and do not pull the solution as noise does
-LEAST_CORRELATION = 0.05  # what is matched at all has several times as much
-MAX_NOISE_SHARE = 0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise taken for texture
+ALIKE_SD = 3.0  # comparisons with residuals as similar as this hold noise alone
+UNLIKE = 1.5  # small differences of the views raise residuals by less, and affect the solution less than noise does
+MIN_CORRELATION = 0.05  # valid matches have several times as much
+MAX_NOISE_SHARE = (
+    0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise mistaken for texture
+)
 
 # an image's levels; the misfit is the residuals' sum of squares, then the noise of its interpolated grey levels over
 # that of its pixels, and how many of its pixels show what one pixel of the reference shows
@@ -55,10 +57,10 @@ def _spread_over(reach):
 
 
 @inner
-def _mean_cosine(place, along_x, along_y):
-    """Mean of cos(2 pi t) over a subset whose places run from ``place`` by up to these px each way."""
+def _mean_cosine(middle, along_x, along_y):
+    """Mean of cos(2 pi t) over a subset whose positions extend from ``middle`` by up to these px each way."""
     spread = _spread_over(along_x) * _spread_over(along_y)
-    return spread * math.cos(2.0 * math.pi * place) if spread != 0.0 else 0.0
+    return spread * math.cos(2.0 * math.pi * middle) if spread != 0.0 else 0.0
 
 
 @inner
@@ -74,8 +76,8 @@ def interpolated_noise(warp, half, order):
 def noise_from_residuals(levels, images, n, unknowns):
     """Variance of one image's noise at weight one, in reference grey levels squared, from the residuals.
 
-    Of three comparisons the quietest count: what raises the others' residuals are small differences of the views,
-    which do not pull the solution as noise does.
+    Of three comparisons the least noisy count: the others' residuals are raised by small differences of the views,
+    which affect the solution less than noise does.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
     smallest = np.inf
@@ -93,8 +95,8 @@ def noise_from_residuals(levels, images, n, unknowns):
 
 @inner
 def best_correlation(levels, images):
-    """Of the comparisons, at least ``LEAST_CORRELATION``."""
-    best = LEAST_CORRELATION
+    """Of the comparisons, at least ``MIN_CORRELATION``."""
+    best = MIN_CORRELATION
     for k in range(images):
         best = max(best, levels[k, ZNCC])
     return best
@@ -102,13 +104,14 @@ def best_correlation(levels, images):
 
 @inner
 def unlike_noise(levels, images, n, unknowns):
-    """Variance by which the noisiest image exceeds what the quietest comparison tells of all; zero where all are alike.
+    """Variance by which the noisiest image exceeds the estimate of the least noisy comparison; zero where all are
+    alike.
 
-    The weights take all images' noise for equal. Where one has clearly more (less light, blur, a surface that changed),
-    the unknowns that depend on it scatter with the mean of its variance and the reference's, which is what its own
-    comparison tells; so the covariance is that of the noisiest comparison. That image's contrast is noise in part, so
-    its residuals, brought to the reference's contrast, are smaller than the noise: by its correlation over the best
-    one, which tells what the reference's own noise leaves of a correlation.
+    The weights assume equal noise of all images. Where one has clearly more (less light, blur, a surface that changed),
+    the variance of the unknowns that depend on it is the mean of its variance and the reference's, as estimated by its
+    own comparison; so the covariance is that of the noisiest comparison. That image's contrast is noise in part, so its
+    residuals, brought to the reference's contrast, are smaller than the noise: by its correlation over the best one,
+    which gives the effect of the reference's own noise on a correlation.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
     best = best_correlation(levels, images)
@@ -116,7 +119,7 @@ def unlike_noise(levels, images, n, unknowns):
     for k in range(images):
         one = _one_variance(levels, k)
         smallest = min(smallest, one)
-        largest = max(largest, one * (best / max(levels[k, ZNCC], LEAST_CORRELATION)) ** 2)
+        largest = max(largest, one * (best / max(levels[k, ZNCC], MIN_CORRELATION)) ** 2)
     return max(largest - UNLIKE * smallest, 0.0) / freedom
 
 

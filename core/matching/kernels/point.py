@@ -1,17 +1,18 @@
-"""What the fits of shape and of motion share at one point, for plane and for curved patches.
+"""Common parts of the fits of shape and of motion at one point, for plane and for curved patches.
 
-With C = [c, ex, ey, 0, ...], c = (Xc, Yc, 1), camera images see the patch through matrices that act on its monomials m:
+With C = [c, ex, ey, 0, ...], c = (Xc, Yc, 1), the patch is mapped into the camera images by matrices that act on its
+monomials m:
 
-    cam2 at t0   M_0 = S(e) (R21 C + t21 w^T)
-    cam1 at t    M_1 = G
-    cam2 at t    M_2 = S(e) (R21 G + t21 w^T)
+    cam2 reference  M_0 = S(e) (R21 C + t21 w^T)
+    cam1 current    M_1 = G
+    cam2 current    M_2 = S(e) (R21 G + t21 w^T)
 
 S(e) shifts camera 2's normalised image by e times one pixel across the epipolar line of the point.
 
-Unknowns, in this order inside: (w_j, G_0j, G_1j, G_2j) for j = 1, 2, ..., then for j = 0, then e. So what belongs to
-the point itself comes last, where its covariance can be read off the factor. A step changes image k's matrix by dM_k;
-what the patch does in its own coordinates then is ``d = M_k^-1 dM_k m``, from which ``dX = d_1 - X d_0`` and
-``dY = d_2 - Y d_0``.
+Unknowns, in this order inside: (w_j, G_0j, G_1j, G_2j) for j = 1, 2, ..., then for j = 0, then e. So the unknowns of
+the point itself come last, where their covariance can be read off the factor. A step changes image k's matrix by dM_k;
+the patch then moves in its own coordinates by ``d = M_k^-1 dM_k m``, from which ``dX = d_1 - X d_0`` and ``dY = d_2 - Y
+d_0``.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are set up anew
 PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted, not compared anew
 FIRST_RATE = 0.1  # convergence rate assumed before two steps have shown it
-FLAT = 1e-6  # squared contrast below which an image shows nothing
+FLAT = 1e-6  # squared contrast below which an image has no texture
 WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
 
 
@@ -62,8 +63,8 @@ WHITE = 0.86  # squared differences of neighbours over twice the variance: one f
 def epipolar_shift(lens2, R, t, xc, yc, w0):
     """Camera 2's normalised shift (nu_x, nu_y) that moves the point's image by 1 px across its epipolar line.
 
-    Positive where ``StereoPair.epipolar_residual_px`` is. Also returns how many px of camera 2 a unit of w0 moves the
-    point; zero where the epipolar line is a point.
+    Positive where ``StereoPair.epipolar_residual_px`` is. Also returns the shift of the point in camera 2 by a unit of
+    w0, px; zero where the epipolar line is a point.
     """
     q0 = R[0, 0] * xc + R[0, 1] * yc + R[0, 2]
     q1 = R[1, 0] * xc + R[1, 1] * yc + R[1, 2]
@@ -87,7 +88,7 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
 
 @inner
 def settled(motion, previous, tolerance):
-    """Whether the steps still to come, as a geometric series, move no corner further than the tolerance."""
+    """Return True if the remaining steps, as a geometric series, move no corner further than the tolerance."""
     if motion < tolerance:
         return True
     rate = FIRST_RATE if previous == 0.0 else motion / previous
@@ -96,7 +97,7 @@ def settled(motion, previous, tolerance):
 
 @inner
 def texture_status(status, share, sigma_px, max_sigma_px, zncc):
-    """Final status: a point that settled, or did not, on noise taken for texture or on a match that scatters."""
+    """Final status: converged or not, rejected for noise mistaken for texture or for a large standard deviation."""
     if status == OK and share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:
         return OK
     if zncc > 0.5 and not share < MAX_NOISE_SHARE:
@@ -138,8 +139,8 @@ def make_compare(degree: int) -> Any:
         coefficients, rows, cols, stride = image
         blocks, p, offset, f2 = known
         sum_g, sum_fg = of_reference.sum_g, of_reference.sum_fg
-        warp, places, sums = space
-        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, places, warp)
+        warp, positions, sums = space
+        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, positions, warp)
         if base < 0:
             return False
         warp[20] = levels[GAIN]
@@ -162,7 +163,7 @@ def make_compare(degree: int) -> Any:
         levels[ZNCC] = (fd + f2) / math.sqrt(f2 * y2)
         levels[CONTRAST] = c / gain
         levels[MISFIT] = 2.0 * f2 * (1.0 - levels[ZNCC])
-        half = of_reference.place[2]
+        half = of_reference.middle[2]
         levels[SMOOTHED] = interpolated_noise(warp, half, order)
         levels[DENSITY] = min(max(abs(warp[1] * warp[12] - warp[2] * warp[11]) / (half * half), 0.01), 100.0)
         return True
@@ -171,7 +172,7 @@ def make_compare(degree: int) -> Any:
 
 
 class PointKernels(NamedTuple):
-    """The compiled parts of a fit, what makes its work space, and how many monomials its patch has."""
+    """The compiled parts of a fit, the maker of its work space, and the number of its patch's monomials."""
 
     set_up_reference: Any
     work_space: Callable[[int], WorkSpace]
@@ -188,7 +189,8 @@ class PointKernels(NamedTuple):
 
 
 def make_point(degree: int, images: int) -> PointKernels:
-    """Compile what the fits share, for patches of this degree (1 plane, 2 curved) and one or three comparisons."""
+    """Compile the common parts of the fits, for patches of this degree (1 plane, 2 curved) and one or three
+    comparisons."""
     few = len(monomials(degree))
     each = 4 if images == 3 else 1  # unknowns a monomial: w_j, and G_0j, G_1j, G_2j
     unknowns = each * few + 1
@@ -207,7 +209,7 @@ def make_point(degree: int, images: int) -> PointKernels:
             node_work=np.empty(22),
             powers=np.empty((few, N_NODES)),
             basis=basis,
-            place=np.empty(3),
+            middle=np.empty(3),
             sum_g=np.empty(n_columns),
             sum_fg=np.empty(n_columns),
             gram=np.empty((n_columns, n_columns)),
@@ -239,7 +241,7 @@ def make_point(degree: int, images: int) -> PointKernels:
 
     @kernel(made_for)
     def image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M):
-        """The matrices through which the images see the patch."""
+        """Compute the matrices that map the patch into the images."""
         for i in range(3):
             for j in range(few):
                 M[0, i, j] = t[i] * w[j]
@@ -257,11 +259,12 @@ def make_point(degree: int, images: int) -> PointKernels:
 
     @kernel(made_for)
     def jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
-        """What each unknown does to the patch, px in the reference, as coefficients of ``columns``; False if singular.
+        """Compute the effect of each unknown on the patch, px in the reference, as coefficients of ``columns``; False
+        if singular.
 
         ``slopes`` are d(px) / d(ray) of camera 1 at the point.
         """
-        basis, place = of_reference.basis, of_reference.place
+        basis, middle = of_reference.basis, of_reference.middle
         last = each * few
         j11, j12, j21, j22 = slopes
         for k in range(images):
@@ -296,7 +299,7 @@ def make_point(degree: int, images: int) -> PointKernels:
                         out[few + m, at + i] += block[2, i] * b
                     out[m, last] += block[1, 4] * from_e
                     out[few + m, last] += block[2, 4] * from_e
-                # - X d_0 and - Y d_0 have one degree more; X and Y in px are the pixel's place
+                # - X d_0 and - Y d_0 have one degree more; X and Y in px are the pixel's position
                 if j == 0 or (few == 6 and j < 3):
                     for m in range(degree_of_m):
                         b = basis[j, m]
@@ -306,10 +309,10 @@ def make_point(degree: int, images: int) -> PointKernels:
                         for i in range(each + 1):
                             c = at + i if i < each else last
                             d = block[0, i] * b if i < each else block[0, 4] * b * M[k, 2, j]
-                            out[m, c] -= d * place[0]
-                            out[by_x, c] -= d * place[2]
-                            out[few + m, c] -= d * place[1]
-                            out[few + by_y, c] -= d * place[2]
+                            out[m, c] -= d * middle[0]
+                            out[by_x, c] -= d * middle[2]
+                            out[few + m, c] -= d * middle[1]
+                            out[few + by_y, c] -= d * middle[2]
         return True
 
     @kernel(made_for)
@@ -344,7 +347,8 @@ def make_point(degree: int, images: int) -> PointKernels:
 
     @kernel(made_for)
     def moves_of(columns, step, moves):
-        """Each image's motion of the patch (coefficients) for a step; returns the largest corner motion, camera 1 px.
+        """Compute each image's motion of the patch (coefficients) for a step; return the largest corner motion, camera
+        1 px.
 
         The sum of the coefficients' sizes bounds it.
         """

@@ -1,11 +1,10 @@
-"""The reference subset: grey levels, gradients, and the sums that the normal equations are made of.
+"""The reference subset: grey levels, gradients, and the sums for the normal equations.
 
-A step of the unknowns displaces the patch, as any image sees it, by ``dx = a . m, dy = b . m`` px in the reference
-image (``m`` the monomials 1, x, y, or those up to second order, of a pixel's place in the subset), and an image's grey
-levels by contrast times ``gx dx + gy dy`` with the *reference's* gradient (gx, gy). So the columns ``gx m_j, gy m_j``,
-which know nothing of any image, make every Jacobian. Terms of higher degree, that perspective adds, are left out of the
-Jacobian (not of the warp): they are some thousandths of the others, and change where Gauss-Newton goes, not where it
-ends.
+A step of the unknowns displaces the patch, in any image, by ``dx = a . m, dy = b . m`` px in the reference image (``m``
+the monomials 1, x, y, or those up to second order, of a pixel's position in the subset), and an image's grey levels by
+contrast times ``gx dx + gy dy`` with the *reference's* gradient (gx, gy). So the columns ``gx m_j, gy m_j``, which
+depend on no other image, make every Jacobian. Terms of higher degree, that perspective adds, are left out of the
+Jacobian (not of the warp): they are some thousandths of the others, and change the path of Gauss-Newton, not its end.
 
 The gradients are expected to be the best estimate of the noise-free texture's: then the Gram matrix of the columns is
 also the sensitivity of their sums to a displacement.
@@ -32,9 +31,9 @@ def subset_array(subset: int) -> np.ndarray:
     """Return an array for the reference subset, its rows that all points share filled; the surplus is zero."""
     width = (subset * subset + LANES - 1) // LANES * LANES + LANES
     ref = np.zeros((N_ROWS, width), np.float32)
-    place = np.linspace(-1.0, 1.0, subset)
+    coordinate = np.linspace(-1.0, 1.0, subset)
     n = subset * subset
-    ref[X, :n], ref[Y, :n] = (axis.ravel() for axis in np.meshgrid(place, place))
+    ref[X, :n], ref[Y, :n] = (axis.ravel() for axis in np.meshgrid(coordinate, coordinate))
     ref[WEIGHT, :n] = 1.0
     return ref
 
@@ -78,7 +77,7 @@ def _copy(image, top, left, subset, ref, row):
 
 @inner
 def _count_visible(patches, which, subset, weighted, ref):
-    """Take out of the weights what the point's patch does not show; returns how many pixels are left."""
+    """Set the weights of invisible pixels to zero; return the number of pixels left."""
     n = subset * subset
     if which < 0:
         if not weighted:  # the last point may have left its own
@@ -113,7 +112,7 @@ def make_reference(degree: int) -> Any:
 
     @kernel(f"{degree}")
     def set_up_reference(reference, patches, which, lens, x_px, y_px, subset, ref, space):
-        """Copy the subset nearest to (x_px, y_px) and sum it; returns a :class:`Subset`.
+        """Copy the subset nearest to (x_px, y_px) and sum it; return a :class:`Subset`.
 
         Parameters
         ----------
@@ -127,7 +126,7 @@ def make_reference(degree: int) -> Any:
             A :class:`ReferenceSpace`.
         """
         pixels, grad_x, grad_y, weights = reference
-        raw, node_work, powers, basis, place, sum_g, sum_fg, gram = space
+        raw, node_work, powers, basis, middle, sum_g, sum_fg, gram = space
         nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
@@ -137,8 +136,8 @@ def make_reference(degree: int) -> Any:
         xc, yc = undistort(lens, x_px, y_px)
         if not np.isfinite(xc + yc):
             return nothing
-        place[0], place[1], place[2] = left + half - x_px, top + half - y_px, half
-        if not set_up_nodes(lens, place[0], place[1], half, xc, yc, node_work, powers):
+        middle[0], middle[1], middle[2] = left + half - x_px, top + half - y_px, half
+        if not set_up_nodes(lens, middle[0], middle[1], half, xc, yc, node_work, powers):
             return nothing
         _copy(pixels, top, left, subset, ref, np.int64(F))
         _copy(grad_x, top, left, subset, ref, np.int64(GX))
@@ -170,11 +169,11 @@ def make_reference(degree: int) -> Any:
             a, b = sum_g[i] * per_weight, sum_fg[i] * per_f2
             for j in range(n_columns):
                 gram[i, j] -= a * sum_g[j] + b * sum_fg[j]
-        # places -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
+        # positions -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
         u, v = basis[1], basis[2]
         u[1], u[2], v[1], v[2] = half * node_work[16], half * node_work[17], half * node_work[18], half * node_work[19]
-        u[0] = (u[1] * place[0] + u[2] * place[1]) / half
-        v[0] = (v[1] * place[0] + v[2] * place[1]) / half
+        u[0] = (u[1] * middle[0] + u[2] * middle[1]) / half
+        v[0] = (v[1] * middle[0] + v[2] * middle[1]) / half
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from core.matching.kernels.cluster_robust import make_cluster_robust
 from core.matching.kernels.given import FitKernels
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
@@ -18,7 +19,6 @@ from core.matching.kernels.noise import (
     noise_from_residuals,
     share_correction,
 )
-from core.matching.kernels.observed import make_observed
 from core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
@@ -148,4 +148,4 @@ def make_shape(degree: int) -> FitKernels:
         share = setting.slope_noise * variance * p / weakest
         return texture_status(status, share, sigma, setting.max_sigma, levels[0, ZNCC]), iterations
 
-    return FitKernels(shape_point, parts.work_space, *make_observed(degree, 1, parts, freeze))
+    return FitKernels(shape_point, parts.work_space, *make_cluster_robust(degree, 1, parts, freeze))

@@ -1,8 +1,8 @@
 """Fixed-width vectors for the innermost loops, as a thin layer over LLVM's instruction builder.
 
-numba compiles a loop over pixels well but cannot be told to load four neighbouring taps at once: it emits sixteen
-gathers for a cubic spline, two to four times slower than rows. So the pixel loops are written in vectors of eight
-pixels with the few operations below; LLVM turns them into what the machine has (SSE, AVX2, AVX-512, NEON).
+numba compiles a loop over pixels well but has no means to load four neighbouring taps at once: it emits sixteen gathers
+for a cubic spline, two to four times slower than rows. So the pixel loops are written in vectors of eight pixels with
+the few operations below; LLVM turns them into the machine's instructions (SSE, AVX2, AVX-512, NEON).
 """
 
 from __future__ import annotations

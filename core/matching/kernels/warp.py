@@ -117,14 +117,14 @@ def undistort(lens, x, y):
 
 
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
-    place = np.array([-1.0, -0.4, 0.4, 1.0])
-    x, y = (a.ravel() for a in np.meshgrid(place, place))
+    position = np.array([-1.0, -0.4, 0.4, 1.0])
+    x, y = (a.ravel() for a in np.meshgrid(position, position))
     columns = np.stack([x**i * y**j for i, j in monomials(3)], axis=1)
     return np.stack([x, y]), np.linalg.pinv(columns)
 
 
 NODES, _FIT = _nodes()
-"""(2, 16) places in the subset, -1 to 1, through which each image's warp goes; (10, 16) cubic polynomial from them."""
+"""(2, 16) positions in the subset, -1 to 1, of the nodes of each image's warp; (10, 16) cubic polynomial from them."""
 N_NODES = 16
 
 
@@ -181,8 +181,8 @@ def _node_rays(_typingctx: Any, q: Any, iterations: Any, powers: Any) -> Any:
             for row, value in enumerate((u * u, u * v, v * v)):
                 store(value, at(builder, out, LONG(N_NODES * (3 + row))))
         reach = (u + xc) * (u + xc) + (v + yc) * (v + yc)
-        for place, value in ((20, error), (21, reach)):
-            builder.store(value.reduce("fmax"), at(builder, pointer, LONG(place)))
+        for position, value in ((20, error), (21, reach)):
+            builder.store(value.reduce("fmax"), at(builder, pointer, LONG(position)))
         return context.get_dummy_value()
 
     return sig, codegen
@@ -229,7 +229,7 @@ def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
 
 @intrinsic
 def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> Any:
-    """Polynomials of the nodes' places in one image.
+    """Compute the polynomials of the nodes' positions in one image.
 
     Parameters
     ----------
@@ -282,11 +282,11 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
         p1, p2 = if_seidel(0.0, a[8]), if_seidel(0.0, a[9])
         xd = u * radial + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
         yd = v * radial + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)
-        for row, place in enumerate((a[4] + a[1] * xd + a[3] * yd, a[5] + a[2] * yd)):
+        for row, position in enumerate((a[4] + a[1] * xd + a[3] * yd, a[5] + a[2] * yd)):
             total = None
             for n in range(N_NODES):
                 fit = ir.Constant(ir.VectorType(DOUBLE, 12), [*(float(c) for c in _FIT[:, n]), 0.0, 0.0])
-                term = place.pick([n] * 12) * Vec(builder, fit)
+                term = position.pick([n] * 12) * Vec(builder, fit)
                 total = term if total is None else total + term
             assert total is not None
             store(total, at(builder, out, LONG(12 * row)))
@@ -299,11 +299,11 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
 
 @njit(nogil=True, error_model="numpy")
 def set_up_warp(lens, m, powers, rows, cols, stride, lead, work, p):
-    """Prepare the pixel loop for one image that sees the patch through ``m``.
+    """Prepare the pixel loop for one image, into which ``m`` maps the patch.
 
     The warp from the subset to the image, perspective and both lenses included, is a cubic polynomial through sixteen
-    exact places. For a subset of half width h at focal length f (both px) and tilt t it is good to some
-    h (h / f tan t)^3 / 8: 1e-9 px with the paper's cameras, 1e-5 px with h = 16, f = 1200 and 45 degrees.
+    exact positions. For a subset of half width h at focal length f (both px) and tilt t it is good to some h (h / f tan
+    t)^3 / 8: 1e-9 px with the paper's cameras, 1e-5 px with h = 16, f = 1200 and 45 degrees.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ def set_up_warp(lens, m, powers, rows, cols, stride, lead, work, p):
     work
         (26,) work space.
     p
-        (22,) float32 out; entries 20 and 21 (grey levels) are left alone.
+        (22,) float32 out; entries 20 and 21 (grey levels) are left unchanged.
 
     Returns
     -------

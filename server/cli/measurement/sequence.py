@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from core.compiling import COMPILING, told_when_compiling
+from core.compiling import COMPILING, report_compiling
 from core.errors import MeasurementError
 from core.field.points.result import Field
 from core.settings import StoredSettings
@@ -81,7 +81,7 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
     with (
         _output_folder(job.out),
         CompileAside(job.settings.patch) as aside,
-        told_when_compiling(on_compiling),
+        report_compiling(on_compiling),
         WriteBehind[dict[str, Any]]() as written,
     ):
         runner = _Runner(job, progress, written)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from core.arrays import Float
-from core.cameras.conversion import image_places
+from core.cameras.conversion import image_positions
 from core.cameras.lens import OpenCVLens, SeidelLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
@@ -178,7 +178,7 @@ def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
         )
     shares = {}
     for name, camera, size in (("cam1", loaded.pair.cam1, size1), ("cam2", loaded.pair.cam2, size2)):
-        shares[name] = float(camera.lens.normalised_from_image(image_places(size)).valid.mean())
+        shares[name] = float(camera.lens.normalised_from_image(image_positions(size)).valid.mean())
         if shares[name] < 1.0:
             warnings.append(f"{name}: {1 - shares[name]:.1%} of the image has no ray, its lens folds back there")
     if not known:

@@ -16,8 +16,8 @@ from core.field.points.shared_pixels import SharedPixels
 from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
-from core.gauge.line import places_along
-from core.gauge.locate import places_from_mm
+from core.gauge.line import positions_along
+from core.gauge.locate import positions_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
@@ -200,7 +200,7 @@ def _check_same(step: _Step, first: ResultHead, grid: tuple[Float, Float], path:
 
 
 def _count(field: Field, lines: Sequence[LineGauge], variables: int) -> int:
-    return variables * sum(len(places_along(field, line.vertices_px, line.count)[1]) for line in lines)
+    return variables * sum(len(positions_along(field, line.vertices_px, line.count)[1]) for line in lines)
 
 
 def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
@@ -218,7 +218,7 @@ def _placed(field: Field, request: GaugeRequest) -> _Placed:
     gauges: list[PointGauge | ExtensometerGauge] = [*request.points, *request.extensometers]
     for gauge in gauges:
         places, in_mm = gauge.places()
-        xy = places_from_mm(field, places) if in_mm else places
+        xy = positions_from_mm(field, places) if in_mm else places
         placed[gauge.name] = [(float(x), float(y)) for x, y in xy]
     return placed
 
@@ -282,7 +282,7 @@ def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tup
 
 
 def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> LineReading:
-    xy, distance = places_along(variables.field, line.vertices_px, line.count)
+    xy, distance = positions_along(variables.field, line.vertices_px, line.count)
     places = sample(variables.field, xy)
     return LineReading(
         name=line.name,
@@ -314,7 +314,7 @@ def _area(
         # how far other variables' errors reach is not known here: no uncertainty of their mean
         known = sigma if component_of(n) is not None else None
         of_place = component_of(n) in range(3)
-        shared = variables.shared.places if of_place else variables.shared
+        shared = variables.shared.positions if of_place else variables.shared
         got = area_statistics(field, variable.values, known, inside, shared=shared)
         if n in STRAIN_NAMES and got.count:
             got = replace(got, mean_sigma=variables.mean_strain_sigma(inside)[STRAIN_NAMES.index(n)])

@@ -17,7 +17,7 @@ from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.errors import StereorigError
 from core.field.checks.epipolar_offset import check_epipolar
-from core.field.checks.gates import GateOptions
+from core.field.checks.validity import ValidityOptions
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair, measure_motion
@@ -161,7 +161,7 @@ def adversarial(figures: Path) -> Section:
                 right = 0 if outcome.field is None else int((outcome.field.valid & outcome.clean).sum())
                 share = 100.0 * right / int(outcome.clean.sum())
                 scatter_px = _scatter_px(scene, case) if share < KEPT_PERCENT else 0.0
-                allowed = scatter_px < GateOptions().largest_sigma_px
+                allowed = scatter_px < ValidityOptions().max_sigma_px
                 what = "the same: valid where every image shows the subset"
                 rows.append(Row(what, share, "%", KEPT_PERCENT if allowed else None, at_least=True))
                 if scatter_px > 0.0:
@@ -200,8 +200,8 @@ def adversarial(figures: Path) -> Section:
 
 def _scatter_px(scene: _Scene, case: Case) -> float:
     """How far matches are off in camera 1, rms, if none is refused for its scatter: what the pictures allow."""
-    free = GateOptions(largest_sigma_px=10.0, largest_depth_sigma_px=10.0)
-    options = MeasureOptions(subset_px=scene.setting.subset_px, gates=free)
+    free = ValidityOptions(max_sigma_px=10.0, max_depth_sigma_px=10.0)
+    options = MeasureOptions(subset_px=scene.setting.subset_px, validity=free)
     field = measure_motion(scene.rig.pair, *case.pictures, scene.grid, options)
     assert field.uvw_mm is not None
     camera = scene.rig.pair.cam1

@@ -42,7 +42,7 @@ STAGES = (
     ("read and decode", "server.compute.sequence", "read_image"),
     ("splines", "core.field.points.images", "prepare"),
     ("fit", "core.field.points.fitter", "fit_motion"),
-    ("gates", "core.field.growth.check", "apply_gates"),
+    ("checks", "core.field.growth.check", "apply_validity_checks"),
     ("assemble", "core.field.growth.field", "assemble"),
     ("summary", "server.compute.sequence", "summarise"),
     ("write", "server.compute.sequence", "write_field"),

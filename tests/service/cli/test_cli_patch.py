@@ -71,9 +71,9 @@ def test_auto_decides_shape_and_motion_apart_keeps_to_it_and_says_why(
 ) -> None:
     assert main(command(folder, tmp_path / "out", patch="auto")) == 0
     said = capfd.readouterr().err
-    assert "shape: curved: plane patches err by" in said
-    assert "step 1: stretch: plane patches err by less than" in said
-    assert "step 2: curved: plane patches err by" in said
+    assert "shape: curved: plane patches have a bias of" in said
+    assert "step 1: stretch: plane patches have a bias of less than" in said
+    assert "step 2: curved: plane patches have a bias of" in said
     steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
     assert [step["patch"]["patch"] for step in steps] == ["curved", "stretch", "curved", "curved"]
     assert [step["patch"]["kept"] for step in steps] == [False, False, False, True]
@@ -105,9 +105,9 @@ def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
     two = {cam: [str(folder / f"{cam}_{n}.tif") for n in (0, 2)] for cam in ("cam1", "cam2")}
     assert main(command(folder, tmp_path / "out", patch="stretch", **two)) == 0
     said = capfd.readouterr().err
-    assert "shape: plane: asked for; plane patches err by" in said
-    assert "step 1: stretch: asked for; plane patches err by" in said
-    assert said.count("curved ones would err less") == 2
+    assert "shape: plane: asked for; plane patches have a bias of" in said
+    assert "step 1: stretch: asked for; plane patches have a bias of" in said
+    assert said.count("curved ones would have the smaller total error") == 2
     with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
         z, _ = errors_um(rig, data, "still")
         choice = json.loads(data.attrs["patch_choice"])

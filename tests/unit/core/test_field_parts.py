@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.field.checks.gates import GateOptions, apply_gates, neighbour_disagreement
+from core.field.checks.validity import ValidityOptions, apply_validity_checks, neighbour_disagreement
 from core.field.points.features import detect, match
 from core.field.points.fitter import PointFits
 from core.field.points.starts import faces_both_cameras, move_matrix, move_w, position_now
@@ -58,14 +58,14 @@ def good_points(w: np.ndarray, G: np.ndarray | None, rng: np.random.Generator) -
 
 
 def gate(points: PointFits) -> None:
-    apply_gates(
+    apply_validity_checks(
         points,
         pair=pair(),
         shape=GRID.shape,
         xy_px=XY,
         rays=RAYS,
         texture=np.full(len(XY), 900.0),
-        options=GateOptions(),
+        options=ValidityOptions(),
     )
 
 
@@ -149,7 +149,7 @@ def test_the_neighbour_kernel_agrees_with_numpy(motion: bool) -> None:
     w = plane_w(0.2, 0.1) * (1.0 + 1e-5 * rng.standard_normal((len(XY), 3)))
     G = no_motion(pair(), XY) * (1.0 + 1e-5 * rng.standard_normal((len(XY), 3, 3)))
     points = good_points(w, G if motion else None, rng)
-    points.refuse(rng.random(len(XY)) < 0.3, PointStatus.NOT_CONVERGED)
+    points.reject(rng.random(len(XY)) < 0.3, PointStatus.NOT_CONVERGED)
     difference, spread, count = neighbour_disagreement(points, pair(), GRID.shape, RAYS)
     rows, cols = GRID.shape
     J = pair().cam1.lens.image_jacobian(RAYS[:, :2])

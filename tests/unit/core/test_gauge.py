@@ -17,8 +17,8 @@ from core.field.region.cuts import Cuts
 from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import Extensometer, extensometer
-from core.gauge.line import places_along
-from core.gauge.locate import places_from_mm
+from core.gauge.line import positions_along
+from core.gauge.locate import positions_from_mm
 from core.gauge.reading import Reading
 from core.gauge.rigid import rigid_motion, without_rigid_motion
 from core.gauge.sampling import sample
@@ -130,7 +130,7 @@ def test_no_value_reaches_over_a_cut_and_a_jump_is_not_smeared() -> None:
     cut = Cuts([[(40.0, 100.0), (160.0, 100.0)]])
     field = make_field(lambda x: x + np.where(x[..., 1:2] > -1.0, 0.5, 0.0) * [0.0, 1.0, 0.0], cuts=cut)
     assert field.uvw_mm is not None
-    xy, _ = places_along(field, [(90.0, 62.0), (90.0, 148.0)], 173)
+    xy, _ = positions_along(field, [(90.0, 62.0), (90.0, 148.0)], 173)
     v = sample(field, xy).of(field.uvw_mm)[:, 1]
     found = np.isfinite(v)
     assert set(np.round(v[found], 12)) == {0.0, 0.5}
@@ -233,13 +233,13 @@ def test_area_without_points_is_refused_and_without_values_is_missing() -> None:
 
 def test_line_places_run_evenly_round_a_corner() -> None:
     field = make_field(rigid)
-    xy, at = places_along(field, [(50.0, 70.0), (80.0, 70.0), (80.0, 110.0)], 8)
+    xy, at = positions_along(field, [(50.0, 70.0), (80.0, 70.0), (80.0, 110.0)], 8)
     assert at == pytest.approx(np.arange(8) * 10.0)
     assert xy[3] == pytest.approx([80.0, 70.0])
-    assert len(places_along(field, [(50.0, 70.0), (120.0, 70.0)])[1]) == 11
+    assert len(positions_along(field, [(50.0, 70.0), (120.0, 70.0)])[1]) == 11
     for line, count in (([(1, 1), (1, 1)], None), ([(1, 1)], None), ([(1, 1), (2, 2)], 1)):
         with pytest.raises(RegionError):
-            places_along(field, line, count)
+            positions_along(field, line, count)
 
 
 # millimetres ----------------------------------------------------------------------------------------------------
@@ -251,18 +251,18 @@ def test_places_in_mm_are_found_where_the_shape_has_them() -> None:
     field = make_field(rigid, shape=lambda x, y: surface(x, y) @ TURN.T + SHIFT, failed=failed)
     xy = np.array([(40.0, 60.0), (152.0, 151.0), (61.0, 95.0), (100.3, 71.9)])
     on_it = sample(field, xy).of(field.xyz_mm)
-    assert places_from_mm(field, on_it[:, :2]) == pytest.approx(xy, abs=1e-6)
+    assert positions_from_mm(field, on_it[:, :2]) == pytest.approx(xy, abs=1e-6)
     lost = surface(np.array(70.0), np.array(83.0)) @ TURN.T + SHIFT
     for place in (lost[:2], [500.0, 0.0]):
         with pytest.raises(RegionError) as caught:
-            places_from_mm(field, [place])
+            positions_from_mm(field, [place])
         assert caught.value.code == "gauge_outside"
 
 
 def test_a_place_that_a_folded_surface_has_twice_is_refused() -> None:
     folded = make_field(rigid, shape=lambda x, y: np.stack([abs(x - 93.0), y, x], axis=-1))
     with pytest.raises(RegionError) as caught:
-        places_from_mm(folded, [(20.0, 100.0)])
+        positions_from_mm(folded, [(20.0, 100.0)])
     assert caught.value.code == "gauge_ambiguous"
 
 

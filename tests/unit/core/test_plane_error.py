@@ -107,7 +107,7 @@ def test_a_curved_surface_that_only_shifts_moves_without_error() -> None:
 def test_points_too_far_apart_or_too_few_say_nothing() -> None:
     points, _ = field(BULGE, None, noise_mm=3e-4)
     assert told(points, step=2.1 * SUBSET) is None
-    points.refuse(np.arange(len(XY)) % 7 > 0, 4)  # type: ignore[arg-type]
+    points.reject(np.arange(len(XY)) % 7 > 0, 4)  # type: ignore[arg-type]
     assert told(points) is None
 
 

@@ -17,7 +17,7 @@ from server.api.protocol.dependencies import AnalysisId, Camera, ServiceDep, Ste
 from server.api.protocol.problems import errors
 from server.formats.files import known_sha256
 from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
-from server.results.positions import image_places
+from server.results.positions import image_positions
 from server.results.reader import list_variables, probe_result, read_cut_pieces, read_variable
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
@@ -123,7 +123,7 @@ def get_places(
 ) -> Response:
     """Return column and row of each point, where it is at that step, by the calibration; null where it has none."""
     result = service.tests.result_file(test_id, analysis_id, n)
-    places = image_places(result, service.tests.calibration_file(test_id), cam)
+    places = image_positions(result, service.tests.calibration_file(test_id), cam)
     if format == "npy":
         buffer = io.BytesIO()
         np.save(buffer, places, allow_pickle=False)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from core.errors import InputError
-from core.field.checks.gates import GateOptions
-from core.field.checks.residual_test import SigmaLimits, judge
+from core.field.checks.residual_test import SigmaLimits, residual_test
+from core.field.checks.validity import ValidityOptions
 from core.field.growth.field import fill_field
 from core.field.growth.seed import seed_shape
 from core.field.growth.state import begin, prepare
 from core.field.points.starts import depth_per_px
 from core.matching import MatchOptions, fit_motion, fit_shape
-from core.matching.kernels.observed import blocks_across
-from core.matching.observed import observed_covariance
+from core.matching.cluster_robust import cluster_robust_covariance
+from core.matching.kernels.cluster_robust import blocks_across
 from core.measure import MeasureOptions, ReferencePair
 from core.status import PointStatus
 from tests.support import field_bench as bench
@@ -77,12 +77,12 @@ def twins_covariance(twin: Twin, p: np.ndarray) -> np.ndarray:
     return covariance[np.ix_(order, order)]
 
 
-def assert_alike(observed, theirs):
+def assert_alike(robust, theirs):
     """But for one factor: the share of noise in the gradients, which the twin does not know."""
     scale = np.sqrt(np.outer(np.diag(theirs), np.diag(theirs)))
-    ratio = np.trace(observed / scale) / len(theirs)
+    ratio = np.trace(robust / scale) / len(theirs)
     assert 0.97 < ratio < 1.06
-    assert np.abs(observed / scale - ratio * theirs / scale).max() < 0.02
+    assert np.abs(robust / scale - ratio * theirs / scale).max() < 0.02
 
 
 @pytest.mark.parametrize(("interpolation", "order"), [("cubic", 3), ("quintic", 5)])
@@ -93,23 +93,23 @@ def test_it_is_the_twins_for_a_motion(images, interpolation, order):
         pair, *pictures, XY, true_w(pair.cam1, Plane(), XY), true_g(pair.cam1, Plane(), AFTER, XY), options
     )
     assert (fit.status == 0).all()
-    observed, known = observed_covariance(pair, pictures, XY, fit.w, fit.G, fit.epipolar_px, options)
+    robust, known = cluster_robust_covariance(pair, pictures, XY, fit.w, fit.G, fit.epipolar_px, options)
     assert known.all()
     for i, xy in enumerate(XY):
         twin = Twin(pair, pictures, xy, subset=SUBSET, order=order)
         theirs = twins_covariance(twin, np.array([*fit.w[i], fit.epipolar_px[i], *fit.G[i].ravel()]))
-        assert_alike(observed[i], theirs)
+        assert_alike(robust[i], theirs)
 
 
 def test_it_is_the_twins_for_a_shape(images):
     pair, pictures = images
     options = MatchOptions(subset_px=SUBSET, tolerance_px=3e-6)
     fit = fit_shape(pair, *pictures[:2], XY, true_w(pair.cam1, Plane(), XY), options)
-    observed, _ = observed_covariance(pair, pictures[:2], XY, fit.w, None, fit.epipolar_px, options)
+    robust, _ = cluster_robust_covariance(pair, pictures[:2], XY, fit.w, None, fit.epipolar_px, options)
     for i, xy in enumerate(XY):
         twin = Twin(pair, pictures[:2], xy, subset=SUBSET, order=5)
         theirs = twins_covariance(twin, np.array([*fit.w[i], fit.epipolar_px[i]]))
-        assert_alike(observed[i], theirs)
+        assert_alike(robust[i], theirs)
 
 
 def test_points_outside_have_none_and_unknowns_must_fit(images):
@@ -117,10 +117,10 @@ def test_points_outside_have_none_and_unknowns_must_fit(images):
     w = true_w(pair.cam1, Plane(), XY)
     far = XY.copy()
     far[1] = (5.0, 5.0)
-    _, known = observed_covariance(pair, pictures[:2], far, w, None, np.zeros(3), MatchOptions(subset_px=SUBSET))
+    _, known = cluster_robust_covariance(pair, pictures[:2], far, w, None, np.zeros(3), MatchOptions(subset_px=SUBSET))
     assert known.tolist() == [True, False, True]
     with pytest.raises(InputError):
-        observed_covariance(pair, pictures[:2], XY, w, np.zeros((3, 3, 3)), np.zeros(3))
+        cluster_robust_covariance(pair, pictures[:2], XY, w, np.zeros((3, 3, 3)), np.zeros(3))
 
 
 # fields
@@ -168,10 +168,12 @@ def observed_factor(reference, now, field):
     xy = np.stack([field.x_px, field.y_px], -1)[v]
     options = OPTIONS.match_options()
     fit = fit_motion(bench.pair(), *reference, *now, xy, field.starts.w[v], field.starts.G[v], options)
-    observed, known = observed_covariance(bench.pair(), [*reference, *now], xy, fit.w, fit.G, fit.epipolar_px, options)
+    robust, known = cluster_robust_covariance(
+        bench.pair(), [*reference, *now], xy, fit.w, fit.G, fit.epipolar_px, options
+    )
     assert known.all()
     told = np.diagonal(fit.covariance, axis1=1, axis2=2)
-    return (np.diagonal(observed, axis1=1, axis2=2) / told).mean(0)
+    return (np.diagonal(robust, axis1=1, axis2=2) / told).mean(0)
 
 
 def test_another_pattern_shining_through_is_told_by_the_residuals_not_by_the_fit():
@@ -210,11 +212,11 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
     changed[:, 160:] = True
     now = tuple(through(image, 0.2, changed) for image in clean)
     # the comparison of correlations alone would be quicker to refuse
-    wide = GateOptions(correlation_least_factor=1e3, correlation_most_factor=2e3)
+    wide = ValidityOptions(correlation_min_factor=1e3, correlation_max_factor=2e3)
     statuses = {}
     for limit_px in (0.02, 1.0):
-        gates = replace(wide, largest_sigma_px=limit_px, largest_depth_sigma_px=limit_px)
-        field, error = measured(reference, now, replace(OPTIONS, gates=gates))
+        validity = replace(wide, max_sigma_px=limit_px, max_depth_sigma_px=limit_px)
+        field, error = measured(reference, now, replace(OPTIONS, validity=validity))
         assert (field.status[field.x_px < 160 - 21] == PointStatus.OK).mean() > 0.99
         assert np.abs(error / field.sigma_mm[..., 3:])[field.valid].max() < 6.0
         statuses[limit_px] = field.status[field.x_px > 160 + 21]
@@ -234,8 +236,8 @@ def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(d
     said = np.array([depth_said, offset_said])
     points.covariance /= np.sqrt(said[:, None] * said)
     limits = SigmaLimits(motion_px=0.1, depth_px=0.75 * depth_px)
-    judged = judge(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
-    assert judged.factor == pytest.approx(said, rel=0.25)
+    tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
+    assert tested.factor == pytest.approx(said, rel=0.25)
     assert points.ok.sum() / count == pytest.approx(kept, abs=0.05)
 
 
@@ -247,13 +249,13 @@ def test_matches_without_any_residual_stay_as_they_are():
     points.covariance[:2] = 0.0
     before = points.covariance.copy()
     limits = SigmaLimits(motion_px=0.1, depth_px=0.05)
-    judged = judge(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
-    assert judged.refused == 0
-    assert np.isfinite(judged.factor).all()
+    tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
+    assert tested.rejected == 0
+    assert np.isfinite(tested.factor).all()
     np.testing.assert_array_equal(points.covariance[:2], before[:2])
     assert np.isfinite(points.covariance[points.ok]).all()
     points.covariance[:] = 0.0
-    assert judge(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits).refused == 0
+    assert residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits).rejected == 0
     assert not points.covariance.any()
 
 

@@ -10,9 +10,9 @@ import pytest
 from core.errors import RegionError
 from core.field.growth.grow import Attempts
 from core.field.region.cuts import Cuts, crosses
-from core.field.region.find_visible import MARGIN_PX, with_sight
+from core.field.region.find_visible import MARGIN_PX, with_visibility
 from core.field.region.region import PointGrid, check_region
-from core.field.region.visibility import LEAST_SHARE
+from core.field.region.visibility import MIN_SHARE
 from core.field.seeding.local_fit import robust_local_fits
 from core.field.seeding.seeds import as_seeds, nearest_points
 
@@ -31,8 +31,8 @@ def distance(p: tuple[float, float], a: tuple[float, float], b: tuple[float, flo
 
 def test_a_point_sees_what_the_definition_says() -> None:
     grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, step_px=7.0).with_cracks([KINKED])
-    sight = with_sight(grid, SUBSET).sight
-    assert sight is not None
+    visibility = with_visibility(grid, SUBSET).visibility
+    assert visibility is not None
     half = SUBSET // 2
     cut = 0
     for k, (x, y) in enumerate(grid.xy_px.reshape(-1, 2)):
@@ -43,10 +43,10 @@ def test_a_point_sees_what_the_definition_says() -> None:
         for r, c in np.ndindex(SUBSET, SUBSET):
             near = min(distance(tuple(pixels[r, c]), KINKED[i], KINKED[i + 1]) for i in range(2))
             free[r, c] &= near >= MARGIN_PX
-        which = sight.visible.of_point[k]
-        seen = np.ones((SUBSET, SUBSET), bool) if which < 0 else sight.visible.patches[which].astype(bool)
+        which = visibility.visible.of_point[k]
+        seen = np.ones((SUBSET, SUBSET), bool) if which < 0 else visibility.visible.patches[which].astype(bool)
         np.testing.assert_array_equal(seen, free)
-        assert sight.share[k] == pytest.approx(free.mean())
+        assert visibility.share[k] == pytest.approx(free.mean())
         assert (which >= 0) == (not free.all())
         cut += int(which >= 0)
     assert 20 < cut < 120
@@ -54,17 +54,17 @@ def test_a_point_sees_what_the_definition_says() -> None:
 
 def test_neighbours_that_a_crack_parts_are_none() -> None:
     grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, step_px=7.0).with_cracks([KINKED])
-    sight = with_sight(grid, SUBSET).sight
-    assert sight is not None
+    visibility = with_visibility(grid, SUBSET).visibility
+    assert visibility is not None
     rows, cols = grid.shape
     xy = grid.xy_px
-    neighbours = Attempts.on(grid.shape, sight).neighbours.reshape(rows, cols, 8)
+    neighbours = Attempts.on(grid.shape, visibility).neighbours.reshape(rows, cols, 8)
     parted = 0
     for dr in range(-2, 3):
         for dc in range(-2, 3):
             if (dr, dc) == (0, 0):
                 continue
-            told = sight.parted_at(dr, dc).reshape(rows, cols)
+            told = visibility.separated_at(dr, dc).reshape(rows, cols)
             for r, c in np.ndindex(rows, cols):
                 i, j = r + dr, c + dc
                 if not (0 <= i < rows and 0 <= j < cols):
@@ -83,15 +83,15 @@ def test_a_mask_is_seen_along_its_white_alone() -> None:
     mask[10:110, 10:110] = True
     mask[10:90, 55:63] = False
     grid = PointGrid.rectangle(20.0, 20.0, 100.0, 104.0, step_px=6.0).within_mask(mask)
-    sight = with_sight(grid, SUBSET).sight
-    assert sight is not None
+    visibility = with_visibility(grid, SUBSET).visibility
+    assert visibility is not None
     col = int(np.flatnonzero(grid.x_px[0] == 50.0)[0])
     row = int(np.flatnonzero(grid.y_px[:, 0] == 44.0)[0])
-    patch = sight.visible.patches[sight.visible.of_point[row * grid.shape[1] + col]]
+    patch = visibility.visible.patches[visibility.visible.of_point[row * grid.shape[1] + col]]
     columns = 40 + np.arange(SUBSET)
     np.testing.assert_array_equal(patch.astype(bool), np.broadcast_to(columns <= 53, patch.shape))
     a, b = np.array([[50.0, 44.0], [50.0, 100.0]]), np.array([[68.0, 44.0], [68.0, 100.0]])
-    assert sight.apart(a, b).tolist() == [True, False]
+    assert visibility.are_separated(a, b).tolist() == [True, False]
 
 
 def test_a_hole_takes_its_points_and_what_lies_behind_it() -> None:
@@ -101,19 +101,19 @@ def test_a_hole_takes_its_points_and_what_lies_behind_it() -> None:
     np.testing.assert_array_equal(grid.allowed, ~inside)
     assert grid.cuts is not None
     assert grid.cuts.lines_px[0].tolist() == [*map(list, hole), list(hole[0])]
-    sight = with_sight(grid, SUBSET).sight
-    assert sight is not None
-    beside = sight.visible.patches[sight.visible.of_point[6 * grid.shape[1] + 3]].astype(bool)  # (35, 50)
+    visibility = with_visibility(grid, SUBSET).visibility
+    assert visibility is not None
+    beside = visibility.visible.patches[visibility.visible.of_point[6 * grid.shape[1] + 3]].astype(bool)  # (35, 50)
     assert beside[:, : 40 - 2 - 25 + 1].all()
     assert not beside[10, 40 - 2 - 25 + 1 :].any()
 
 
 def test_a_point_on_the_line_sees_nothing() -> None:
     grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0).with_cracks([[(20.0, 50.0), (80.0, 50.0)]])
-    sight = with_sight(grid, SUBSET).sight
-    assert sight is not None
-    np.testing.assert_array_equal(sight.enough, grid.y_px != 50.0)
-    assert (sight.share[sight.enough.ravel()] > LEAST_SHARE).all()
+    visibility = with_visibility(grid, SUBSET).visibility
+    assert visibility is not None
+    np.testing.assert_array_equal(visibility.enough, grid.y_px != 50.0)
+    assert (visibility.share[visibility.enough.ravel()] > MIN_SHARE).all()
 
 
 def test_local_fits_hear_only_what_they_see() -> None:
@@ -127,7 +127,9 @@ def test_local_fits_hear_only_what_they_see() -> None:
 
     places = np.stack([np.linspace(10.0, 90.0, 30), np.full(30, 50.5)], axis=-1)
     options = {"tolerance": 20.0, "neighbours": 14}
-    heard = robust_local_fits(places, points, value(points)[:, None], apart=lambda a, b: crosses(a, b, cuts), **options)
+    heard = robust_local_fits(
+        places, points, value(points)[:, None], are_separated=lambda a, b: crosses(a, b, cuts), **options
+    )
     np.testing.assert_allclose(heard.value[:, 0], value(places), atol=1e-9)
     plain = robust_local_fits(places, points, value(points)[:, None], **options)
     assert np.abs(plain.value[:, 0] - value(places)).max() > 1.0
@@ -136,13 +138,13 @@ def test_local_fits_hear_only_what_they_see() -> None:
 def test_a_click_starts_on_its_own_side() -> None:
     """The nearest point lies just over the line."""
     grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=10.0).with_cracks([[(15.0, 49.0), (85.0, 49.0)]])
-    sight = with_sight(grid, SUBSET).sight
+    visibility = with_visibility(grid, SUBSET).visibility
     xy, usable = grid.xy_px.reshape(-1, 2), np.ones(49, bool)
     seeds = as_seeds([(50.0, 48.0), (50.0, 51.0)])
-    found = nearest_points(seeds, xy, usable, reach_px=20.0, sight=sight)
+    found = nearest_points(seeds, xy, usable, reach_px=20.0, visibility=visibility)
     assert xy[found].tolist() == [[50.0, 40.0], [50.0, 50.0]]
     with pytest.raises(RegionError) as caught:
-        nearest_points(seeds, xy, usable & (xy[:, 1] > 49.0), reach_px=20.0, sight=sight)
+        nearest_points(seeds, xy, usable & (xy[:, 1] > 49.0), reach_px=20.0, visibility=visibility)
     assert caught.value.code == "seed_outside"
 
 
@@ -154,4 +156,4 @@ def test_a_crack_outside_the_image_is_refused() -> None:
 
 
 def test_without_anything_in_the_way_there_is_nothing_to_see() -> None:
-    assert with_sight(PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0), SUBSET).sight is None
+    assert with_visibility(PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0), SUBSET).visibility is None

@@ -1,4 +1,4 @@
-"""The covariance of fitted points as their residuals show it: the narrow function before the compiled kernels."""
+"""Cluster-robust covariance of fitted points: the narrow function before the compiled kernels."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from core.cameras.stereo import StereoPair
 from core.errors import InputError
 from core.matching.arguments import VisiblePixels, degree_of, given_to_kernels, own, points_of, run_kernel, starts_of
 from core.matching.image import ImageData, prepare
-from core.matching.kernels.drivers import observe_points, observed_space
+from core.matching.kernels.drivers import cluster_robust_points, cluster_robust_space
 from core.matching.options import MatchOptions
 
 
-def observed_covariance(
+def cluster_robust_covariance(
     pair: StereoPair,
     images: Sequence[ArrayLike | ImageData],
     xy_px: ArrayLike,
@@ -26,16 +26,16 @@ def observed_covariance(
     options: MatchOptions | None = None,
     visible: VisiblePixels | None = None,
 ) -> tuple[Float, Bool]:
-    """Return the covariance of fitted points from how their residuals pull in blocks of the subset.
+    """Return the cluster-robust covariance of fitted points, from their residuals in blocks of the subset.
 
     Parameters
     ----------
     pair
         The calibrated cameras.
     images
-        Camera 1's and camera 2's image at t0 and, for a motion, at t.
+        Camera 1's and camera 2's reference images and, for a motion, current images.
     xy_px
-        (N, 2) points in camera 1 at t0.
+        (N, 2) points in camera 1's reference image.
     w, G, epipolar_px
         (N, 3 or 6), (N, 3, 3 or 6), (N,) as the fit gave them; G is None for a shape.
     options, visible
@@ -56,8 +56,12 @@ def observed_covariance(
     Notes
     -----
     A sandwich covariance with clustered errors: the sum over blocks of the outer products of their scores, between
-    inverses of the normal equations. It holds for residuals of any origin that hang together over less than a block;
-    of a single point it scatters itself by some 20 % (33 px) or 25 % (21 px) of a variance.
+    inverses of the normal equations. It holds for residuals of any origin that are correlated over less than a block;
+    its own standard deviation at a single point is some 20 % (33 px) or 25 % (21 px) of a variance.
+
+    References
+    ----------
+    Liang and Zeger, Biometrika 73 (1986), doi:10.1093/biomet/73.1.13
     """
     options = options or MatchOptions()
     prepared = [prepare(image, options.interpolation) for image in images]
@@ -71,7 +75,7 @@ def observed_covariance(
     given = given_to_kernels(pair, prepared, xy, unknown_w, options, visible, G=unknown_g, epipolar_px=offsets)
     what, q = ("shape", 2) if G is None else ("motion", 5)
     out = np.full((n, q * q), np.nan)
-    status, _ = run_kernel(observe_points[what][degree], observed_space[what][degree], given, out)
+    status, _ = run_kernel(cluster_robust_points[what][degree], cluster_robust_space[what][degree], given, out)
     known: Bool = status == 0
     out[~known] = np.nan
     return out.reshape(n, q, q), known

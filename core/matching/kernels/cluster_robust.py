@@ -1,11 +1,11 @@
-"""The covariance of a fitted point as its residuals show it, whatever they are made of.
+"""Cluster-robust covariance of a fitted point, from its residuals of any origin.
 
-The fit's own covariance takes the residuals for white noise. A texture that changed, paint that flaked, something in
-front of a corner of the subset, a view that differs leave residuals that hang together over some pixels and pull the
-solution by more. So the subset is cut into blocks about as wide as a speckle; each block's pull on the unknowns is
-summed, and the scatter of these sums is the scatter of the solution (a sandwich covariance with clustered errors,
-Liang and Zeger 1986). Whatever the blocks hold in common over the three comparisons stays in: residuals that camera 2
-shows at t0 and at t alike do not become scatter of the displacement.
+The fit's own covariance assumes residuals of white noise. A texture that changed, paint that flaked, an object in front
+of a corner of the subset, a view that differs leave residuals that are correlated over some pixels and have more effect
+on the solution. So the subset is cut into blocks about as wide as a speckle; the score of each block is summed, and the
+covariance of these sums gives that of the solution (a sandwich covariance with clustered errors, Liang and Zeger 1986,
+doi:10.1093/biomet/73.1.13). The scores of the three comparisons are added block by block: residuals that are equal in
+camera 2's reference and current images do not count in the displacement.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from core.matching.kernels.given import ObservedSpace
+from core.matching.kernels.given import ClusterRobustSpace
 from core.matching.kernels.linear import solve
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
 from core.matching.kernels.naming import kernel
@@ -41,24 +41,24 @@ from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
 from core.matching.kernels.vectors import LANES
 from core.matching.kernels.warp import lens_jacobian, set_up_warp
 
-BLOCK_PX = 5.5  # about a good speckle; in smaller blocks less of what hangs together is seen
-FEWEST_BLOCKS, MOST_BLOCKS = 3, 7  # across the subset
+BLOCK_PX = 5.5  # about a good speckle; smaller blocks miss part of the correlation
+MIN_BLOCKS, MAX_BLOCKS = 3, 7  # across the subset
 
 
 def blocks_across(subset_px: int) -> int:
-    """Return into how many blocks a subset is cut each way."""
-    return int(min(max(round(subset_px / BLOCK_PX), FEWEST_BLOCKS), MOST_BLOCKS))
+    """Return the number of blocks across a subset."""
+    return int(min(max(round(subset_px / BLOCK_PX), MIN_BLOCKS), MAX_BLOCKS))
 
 
-def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) -> tuple[Any, Any]:
-    """Compile the observed covariance for the fit that ``parts`` and ``freeze`` belong to.
+def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: Any) -> tuple[Any, Any]:
+    """Compile the cluster-robust covariance for the fit that ``parts`` and ``freeze`` belong to.
 
     Parameters
     ----------
     degree, images
-        Of the patch, and how many comparisons: 1 (shape) or 3 (motion).
+        Degree of the patch, and number of comparisons: 1 (shape) or 3 (motion).
     parts
-        What :func:`core.matching.kernels.point.make_point` returned.
+        Result of :func:`core.matching.kernels.point.make_point`.
     freeze
         The fit's set-up of the normal equations.
     """
@@ -69,11 +69,11 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
     unknowns = (4 if images == 3 else 1) * few + 1
     sum_pixels = make_sum_pixels(degree)
 
-    def work_space(subset: int) -> ObservedSpace:
+    def work_space(subset: int) -> ClusterRobustSpace:
         across = blocks_across(subset)
         widest = -(-subset // across) + 1
         width = (widest * widest + LANES - 1) // LANES * LANES + LANES
-        return ObservedSpace(
+        return ClusterRobustSpace(
             fit=make_space(subset),
             part=np.zeros((N_ROWS, width), np.float32),
             scores=np.empty((images, across * across, n_columns)),
@@ -84,7 +84,7 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
 
     @kernel(f"{degree}_{images}")
     def cut_out(ref, subset, top, bottom, left, right, part):
-        """Copy a block's pixels; returns their number over eight, rounded up, and their squared gradients' sum."""
+        """Copy a block's pixels; return their number over eight, rounded up, and their squared gradients' sum."""
         n, texture = 0, 0.0
         for r in range(top, bottom):
             for c in range(left, right):
@@ -101,7 +101,7 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
 
     @kernel(f"{degree}_{images}")
     def sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores):
-        """One image's residuals times the columns, summed in each block; returns how many even blocks that is worth."""
+        """Sum one image's residuals times the columns in each block; return the equivalent number of even blocks."""
         across = int(math.sqrt(scores.shape[0]) + 0.5)
         total, squares = 0.0, 0.0
         for a in range(across):
@@ -123,8 +123,9 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
-    def observed_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
-        """Covariance (``last`` squared numbers) of the last unknowns at a point that was fitted; status, and 0."""
+    def cluster_robust_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
+        """Compute the covariance (``last`` squared numbers) of the last unknowns at a fitted point; return status, and
+        0."""
         subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
         fit_space, part, scores, pull, z, sums = space
         ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _ = fit_space
@@ -154,16 +155,16 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
                 return OUTSIDE_IMAGE, 0
             if levels[k, CONTRAST] == 0.0 or not levels[k, ZNCC] > 0.0:
                 return LOW_TEXTURE, 0
-            # residuals that hold nothing of the reference itself: its mean and its contrast are taken out
+            # residuals orthogonal to the reference: its mean and its contrast are taken out
             correlation = levels[k, ZNCC]
             warp[20] = levels[k, GAIN] / correlation
             warp[21] = (levels[k, SHIFT] + offset) / correlation - offset
             coefficients, rows, cols, stride = shown[k]
             base = set_up_warp(
-                lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.places, warp
+                lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.positions, warp
             )
             worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores[k])
-        # the contrast of all is taken for the best one's: what another lacks of its correlation is noise of its own
+        # the contrast of all is assumed to be the best one's: a lower correlation is the image's own noise
         best = best_correlation(levels, images)
         n = unknowns
         if images == 3 and few == 3 and rigid:
@@ -204,7 +205,7 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
             for i in range(last):
                 for j in range(last):
                     out[last * i + j] += z[i] * z[j]
-        # the fit took the mean and slopes of the residuals' pull away from the blocks
+        # the fit has removed mean and slopes of the residuals from the blocks
         factor_on = 1.0 / max(1.0 - few / worth, 0.2)
         variance = (
             variances[0] if setting.known_noise else noise_from_residuals(levels, images, seen.n_pixels, float(n))
@@ -214,4 +215,4 @@ def make_observed(degree: int, images: int, parts: PointKernels, freeze: Any) ->
             out[i] *= factor_on
         return OK, 0
 
-    return observed_point, work_space
+    return cluster_robust_point, work_space

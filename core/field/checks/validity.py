@@ -1,8 +1,8 @@
-"""Every point that is shipped is checked again, against what the field itself says a right match looks like.
+"""Validity checks: every point is compared with the statistics of its own field.
 
-Four checks: correlation in each comparison, offset across the epipolar line, agreement with the neighbours' patches,
-and support by other points at all. Limits are multiples of the field's own robust scatter, so they follow noise,
-texture and lens; the floors keep a nearly perfect field from throwing away its second-best points.
+Four checks: correlation in each comparison, epipolar offset, agreement with the neighbours' patches, and the size of
+the cluster that a point belongs to. Limits are multiples of the field's own robust standard deviations, so they follow
+noise, texture and lens; the floors keep the second-best points of a nearly perfect field.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from core.field.points.fitter import PointFits
 from core.field.points.starts import depth_per_px
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
 from core.field.region.trend import smooth_terms
-from core.field.region.visibility import Sight
+from core.field.region.visibility import Visibility
 from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, spread_indices
 from core.status import PointStatus
 from core.threads import run_ranges
@@ -29,13 +29,13 @@ from core.threads import run_ranges
 _FEW = 12
 _NETWORK = sorting_network(24)
 _ROWS_AT_ONCE = 4
-_SETTLED = 0.01  # of the scatter: a robust fit that moves less has converged, far below what a limit of 5 sigma feels
-_TREND_POINTS = 3000  # carry a trend of seven terms: it then scatters by a twentieth of the points' own scatter
+_SETTLED = 0.01  # of the standard deviation: a robust fit that moves less has converged
+_TREND_POINTS = 3000  # for a trend of seven terms: its standard deviation is then a twentieth of the points' own
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateOptions:
-    """Limits of the checks.
+class ValidityOptions:
+    """Limits of the validity checks.
 
     Parameters
     ----------
@@ -44,35 +44,35 @@ class GateOptions:
     epipolar_floor_px
         Added to it, so that a noise-free field keeps its second-best points.
     correlation_sigmas
-        Allowed excess of log(1 - zncc) over what texture and place predict, in robust standard deviations.
-    correlation_least_factor, correlation_most_factor
-        1 - zncc up to the first times its expectation is never refused; above the second always.
+        Allowed excess of log(1 - zncc) over its trend with texture and position, in robust standard deviations.
+    correlation_min_factor, correlation_max_factor
+        1 - zncc up to the first times its expectation is never rejected; above the second always.
     neighbour_sigmas
         Allowed disagreement with the neighbours' patches, in robust standard deviations.
     neighbour_floor_px
         Added to it, as a distance in the images: curvature between neighbouring points must fit in.
-    least_cluster
-        Groups of fewer connected points are not trusted.
-    largest_sigma_px
-        Scatter of a point's place in camera 1, px, as its residuals show it, beyond which a point whose residuals are
-        not noise is refused: five times as much is half a pixel.
-    largest_depth_sigma_px
-        The same of what its depth is told by, in camera 2: it counts several times in depth.
+    min_cluster
+        Groups of fewer connected points are rejected.
+    max_sigma_px
+        Standard deviation of a point's position in camera 1, px, from its residuals, beyond which a point whose
+        residuals are not noise is rejected: five times as much is half a pixel.
+    max_depth_sigma_px
+        The same of its position in camera 2, which determines the depth and counts several times there.
     """
 
     epipolar_sigmas: float = 5.0
     epipolar_floor_px: float = 0.005
     correlation_sigmas: float = 6.0
-    correlation_least_factor: float = 1.35
-    correlation_most_factor: float = 12.0
+    correlation_min_factor: float = 1.35
+    correlation_max_factor: float = 12.0
     neighbour_sigmas: float = 6.0
     neighbour_floor_px: float = 0.05
-    least_cluster: int = 4
-    largest_sigma_px: float = 0.1
-    largest_depth_sigma_px: float = 0.05
+    min_cluster: int = 4
+    max_sigma_px: float = 0.1
+    max_depth_sigma_px: float = 0.05
 
 
-def apply_gates(
+def apply_validity_checks(
     points: PointFits,
     *,
     pair: StereoPair,
@@ -80,10 +80,10 @@ def apply_gates(
     xy_px: Float,
     rays: Float,
     texture: Float,
-    options: GateOptions,
-    sight: Sight | None = None,
+    options: ValidityOptions,
+    visibility: Visibility | None = None,
 ) -> int:
-    """Refuse points in place; returns how many.
+    """Apply all checks, rejecting points in place.
 
     Parameters
     ----------
@@ -99,24 +99,29 @@ def apply_gates(
         (n,) grey-level variance of camera 1's subset.
     options
         Limits.
-    sight
-        Which points see each other; all of them when left out.
+    visibility
+        Which points are neighbours across cuts and mask; None: all.
+
+    Returns
+    -------
+    int
+        Number of points rejected.
     """
     before = int(points.ok.sum())
     few = before < _FEW
     terms = smooth_terms(xy_px)
     if not few:
-        _gate_correlation(points, terms, texture, options)
+        _check_correlation(points, terms, texture, options)
     for _ in range(2):
-        if _gate_neighbours(points, pair, shape, rays, options, sight, few=few) == 0:
+        if _check_neighbours(points, pair, shape, rays, options, visibility, few=few) == 0:
             break
     if not few:
-        _gate_epipolar(points, terms, options)
-        _gate_clusters(points, shape, options, sight)
+        _check_epipolar(points, terms, options)
+        _check_clusters(points, shape, options, visibility)
     return before - int(points.ok.sum())
 
 
-def _gate_correlation(points: PointFits, terms: Float, texture: Float, options: GateOptions) -> None:
+def _check_correlation(points: PointFits, terms: Float, texture: Float, options: ValidityOptions) -> None:
     ok = np.flatnonzero(points.ok)
     if len(ok) < _FEW:
         return
@@ -127,37 +132,37 @@ def _gate_correlation(points: PointFits, terms: Float, texture: Float, options: 
         r, sigma = _robust_residual(trend, y)
         limit = np.clip(
             options.correlation_sigmas * sigma,
-            np.log(options.correlation_least_factor),
-            np.log(options.correlation_most_factor),
+            np.log(options.correlation_min_factor),
+            np.log(options.correlation_max_factor),
         )
         worst = np.maximum(worst, r - limit)
-    points.refuse(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
+    points.reject(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
 
 
-def _gate_epipolar(points: PointFits, terms: Float, options: GateOptions) -> None:
+def _check_epipolar(points: PointFits, terms: Float, options: ValidityOptions) -> None:
     for _ in range(4):
         ok = np.flatnonzero(points.ok)
         if len(ok) < _FEW:
             return
         e = points.epipolar_px[ok]
         r, sigma = _robust_residual(_at_points(terms, ok), e)
-        # plain and robust scatter about the field's middle too: the figures that a reader recomputes from the file
+        # plain and robust standard deviations about the field's middle too: a reader can recompute these from the file
         about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
         plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
-        scatter = MAD_TO_SIGMA * float(np.median(about_median))
-        middle = (about_median > options.epipolar_sigmas * scatter) & (about_median > options.epipolar_floor_px)
+        sigma_all = MAD_TO_SIGMA * float(np.median(about_median))
+        middle = (about_median > options.epipolar_sigmas * sigma_all) & (about_median > options.epipolar_floor_px)
         bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
         if not bad.any():
             return
-        points.refuse(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
+        points.reject(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
 
 
 def neighbour_disagreement(
-    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, sight: Sight | None = None
+    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, visibility: Visibility | None = None
 ) -> tuple[Float, Float, NDArray[np.int32]]:
-    """Return (n, 4) disagreement with the neighbours and its local spread in px, and how many neighbours spoke.
+    """Return (n, 4) disagreement with the neighbours and its local spread in px, and the number of neighbours compared.
 
-    The four are depth as camera 2 sees it, and displacement along x, y and (as camera 2 sees it) depth.
+    The four are depth, by its effect in camera 2's image, and displacement along x, y and depth, likewise.
     """
     rows, cols = shape
     n = rows * cols
@@ -165,11 +170,11 @@ def neighbour_disagreement(
     spread = np.full((rows, cols, N_QUANTITIES), np.nan)
     count = np.zeros((rows, cols), np.int32)
     motion = points.zncc.shape[1] == 3
-    parted = np.zeros((0, 0), np.uint32) if sight is None else sight.parted
+    separated = np.zeros((0, 0), np.uint32) if visibility is None else visibility.separated
     arrays = (
         _NETWORK,
         points.ok.reshape(shape),
-        parted,
+        separated,
         np.ascontiguousarray(rays.reshape(rows, cols, 3)),
         np.ascontiguousarray(points.w.reshape(rows, cols, -1)),
         np.ascontiguousarray(points.G.reshape(rows, cols, 3, -1)),
@@ -189,55 +194,57 @@ def neighbour_disagreement(
     return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
 
 
-def _gate_neighbours(
+def _check_neighbours(
     points: PointFits,
     pair: StereoPair,
     shape: tuple[int, int],
     rays: Float,
-    options: GateOptions,
-    sight: Sight | None,
+    options: ValidityOptions,
+    visibility: Visibility | None,
     *,
     few: bool,
 ) -> int:
-    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, sight)
+    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, visibility)
     ok = points.ok
     bad = np.zeros(len(ok), bool)
-    heard = ok & (count >= 2)
+    used = ok & (count >= 2)
     for q in range(N_QUANTITIES if points.zncc.shape[1] == 3 else 1):
-        d = np.abs(difference[heard, q])
+        d = np.abs(difference[used, q])
         if len(d) == 0:
             continue
         sigma = MAD_TO_SIGMA * float(np.median(d))
-        limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[heard, q]) + options.neighbour_floor_px
-        bad[np.flatnonzero(heard)[d > limit]] = True
+        limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[used, q]) + options.neighbour_floor_px
+        bad[np.flatnonzero(used)[d > limit]] = True
     if not few:
-        bad |= ok & (count < 2)  # nothing near it that could confirm it
-    points.refuse(bad, PointStatus.NEIGHBOUR_MISMATCH)
+        bad |= ok & (count < 2)  # isolated points fail the check
+    points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
     return int(bad.sum())
 
 
-def _gate_clusters(points: PointFits, shape: tuple[int, int], options: GateOptions, sight: Sight | None) -> None:
-    if sight is not None:
-        group = _connected(points.ok, shape, sight)
-        points.refuse(points.ok & (np.bincount(group)[group] < options.least_cluster), PointStatus.NEIGHBOUR_MISMATCH)
+def _check_clusters(
+    points: PointFits, shape: tuple[int, int], options: ValidityOptions, visibility: Visibility | None
+) -> None:
+    if visibility is not None:
+        group = _connected(points.ok, shape, visibility)
+        points.reject(points.ok & (np.bincount(group)[group] < options.min_cluster), PointStatus.NEIGHBOUR_MISMATCH)
         return
-    n, labels, facts, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
     if n < 2:
         return
-    size = facts[:, cv2.CC_STAT_AREA].copy()
-    size[0] = options.least_cluster
-    points.refuse((size[labels] < options.least_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
+    size = stats[:, cv2.CC_STAT_AREA].copy()
+    size[0] = options.min_cluster
+    points.reject((size[labels] < options.min_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
 
 
-def _connected(ok: Bool, shape: tuple[int, int], sight: Sight) -> NDArray[np.int32]:
-    """Label (n,) the groups of points that are connected through neighbours that see each other."""
+def _connected(ok: Bool, shape: tuple[int, int], visibility: Visibility) -> NDArray[np.int32]:
+    """Label (n,) the groups of points that are connected through neighbours, none across a cut."""
     rows, cols = shape
-    place = np.arange(rows * cols).reshape(shape)
+    index = np.arange(rows * cols).reshape(shape)
     ends = []
     for dr, dc in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        here = place[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
+        here = index[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
         there = here + dr * cols + dc
-        together = ok[here] & ok[there] & ~sight.parted_at(dr, dc)[here]
+        together = ok[here] & ok[there] & ~visibility.separated_at(dr, dc)[here]
         ends.append(np.stack([here[together], there[together]]))
     a, b = np.concatenate(ends, axis=1)
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))
@@ -251,7 +258,7 @@ def _at_points(terms: Float, ok: NDArray[np.intp]) -> Float:
 def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
     """Return residuals about a robust linear fit (Tukey's biweight) and their robust standard deviation.
 
-    Of many points a few thousand carry the fit, spread over all of them by multiples of the golden section.
+    Of many points a few thousand are fitted, spread over all of them by multiples of the golden section.
     """
     n = len(values)
     some = slice(None) if n <= _TREND_POINTS else np.sort(spread_indices(n, _TREND_POINTS))
