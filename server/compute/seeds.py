@@ -10,7 +10,7 @@ import numpy as np
 from core.cameras.stereo import StereoPair
 from core.errors import RegionError
 from core.field.seeding.epipolar_search import visible_depths
-from core.field.seeding.seeds import Seed
+from core.field.seeding.seeds import Seed, seeds_of
 from core.settings import AnalysisSettings
 from server.formats.calibrations.recognise import load_calibration
 
@@ -18,15 +18,6 @@ from server.formats.calibrations.recognise import load_calibration
 FARTHEST_PX = 8.0
 
 Place = Sequence[float]
-
-
-def seeds_of(settings: AnalysisSettings) -> list[Seed] | None:
-    """Return the seeds of an analysis's settings; None where they are to be found."""
-    one = settings.seeds
-    if one is None:
-        return None
-    two = settings.seeds_cam2 or [None] * len(one)
-    return [Seed(a, b) for a, b in zip(one, two, strict=True)]
 
 
 def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[int, int]) -> None:

@@ -20,13 +20,13 @@ from core.errors import FileFormatError
 from core.field.checks.extrapolated import mark_extrapolated
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
+from core.field.region.lay_points import make_grid
+from core.field.seeding.seeds import seeds_of
 from core.field.settings import MeasureOptions
 from core.measure import Earlier, ReferencePair, Updating
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
-from server.compute.region import make_grid
-from server.compute.seeds import seeds_of
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import rbe_of, volume_of

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.errors import InputError, StateError
+from core.field.region.lay_points import make_grid
 from core.settings import AnalysisSettings, NoiseRecord, StoredSettings
 from server.base.models import Ids
-from server.compute.region import make_grid
 from server.compute.seeds import check_seeds
 from server.formats.files import sha256_of
 from server.formats.images import decode_mask, read_image

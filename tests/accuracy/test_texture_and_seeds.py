@@ -12,8 +12,7 @@ import pytest
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
-from core.field.seeding.seeds import Seed
-from server.compute.seeds import seeds_of
+from core.field.seeding.seeds import Seed, seeds_of
 from server.formats.results.settings import stored_settings
 from server.results.texture import errors_at, texture_verdict
 from tests.support.service_rig import SMALL, new_test, true_cameras

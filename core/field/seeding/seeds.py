@@ -21,6 +21,7 @@ from core.field.seeding.epipolar_search import sweep
 from core.field.seeding.scattered_matches import ScatteredMotion, ScatteredShape, combine, motion_starts, shape_starts
 from core.matching.fit import no_motion
 from core.matching.image import ImageData
+from core.settings import AnalysisSettings
 from core.status import PointStatus
 
 _FAR_PX = 4.0
@@ -49,6 +50,15 @@ class Seed:
     xy2_px: tuple[float, float] | None = None
     xy_now_px: tuple[float, float] | None = None
     xy2_now_px: tuple[float, float] | None = None
+
+
+def seeds_of(settings: AnalysisSettings) -> list[Seed] | None:
+    """Return the seeds of an analysis's settings; None where they are to be found."""
+    one = settings.seeds
+    if one is None:
+        return None
+    two = settings.seeds_cam2 or [None] * len(one)
+    return [Seed(a, b) for a, b in zip(one, two, strict=True)]
 
 
 def as_seeds(seeds: Sequence[Seed | Sequence[float]] | NDArray[Any]) -> tuple[Seed, ...]:

@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import argparse
 import re
-from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
 
-from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationResult, Measures
-from core.calibration.from_images import ImageOfTarget, calibrate_views
-from core.errors import CalibrationError, InputError
+from core.calibration import COVARIANCE_NAMES, CalibrationResult, Measures
+from core.errors import InputError
 from core.names import CAMERAS
 from server.cli.terminal import ProgressLine
-from server.formats.calibrations.native import write_calibration
-from server.formats.calibrations.target_toml import read_rig, read_target
-from server.formats.files import make_folder, sha256_of
-from server.formats.images import read_image
-from server.formats.version import software_version
-from server.formats.views import find_views
+from server.formats.calibrations.from_folder import calibrate_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,44 +53,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate; print a table; write the file unless the verdict is failed."""
     held_out = parse_hold_out(args.hold_out)
-    target = read_target(args.target)
-    rig = read_rig(args.rig)
-    files = find_views(args.views)
     if args.out.is_dir():
         raise InputError(f"The output {args.out} is a folder.", code="output_unusable", remedy="Give a file's name.")
-    images = [ImageOfTarget(f.camera, f.dz_mm, read_image(f.path), f.path.name) for f in files]
-    options = CalibrationOptions(held_out_mm=held_out, axis_tilt_sigma_rad=rig.axis_tilt_sigma_rad)
-
     line = ProgressLine()
     try:
-        found = calibrate_views(
-            images,
-            target,
-            (rig.cam1, rig.cam2),
-            options,
+        found = calibrate_folder(
+            args.views,
+            args.target,
+            args.rig,
+            hold_out_mm=held_out,
             localiser=args.localiser,
-            progress=lambda stage, done, total: line.show(stage, done / total),
+            progress=lambda phase, done, total: line.show(phase, done / total),
         )
     finally:
         line.close()
-    result = found.result
-    print(report(result))
-    if result.verdict.level == "failed":
-        raise CalibrationError(
-            f"The calibration is not usable, nothing was written: {' '.join(result.verdict.reasons)}",
-            code="calibration_rejected",
-        )
-    make_folder(args.out.absolute().parent)
-    provenance = {
-        "software": software_version(),
-        "localiser": args.localiser,
-        "line_model": found.grids[0].line_model,
-        "views_sha256": {f.path.name: sha256_of(f.path) for f in files},
-        "target_file": str(args.target),
-        "rig_file": str(args.rig),
-        "nominal_rig": asdict(rig),
-    }
-    write_calibration(args.out, result, target, provenance=provenance)
+    print(report(found.result))
+    found.write(args.out)
     print(f"written: {args.out}")
     return 0
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError, RegionError
+from core.field.region.lay_points import lay_points
 from core.field.region.region import check_region as check_points
 from core.field.seeding.seeds import Seed
 from core.settings import Range, StoredRegion
-from server.compute.region import lay_points
 from server.formats.images import read_mask
 
 Rectangle = tuple[float, float, float, float]

@@ -103,7 +103,8 @@ def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
     )
 
 
-def _fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainField | None) -> None:
+def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainField | None) -> None:
+    """Put a field's variables and attributes into an empty data set."""
     dataset.set_fill_off()
     rows, cols = result.shape
     sparse = float(np.mean(~result.valid)) >= _MANY_EMPTY
@@ -311,6 +312,6 @@ def write_field(
         ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
     """
     with written_dataset(Path(path), checksum=checksum) as dataset:
-        _fill(dataset, result, provenance, strain)
+        fill(dataset, result, provenance, strain)
         if measured is not None:
             _put_measured(dataset, result, measured)

@@ -10,6 +10,7 @@ from fastapi import APIRouter
 from pydantic import Field, StringConstraints
 
 from core.errors import InputError
+from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import Seed
 from core.settings import STEP_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, StepPx, SubsetPx, Whole
 from server.api.models import Region, Reply, Request
@@ -17,7 +18,6 @@ from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
 from server.api.routes.analyses.looks import step_image
-from server.compute.region import make_grid
 from server.compute.seeds import distances_px, epipolar_line
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import decode_mask, read_image

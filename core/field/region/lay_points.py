@@ -1,4 +1,4 @@
-"""From a request's region to the grid of points: the same for the check before a job and for the worker."""
+"""The grid of points of a region, laid and checked against camera 1's reference image."""
 
 from __future__ import annotations
 

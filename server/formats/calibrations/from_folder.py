@@ -1,0 +1,101 @@
+"""Calibration from a folder of views, a target file and a rig file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from core.calibration import CalibrationOptions, CalibrationResult
+from core.calibration.from_images import ImageOfTarget, calibrate_views
+from core.errors import CalibrationError
+from core.grid import Localiser
+from core.progress import Progress, no_progress
+from core.target import GridTarget
+from server.formats.calibrations.native import calibration_content, write_calibration
+from server.formats.calibrations.target_toml import read_rig, read_target
+from server.formats.files import make_folder, sha256_of
+from server.formats.images import read_image
+from server.formats.version import software_version
+from server.formats.views import find_views
+
+
+@dataclass(frozen=True)
+class FolderCalibration:
+    """A calibration, with what its file records of its origin."""
+
+    result: CalibrationResult
+    target: GridTarget
+    provenance: dict[str, object]
+
+    def content(self) -> dict[str, object]:
+        """Return what calibration.json holds."""
+        return calibration_content(self.result, self.target, provenance=self.provenance)
+
+    def write(self, path: Path) -> None:
+        """Write calibration.json.
+
+        Raises
+        ------
+        CalibrationError
+            ``calibration_rejected`` if the verdict is failed; nothing is written.
+        StorageError
+            ``storage_full`` or ``storage_failed``.
+        """
+        self.check()
+        make_folder(path.absolute().parent)
+        write_calibration(path, self.result, self.target, provenance=self.provenance)
+
+    def check(self) -> None:
+        """Raise CalibrationError ``calibration_rejected`` if the verdict is failed."""
+        if self.result.verdict.level == "failed":
+            raise CalibrationError(
+                f"The calibration is not usable, nothing was written: {' '.join(self.result.verdict.reasons)}",
+                code="calibration_rejected",
+            )
+
+
+def calibrate_folder(
+    views: Path,
+    target: Path,
+    rig: Path,
+    *,
+    hold_out_mm: Sequence[float] = (),
+    localiser: Localiser = "profile",
+    progress: Progress = no_progress,
+) -> FolderCalibration:
+    """Calibrate from files.
+
+    Parameters
+    ----------
+    views
+        Folder of images with camera and travel in the name, as ``cam2_+5.000mm.tif``.
+    target, rig
+        TOML files: the grid of lines; the nominal cameras.
+    hold_out_mm
+        Positions to leave out of the fit and check with.
+    localiser
+        How intersections are found.
+    progress
+        Reports (phase, done, total).
+
+    Raises
+    ------
+    StereorigError
+        Files that cannot be used, a grid that is not found, positions that do not determine the cameras.
+    """
+    grid, nominal = read_target(target), read_rig(rig)
+    files = find_views(views)
+    images = [ImageOfTarget(f.camera, f.dz_mm, read_image(f.path), f.path.name) for f in files]
+    options = CalibrationOptions(held_out_mm=tuple(hold_out_mm), axis_tilt_sigma_rad=nominal.axis_tilt_sigma_rad)
+    found = calibrate_views(images, grid, (nominal.cam1, nominal.cam2), options, localiser=localiser, progress=progress)
+    provenance: dict[str, object] = {
+        "software": software_version(),
+        "localiser": localiser,
+        "line_model": found.grids[0].line_model,
+        "views_sha256": {f.path.name: sha256_of(f.path) for f in files},
+        "target_file": str(target),
+        "rig_file": str(rig),
+        "nominal_rig": asdict(nominal),
+    }
+    return FolderCalibration(found.result, grid, provenance)

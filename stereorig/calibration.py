@@ -1,0 +1,73 @@
+"""Calibrations: read from a file of this or another program, or fitted from images of the target."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from core.grid import Localiser
+from server.formats.calibrations.from_folder import calibrate_folder
+from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
+
+
+def read_calibration(path: str | Path) -> LoadedCalibration:
+    """Read a calibration: ``calibration.json``, DICe's XML, OpenCV's YAML, MatchID's caldat or VIC-3D's XML.
+
+    Parameters
+    ----------
+    path
+        The file; its form is recognised by its content.
+
+    Returns
+    -------
+    Calibration
+        The cameras as ``pair``; what a ``calibration.json`` holds beside them as ``record``.
+
+    Raises
+    ------
+    StereorigError
+        ``file_missing``, ``calibration_unreadable``, ``calibration_invalid`` or ``calibration_unsupported``.
+    """
+    return load_calibration(path)
+
+
+def calibrate(
+    views: str | Path,
+    target: str | Path,
+    rig: str | Path,
+    *,
+    hold_out_mm: Sequence[float] = (),
+    localiser: Localiser = "profile",
+    out: str | Path | None = None,
+) -> LoadedCalibration:
+    """Calibrate a pair of cameras from images of the line grid (Helm, McNeill and Sutton 1996, doi:10.1117/1.600624).
+
+    Parameters
+    ----------
+    views
+        Folder of images with camera and travel in the name, as ``cam2_+5.000mm.tif``.
+    target, rig
+        TOML files: the grid of lines (``pitch_mm``, ``lines`` ...); the nominal cameras.
+    hold_out_mm
+        Travels that are left out of the fit, to check it with.
+    localiser
+        How intersections are found: ``profile`` or the paper's (``paper``).
+    out
+        Write ``calibration.json`` there.
+
+    Returns
+    -------
+    Calibration
+        With verdict, covariance and residuals in ``record`` and ``details``.
+
+    Raises
+    ------
+    StereorigError
+        Files that cannot be used, a grid that is not found; ``calibration_rejected`` if the verdict is failed.
+    """
+    found = calibrate_folder(Path(views), Path(target), Path(rig), hold_out_mm=hold_out_mm, localiser=localiser)
+    found.check()
+    if out is not None:
+        found.write(Path(out))
+    return parse_calibration(json.dumps(found.content()).encode(), name="calibration.json")

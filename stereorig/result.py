@@ -1,0 +1,195 @@
+"""One step's result: arrays, data set, gauges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from core.arrays import Bool, Float
+from core.errors import InputError
+from core.field.points.result import Field
+from core.field.points.shared_pixels import SharedPixels
+from core.gauge.area import AreaStatistics, area_statistics, points_within
+from core.gauge.extensometer import Extensometer, extensometer
+from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
+from core.settings import AnalysisSettings, StrainSettings
+from core.strain import StrainField, StrainOptions, surface_strain
+from server.formats.results.dataset import as_dataset
+from server.formats.results.layout import field_variable
+from server.formats.results.reading import read_field, read_head
+from server.formats.results.settings import stored_settings
+from server.formats.results.strain import read_strain
+from server.formats.results.writing import Provenance, write_field
+from server.formats.version import software_version
+
+if TYPE_CHECKING:
+    import xarray
+
+_STRAIN = ("exx", "eyy", "exy")
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Shape, and after the reference displacement and strain, at (r, c) points.
+
+    Attributes
+    ----------
+    field
+        Every array: ``xyz_mm`` (r, c, 3), ``uvw_mm`` (r, c, 3) or None, ``covariance``, ``zncc``, ``status`` ...
+    strain
+        ``strain`` (r, c, 3) of exx, eyy, exy with ``covariance``; None for a shape, or where it was switched off.
+    settings
+        What it was measured with.
+    step
+        Number of the load step, 0 = the reference.
+    frame
+        ``target`` or ``camera1``: what the system frame is.
+    """
+
+    field: Field
+    strain: StrainField | None
+    settings: AnalysisSettings
+    step: int = 0
+    frame: str = "target"
+    calibration_sha256: str = ""
+
+    @property
+    def valid(self) -> Bool:
+        """(r, c) True where the point has values."""
+        return self.field.valid
+
+    def __getitem__(self, name: str) -> Float:
+        """Return a variable (r, c) by its name in result files: ``w_mm``, ``sigma_w_mm``, ``exx``, ``sigma_exx`` ...
+
+        Raises
+        ------
+        InputError
+            ``field_missing`` for a name that the result does not have.
+        """
+        values = self._values(name)
+        if values is None:
+            raise InputError(
+                f"The result has no variable {name}.", code="field_missing", remedy="Ask for one that `dataset` lists."
+            )
+        return values
+
+    @cached_property
+    def dataset(self) -> xarray.Dataset:
+        """The step as its result file holds it, with units and long names; needs xarray."""
+        return as_dataset(self.field, self._provenance, self.strain)
+
+    def save(self, path: str | Path) -> None:
+        """Write the result file (NetCDF-4), as ``stereorig measure`` does.
+
+        Raises
+        ------
+        StorageError
+            ``storage_full`` or ``storage_failed``.
+        """
+        write_field(path, self.field, self._provenance, self.strain)
+
+    def with_strain(self, **settings: object) -> Result:
+        """Return the result with strain over another window, order or tensor: see :class:`stereorig.StrainSettings`.
+
+        Raises
+        ------
+        StereorigError
+            ``strain_needs_motion`` for a shape.
+        """
+        chosen = StrainSettings.model_validate(settings)
+        strain = surface_strain(self.field, StrainOptions.of(chosen), subset_px=self.settings.subset_px)
+        return self._with(self.field, strain, strain_settings=chosen)
+
+    def without_rigid_motion(self, *, robust: bool = False) -> Result:
+        """Return the result with the specimen's rigid motion taken out of the displacements.
+
+        Parameters
+        ----------
+        robust
+            Give points that move otherwise than most little weight.
+        """
+        motion = self.rigid_motion(robust=robust)
+        return self._with(without_rigid_motion(self.field, motion, shared=self._shared), self.strain)
+
+    def rigid_motion(self, *, robust: bool = False) -> RigidMotion:
+        """Fit the rigid motion of the displacements, with its covariance."""
+        return rigid_motion(self.field, shared=self._shared, robust=robust)
+
+    def extensometer(self, a_px: ArrayLike, b_px: ArrayLike) -> Extensometer:
+        """Read a virtual extensometer between two positions (x, y) of camera 1's reference image.
+
+        Returns
+        -------
+        Extensometer
+            ``length0_mm``, ``elongation_mm``, ``strain`` ..., each with ``value`` and ``sigma``.
+        """
+        return extensometer(self.field, a_px, b_px, shared=self._shared)
+
+    def area(self, name: str, polygon_px: ArrayLike | None = None) -> AreaStatistics:
+        """Return the statistics of a variable over a polygon (n, 2), px; None: over the whole field.
+
+        Raises
+        ------
+        StereorigError
+            ``field_missing``, ``gauge_outside`` or ``region_unusable``.
+        """
+        values, sigma = self[name], self._values(f"sigma_{name}")
+        return area_statistics(self.field, values, sigma, points_within(self.field, polygon_px), shared=self._shared)
+
+    @cached_property
+    def _shared(self) -> SharedPixels:
+        return SharedPixels.of(self.field, float(self.settings.subset_px))
+
+    @property
+    def _provenance(self) -> Provenance:
+        return Provenance(
+            settings=self.settings.model_dump(),
+            inputs={"calibration": self.calibration_sha256} if self.calibration_sha256 else {},
+            software_version=software_version(),
+            frame=self.frame,
+            step=self.step,
+        )
+
+    def _with(
+        self, field: Field, strain: StrainField | None, *, strain_settings: StrainSettings | None = None
+    ) -> Result:
+        settings = self.settings
+        if strain_settings is not None:
+            settings = settings.model_copy(update={"strain": strain_settings})
+        return Result(field, strain, settings, self.step, self.frame, self.calibration_sha256)
+
+    def _values(self, name: str) -> Float | None:
+        found = field_variable(self.field, name)
+        if found is not None:
+            return found[0]
+        sigma = name.startswith("sigma_")
+        of = name.removeprefix("sigma_")
+        if sigma and of.endswith("_mm") and of[:-3] in (names := "xyzuvw"[: self.field.covariance.shape[-1]]):
+            return np.asarray(self.field.sigma_mm[..., names.index(of[:-3])])
+        if self.strain is not None and of in _STRAIN:
+            return np.asarray((self.strain.sigma if sigma else self.strain.strain)[..., _STRAIN.index(of)])
+        return None
+
+
+def read_result(path: str | Path) -> Result:
+    """Read a result file, ``step_*.nc``.
+
+    Raises
+    ------
+    StereorigError
+        ``file_missing``, ``file_unreadable`` or ``format_too_new``.
+    """
+    head = read_head(path)
+    return Result(
+        read_field(path),
+        read_strain(path),
+        stored_settings(head.settings),
+        head.step,
+        head.frame,
+        head.inputs_sha256.get("calibration", ""),
+    )
