@@ -23,13 +23,13 @@ help:
 	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls; lint and types of the page's scripts"
-	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a few minutes)"
-	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/reliability.md (ARGS='--minutes N')"
-	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/reliability.md (ARGS='--kills N')"
+	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
+	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
+	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
 	@echo "make openapi write docs/openapi.json, the description of the API, and the list of problems, after a change of either"
-	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/page.md"
-	@echo "make accuracy   measure every figure of docs/accuracy.md again (about twenty minutes)"
+	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/explanation/page_speed.md"
+	@echo "make accuracy   measure every figure of docs/explanation/accuracy again (about twenty minutes)"
 
 $(PROGRAM): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }

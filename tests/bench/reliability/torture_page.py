@@ -1,4 +1,4 @@
-"""The section on kills of docs/reliability.md, and its figure, from the figures of a run."""
+"""The section on kills of docs/explanation/reliability.md, and its figure, from the figures of a run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ mpl.use("agg")
 import matplotlib.pyplot as plt
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PAGE = DOCS / "reliability.md"
+PAGE = DOCS / "explanation" / "reliability.md"
 BEGIN, END = "<!-- kills: begin -->", "<!-- kills: end -->"
 FIGURE = "reliability_kills.png"
 _ACTS = {
@@ -74,7 +74,7 @@ def section(run: dict[str, Any]) -> str:
         "",
         _processor(run),
         "",
-        f"![Restart to ready](figures/{FIGURE})",
+        f"![Restart to ready](../figures/{FIGURE})",
     ]
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""Writes ``docs/performance.md`` and its plots from what the bench measured."""
+"""Writes ``docs/explanation/performance.md`` and its plots from what the bench measured."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def save(figure: plt.Figure, name: str, caption: str) -> str:
     (DOCS / "figures").mkdir(exist_ok=True)
     figure.savefig(DOCS / "figures" / name, dpi=110)
     plt.close(figure)
-    return f"![{caption}](figures/{name})"
+    return f"![{caption}](../figures/{name})"
 
 
 # targets
@@ -534,6 +534,6 @@ def write_page(report: Report) -> Path:
         if parts:
             glue = "\n" if title == "Machine" else "\n\n"
             page += [f"## {title}\n", glue.join(parts) + "\n"]
-    path = DOCS / "performance.md"
+    path = DOCS / "explanation" / "performance.md"
     path.write_text("\n".join(page).rstrip() + "\n")
     return path

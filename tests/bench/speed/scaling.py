@@ -1,4 +1,4 @@
-"""Measures docs/scaling.md: one analysis by the service's own worker, and by Dask clusters of 1, 2 and 4 workers here.
+"""Measures docs/how_to/scale_on_dask.md: one analysis by the service's own worker, and by Dask clusters of 1, 2 and 4 workers here.
 
 Run from the repository's root, on a machine that does nothing else::
 
@@ -35,7 +35,7 @@ from sim.rig import SimRig
 from sim.world import SimWorld
 from tests.support.requirements import ROOT
 
-PAGE = ROOT / "docs" / "scaling.md"
+PAGE = ROOT / "docs" / "how_to" / "scale_on_dask.md"
 RIG = ROOT / "config" / "sim_paper.toml"
 STEPS = 17  # the reference and sixteen more
 TEST = "t000001-abcdef"
