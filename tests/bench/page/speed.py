@@ -239,7 +239,9 @@ def table(figures: list[Figure], load: tuple[float, float]) -> str:
 def main() -> None:
     """Measure, and put the table into the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--print", action="store_true", dest="only_print", help="leave docs/explanation/page_speed.md as it is")
+    parser.add_argument(
+        "--print", action="store_true", dest="only_print", help="leave docs/explanation/page_speed.md as it is"
+    )
     only_print = parser.parse_args().only_print
     load = os.getloadavg()[0]
     text = table(measure(), (load, os.getloadavg()[0]))

@@ -340,7 +340,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--json", type=Path, help="write everything that was seen to this file")
-    parser.add_argument("--page", action="store_true", help="write figures and plot into docs/explanation/reliability.md")
+    parser.add_argument(
+        "--page", action="store_true", help="write figures and plot into docs/explanation/reliability.md"
+    )
     args = parser.parse_args()
     os.environ["MALLOC_ARENA_MAX"] = "2"  # as the systemd unit gives it to a service that runs for days
     set_priority(-15)  # the controller in here is the instrument: its clock must not wait
