@@ -246,7 +246,8 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
             + ("by the cameras' common clock" if common_clock(pair.units) else "by this machine's clock")
             + (f"; {refused} refused" if refused else ""),
             limit=f"{limit:g} ms but for 1 or {100 * _LOSS_SHARE:g} %",
-            remedy="Use a common hardware trigger (docs/how_to/triggers.md), or raise max_skew_ms for a specimen at rest.",
+            remedy="Use a common hardware trigger (docs/how_to/triggers.md), or raise max_skew_ms "
+            "for a specimen at rest.",
             median_ms=statistics.median(seen.skews_ms),
             worst_ms=worst,
             limit_ms=limit,
