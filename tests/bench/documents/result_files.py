@@ -46,9 +46,9 @@ CALIBRATION = {
     "image_size_px": "width and height by camera",
     "covariance": "`names` of 20 parameters (all but the aspects) and their `matrix`, in the units of the names, squared",
     "sigma": "standard uncertainty of each parameter, by its name",
-    "noise_px": "estimated standard deviation of a grid intersection, px, by camera: x and y",
-    "redundancy": "share of the observations that the fit's unknowns leave over, by camera",
-    "axis_tilt_rad": "angle between stage axis and optical axis, by camera, where it was declared as a prior",
+    "noise_px": "standard deviation of a coordinate of a grid intersection, from the residuals, by camera",
+    "redundancy": "observations beyond the unknowns, by camera",
+    "axis_tilt_rad": "angle between stage axis and optical axis, by camera and direction; zero where it was held",
     "axis_tilt_sigma_rad": "its standard uncertainty",
     "checks": "`fitted` and `held_out` positions: `rbe_px` (mean reprojection error), `raz_mm`, `nsce` of Eqs. (15) to (17), `points`, "
     "`per_camera`, `against_nominal_grid`; `made`: each check by name, with its outcome",
