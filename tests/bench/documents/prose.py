@@ -13,7 +13,7 @@ def wrapped(text: str, width: int = WIDTH) -> str:
     """Return the text with every paragraph and list item that has a longer line laid out anew."""
     lines: list[str] = []
     block: list[str] = []
-    fenced = False
+    fenced = math = False
 
     def flush() -> None:
         if any(len(line) > width for line in block):
@@ -27,7 +27,17 @@ def wrapped(text: str, width: int = WIDTH) -> str:
             flush()
             fenced = not fenced
             lines.append(line)
-        elif fenced or not line.strip() or line.lstrip().startswith(("|", "!", "#", "<", ":", "    ", "$$", "(")):
+        elif line.strip() == "$$":
+            flush()
+            math = not math
+            lines.append(line)
+        elif (
+            fenced
+            or math
+            or not line.strip()
+            or line.lstrip().startswith(("|", "!", "#", "<", ":", "$$"))
+            or line.startswith("    ")
+        ):
             flush()
             lines.append(line)
         else:

@@ -25,6 +25,7 @@ import psutil
 from playwright.sync_api import Browser, Page
 
 from server.demo.process import running_service
+from tests.bench.documents.prose import wrapped
 from tests.bench.page.browser import browser, fresh_page
 from tests.bench.speed.scaling import RIG, ROOT, TEST, write_test
 
@@ -250,7 +251,7 @@ def main() -> None:
         return
     page = PAGE.read_text(encoding="utf-8")
     head, _, rest = page.partition(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+    PAGE.write_text(f"{head}{BEGIN}\n{wrapped(text)}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
 
 
 if __name__ == "__main__":

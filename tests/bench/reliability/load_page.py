@@ -10,6 +10,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tests.bench.documents.prose import wrapped
 from tests.bench.reliability.load import PER_MINUTE, READERS, Load, percentile
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -139,4 +140,4 @@ def write_page(load: Load) -> None:
     draw(load)
     text = PAGE.read_text(encoding="utf-8")
     head, rest = text.split(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}{section(load)}{END}{rest.split(END)[1]}", encoding="utf-8")
+    PAGE.write_text(f"{head}{BEGIN}{wrapped(section(load))}{END}{rest.split(END)[1]}", encoding="utf-8")

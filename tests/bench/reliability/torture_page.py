@@ -11,6 +11,8 @@ import matplotlib as mpl
 mpl.use("agg")
 import matplotlib.pyplot as plt
 
+from tests.bench.documents.prose import wrapped
+
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 PAGE = DOCS / "explanation" / "reliability.md"
 BEGIN, END = "<!-- kills: begin -->", "<!-- kills: end -->"
@@ -169,5 +171,5 @@ def write_page(run: dict[str, Any]) -> None:
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{section(run)}\n{END}{after}", encoding="utf-8")
+    PAGE.write_text(f"{before}{BEGIN}\n{wrapped(section(run))}\n{END}{after}", encoding="utf-8")
     draw(run)

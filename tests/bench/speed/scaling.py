@@ -33,6 +33,7 @@ from server.demo.process import running_service
 from server.formats.images import encode_tiff
 from sim.rig import SimRig
 from sim.world import SimWorld
+from tests.bench.documents.prose import wrapped
 from tests.support.requirements import ROOT
 
 PAGE = ROOT / "docs" / "how_to" / "scale_on_dask.md"
@@ -225,7 +226,7 @@ def main() -> None:
     text = PAGE.read_text(encoding="utf-8")
     head, _, rest = text.partition(BEGIN)
     tail = rest.partition(END)[2]
-    PAGE.write_text(f"{head}{BEGIN}\n{table(runs, points, load)}\n{END}{tail}", encoding="utf-8")
+    PAGE.write_text(f"{head}{BEGIN}\n{wrapped(table(runs, points, load))}\n{END}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":
