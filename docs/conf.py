@@ -18,8 +18,6 @@ version = release = _PROJECT["version"]
 extensions = ["myst_parser"]
 source_suffix = {".md": "markdown"}
 nitpicky = True
-#: places for pages that may not be there yet
-suppress_warnings = ["toc.empty_glob"]
 #: formulas between dollar signs, definition lists, a picture in the text's size
 myst_enable_extensions = ["dollarmath", "deflist", "attrs_inline"]
 #: headings down to this level can be linked to, by the names that GitHub gives them
