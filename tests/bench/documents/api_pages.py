@@ -100,7 +100,7 @@ class _Pages:
         query = [f"`{p['name']}`" for p in operation.get("parameters", ()) if p["in"] == "query"]
         asked = "; ".join(filter(None, [body, f"query: {', '.join(query)}" if query else ""]))
         shown = path.removeprefix("/api/v1")
-        return f"| {method.upper()} | `{shown}` | {cell(operation['summary'])} | {asked} | {'; '.join(replies)} |"
+        return f"| {method.upper()} `{shown}` | {cell(operation['summary'])} | {asked} | {'; '.join(replies)} |"
 
     def model(self, name: str, tag: str) -> list[str]:
         """Return a model's heading and table of fields."""
@@ -122,7 +122,7 @@ class _Pages:
     def page(self, tag: str) -> str:
         """Return a tag's page."""
         lines = [f"# {_TITLES.get(tag, tag.capitalize())}", ""]
-        lines += ["| method | path | purpose | body, query | reply |", "| --- | --- | --- | --- | --- |"]
+        lines += ["| operation | purpose | body, query | reply |", "| --- | --- | --- | --- |"]
         lines += [self.operation(*operation, tag) for operation in self.tags[tag]]
         lines += ["", "## Fields", ""]
         for name in sorted(n for n, home in self.home.items() if home == tag):
