@@ -30,7 +30,7 @@ _COUNTS = {
     "images read back": "of their images read back over HTTP and compared with the acknowledged SHA-256",
     "results": "results of analyses announced",
     "results read back": "of them read back and compared",
-    "complete, unacknowledged steps": "steps that were whole although nobody had an answer",
+    "complete, unacknowledged steps": "steps that were whole although no reply had been sent",
     "incomplete steps": "steps left incomplete, each one that had no answer",
     "jobs": "jobs acknowledged",
     "interrupted after a kill": "jobs that read `interrupted` after the restart",
