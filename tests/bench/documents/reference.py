@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.bench.documents import api_pages, command_line, error_page, result_files, rig_file, settings_pages
+from tests.bench.documents.prose import wrapped
 from tests.support.requirements import ROOT
 
 FOLDER = ROOT / "docs" / "reference"
@@ -11,7 +12,7 @@ MAKERS = (api_pages, command_line, error_page, result_files, rig_file, settings_
 
 def pages() -> dict[str, str]:
     """Return the text of every generated page by its path below docs/reference."""
-    return {path: text for maker in MAKERS for path, text in maker.pages().items()}
+    return {path: wrapped(text) for maker in MAKERS for path, text in maker.pages().items()}
 
 
 def main() -> None:

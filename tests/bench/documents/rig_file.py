@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from server.config.reference import markdown
+from tests.bench.documents.prose import wrapped
 from tests.support.requirements import ROOT
 
 PAGE = ROOT / "docs" / "reference" / "rig_file.md"
@@ -10,4 +11,4 @@ PAGE = ROOT / "docs" / "reference" / "rig_file.md"
 
 def pages() -> dict[str, str]:
     """Return the page by its path below docs/reference."""
-    return {PAGE.name: markdown()}
+    return {PAGE.name: wrapped(markdown())}
