@@ -23,9 +23,11 @@ myst_enable_extensions = ["dollarmath", "deflist", "attrs_inline"]
 #: headings down to this level can be linked to, by the names that GitHub gives them
 myst_heading_anchors = 4
 
+#: options keep both their dashes
+smartquotes = False
+
 html_theme = "furo"
 html_title = f"stereorig {release}"
-html_logo = None
 html_static_path = ["site"]
 html_css_files = ["stereorig.css"]
 html_copy_source = html_show_sourcelink = html_show_sphinx = False
