@@ -72,6 +72,7 @@ points. A value that is not known is NaN in the file and `null` in JSON, never z
 
 ```python
 import xarray
+
 step = xarray.open_dataset("result/step_0001.nc")
 step["w_mm"].where(step["status"] == 0).plot()
 ```
