@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+
+from pydantic.json_schema import JsonSchemaValue
 
 from server.config.rig_file import RigConfig
+
+#: schemas of the models, by name
+Definitions = dict[str, JsonSchemaValue]
 
 _HEAD = """# The rig file
 
@@ -20,7 +24,7 @@ examples with comments are in `config/`.
 """
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> JsonSchemaValue:
     """Return the JSON schema of a rig file."""
     schema = RigConfig.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
@@ -47,7 +51,7 @@ def markdown() -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _section(title: str, section: dict[str, Any], known: dict[str, Any], *, prefix: str) -> list[str]:
+def _section(title: str, section: JsonSchemaValue, known: Definitions, *, prefix: str) -> list[str]:
     text = section.get("description", "").split(": ", 1)[-1].replace("\n", " ")
     lines = [f"## {title}", "", text[:1].upper() + text[1:], ""]
     lines += ["| key | value | default | meaning |", "| --- | --- | --- | --- |"]
@@ -67,18 +71,18 @@ def _section(title: str, section: dict[str, Any], known: dict[str, Any], *, pref
     return lines
 
 
-def _core(field: dict[str, Any]) -> dict[str, Any]:
+def _core(field: JsonSchemaValue) -> JsonSchemaValue:
     """Take the alternative `null` away: a key that may be left out."""
     options = [option for option in field.get("anyOf", [field]) if option.get("type") != "null"]
     return options[0] if len(options) == 1 else {"anyOf": options}
 
 
-def _target(field: dict[str, Any]) -> str | None:
+def _target(field: JsonSchemaValue) -> str | None:
     reference = _core(field).get("$ref") or (field.get("allOf") or [{}])[0].get("$ref")
     return None if reference is None else str(reference).rsplit("/", 1)[-1]
 
 
-def _table(field: dict[str, Any]) -> str | None:
+def _table(field: JsonSchemaValue) -> str | None:
     """Name of the model behind a key that holds a table of its own, or tables by number."""
     target = _target(field)
     if target is not None:
@@ -90,14 +94,14 @@ def _table(field: dict[str, Any]) -> str | None:
     return None
 
 
-def default_text(default: Any) -> str:
+def default_text(default: object) -> str:
     """Return a default as a table shows it."""
     if default is None or default == {}:
         return "left out"
     return f"`{json.dumps(default)}`"
 
 
-def kind_of_value(field: dict[str, Any], known: dict[str, Any]) -> str:
+def kind_of_value(field: JsonSchemaValue, known: Definitions) -> str:
     """Return the values that a field of a JSON schema takes, in words."""
     core = _core(field)
     if "anyOf" in core:
@@ -119,7 +123,7 @@ def kind_of_value(field: dict[str, Any], known: dict[str, Any]) -> str:
     return f"{names.get(str(kind), str(kind))}{_range(core)}"
 
 
-def _array(core: dict[str, Any], known: dict[str, Any]) -> str:
+def _array(core: JsonSchemaValue, known: Definitions) -> str:
     if "prefixItems" in core:
         inner = [kind_of_value(item, known) for item in core["prefixItems"]]
         return f"[{inner[0]}] x {len(inner)}" if len(set(inner)) == 1 else f"[{', '.join(inner)}]"
@@ -127,7 +131,7 @@ def _array(core: dict[str, Any], known: dict[str, Any]) -> str:
     return f"list of {kind_of_value(core.get('items', {}), known)}" + ("" if most is None else f", {least} to {most}")
 
 
-def _range(core: dict[str, Any]) -> str:
+def _range(core: JsonSchemaValue) -> str:
     low, high = core.get("minimum"), core.get("maximum")
     above, below = core.get("exclusiveMinimum"), core.get("exclusiveMaximum")
     if low is not None and high is not None:

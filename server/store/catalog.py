@@ -7,11 +7,12 @@ index of calibrations, tests, steps and analyses can be lost at any time; it is 
 from __future__ import annotations
 
 import json
+import logging
 import queue
 import sqlite3
 import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -20,6 +21,8 @@ from server.base.models import Ids
 from server.store.documents import JobRecord
 
 T = TypeVar("T")
+_log = logging.getLogger("stereorig.store")
+_PATIENCE_S = 30.0
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
@@ -121,7 +124,12 @@ class Catalog:
         """Run ``function`` in a transaction on the writer thread, and wait for its commit."""
         future: Future[T] = Future()
         self._work.put((function, future))
-        return future.result(timeout=30.0)
+        # a disk that is busy for so long still commits; giving up would leave unknown what came of it
+        while not wait([future], timeout=_PATIENCE_S).done and self.alive:
+            _log.warning("The catalogue has not committed for %.0f s: the disk is slow.", _PATIENCE_S)
+        if not future.done():
+            raise StorageError("The catalogue is closed.")
+        return future.result()
 
     @property
     def alive(self) -> bool:
@@ -150,7 +158,7 @@ class Catalog:
     ) -> list[JobRecord]:
         """Return jobs, newest first; ``before``: only those whose id is smaller."""
 
-        def read(c: sqlite3.Connection) -> list[JobRecord]:
+        def read(c: sqlite3.Connection) -> list[tuple[str]]:
             terms: list[str] = []
             values: list[str] = []
             if states is not None:
@@ -160,10 +168,10 @@ class Catalog:
                 terms.append("id < ?")
                 values.append(before)
             where = f"WHERE {' AND '.join(terms)}" if terms else ""
-            rows = c.execute(f"SELECT document FROM jobs {where} ORDER BY id DESC LIMIT ?", (*values, limit or -1))
-            return [JobRecord.model_validate_json(row[0]) for row in rows]
+            query = f"SELECT document FROM jobs {where} ORDER BY id DESC LIMIT ?"
+            return c.execute(query, (*values, limit or -1)).fetchall()
 
-        return self.transact(read)
+        return [JobRecord.model_validate_json(row[0]) for row in self.transact(read)]
 
     def job(self, job_id: str) -> JobRecord | None:
         """Return one job's document."""

@@ -45,6 +45,7 @@ class ControllerServer:
         self._listener: socket.socket | None = None
         self._pty: tuple[int, int] | None = None
         self._wake_read = self._wake_write = -1
+        self._hung_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="simulated controller", daemon=True)
 
     def start(self) -> Self:
@@ -81,8 +82,10 @@ class ControllerServer:
             self._thread.join()
 
     def hang_up(self) -> None:
-        """Drop every TCP client, as when the cable is pulled out of a terminal server."""
+        """Drop every TCP client, as when the cable is pulled out of a terminal server; back when they are dropped."""
+        self._hung_up.clear()
         os.write(self._wake_write, b"h")
+        self._hung_up.wait(10.0)
 
     def _run(self) -> None:
         try:
@@ -106,6 +109,7 @@ class ControllerServer:
                 if order == b"x":
                     return False
                 self._drop_clients()
+                self._hung_up.set()
                 break
             if self._listener is not None and key.fd == self._listener.fileno():
                 self._accept(self._listener)
