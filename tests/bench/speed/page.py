@@ -536,5 +536,6 @@ def write_page(report: Report) -> Path:
             glue = "\n" if title == "Machine" else "\n\n"
             page += [f"## {title}\n", glue.join(parts) + "\n"]
     path = DOCS / "explanation" / "performance.md"
+    path.parent.mkdir(exist_ok=True)
     path.write_text(wrapped("\n".join(page)).rstrip() + "\n")
     return path
