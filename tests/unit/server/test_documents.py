@@ -13,6 +13,9 @@ from tests.support.requirements import ROOT
 DOCS = ROOT / "docs"
 PAGES = [*sorted(DOCS.rglob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
+_FILE = re.compile(
+    r"(?<![\w/.>])(?:core|drivers|sim|server|tests|config|deploy|docs)/[\w/]+\.(?:py|toml|json|md|service)\b"
+)
 #: where a question's answer is, and a text that the page must have
 ANSWERS = {
     "How do I choose the subset?": "## Subset",
@@ -54,6 +57,14 @@ def test_links_lead_somewhere_and_lines_can_be_read(page: Path) -> None:
     assert [str(target) for target in links(page) if not target.exists()] == []
     too_long = [line for line in plain(page).splitlines() if len(line) > 160 and not line.startswith(("|", "!"))]
     assert too_long == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_files_that_it_names_are_there(page: Path) -> None:
+    if page.name == "CHANGELOG.md":
+        return  # it names what is gone
+    named = set(_FILE.findall(page.read_text(encoding="utf-8")))
+    assert sorted(name for name in named if not (ROOT / name).exists()) == []
 
 
 def test_a_folder_has_an_index_and_few_pages() -> None:
