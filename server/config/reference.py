@@ -110,6 +110,8 @@ def kind_of_value(field: JsonSchemaValue, known: Definitions) -> str:
         return "table"
     if "$ref" in core:
         core = known[_target(field) or ""]
+        if core.get("type") == "array":  # of arrays of itself, as the numbers of a field
+            return "nested list"
     if "const" in core:
         return f"`{json.dumps(core['const'])}`"
     if "enum" in core:

@@ -193,9 +193,10 @@ class Rig:
     def describe_camera(self, cam: CameraName) -> CameraReply:
         """Nominal data, the device's own description, and the settings it has."""
         nominal = NominalCamera.model_validate(self.config.camera(cam).model_dump(mode="json"))
-        if self._devices is None:
+        devices = self._devices
+        if devices is None:
             return CameraReply(name=cam, nominal=nominal, device=None, settings=None)
-        unit = self._devices.pair.units[cam]
+        unit = devices.pair.units[cam]
         return CameraReply(
             name=cam,
             nominal=nominal,

@@ -66,7 +66,7 @@ class _Pages:
             if name not in found:
                 found.append(name)
                 waiting += _references(self.models[name])
-        return found
+        return [name for name in found if self.models[name].get("type") != "array"]
 
     def link(self, schema: dict[str, Any], tag: str) -> str:
         """Return a schema in words, with links to the models in it."""
