@@ -72,10 +72,9 @@ class _Pages:
         """Return a schema in words, with links to the models in it."""
         text = kind_of_value(schema, self.models) if schema else "any"
         named = [n for n in _references(schema) if n in self.home]
-        links = ", ".join(self._to(name, tag) for name in named)
-        if not links:
-            return cell(text)
-        return links if text == "table" else f"{cell(text)}: {links}"
+        for name in named:  # the words have "table" for each model, in the same order
+            text = text.replace("table", self._to(name, tag), 1)
+        return cell(f"by name: {text}" if named and "additionalProperties" in json.dumps(schema) else text)
 
     def _to(self, name: str, tag: str) -> str:
         return f"[{name}]({'' if self.home[name] == tag else self.home[name] + '.md'}#{name.lower()})"
@@ -119,12 +118,31 @@ class _Pages:
             )
         return [*lines, ""]
 
+    def parameters(self, tag: str) -> list[str]:
+        """Return the table of a tag's query parameters, each once."""
+        rows: dict[tuple[str, str, str, str], list[str]] = {}
+        for _, path, operation in self.tags[tag]:
+            for parameter in operation.get("parameters", ()):
+                schema = parameter["schema"]
+                text = parameter.get("description") or schema.get("description", "")
+                default = default_text(schema["default"]) if schema.get("default") is not None else ""
+                if parameter["in"] == "query":
+                    row = (parameter["name"], kind_of_value(schema, self.models), default, text)
+                    rows.setdefault(row, []).append(path.rsplit("/", 1)[-1])
+        if not rows:
+            return []
+        head = ["## Query parameters", "", "| parameter | of | value | default | meaning |", f"|{' --- |' * 5}"]
+        for (name, value, default, text), paths in rows.items():
+            of = ", ".join(f"`{path}`" for path in dict.fromkeys(paths))
+            head.append(f"| `{name}` | {of} | {cell(value)} | {default} | {cell(_plain(text))} |")
+        return [*head, ""]
+
     def page(self, tag: str) -> str:
         """Return a tag's page."""
         lines = [f"# {_TITLES.get(tag, tag.capitalize())}", ""]
         lines += ["| operation | purpose | body, query | reply |", "| --- | --- | --- | --- |"]
         lines += [self.operation(*operation, tag) for operation in self.tags[tag]]
-        lines += ["", "## Fields", ""]
+        lines += ["", *self.parameters(tag), "## Fields", ""]
         for name in sorted(n for n, home in self.home.items() if home == tag):
             lines += self.model(name, tag)
         return "\n".join(lines).rstrip() + "\n"
