@@ -25,7 +25,7 @@ ANSWERS = {
     "How do I calibrate?": "stereorig calibrate",
     "What file do I get, and how do I open it in MATLAB, ParaView or Python?": "ncread(",
     "How do I connect a load frame?": "load_n",
-    "What does RBE mean?": "reprojection error",
+    "What does RBE mean?": "| RBE |",
     "What can it do with a crack?": "--crack",
     "How accurate is it?": "| measured |",
 }
