@@ -19,7 +19,7 @@ listed here is refused, and so is a value outside its range; the message names t
 a file without opening any device, and `stereorig rigfile --schema` prints a JSON schema, with which editors complete
 and check keys while you write.
 
-This page is made from the model that reads the file (`python -m tests.bench.documents.rig_file`). Complete
+This page is made from the model that reads the file (`make reference`). Complete
 examples with comments are in `config/`.
 """
 
@@ -58,9 +58,9 @@ def _section(title: str, section: JsonSchemaValue, known: Definitions, *, prefix
     required = set(section.get("required", ()))
     tables = []
     for key, field in section["properties"].items():
-        default = "**required**" if key in required else _value(field.get("default"))
+        default = "**required**" if key in required else default_text(field.get("default"))
         meaning = field.get("description", "").replace("|", "\\|").replace("\n", " ")
-        lines.append(f"| `{key}` | {_type(field, known)} | {default} | {meaning} |")
+        lines.append(f"| `{key}` | {kind_of_value(field, known)} | {default} | {meaning} |")
         table = _table(field)
         if table is not None:
             numbered = "additionalProperties" in _core(field) or "patternProperties" in _core(field)
@@ -94,20 +94,24 @@ def _table(field: JsonSchemaValue) -> str | None:
     return None
 
 
-def _value(default: object) -> str:
+def default_text(default: object) -> str:
+    """Return a default as a table shows it."""
     if default is None or default == {}:
         return "left out"
     return f"`{json.dumps(default)}`"
 
 
-def _type(field: JsonSchemaValue, known: Definitions) -> str:
+def kind_of_value(field: JsonSchemaValue, known: Definitions) -> str:
+    """Return the values that a field of a JSON schema takes, in words."""
     core = _core(field)
     if "anyOf" in core:
-        return " or ".join(_type(option, known) for option in core["anyOf"])
+        return " or ".join(kind_of_value(option, known) for option in core["anyOf"])
     if _table(field) is not None and ("$ref" not in core or "properties" in known[_target(field) or ""]):
         return "table"
     if "$ref" in core:
         core = known[_target(field) or ""]
+        if core.get("type") == "array":  # of arrays of itself, as the numbers of a field
+            return "nested list"
     if "const" in core:
         return f"`{json.dumps(core['const'])}`"
     if "enum" in core:
@@ -123,10 +127,10 @@ def _type(field: JsonSchemaValue, known: Definitions) -> str:
 
 def _array(core: JsonSchemaValue, known: Definitions) -> str:
     if "prefixItems" in core:
-        inner = [_type(item, known) for item in core["prefixItems"]]
+        inner = [kind_of_value(item, known) for item in core["prefixItems"]]
         return f"[{inner[0]}] x {len(inner)}" if len(set(inner)) == 1 else f"[{', '.join(inner)}]"
     least, most = core.get("minItems", 0), core.get("maxItems")
-    return f"list of {_type(core.get('items', {}), known)}" + ("" if most is None else f", {least} to {most}")
+    return f"list of {kind_of_value(core.get('items', {}), known)}" + ("" if most is None else f", {least} to {most}")
 
 
 def _range(core: JsonSchemaValue) -> str:
