@@ -24,7 +24,7 @@ pytestmark = pytest.mark.timeout(400)
 API = "/api/v1"
 NO_CURL = "curl not found: apt install curl to run the tutorial's scripts"
 RIG = ROOT / "config" / "sim_paper.toml"
-SCRIPT, FILES = "docs/tutorial/script.md", "docs/tutorial/files.md"
+SCRIPT, FILES, LIBRARY = "docs/tutorial/script.md", "docs/tutorial/files.md", "docs/tutorial/library.md"
 # what the scripts say of the plate: the paper's, in mm and N/mm^2, and the last pressure in kPa
 RADIUS, THICKNESS, MODULUS, POISSON, PRESSURE = 13.385, 0.762, 71.0e3, 0.334, 689.0
 
@@ -126,3 +126,16 @@ def test_from_files(client: httpx.Client, tmp_path: Path) -> None:
     assert strain == [pytest.approx(0.00084, abs=0.00005)]
     assert list((tmp_path / "maps").glob("*exx.png"))
     assert (tmp_path / "paraview" / "result.pvd").exists()
+    # the library's page goes on in the same folder
+    text = one_block(LIBRARY, "python", "import stereorig")
+    assert len([line for line in text.splitlines() if line.strip()]) <= 15
+    (tmp_path / "library.py").write_text(text, encoding="utf-8")
+    done = run([sys.executable, "library.py"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    valid, points, w_mm, sigma_um = (
+        float(v) for v in re.findall(r"(\d+) of (\d+) points, W from (\S+) mm, .* (\S+) um", done.stdout)[0]
+    )
+    assert valid > 0.98 * points
+    assert w_mm == pytest.approx(-0.117, abs=0.001)
+    assert 0.05 < sigma_um < 1.0
+    assert (tmp_path / "w.png").stat().st_size > 5000

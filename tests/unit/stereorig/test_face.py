@@ -1,0 +1,71 @@
+"""The library's face: its names, what importing it costs, and what it refuses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import stereorig as dic
+
+NAMES = {
+    "AnalysisSettings",
+    "AreaStatistics",
+    "Calibration",
+    "Extensometer",
+    "Measurement",
+    "Noise",
+    "PointStatus",
+    "Reading",
+    "Region",
+    "Result",
+    "RigidMotion",
+    "StereorigError",
+    "StrainSettings",
+    "__version__",
+    "calibrate",
+    "read_calibration",
+    "read_image",
+    "read_noise",
+    "read_result",
+}
+
+
+def test_the_face_has_these_names_and_each_is_there() -> None:
+    assert set(dic.__all__) == NAMES
+    assert dic.__all__ == sorted(dic.__all__)
+    assert set(dir(dic)) == NAMES
+    for name in NAMES - {"__version__"}:
+        assert getattr(dic, name).__doc__, name
+    with pytest.raises(AttributeError):
+        dic.nothing  # noqa: B018
+
+
+def test_importing_it_loads_neither_service_nor_kernels() -> None:
+    """Nothing is compiled, and the heavy libraries wait for their first use."""
+    code = (
+        "import stereorig, sys; print([m for m in sys.modules if m.split('.')[0] in ('fastapi', 'numba', 'uvicorn')])"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "[]"
+
+
+def test_measuring_needs_neither_web_service_nor_devices() -> None:
+    code = (
+        "import stereorig, sys; [getattr(stereorig, n) for n in stereorig.__all__];"
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'fastapi', 'uvicorn', 'serial', 'drivers', 'sim'}),"
+        "[m for m in sys.modules if m.startswith(('server.worker', 'server.rig', 'server.api'))])"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "[] []"
+
+
+def test_parameters_are_checked_once_and_by_the_settings() -> None:
+    image = np.zeros((64, 64), np.uint8)
+    with pytest.raises(dic.StereorigError) as caught:
+        dic.Measurement("nowhere.json", image, image, roi=(0, 0, 60, 60))
+    assert caught.value.code == "file_missing"
+    with pytest.raises(ValueError, match="subset_px"):
+        dic.AnalysisSettings.model_validate({"region": {"rectangle": [0, 0, 60, 60]}, "subset_px": 20})
