@@ -46,7 +46,7 @@ class Pulse:
 class GrabberFaults:
     """What is wrong with a camera; every value may be set while it runs.
 
-    Parameters
+    Attributes
     ----------
     drop
         So many of the next frames never arrive, though they were counted.

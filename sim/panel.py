@@ -37,7 +37,7 @@ _IMPERFECTION = 0.1
 class CrackedPanel:
     """Dimensions, material and out-of-plane model; a 2024-T3 sheet of 305 x 2.3 mm with a crack of 102 mm by default.
 
-    Parameters
+    Attributes
     ----------
     half_crack_mm, width_mm, thickness_mm
         a, W, t.

@@ -37,7 +37,7 @@ _BAND_ROWS: Final = 32  # rows of one piece of work: small enough for the cache,
 class RenderOptions:
     """How to integrate.
 
-    Parameters
+    Attributes
     ----------
     blur_px
         Standard deviation of the lens's Gaussian blur.

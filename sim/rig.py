@@ -25,7 +25,7 @@ from sim.sensor import Lighting, Sensor
 class SimCamera:
     """One true camera with its sensor, its light and its stage axis.
 
-    Parameters
+    Attributes
     ----------
     camera
         The true camera at dz = 0.
@@ -75,7 +75,7 @@ class SimTarget:
 class SimRig:
     """Everything true about a simulated rig.
 
-    Parameters
+    Attributes
     ----------
     name
         From ``[rig]``.
@@ -107,8 +107,7 @@ class SimRig:
 
     @staticmethod
     def from_dict(tables: Mapping[str, Any]) -> SimRig:
-        """Read a rig file's tables: ``rig``, ``cam1``, ``cam2``, ``target`` and ``sim`` with ``sim.cam1``,
-        ``sim.cam2``.
+        """Read a rig file's tables ``rig``, ``cam1``, ``cam2``, ``target`` and ``sim`` with ``sim.cam1``, ``sim.cam2``.
 
         Raises
         ------

@@ -21,7 +21,7 @@ UPRIGHT = RigidTransform(
 class Scene:
     """One state of one specimen.
 
-    Parameters
+    Attributes
     ----------
     name
         Of the scene.

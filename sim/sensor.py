@@ -22,7 +22,7 @@ from core.arrays import Float, Float32
 class Sensor:
     """Noise and converter.
 
-    Parameters
+    Attributes
     ----------
     bit_depth
         8 gives uint8 images, 9 to 16 give uint16, right-aligned.
@@ -79,7 +79,7 @@ class Lighting:
 
     (u, v) run from -1 to 1 across the image. It varies so slowly that it is taken at the pixels' centres.
 
-    Parameters
+    Attributes
     ----------
     gain
         Overall.

@@ -1,5 +1,4 @@
-"""Analytic surfaces and their deformation: material point (s, t) -> place in the body's frame, and the way back from
-a ray.
+"""Analytic surfaces and their deformation: from material point (s, t) to the body's frame, and back from a ray.
 
 The body's frame has z pointing away from the cameras, like the system frame; a scene's pose puts the body into the
 system frame. (s, t) are material coordinates in mm: they name a material point for ever, and the texture is written
@@ -41,7 +40,7 @@ _CHUNK: Final = 4096  # rays solved together: their tangents stay in the cache
 class Surface:
     """A surface in one state of deformation, in the flat form that the kernels take.
 
-    Parameters
+    Attributes
     ----------
     kind
         ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL`` or ``SPHERE``.
@@ -61,7 +60,7 @@ class Surface:
         return self._evaluated(st_mm, lip)[..., :3]
 
     def tangents(self, st_mm: ArrayLike, lip: ArrayLike = 1.0) -> Float:
-        """d(place) / d(s, t), (..., 3, 2), at material points (..., 2)."""
+        """Return d(position) / d(s, t), (..., 3, 2), at material points (..., 2)."""
         values = self._evaluated(st_mm, lip)
         return np.stack([values[..., 3:6], values[..., 6:9]], axis=-1)
 

@@ -43,7 +43,7 @@ _UNIT: Final = 1.0 / float(1 << 21)
 class Texture:
     """A texture in the flat form that the kernels take.
 
-    Parameters
+    Attributes
     ----------
     kind
         ``SPECKLE``, ``GRID`` or ``DOTS``.
@@ -115,7 +115,7 @@ def line_grid(
     dark: float = 0.1,
     bright: float = 0.8,
 ) -> Texture:
-    """The calibration target: two families of lines through nodes that miss their places by up to the tolerance.
+    """Return the calibration target: two families of lines through nodes with errors up to the tolerance.
 
     Every node is off by an independent amount, uniform within +-tolerance in s and in t, and lines run straight from
     node to node. (Uniform +-4 um is the reading of "toleranced to 4 um" that makes the 0.087 px at 33 um/px that is
@@ -123,10 +123,12 @@ def line_grid(
 
     Parameters
     ----------
-    pitch_mm, line_width_mm
-        Spacing and width of lines.
+    pitch_mm
+        Spacing of lines.
     lines
-        How many lines are crossed walking along s and along t; the origin is at the centre of the full set.
+        Numbers of lines crossed walking along s and along t; the origin is at the centre of the full set.
+    line_width_mm
+        Width of lines.
     node_tolerance_mm
         Half width of the uniform distribution of the nodes' errors, each axis.
     dark_lines

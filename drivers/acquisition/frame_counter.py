@@ -18,7 +18,7 @@ class Arrival(StrEnum):
 class Reading:
     """One frame number understood.
 
-    Parameters
+    Attributes
     ----------
     arrival
         See there.

@@ -23,7 +23,7 @@ from drivers.cameras.protocol import Frame, FrameStatus
 class Pair:
     """Two frames of one trigger.
 
-    Parameters
+    Attributes
     ----------
     cam1, cam2
         The frames.

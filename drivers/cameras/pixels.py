@@ -40,7 +40,7 @@ Layout = Literal["bytes", "words", "lsb", "msb"]
 class PixelFormat:
     """How gray values lie in a camera's bytes.
 
-    Parameters
+    Attributes
     ----------
     name, code
         As PFNC has them.

@@ -28,7 +28,7 @@ class FrameStatus(StrEnum):
 class Frame:
     """One digitised image and where it stands in its camera's sequence.
 
-    Parameters
+    Attributes
     ----------
     pixels
         Gray image, shape (rows, columns), uint8 up to 8 bit and uint16 above; significant bits right-aligned.
@@ -77,7 +77,7 @@ class Frame:
 class CameraSettings:
     """Settings as asked for; ``None`` leaves what the device has. `FrameGrabber.configure` returns what it took.
 
-    Parameters
+    Attributes
     ----------
     exposure_ms, gain_db, frame_rate_hz
         Read back, they are the device's own, which may round them; ``None`` where the device has no such setting.
@@ -107,7 +107,7 @@ class CameraSettings:
 class CameraOptions:
     """How a driver reaches its camera and uses it: what is set once, when it is opened.
 
-    Parameters
+    Attributes
     ----------
     device
         The driver's name of the device, as `discover` lists it: an Aravis id or IP address, ``/dev/video0``, or a
@@ -137,7 +137,7 @@ class CameraOptions:
 class FoundDevice:
     """A device that discovery saw.
 
-    Parameters
+    Attributes
     ----------
     kind
         What it may be used as; a serial port may hold anything.

@@ -29,7 +29,7 @@ class AxisState(StrEnum):
 class AxisOptions:
     """How one axis is used; comes from the rig file.
 
-    Parameters
+    Attributes
     ----------
     soft_limits_mm
         (low, high); can only tighten the controller's own travel limits.

@@ -96,7 +96,7 @@ def brake(position_mm: float, velocity_now_mm_s: float, now_s: float, ramp_mm_s2
 class AxisFaults:
     """What is wrong with an axis; every value may be set while it runs.
 
-    Parameters
+    Attributes
     ----------
     backlash_mm
         Lost motion between motor and load. A load that was last pushed upwards stands where the motor does.

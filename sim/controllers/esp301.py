@@ -115,7 +115,7 @@ _SETTINGS = {
 class SimESP301(WireController):
     """The simulated controller.
 
-    Parameters
+    Attributes
     ----------
     axes
         How many axes, 1 to 3.

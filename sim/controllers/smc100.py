@@ -96,7 +96,7 @@ class _Unit(WireAxis):
 class SimSMC100(WireController):
     """The simulated chain.
 
-    Parameters
+    Attributes
     ----------
     addresses
         Addresses on the chain, 1 to 31.

@@ -15,7 +15,7 @@ from sim.controllers.axis import SimAxis, SimClock
 class LineFaults:
     """What is wrong with the line; every value may be set while it runs.
 
-    Parameters
+    Attributes
     ----------
     silent
         Commands are carried out, replies never come.
@@ -61,7 +61,7 @@ class LineFaults:
 class Motion(TypedDict, total=False):
     """How the axes of a controller move.
 
-    Parameters
+    Attributes
     ----------
     travel_mm
         (low, high) software limits that it reports, measured from home; -50 to 50.

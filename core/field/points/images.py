@@ -117,10 +117,9 @@ class MeasureImage:
         return out
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
-        """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box or the whole
-        image.
+        """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box.
 
-        Computed on the first call; zero structure where there is one grey level.
+        None: in the whole image. Computed on the first call; zero structure where there is one grey level.
         """
         if box not in self._contrast:
             pixels = self.pixels

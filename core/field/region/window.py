@@ -15,8 +15,7 @@ from core.field.region.cuts import Cuts, crosses
 
 @lru_cache(maxsize=8)
 def window_offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next towards the
-    centre."""
+    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next inwards."""
     side = np.arange(-half, half + 1)
     row, col = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
     ring = np.maximum(np.abs(row), np.abs(col))

@@ -99,8 +99,7 @@ def scattered_motion(features_ref: Features, features_now: Features) -> Scattere
 
 
 def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scale: int) -> ScatteredMotion:
-    """Match stretched copies of camera 1's reference image with its current image; the copy with most matches
-    counts."""
+    """Match stretched copies of camera 1's reference image with its current one; the copy with most matches counts."""
     tries = [
         scattered_motion(stretched_features(image, box, stretch, scale=scale), features_now) for stretch in stretches()
     ]
@@ -144,8 +143,7 @@ def motion_starts(
     xy_px: Float,
     are_separated: AreSeparated | None = None,
 ) -> Starts:
-    """Return start values at positions ``xy_px`` with known shape ``w`` (n, 3), from matches in time and between
-    cameras.
+    """Return starts at positions ``xy_px`` with known shape ``w`` (n, 3), from matches in time and between cameras.
 
     ``are_separated`` as in :func:`shape_starts`, in the reference image.
     """

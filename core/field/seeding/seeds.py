@@ -207,8 +207,7 @@ def starts_at(
     known_w: Float | None,
     visibility: Visibility | None = None,
 ) -> Starts:
-    """Return start values at positions from the matches not separated from them, with the measured shape where
-    known."""
+    """Return starts at positions from the matches not separated from them, with the measured shape where known."""
     are_separated = None if visibility is None else visibility.are_separated
     w = shape_starts(pair, shape, xy_px, are_separated).w
     if known_w is not None:
@@ -265,8 +264,7 @@ def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: i
 
 
 def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
-    """Find one point's motion from its shape ``w`` (3,): at its reference position, then by template and depth
-    search."""
+    """Find one point's motion from its shape ``w`` (3,): at rest, then by template and depth search."""
     if fitter.cur1 is None or fitter.cur2 is None:
         raise ValueError("search_motion needs current images")
     position = xy_px[None]

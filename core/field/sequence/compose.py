@@ -65,8 +65,7 @@ class Totals:
 
 
 def image_slopes(G: Float) -> Float:
-    """Return (n, 2, 2), derivative of camera 1's current image over its reference image, in the middle of the
-    patches."""
+    """Return (n, 2, 2), derivative of camera 1's current image over its reference, in the middle of the patches."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     return np.asarray((G[:, :2, 1:3] - seen[:, :, None] * G[:, 2:, 1:3]) / G[:, 2, 0, None, None])
 
@@ -120,8 +119,7 @@ def _rotations(vectors: Float) -> Float:
 
 
 def follow(start: Totals, w: Float, G: Float) -> Totals:
-    """Return the totals (n) after a segment with the unknowns ``w`` (n, 3), ``G`` (n, 3, 3) about the points' own
-    rays."""
+    """Return the totals (n) after a segment's ``w`` (n, 3), ``G`` (n, 3, 3), about the points' own rays."""
     P = G[:, :, 0] / w[:, :1]
     tangents = point_slopes(w, G) @ start.image_slopes
     first = start.w[:, :1] * P
@@ -192,8 +190,7 @@ def in_step(a: Float, b: Float) -> Float:
 
 
 def position_covariance(G: Float, covariance: Float) -> Float:
-    """Return the covariance (n, 2, 2) of positions in camera 1's current image, normalised, from that of (w0, G,
-    offset)."""
+    """Return the covariance (n, 2, 2) of camera 1's current image positions, normalised, from (w0, G, offset)."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     J = np.zeros((len(G), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0

@@ -121,8 +121,7 @@ def pattern_share(zncc: Float) -> Float:
 
 
 def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> Propagated:
-    """Return the covariance propagated to a segment that begins at a field matched against the first reference,
-    px^2."""
+    """Return the covariance, px^2, propagated to a segment that begins at a field of the first reference."""
     n = len(totals.w)
     C = field.covariance.reshape(n, 6, 6).astype(np.float32).astype(np.float64)
     R = pair.cam1.cam_from_sys.rotation

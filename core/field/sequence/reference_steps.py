@@ -67,13 +67,13 @@ class Updating:
     ----------
     pair, reference, shape, grid, options
         Cameras, the first reference's images and shape, points and settings.
-    first
-        The first reference's number.
     mode
         ``never``, ``auto`` or ``always``.
     images_of, field_of
         Functions that return images and field of an earlier step, by its number. The field as measured or as read from
         its file.
+    first
+        The first reference's number.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ Bytes = NDArray[np.uint8]
 class GrayFormat:
     """One pixel format with a brightness that can be read.
 
-    Parameters
+    Attributes
     ----------
     code
         The kernel's four characters as a number; bit 31 says big-endian.
