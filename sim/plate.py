@@ -1,4 +1,4 @@
-"""The clamped circular plate under pressure, Eq. (18), with the large-deflection term where it is wanted.
+"""The clamped circular plate under pressure, Eq. (18), with the large-deflection term as an option.
 
 Deflection w(r) = w0 (1 - (r/a)^2)^2 towards the cameras (-z). Linear theory: w0 = q a^4 / (64 D), D = E t^3 / (12 (1
 - nu^2)).
@@ -39,7 +39,7 @@ class CircularPlate:
     youngs_modulus_mpa, poisson
         E in N/mm^2, nu.
     large_deflection
-        Whether the membrane carries its share.
+        True to include the membrane's stiffness.
     """
 
     radius_mm: float = 13.385

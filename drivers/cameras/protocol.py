@@ -1,4 +1,4 @@
-"""What every camera driver delivers and promises: frames, settings, counters and the grabber protocol."""
+"""Interface of the camera drivers: frames, settings, counters and the grabber protocol."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FeatureValue = bool | int | float | str
 
 
 class FrameStatus(StrEnum):
-    """Whether the pixels of a frame may be used."""
+    """Usability of a frame's pixels."""
 
     OK = "ok"
     INCOMPLETE = "incomplete"  # lines or packets are missing; never delivered as a measurement image
@@ -26,7 +26,7 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One digitised image and where it stands in its camera's sequence.
+    """One digitised image and its number in its camera's sequence.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class Frame:
     host_ns
         Arrival by the host's monotonic clock, in ns.
     status
-        Anything but ``OK`` is counted and thrown away by the reader.
+        Anything but ``OK`` is counted and discarded by the reader.
     trigger
         Number of the trigger that made this frame, where the device or driver knows it; pairs are made by it.
     exposed_ns
-        Start of the exposure brought to the host's monotonic clock (`drivers.acquisition.clocks`), set by the reader.
+        Start of the exposure converted to the host's monotonic clock (`drivers.acquisition.clocks`), set by the reader.
     """
 
     pixels: Pixels
@@ -75,7 +75,7 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """Settings as asked for; ``None`` leaves what the device has. `FrameGrabber.configure` returns what it took.
+    """Settings as requested; ``None`` leaves the device's own. `FrameGrabber.configure` returns them as read back.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class CameraSettings:
     bit_depth
         Significant bits; the driver takes the plainest pixel format that carries them. ``pixel_format`` names one.
     trigger
-        What starts an exposure: nothing, a call, a pulse on the camera's line.
+        Start of an exposure: by itself, by a call, by a pulse on the camera's line.
     region_px
         x0, y0, width, height on the sensor.
     pixel_format
@@ -105,7 +105,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
-    """How a driver reaches its camera and uses it: what is set once, when it is opened.
+    """Connection of a driver to its camera: options that are set once, when it is opened.
 
     Attributes
     ----------
@@ -135,18 +135,18 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundDevice:
-    """A device that discovery saw.
+    """A device found by discovery.
 
     Attributes
     ----------
     kind
-        What it may be used as; a serial port may hold anything.
+        Possible use; a serial port may hold anything.
     driver
         Driver to name in the rig file; empty for a serial port.
     device
-        What to write as ``device`` (cameras) or ``url`` (stages) in the rig file.
+        Value of ``device`` (cameras) or ``url`` (stages) in the rig file.
     problem
-        Why it cannot be used as it is, with what to do about it; ``None`` when nothing is known to be wrong.
+        Reason for which it cannot be used as it is, with the remedy; ``None`` without a known problem.
     """
 
     kind: Literal["camera", "serial"]
@@ -161,12 +161,12 @@ class FoundDevice:
 
 @dataclass(frozen=True)
 class CameraDescription:
-    """Who the camera is and what it can do.
+    """Identity and abilities of a camera.
 
     Ranges are (lowest, highest) as the device reports them; ``None`` where the device has no such setting.
-    ``latency_s`` is what a frame may take beyond its period before it arrives, for the watchdog: zero but for cameras
-    that render. ``clock`` names the clock of ``Frame.device_ns``: those of two cameras may be compared when both name
-    the same one (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
+    ``latency_s`` is the longest time of a frame beyond its period before it arrives, for the watchdog: zero but for
+    cameras that render. ``clock`` names the clock of ``Frame.device_ns``: those of two cameras may be compared when
+    both name the same one (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
     ``counter_range`` is where ``Frame.sequence`` starts again and ends before it wraps. ``feature_names`` are what
     ``CameraSettings.features`` may name.
     """
@@ -191,10 +191,11 @@ class CameraDescription:
 
 @dataclass(frozen=True)
 class FrameCounters:
-    """What became of every frame a camera announced since it was armed.
+    """Counters of the frames that a camera announced since it was armed.
 
-    ``delivered`` reached the consumer or waits in the buffer; ``overrun`` was thrown away because the consumer was too
-    slow; ``dropped`` never arrived (gaps in the sequence numbers); the other names say why a frame was not delivered.
+    ``delivered`` reached the consumer or waits in the buffer; ``overrun`` was discarded because the consumer was too
+    slow; ``dropped`` never arrived (gaps in the sequence numbers); the other names are reasons for which a frame was
+    not delivered.
     """
 
     delivered: int = 0
@@ -205,7 +206,7 @@ class FrameCounters:
     out_of_order: int = 0
 
     def as_dict(self) -> dict[str, int]:
-        """Names and numbers, for reports."""
+        """Return names and numbers, for reports."""
         return asdict(self)
 
 
@@ -221,13 +222,13 @@ class FrameGrabber(Protocol):
         """Connect. Raises `CameraError` (``camera_lost``, ``camera_busy``) when it cannot."""
 
     def describe(self) -> CameraDescription:
-        """Say who the camera is and what it can do; ranges may depend on what was configured."""
+        """Return the camera's identity and abilities; ranges may depend on its settings."""
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Set what is not ``None`` and return every setting as read back from the device.
 
         A value outside the device's range is refused with code ``out_of_range`` before anything is changed; a setting
-        or feature that the device does not have with ``unknown_feature``; what cannot be changed while armed with
+        or feature that the device does not have with ``unknown_feature``; one that cannot be changed while armed with
         ``armed``.
         """
 
@@ -243,7 +244,7 @@ class FrameGrabber(Protocol):
     def next_frame(self, timeout_s: float) -> Frame | None:
         """Wait for the next frame, complete or not; ``None`` when none came in time.
 
-        Raises `CameraError` with code ``camera_lost`` when the device says that it is gone.
+        Raises `CameraError` with code ``camera_lost`` when the device reports that it is gone.
         """
 
     def statistics(self) -> dict[str, int | float]:
