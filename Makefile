@@ -14,7 +14,7 @@ ARGS ?=
 # test files side by side, a process each; more than four only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 4 ? 4 : n)))
 
-.PHONY: help demo quick test test-deep serve check check-page bench format accuracy fuzz load openapi torture pagespeed pagepictures clean
+.PHONY: help demo quick test test-deep serve check check-page bench format accuracy fuzz load openapi reference docs torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -23,13 +23,15 @@ help:
 	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
-	@echo "make bench   time everything on this machine, beside pyvale, and write docs/performance.md (ARGS=--quick: a few minutes)"
-	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/reliability.md (ARGS='--minutes N')"
-	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/reliability.md (ARGS='--kills N')"
+	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
+	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
+	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
-	@echo "make openapi write docs/openapi.json, the description of the API, and the list of problems, after a change of either"
-	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/page.md"
-	@echo "make accuracy   measure every figure of docs/accuracy.md again (about twenty minutes)"
+	@echo "make docs    build the site into build/site, offline, and check every link in it"
+	@echo "make openapi write docs/openapi.json, the description of the API, the list of problems and the reference, after a change of either"
+	@echo "make reference  write the pages of docs/reference that are made from the program"
+	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/explanation/page_speed.md"
+	@echo "make accuracy   measure every figure of docs/explanation/accuracy again (about twenty minutes)"
 
 $(PROGRAM): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }
@@ -49,7 +51,7 @@ $(ARAVIS): $(PROGRAM)
 
 $(STAMP): $(PROGRAM) $(ARAVIS)
 	@echo "Adding what the tests and checks need (once) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; exit 1; }
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docs]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; exit 1; }
 	@touch $@
 
 demo: $(PROGRAM)
@@ -112,6 +114,15 @@ fuzz: $(STAMP)
 openapi: $(STAMP)
 	$(BIN)/python -m tests.bench.documents.problem_list
 	$(BIN)/python -m tests.bench.documents.openapi $(ARGS)
+	$(BIN)/python -m tests.bench.documents.reference
+
+reference: $(STAMP)
+	$(BIN)/python -m tests.bench.documents.reference
+
+SPHINX = $(BIN)/python -m sphinx -n -W --keep-going -q -d build/doctrees
+docs: $(STAMP)
+	$(SPHINX) -b html docs build/site
+	@echo "build/site/index.html"
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

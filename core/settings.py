@@ -64,7 +64,8 @@ def _a_number(value: Any) -> Any:
     return value
 
 
-ODD: JsonDict = {"not": {"multipleOf": 2}}
+#: the type keeps null, which every multipleOf holds for, from being excluded
+ODD: JsonDict = {"not": {"type": "integer", "multipleOf": 2}}
 Real = Annotated[float, BeforeValidator(_a_number)]
 Whole = Annotated[int, BeforeValidator(_a_number)]
 Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]

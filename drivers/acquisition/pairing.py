@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from core.errors import CameraError
 from core.names import CAMERAS, CameraName
@@ -65,15 +67,15 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairingAccount:
-    """Counters of all triggers; ``refused`` is a part of ``paired``, ``late`` came after its trigger was closed."""
+    """Counters of the triggers: triggered = paired + unpaired + incomplete + dropped."""
 
-    triggered: int = 0
-    paired: int = 0
-    unpaired: int = 0
-    incomplete: int = 0
-    dropped: int = 0
-    refused: int = 0
-    late: int = 0
+    triggered: Annotated[int, Field(description="Occasions on which a pair was due.")] = 0
+    paired: Annotated[int, Field(description="Both frames came.")] = 0
+    unpaired: Annotated[int, Field(description="One frame came.")] = 0
+    incomplete: Annotated[int, Field(description="A frame had lines or packets missing.")] = 0
+    dropped: Annotated[int, Field(description="No frame came.")] = 0
+    refused: Annotated[int, Field(description="Of the paired, those whose skew was too large.")] = 0
+    late: Annotated[int, Field(description="Frames that came after their occasion was given up.")] = 0
 
     def as_dict(self) -> dict[str, int]:
         """Return names and numbers, for reports."""

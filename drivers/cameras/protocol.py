@@ -1,20 +1,27 @@
-"""Interface of the camera drivers: frames, settings, counters and the grabber protocol."""
+"""Interface of the camera drivers: frames, settings, counters and the grabber protocol.
+
+The description of a camera is declared here, each field with its meaning; replies and records of the service derive
+from these classes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from core.errors import CameraError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 TriggerMode = Literal["free", "software", "hardware"]
 FeatureValue = bool | int | float | str
+#: lowest and highest value, as the device reports them
+Range = tuple[float, float]
 
 
 class FrameStatus(StrEnum):
@@ -77,30 +84,24 @@ class Frame:
 class CameraSettings:
     """Settings as requested; ``None`` leaves the device's own. `FrameGrabber.configure` returns them as read back.
 
-    Attributes
-    ----------
-    exposure_ms, gain_db, frame_rate_hz
-        Read back, they are the device's own, which may round them; ``None`` where the device has no such setting.
-    bit_depth
-        Significant bits; the driver takes the plainest pixel format that carries them. ``pixel_format`` names one.
-    trigger
-        Start of an exposure: by itself, by a call, by a pulse on the camera's line.
-    region_px
-        x0, y0, width, height on the sensor.
-    pixel_format
-        The device's own name: ``Mono12Packed`` (GenICam), ``Y12 `` (V4L2).
-    features
-        Anything else by the device's own name (GenICam feature, V4L2 control), set in this order.
+    Read back, they are the device's own, which may round them; ``None`` where it has no such setting. Of ``bit_depth``
+    the driver takes the plainest pixel format that carries it; ``pixel_format`` names one: ``Mono12Packed`` (GenICam),
+    ``Y12 `` (V4L2). ``features`` are GenICam features or V4L2 controls, set in this order.
     """
 
-    exposure_ms: float | None = None
-    gain_db: float | None = None
-    frame_rate_hz: float | None = None
-    bit_depth: int | None = None
-    trigger: TriggerMode | None = None
-    region_px: tuple[int, int, int, int] | None = None
-    pixel_format: str | None = None
-    features: Mapping[str, FeatureValue] | None = None
+    exposure_ms: Annotated[float | None, Field(description="Exposure time.")] = None
+    gain_db: Annotated[float | None, Field(description="Gain.")] = None
+    frame_rate_hz: Annotated[float | None, Field(description="Rate of a free run.")] = None
+    bit_depth: Annotated[int | None, Field(description="Significant bits per pixel.")] = None
+    trigger: Annotated[TriggerMode | None, Field(description="What starts an exposure.")] = None
+    region_px: Annotated[
+        tuple[int, int, int, int] | None, Field(description="x0, y0, width, height on the sensor.")
+    ] = None
+    pixel_format: Annotated[str | None, Field(description="The device's own name of the pixel format.")] = None
+    features: Annotated[
+        Mapping[str, FeatureValue] | None,
+        Field(description="Other settings that were given, by the device's own name."),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,75 +136,77 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundDevice:
-    """A device found by discovery.
+    """A device found by discovery."""
 
-    Attributes
-    ----------
-    kind
-        Possible use; a serial port may hold anything.
-    driver
-        Driver to name in the rig file; empty for a serial port.
-    device
-        Value of ``device`` (cameras) or ``url`` (stages) in the rig file.
-    problem
-        Reason for which it cannot be used as it is, with the remedy; ``None`` without a known problem.
-    """
-
-    kind: Literal["camera", "serial"]
-    driver: str
-    device: str
-    model: str = ""
-    serial: str = ""
-    address: str = ""
-    problem: str | None = None
-    extra: Mapping[str, str] = field(default_factory=dict)
+    kind: Annotated[Literal["camera", "serial"], Field(description="Possible use; a serial port may hold anything.")]
+    driver: Annotated[
+        str, Field(description="`driver` for the rig file; empty for a serial port.", examples=["aravis"])
+    ]
+    device: Annotated[
+        str,
+        Field(description="`device` (camera) or `url` (serial port) for the rig file.", examples=["Aravis-Fake-GV01"]),
+    ]
+    model: Annotated[str, Field(description="Maker and model as the device gives them; empty if it does not.")] = ""
+    serial: Annotated[str, Field(description="Serial number; empty if the device gives none.")] = ""
+    address: Annotated[str, Field(description="Network address, bus position or USB ids; empty if there is none.")] = ""
+    problem: Annotated[
+        str | None, Field(description="Why it cannot be used as it is, and what to do; null if nothing is known.")
+    ] = None
+    extra: Annotated[
+        Mapping[str, str], Field(description="What else is known: `link` is a serial port's lasting name.")
+    ] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class CameraDescription:
-    """Identity and abilities of a camera.
+class CameraIdentity:
+    """Identity of a camera, as stored with its images."""
 
-    Ranges are (lowest, highest) as the device reports them; ``None`` where the device has no such setting.
-    ``latency_s`` is the longest time of a frame beyond its period before it arrives, for the watchdog: zero but for
-    cameras that render. ``clock`` names the clock of ``Frame.device_ns``: those of two cameras may be compared when
-    both name the same one (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
-    ``counter_range`` is where ``Frame.sequence`` starts again and ends before it wraps. ``feature_names`` are what
-    ``CameraSettings.features`` may name.
+    model: Annotated[str, Field(description="Model.", examples=["simulated camera"])]
+    serial: Annotated[str, Field(description="Serial number.")]
+
+
+@dataclass(frozen=True)
+class CameraDescription(CameraIdentity):
+    """Identity and abilities of a camera; a range is ``None`` where the device has no such setting.
+
+    ``latency_s`` is for the watchdog: zero but for cameras that render. ``clock`` names the clock of
+    ``Frame.device_ns`` (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
+    ``counter_range`` is that of ``Frame.sequence``.
     """
 
-    model: str
-    serial: str
-    image_size_px: tuple[int, int]  # width, height
-    bit_depths: tuple[int, ...]
-    trigger_modes: tuple[TriggerMode, ...]
-    exposure_range_ms: tuple[float, float] | None
-    gain_range_db: tuple[float, float] | None
-    frame_rate_range_hz: tuple[float, float] | None
-    driver: str
-    firmware: str = ""
-    latency_s: float = 0.0
-    clock: str = ""
-    counter_range: tuple[int, int] = (0, 2**16 - 1)
-    pixel_formats: tuple[str, ...] = ()
-    feature_names: tuple[str, ...] = ()
-    extra: Mapping[str, str] = field(default_factory=dict)
+    image_size_px: Annotated[tuple[int, int], Field(description="Width and height of its images.")]
+    bit_depths: Annotated[tuple[int, ...], Field(description="Significant bits per pixel that it can deliver.")]
+    trigger_modes: Annotated[tuple[TriggerMode, ...], Field(description="What may start an exposure.")]
+    exposure_range_ms: Annotated[Range | None, Field(description="Shortest and longest exposure.")]
+    gain_range_db: Annotated[Range | None, Field(description="Least and greatest gain.")]
+    frame_rate_range_hz: Annotated[Range | None, Field(description="Lowest and highest rate of a free run.")]
+    driver: Annotated[str, Field(description="Driver that reaches it.", examples=["aravis"])]
+    firmware: Annotated[str, Field(description="Firmware; empty where it does not tell.")] = ""
+    latency_s: Annotated[float, Field(description="What a frame may take beyond its period before it arrives.")] = 0.0
+    clock: Annotated[
+        str, Field(description="Clock of its times; two cameras' may be compared where both name the same one.")
+    ] = ""
+    counter_range: Annotated[
+        tuple[int, int], Field(description="First and last frame number before it begins again.")
+    ] = (0, 2**16 - 1)
+    pixel_formats: Annotated[tuple[str, ...], Field(description="Pixel formats, by the device's own names.")] = ()
+    feature_names: Annotated[tuple[str, ...], Field(description="What `features` of the settings may name.")] = ()
+    extra: Annotated[Mapping[str, str], Field(description="What else the driver knows, as text.")] = field(
+        default_factory=dict
+    )
 
 
 @dataclass(frozen=True)
 class FrameCounters:
-    """Counters of the frames that a camera announced since it was armed.
+    """Counters of the frames that a camera announced since it was opened."""
 
-    ``delivered`` reached the consumer or waits in the buffer; ``overrun`` was discarded because the consumer was too
-    slow; ``dropped`` never arrived (gaps in the sequence numbers); the other names are reasons for which a frame was
-    not delivered.
-    """
-
-    delivered: int = 0
-    overrun: int = 0
-    dropped: int = 0
-    incomplete: int = 0
-    duplicates: int = 0
-    out_of_order: int = 0
+    delivered: Annotated[int, Field(description="Frames that came whole.")] = 0
+    overrun: Annotated[int, Field(description="Thrown away because nobody took them in time.")] = 0
+    #: gaps in the sequence numbers
+    dropped: Annotated[int, Field(description="Never arrived, by their numbers.")] = 0
+    incomplete: Annotated[int, Field(description="Arrived with lines or packets missing; never used.")] = 0
+    duplicates: Annotated[int, Field(description="Delivered twice.")] = 0
+    out_of_order: Annotated[int, Field(description="Arrived after a later one.")] = 0
 
     def as_dict(self) -> dict[str, int]:
         """Return names and numbers, for reports."""

@@ -3,6 +3,9 @@
 A stage is one controller, or one chain of controllers on one serial line, with numbered axes. Positions are in
 millimetres in the controller's own coordinates, whose zero homing defines. Computations use positions that were read
 back, never commanded ones.
+
+The description of a stage is declared here, each field with its meaning; replies of the service derive from these
+classes.
 """
 
 from __future__ import annotations
@@ -10,7 +13,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
+
+from pydantic import Field
 
 
 class AxisState(StrEnum):
@@ -66,64 +71,70 @@ class AxisOptions:
 class AxisIdentity:
     """Stage connected to one axis, in the controller's words."""
 
-    axis: int
-    model: str
-    serial: str = ""
-    units: str = "mm"
+    axis: Annotated[int, Field(description="Axis number.")]
+    model: Annotated[str, Field(description="Model of the actuator.")]
+    serial: Annotated[str, Field(description="Serial number; empty where it does not tell.")] = ""
+    units: Annotated[str, Field(description="Unit of the controller's own numbers.")] = "mm"
 
 
 @dataclass(frozen=True)
 class StageIdentity:
     """Identity of the controller."""
 
-    driver: str
-    model: str
-    firmware: str
-    url: str
-    axes: tuple[AxisIdentity, ...]
+    driver: Annotated[str, Field(description="Protocol.", examples=["esp301"])]
+    model: Annotated[str, Field(description="Model.")]
+    firmware: Annotated[str, Field(description="Firmware.")]
+    url: Annotated[str, Field(description="Port or address that it is reached at.")]
+    axes: Annotated[tuple[AxisIdentity, ...], Field(description="What stands on each axis.")]
 
 
 @dataclass(frozen=True)
 class AxisLimits:
     """Travel of an axis: the controller's, and the tighter of that and the rig file's soft limits."""
 
-    low_mm: float
-    high_mm: float
-    controller_low_mm: float
-    controller_high_mm: float
+    low_mm: Annotated[float, Field(description="Lowest position, the tighter of the controller's and the rig file's.")]
+    high_mm: Annotated[float, Field(description="Highest position.")]
+    controller_low_mm: Annotated[float, Field(description="The controller's own lowest position.")]
+    controller_high_mm: Annotated[float, Field(description="The controller's own highest position.")]
 
 
 @dataclass(frozen=True)
 class AxisDynamics:
-    """Speeds of an axis, as read back from the controller; ``None`` where it does not report its greatest."""
+    """Speeds of an axis, as read back from the controller."""
 
-    axis: int
-    velocity_mm_s: float
-    acceleration_mm_s2: float
-    max_velocity_mm_s: float | None = None
-    max_acceleration_mm_s2: float | None = None
+    axis: Annotated[int, Field(description="Axis number.")]
+    velocity_mm_s: Annotated[float, Field(description="Velocity of moves.")]
+    acceleration_mm_s2: Annotated[float, Field(description="Acceleration of moves.")]
+    max_velocity_mm_s: Annotated[
+        float | None, Field(description="The greatest; null where the controller does not tell.")
+    ] = None
+    max_acceleration_mm_s2: Annotated[float | None, Field(description="The greatest; null where it does not tell.")] = (
+        None
+    )
 
 
 @dataclass(frozen=True)
 class AxisStatus:
     """State of one axis, all read from the controller in one go except ``homed`` where it does not report it."""
 
-    axis: int
-    state: AxisState
-    position_mm: float
-    motor_on: bool
-    homed: bool
-    moving: bool
-    detail: str = ""
+    axis: Annotated[int, Field(description="Axis number.")]
+    state: Annotated[AxisState, Field(description="What it is doing or lacks.", examples=["ready"])]
+    position_mm: Annotated[float, Field(description="Where it stands.")]
+    motor_on: Annotated[bool, Field(description="Whether its motor has power.")]
+    homed: Annotated[bool, Field(description="Whether its position is known.")]
+    moving: Annotated[bool, Field(description="Whether it moves.")]
+    detail: Annotated[str, Field(description="What the controller says beside the state.")] = ""
 
 
 @dataclass(frozen=True)
 class ControllerMessage:
     """One entry of a controller's error queue."""
 
-    code: str
-    text: str
-    axis: int | None = None
+    code: Annotated[str, Field(description="The controller's own code.", examples=["103"])]
+    text: Annotated[
+        str, Field(description="The controller's own words.", examples=["FOLLOWING ERROR THRESHOLD EXCEEDED"])
+    ]
+    axis: Annotated[int | None, Field(description="Axis that it concerns; null for none in particular.")] = None
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from typing_extensions import TypeAliasType
+
+#: rows of numbers, nested as deep as an array has axes; null where a value is missing
+Nested = TypeAliasType("Nested", "list[float | int | str | Nested | None]")
+
 
 def without_nan(value: Any) -> Any:
     """Replace NaN and infinities by None, tuples by lists, in nested JSON-like data."""

@@ -134,6 +134,22 @@ class Reply(BaseModel):
     model_config = ConfigDict(extra="allow")
 
 
+def always_there(schema: JsonDict) -> None:
+    """Say in a model's schema that none of its fields is ever left out."""
+    properties = schema["properties"]
+    assert isinstance(properties, dict)
+    schema["required"] = list(properties)
+    for field in properties.values():
+        assert isinstance(field, dict)
+        field.pop("default", None)
+
+
+class Reported(Reply):
+    """What a device says: the fields of a driver's dataclass, whose defaults are the driver's business."""
+
+    model_config = ConfigDict(json_schema_extra=always_there)
+
+
 #: what names a thing that was made: ids, a step's number, a reading's value
 Ids = dict[str, str | int | float]
 

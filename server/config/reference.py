@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+
+from pydantic.json_schema import JsonSchemaValue
 
 from server.config.rig_file import RigConfig
+
+#: schemas of the models, by name
+Definitions = dict[str, JsonSchemaValue]
 
 _HEAD = """# The rig file
 
@@ -15,12 +19,12 @@ listed here is refused, and so is a value outside its range; the message names t
 a file without opening any device, and `stereorig rigfile --schema` prints a JSON schema, with which editors complete
 and check keys while you write.
 
-This page is made from the model that reads the file (`python -m tests.bench.documents.rig_file`). Complete
+This page is made from the model that reads the file (`make reference`). Complete
 examples with comments are in `config/`.
 """
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> JsonSchemaValue:
     """Return the JSON schema of a rig file."""
     schema = RigConfig.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
@@ -47,16 +51,16 @@ def markdown() -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _section(title: str, section: dict[str, Any], known: dict[str, Any], *, prefix: str) -> list[str]:
+def _section(title: str, section: JsonSchemaValue, known: Definitions, *, prefix: str) -> list[str]:
     text = section.get("description", "").split(": ", 1)[-1].replace("\n", " ")
     lines = [f"## {title}", "", text[:1].upper() + text[1:], ""]
     lines += ["| key | value | default | meaning |", "| --- | --- | --- | --- |"]
     required = set(section.get("required", ()))
     tables = []
     for key, field in section["properties"].items():
-        default = "**required**" if key in required else _value(field.get("default"))
+        default = "**required**" if key in required else default_text(field.get("default"))
         meaning = field.get("description", "").replace("|", "\\|").replace("\n", " ")
-        lines.append(f"| `{key}` | {_type(field, known)} | {default} | {meaning} |")
+        lines.append(f"| `{key}` | {kind_of_value(field, known)} | {default} | {meaning} |")
         table = _table(field)
         if table is not None:
             numbered = "additionalProperties" in _core(field) or "patternProperties" in _core(field)
@@ -67,18 +71,18 @@ def _section(title: str, section: dict[str, Any], known: dict[str, Any], *, pref
     return lines
 
 
-def _core(field: dict[str, Any]) -> dict[str, Any]:
+def _core(field: JsonSchemaValue) -> JsonSchemaValue:
     """Take the alternative `null` away: a key that may be left out."""
     options = [option for option in field.get("anyOf", [field]) if option.get("type") != "null"]
     return options[0] if len(options) == 1 else {"anyOf": options}
 
 
-def _target(field: dict[str, Any]) -> str | None:
+def _target(field: JsonSchemaValue) -> str | None:
     reference = _core(field).get("$ref") or (field.get("allOf") or [{}])[0].get("$ref")
     return None if reference is None else str(reference).rsplit("/", 1)[-1]
 
 
-def _table(field: dict[str, Any]) -> str | None:
+def _table(field: JsonSchemaValue) -> str | None:
     """Name of the model behind a key that holds a table of its own, or tables by number."""
     target = _target(field)
     if target is not None:
@@ -90,20 +94,24 @@ def _table(field: dict[str, Any]) -> str | None:
     return None
 
 
-def _value(default: Any) -> str:
+def default_text(default: object) -> str:
+    """Return a default as a table shows it."""
     if default is None or default == {}:
         return "left out"
     return f"`{json.dumps(default)}`"
 
 
-def _type(field: dict[str, Any], known: dict[str, Any]) -> str:
+def kind_of_value(field: JsonSchemaValue, known: Definitions) -> str:
+    """Return the values that a field of a JSON schema takes, in words."""
     core = _core(field)
     if "anyOf" in core:
-        return " or ".join(_type(option, known) for option in core["anyOf"])
+        return " or ".join(kind_of_value(option, known) for option in core["anyOf"])
     if _table(field) is not None and ("$ref" not in core or "properties" in known[_target(field) or ""]):
         return "table"
     if "$ref" in core:
         core = known[_target(field) or ""]
+        if core.get("type") == "array":  # of arrays of itself, as the numbers of a field
+            return "nested list"
     if "const" in core:
         return f"`{json.dumps(core['const'])}`"
     if "enum" in core:
@@ -117,15 +125,15 @@ def _type(field: dict[str, Any], known: dict[str, Any]) -> str:
     return f"{names.get(str(kind), str(kind))}{_range(core)}"
 
 
-def _array(core: dict[str, Any], known: dict[str, Any]) -> str:
+def _array(core: JsonSchemaValue, known: Definitions) -> str:
     if "prefixItems" in core:
-        inner = [_type(item, known) for item in core["prefixItems"]]
+        inner = [kind_of_value(item, known) for item in core["prefixItems"]]
         return f"[{inner[0]}] x {len(inner)}" if len(set(inner)) == 1 else f"[{', '.join(inner)}]"
     least, most = core.get("minItems", 0), core.get("maxItems")
-    return f"list of {_type(core.get('items', {}), known)}" + ("" if most is None else f", {least} to {most}")
+    return f"list of {kind_of_value(core.get('items', {}), known)}" + ("" if most is None else f", {least} to {most}")
 
 
-def _range(core: dict[str, Any]) -> str:
+def _range(core: JsonSchemaValue) -> str:
     low, high = core.get("minimum"), core.get("maximum")
     above, below = core.get("exclusiveMinimum"), core.get("exclusiveMaximum")
     if low is not None and high is not None:

@@ -186,7 +186,7 @@ def check_frames(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
         _judged(lost, announced) if lost or not odd else "warning",
         f"{announced} frames, " + (", ".join(f"{n} {name}" for name, n in odd.items()) or "none lost or damaged"),
         limit=f"1 frame or {100 * _LOSS_SHARE:g} %",
-        remedy="Check cable, packet size, socket buffers and the load of link and processors (docs/hardware.md).",
+        remedy="Check cable, packet size, socket buffers and the load of link and processors (docs/how_to/cameras.md).",
         frames=announced,
         dropped=counts["dropped"],
         incomplete=counts["incomplete"],
@@ -246,7 +246,8 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
             + ("by the cameras' common clock" if common_clock(pair.units) else "by this machine's clock")
             + (f"; {refused} refused" if refused else ""),
             limit=f"{limit:g} ms but for 1 or {100 * _LOSS_SHARE:g} %",
-            remedy="Use a common hardware trigger (docs/hardware.md), or raise max_skew_ms for a specimen at rest.",
+            remedy="Use a common hardware trigger (docs/how_to/triggers.md), or raise max_skew_ms "
+            "for a specimen at rest.",
             median_ms=statistics.median(seen.skews_ms),
             worst_ms=worst,
             limit_ms=limit,

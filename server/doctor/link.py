@@ -49,7 +49,7 @@ def check_link(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
         "link",
         "warning" if bad else "ok",
         text,
-        remedy="Check cable, packet size, socket buffers and the link's load (docs/hardware.md).",
+        remedy="Check cable, packet size, socket buffers and the link's load (docs/how_to/cameras.md).",
         figures=dict(counts),
     )
 

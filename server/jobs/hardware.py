@@ -11,12 +11,32 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
+
+from pydantic import Field
 
 from core.errors import StateError
 from server.base.errors import BusyError
+from server.base.models import Document
 
 T = TypeVar("T")
+
+
+class Holder(Document):
+    """What holds the hardware, so that nothing else can use it."""
+
+    what: str = Field(description="In words.", examples=["a calibration"])
+    job_id: str | None = Field(None, description="Its job, where it is one.")
+    since_s: float = Field(description="For how long, seconds.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Hold:
+    what: str
+    #: ``job_id`` and ``kind`` of a job, ``test_id`` of a capture
+    details: dict[str, str]
+    since: float
 
 
 class HardwareGate:
@@ -25,38 +45,38 @@ class HardwareGate:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._acting = threading.RLock()  # what is done to a holder from outside comes before the next one's hold
-        self._holder: dict[str, Any] | None = None
+        self._hold: _Hold | None = None
         self._shut = False
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="hardware")
 
     @property
-    def holder(self) -> dict[str, Any] | None:
-        """Who holds the hardware: ``what``, ``since_s`` and, for a job, ``job_id``."""
+    def holder(self) -> Holder | None:
+        """Who holds the hardware."""
         with self._lock:
-            if self._holder is None:
-                return None
-            shown = dict(self._holder)
-        shown["since_s"] = round(time.monotonic() - shown.pop("since"), 3)
-        return shown
+            hold = self._hold
+        if hold is None:
+            return None
+        since_s = round(time.monotonic() - hold.since, 3)
+        return Holder.model_validate({"what": hold.what, **hold.details, "since_s": since_s})
 
-    def claim(self, what: str, **details: Any) -> object:
+    def claim(self, what: str, **details: str) -> object:
         """Take the hold, or raise :class:`BusyError` with the holder; returns the token for :meth:`release`."""
         with self._acting, self._lock:
             if self._shut:
                 raise StateError("The service is shutting down.", code="shutting_down", remedy="Start it again.")
-            if self._holder is None:
-                self._holder = {"what": what, **details, "since": time.monotonic()}
-                return self._holder
+            if self._hold is None:
+                self._hold = _Hold(what, details, time.monotonic())
+                return self._hold
         holder = self.holder
         if holder is None:  # released in between
             return self.claim(what, **details)
-        raise BusyError(holder)
+        raise BusyError(holder.plain())
 
     def while_held_by(self, job_id: str, function: Callable[[], None]) -> bool:
         """Call ``function`` if a job has the hold, and return whether; nobody else gets the hold before it is done."""
         with self._acting:
             with self._lock:
-                if self._holder is None or self._holder.get("job_id") != job_id:
+                if self._hold is None or self._hold.details.get("job_id") != job_id:
                     return False
             function()
             return True
@@ -69,11 +89,11 @@ class HardwareGate:
     def release(self, token: object) -> None:
         """Give the hold back; harmless if it is another's by now."""
         with self._lock:
-            if self._holder is token:
-                self._holder = None
+            if self._hold is token:
+                self._hold = None
 
     @contextmanager
-    def hold(self, what: str, **details: Any) -> Iterator[None]:
+    def hold(self, what: str, **details: str) -> Iterator[None]:
         """Hold for a short operation."""
         token = self.claim(what, **details)
         try:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Literal
 
 from core.errors import Cancelled
-from server.base.models import JobState
+from server.base.models import Ids, JobState
 from server.base.problem import JobProblem
 from server.store.documents import JobRecord, Progress
 from server.store.folder import now_utc
@@ -31,42 +32,131 @@ class Waiting(Exception):
     """Raised by a compute phase that has nothing to do until somebody wakes its job; it is run again then."""
 
 
-@dataclass(eq=False)
-class Job:
-    """One job; ``document`` is what the API shows. Doubles as progress callback and cancel token of its phases."""
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What a job does.
 
-    id: str
-    kind: str
-    subject: dict[str, object]
+    Parameters
+    ----------
+    on_end
+        Called with the final state before that state is shown (writes summaries).
+    on_cancel
+        Called at once when the job is cancelled, from whatever thread asks (stops the stage).
+    follows
+        The test whose new steps wake it.
+    """
+
     phases: Sequence[Phase]
-    publish: Callable[[Job, str], None]
-    state: State = "queued"
-    created_utc: str = field(default_factory=now_utc)
-    started_utc: str | None = None
-    finished_utc: str | None = None
-    result: dict[str, object] | None = None
-    problem: JobProblem | None = None
-    stage: str = "waiting"
-    done: int = 0
-    total: int = 0
-    #: called with the final state before that state is shown (writes summaries)
     on_end: Callable[[Job, State], None] | None = None
-    #: called at once when the job is cancelled, from whatever thread asks (stops the stage)
     on_cancel: Callable[[Job], None] | None = None
-    #: gives the hardware back, if the job has it; before its end is shown
-    let_go: Callable[[], None] | None = None
-    #: the test whose new steps wake it
     follows: str | None = None
-    #: whether it should end once it has nothing to do
-    finishing: threading.Event = field(default_factory=threading.Event)
-    woken: threading.Event = field(default_factory=threading.Event)
-    #: stops what the job waits for, at once, when it is cancelled
-    stop_waiting: Callable[[], None] | None = None
-    saving: threading.Lock = field(default_factory=threading.Lock)
-    ended: bool = False
-    _pace_from: tuple[float, int] | None = None
-    _last_shown: float = 0.0
-    _cancel: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def computes(self) -> bool:
+        """Whether it needs the compute lane."""
+        return any(phase.lane == "compute" for phase in self.phases)
+
+
+def new_record(job_id: str, kind: str, subject: Mapping[str, object]) -> JobRecord:
+    """Return the record of a job that is accepted now."""
+    return JobRecord(
+        id=job_id,
+        kind=kind,
+        state="queued",
+        subject=dict(subject),
+        progress=_Pace().progress(active=False),
+        created_utc=now_utc(),
+        started_utc=None,
+        finished_utc=None,
+        result=None,
+        problem=None,
+    )
+
+
+class _Pace:
+    """How far a job is in its units, and how fast."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin to wait."""
+        self._stage, self._done, self._total = "waiting", 0, 0
+        self._from: tuple[float, int] | None = None
+        self._last_shown = 0.0
+
+    def to(self, stage: str, done: int, total: int) -> bool:
+        """Take what a phase reports; return whether readers should see it: they need it ten times a second."""
+        now = time.monotonic()
+        changed = stage != self._stage
+        if total != self._total or done < self._done or self._from is None:
+            self._from = (now, done)  # other units from here on
+        self._stage, self._done, self._total = stage, done, total
+        if not changed and done < total and now - self._last_shown <= 0.1:
+            return False
+        self._last_shown = now
+        return True
+
+    def progress(self, *, active: bool) -> Progress:
+        """Return it as it is shown."""
+        eta_s = self._eta_s() if active else None
+        return Progress(stage=self._stage, done=self._done, total=self._total, eta_s=eta_s)
+
+    def _eta_s(self) -> float | None:
+        """Seconds left in these units, from their own pace; None while there is nothing to go by."""
+        begun = self._from  # the phases' thread may set it anew meanwhile
+        if begun is None or self._total <= 0:
+            return None
+        since, first = begun
+        if self._done <= first:
+            return None
+        pace_s = (time.monotonic() - since) / (self._done - first)
+        return round(pace_s * max(self._total - self._done, 0), 2)
+
+
+class Job:
+    """A job at work: its record, and what its phases and its manager do with it.
+
+    Doubles as progress callback and cancel token of its phases.
+
+    Parameters
+    ----------
+    record
+        As it begins; progress is added where it is shown.
+    work
+        What it does.
+    publish
+        Called with what has changed.
+    """
+
+    def __init__(self, record: JobRecord, work: Work, publish: Callable[[Job, str], None]) -> None:
+        self.record = record
+        self.work = work
+        #: whether it should end once it has nothing to do
+        self.finishing = threading.Event()
+        self.woken = threading.Event()
+        #: gives the hardware back, if the job has it; before its end is shown
+        self.let_go: Callable[[], None] | None = None
+        #: one document after the other, and none after that of its end
+        self.saving = threading.Lock()
+        self.ended = False
+        self._publish = publish
+        self._guard = threading.Lock()
+        self._pace = _Pace()
+        self._cancel = threading.Event()
+        self._stop_waiting: Callable[[], None] | None = None
+
+    @property
+    def id(self) -> str:
+        """Id of the job."""
+        return self.record.id
+
+    @property
+    def subject(self) -> dict[str, object]:
+        """Ids of what it works on."""
+        return self.record.subject
+
+    # for its phases --------------------------------------------------------------------------------------------
 
     @property
     def cancelled(self) -> bool:
@@ -76,42 +166,76 @@ class Job:
     def check(self) -> None:
         """Raise :class:`core.errors.Cancelled` if the job should stop."""
         if self.cancelled:
-            raise Cancelled(f"The {self.kind} was cancelled.")
+            raise Cancelled(f"The {self.record.kind} was cancelled.")
 
     def progress(self, stage: str, done: int, total: int) -> None:
         """Report progress (:class:`core.progress.Progress`)."""
-        now = time.monotonic()
-        changed = stage != self.stage
-        if total != self.total or done < self.done or self._pace_from is None:
-            self._pace_from = (now, done)  # other units from here on
-        self.stage, self.done, self.total = stage, done, total
-        # a kernel may report thousands of times a second; readers need ten
-        if changed or done >= total or now - self._last_shown > 0.1:
-            self._last_shown = now
-            self.publish(self, "progress")
+        if self._pace.to(stage, done, total):
+            self._publish(self, "progress")
 
     @property
-    def eta_s(self) -> float | None:
-        """Seconds left in these units, from their own pace; None while there is nothing to go by."""
-        if self.state not in ACTIVE or self._pace_from is None or self.total <= 0:
-            return None
-        since, first = self._pace_from
-        if self.done <= first:
-            return None
-        pace_s = (time.monotonic() - since) / (self.done - first)
-        return round(pace_s * max(self.total - self.done, 0), 2)
+    def result(self) -> dict[str, object] | None:
+        """What it has found so far."""
+        return self.record.result
+
+    @result.setter
+    def result(self, found: dict[str, object]) -> None:
+        self._change(result=found)
+
+    @contextmanager
+    def waiting(self, stop: Callable[[], None]) -> Iterator[None]:
+        """Wait for something that ``stop`` ends, at once, when the job is cancelled."""
+        self._stop_waiting = stop
+        try:
+            yield
+        finally:
+            self._stop_waiting = None
+
+    # for its manager -------------------------------------------------------------------------------------------
+
+    def made(self, ids: Ids) -> None:
+        """Add what was made for it to what it works on."""
+        self._change(subject={**self.record.subject, **ids})
+
+    def await_lane(self) -> None:
+        """Wait for its turn, in no units."""
+        self._pace.reset()
+
+    def begin(self) -> bool:
+        """Say that it runs; return False where an earlier phase did."""
+        if self.record.state != "queued":
+            return False
+        self._change(state="running", started_utc=now_utc())
+        return True
+
+    def cancel(self) -> None:
+        """Have it stop at its next check."""
+        self._cancel.set()
+
+    def cancelling(self) -> None:
+        """Show that it is to stop, if it runs."""
+        if self.record.state == "running":
+            self._change(state="cancelling")
+
+    def interrupt(self) -> None:
+        """Stop what it waits for, if it waits."""
+        stop = self._stop_waiting
+        if stop is not None:
+            stop()
+
+    def failed(self, problem: JobProblem | None) -> None:
+        """Keep why it has no result."""
+        self._change(problem=problem)
+
+    def end(self, record: JobRecord) -> None:
+        """Take the record of its end."""
+        self._change(state=record.state, finished_utc=record.finished_utc)
 
     def document(self) -> JobRecord:
         """Return the job as the API shows and the catalogue keeps it."""
-        return JobRecord(
-            id=self.id,
-            kind=self.kind,
-            state=self.state,
-            subject=dict(self.subject),
-            progress=Progress(stage=self.stage, done=self.done, total=self.total, eta_s=self.eta_s),
-            created_utc=self.created_utc,
-            started_utc=self.started_utc,
-            finished_utc=self.finished_utc,
-            result=self.result,
-            problem=self.problem,
-        )
+        record = self.record
+        return record.model_copy(update={"progress": self._pace.progress(active=record.state in ACTIVE)})
+
+    def _change(self, **fields: object) -> None:
+        with self._guard:  # who cancels it and who runs it are two threads
+            self.record = self.record.model_copy(update=fields)

@@ -22,7 +22,7 @@ from server.base.problem import RESTART, problem_of
 from server.jobs.events import EventHub
 from server.jobs.hardware import HardwareGate
 from server.jobs.idempotency import RequestMark
-from server.jobs.job import ACTIVE, Job, Phase, State, Waiting
+from server.jobs.job import ACTIVE, Job, Phase, State, Waiting, Work, new_record
 from server.store.catalog import Catalog
 from server.store.documents import JobRecord
 from server.store.folder import IdMaker, is_id, now_utc
@@ -104,31 +104,22 @@ class JobManager:
         QueueFullError
             Too many computations wait.
         """
-        job = Job(
-            self._ids.new("j"),
-            kind,
-            dict(subject),
-            phases,
-            self._show,
-            on_end=on_end,
-            on_cancel=on_cancel,
-            follows=follows,
-        )
-        computes = any(p.lane == "compute" for p in phases)
-        if computes:
+        work = Work(phases, on_end=on_end, on_cancel=on_cancel, follows=follows)
+        job = Job(new_record(self._ids.new("j"), kind, subject), work, self._show)
+        if work.computes:
             self._reserve()
         token: object | None = None
         try:
             if phases[0].lane == "hardware":
                 token = self._gate.claim(what, job_id=job.id, kind=kind)
             made = prepare(job) if prepare is not None else {}
-            job.subject |= made
+            job.made(made)
             row = None if request is None else request.made({**made, "job_id": job.id})
             self._catalog.put_job(job.document(), row)
         except BaseException:
             if token is not None:
                 self._gate.release(token)
-            if computes:
+            if work.computes:
                 self._unreserve()
             raise
         with self._lock:
@@ -197,15 +188,15 @@ class JobManager:
         with self._lock:
             job = self._active.get(job_id)
             if job is not None:
-                job._cancel.set()
+                job.cancel()
                 waiting = job in self._queue or job in self._parked
                 if job in self._queue:
                     self._queue.remove(job)
                     self._reserved -= 1
                 elif waiting:
                     self._parked.remove(job)
-                elif job.state == "running":
-                    job.state = "cancelling"
+                else:
+                    job.cancelling()
         if job is None:
             state = self.document(job_id).state
             raise StateError(
@@ -214,13 +205,11 @@ class JobManager:
                 remedy="There is nothing to cancel.",
                 state=state,
             )
-        stop_waiting = job.stop_waiting
-        if stop_waiting is not None:
-            stop_waiting()
-        if job.on_cancel is not None:
-            job.on_cancel(job)
+        job.interrupt()
+        if job.work.on_cancel is not None:
+            job.work.on_cancel(job)
         if waiting:
-            self._end(job, "cancelled", Cancelled(f"The {job.kind} was cancelled while it waited."))
+            self._end(job, "cancelled", Cancelled(f"The {job.record.kind} was cancelled while it waited."))
         else:
             self._save(job)
             self._show(job, "state")
@@ -229,7 +218,7 @@ class JobManager:
     def landed(self, test_id: str) -> None:
         """Wake the jobs that follow a test."""
         with self._lock:
-            followers = [job for job in self._active.values() if job.follows == test_id]
+            followers = [job for job in self._active.values() if job.work.follows == test_id]
         for job in followers:
             self._rouse(job)
 
@@ -243,7 +232,7 @@ class JobManager:
         """
         with self._lock:
             job = self._active.get(job_id)
-        if job is None or job.follows is None:
+        if job is None or job.work.follows is None:
             raise StateError(
                 f"Job {job_id} follows no test." if job is not None else f"Job {job_id} has ended.",
                 code="not_following",
@@ -273,22 +262,22 @@ class JobManager:
     def cancel_hardware(self) -> str | None:
         """Cancel the job that holds the hardware, if one does; return its id."""
         holder = self._gate.holder
-        job_id = holder.get("job_id") if holder else None
+        job_id = None if holder is None else holder.job_id
         if job_id is None:
             return None
         with self._lock:
             job = self._active.get(job_id)
             if job is None:
                 return None
-            job._cancel.set()
-        return str(job_id)
+            job.cancel()
+        return job_id
 
     # running ---------------------------------------------------------------------------------------------------
 
     def _enqueue(self, job: Job) -> None:
         with self._wake:
             if not self._closing:
-                job.stage, job.done, job.total = "waiting", 0, 0
+                job.await_lane()
                 self._queue.append(job)
                 self._wake.notify()
                 return
@@ -303,9 +292,9 @@ class JobManager:
         finally:
             self._gate.release(token)
         if not finished:
-            if any(p.lane == "compute" for p in job.phases):
+            if job.work.computes:
                 self._unreserve()
-        elif len(job.phases) > 1:
+        elif len(job.work.phases) > 1:
             self._enqueue(job)
         else:
             self._end(job, "succeeded", None)
@@ -319,7 +308,7 @@ class JobManager:
                     return
                 job = self._queue.popleft()
                 self._reserved -= 1
-            index = 0 if job.phases[0].lane == "compute" else 1
+            index = 0 if job.work.phases[0].lane == "compute" else 1
             with about(job_id=job.id):
                 if self._run_phase(job, index):
                     self._end(job, "succeeded", None)
@@ -327,14 +316,13 @@ class JobManager:
     def _run_phase(self, job: Job, index: int) -> bool:
         try:
             job.check()
-            if job.state == "queued":
-                job.state, job.started_utc = "running", now_utc()
+            if job.begin():
                 self._save(job)
                 self._show(job, "state")
             while True:
                 job.woken.clear()
                 try:
-                    result = job.phases[index].run(job)
+                    result = job.work.phases[index].run(job)
                 except Waiting:
                     if self._park(job):
                         return False
@@ -352,26 +340,28 @@ class JobManager:
                 self._end(job, "interrupted" if self._closing else "cancelled", RESTART if self._closing else error)
                 return False
             if not isinstance(error, StereorigError):
-                _log.exception("job %s (%s) failed", job.id, job.kind)
+                _log.exception("job %s (%s) failed", job.id, job.record.kind)
             self._end(job, "failed", error)
             return False
         return True
 
     def _end(self, job: Job, state: State, error: BaseException | None) -> None:
-        job.problem = None if error is None else problem_of(error)
-        if job.on_end is not None:
+        job.failed(None if error is None else problem_of(error))
+        if job.work.on_end is not None:
             try:
-                job.on_end(job, state)
+                job.work.on_end(job, state)
             except Exception as second:  # noqa: BLE001 - a result that was not kept is no success
                 _log.exception("closing job %s failed", job.id)
-                state, job.problem = "failed", problem_of(second)
+                state = "failed"
+                job.failed(problem_of(second))
         ended = now_utc()
         if job.let_go is not None:
             job.let_go()
         # nobody sees a job's end before it is on disk
-        self._save(job, job.document().ended(state, ended, job.problem))
+        final = job.document().ended(state, ended, job.record.problem)
+        self._save(job, final)
         with self._lock:
-            job.state, job.finished_utc = state, ended
+            job.end(final)
             self._active.pop(job.id, None)
         self._show(job, "state")
 
@@ -424,7 +414,7 @@ class JobManager:
         for job in queued:
             self._end(job, "interrupted", RESTART)
         for job in active:
-            job._cancel.set()
-            if job.on_cancel is not None:
-                job.on_cancel(job)
+            job.cancel()
+            if job.work.on_cancel is not None:
+                job.work.on_cancel(job)
         self._thread.join(timeout=5.0)

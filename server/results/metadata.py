@@ -85,7 +85,7 @@ def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
             f"{name}: {where}: {first['msg']}.",
             code="facts_invalid",
             field=where,
-            remedy="Correct it; docs/report.md lists what can be told.",
+            remedy="Correct it; docs/how_to/report.md lists what can be told.",
         ) from error
 
 

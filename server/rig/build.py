@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from core.errors import CameraError, StageError
 from core.names import CAMERAS, CameraName
@@ -211,7 +211,7 @@ def _axis_options(config: RigConfig, axis: int, dynamics: tuple[float | None, fl
     )
 
 
-def _tables(config: RigConfig) -> dict[str, Any]:
+def _tables(config: RigConfig) -> dict[str, object]:
     tables = config.model_dump(mode="python", exclude_none=True)
     for cam in CAMERAS:
         tables[cam]["stage_zero_mm"] = config.stage.of_axis(config.camera(cam).stage_axis).zero_mm

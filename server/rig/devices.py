@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -21,6 +21,7 @@ from core.names import CAMERAS
 from drivers.cameras.protocol import FoundDevice
 from drivers.registry import CAMERA_DRIVERS, discover_cameras
 from drivers.stages.serial_ports import discover_ports
+from server.base.models import always_there
 from server.rig import Rig
 
 #: name of the search for serial ports among those of the camera drivers
@@ -31,20 +32,12 @@ class _Closed(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ListedDevice(_Closed):
+class ListedDevice(_Closed, FoundDevice):
     """A camera or a serial port."""
 
-    kind: Literal["camera", "serial"] = Field(description="What it may be used as; a serial port may hold anything.")
-    driver: str = Field(description="`driver` for the rig file; empty for a serial port.", examples=["aravis"])
-    device: str = Field(
-        description="`device` (camera) or `url` (serial port) for the rig file.", examples=["Aravis-Fake-GV01"]
-    )
-    model: str = Field(description="Maker and model as the device gives them; empty if it does not.")
-    serial: str = Field(description="Serial number; empty if the device gives none.")
-    address: str = Field(description="Network address, bus position or USB ids; empty if there is none.")
-    problem: str | None = Field(description="Why it cannot be used as it is, and what to do; null if nothing is known.")
+    model_config = ConfigDict(json_schema_extra=always_there)
+
     in_use_by: str | None = Field(description="`cam1`, `cam2` or `stage` when this service itself uses it.")
-    extra: dict[str, str] = Field(description="What else is known: `link` is a serial port's lasting name.")
 
 
 class DriverState(_Closed):
@@ -86,18 +79,18 @@ def held_by(rig: Rig) -> list[HeldDevice]:
     held = []
     for cam in CAMERAS:
         section, shown = rig.config.camera(cam), rig.describe_camera(cam)
-        device = shown["device"]
+        device = shown.device
         if device is None:  # closed in between
             return []
-        fault = shown.get("fault")
+        fault = shown.fault
         held.append(
             HeldDevice(
                 cam,
                 section.driver,
                 section.device or cam,
-                device["model"],
-                device["serial"],
-                None if fault is None else f"{fault['cause']} {fault.get('remedy', '')}".strip(),
+                device.model,
+                device.serial,
+                None if fault is None else f"{fault.cause} {fault.remedy}".strip(),
             )
         )
     held.append(HeldDevice("stage", SERIAL, rig.config.stage.url))
@@ -220,19 +213,12 @@ def _same_path(one: str, two: str) -> bool:
 def _listed(found: FoundDevice, holder: HeldDevice | None) -> ListedDevice:
     # a driver that sees the camera in use cannot know that it is we who use it
     problem = found.problem if holder is None else holder.problem
-    fields: dict[str, Any] = vars(found) | {"problem": problem, "extra": dict(found.extra)}
-    return ListedDevice(**fields, in_use_by=None if holder is None else holder.name)
+    in_use_by = None if holder is None else holder.name
+    return ListedDevice.model_validate(vars(found) | {"problem": problem, "in_use_by": in_use_by})
 
 
 def _unseen(holder: HeldDevice) -> ListedDevice:
-    return ListedDevice(
-        kind="camera",
-        driver=holder.driver,
-        device=holder.device,
-        model=holder.model,
-        serial=holder.serial,
-        address="",
-        problem=holder.problem,
-        in_use_by=holder.name,
-        extra={},
+    found = FoundDevice(
+        kind="camera", driver=holder.driver, device=holder.device, model=holder.model, serial=holder.serial
     )
+    return _listed(found, holder)

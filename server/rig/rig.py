@@ -7,20 +7,35 @@ reading the stage's state and stopping it do not.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from core.errors import CameraError, DeviceError, InputError, StageError, StateError, StereorigError
 from core.names import CAMERAS, CameraName
 from drivers.cameras.protocol import CameraSettings
-from drivers.stages.protocol import MoveResult
-from server.base.problem import problem_of
+from drivers.stages.protocol import MoveResult, Stage
+from server.base.problem import JobProblem, problem_of
 from server.config.rig_file import RigConfig
 from server.jobs.hardware import HardwareGate
 from server.rig.build import Devices, first_settings, open_devices
 from server.rig.cameras import CameraPair
+from server.rig.description import (
+    AxisReply,
+    CameraDevice,
+    CameraReply,
+    CameraSettingsReply,
+    NominalCamera,
+    NominalTarget,
+    RigKept,
+    RigReply,
+    SceneReply,
+    StageIdentityReply,
+    StageReply,
+    UsualPlan,
+    identity_of,
+    kept_camera,
+)
 from server.rig.reconnect import ReconnectWatch
 from server.rig.shared import SharedReading
 from server.rig.stage_controls import StageControls
@@ -28,7 +43,7 @@ from server.rig.stage_controls import StageControls
 _log = logging.getLogger("stereorig.rig")
 
 
-def _tell_nobody(_name: str, _data: dict[str, Any]) -> None:
+def _tell_nobody(_name: str, _data: Mapping[str, object]) -> None:
     """Stand in for an event hub."""
 
 
@@ -51,7 +66,7 @@ class Rig:
         self,
         config: RigConfig,
         gate: HardwareGate,
-        announce: Callable[[str, dict[str, Any]], None] | None = None,
+        announce: Callable[[str, Mapping[str, object]], None] | None = None,
         *,
         record: Path | None = None,
     ) -> None:
@@ -60,10 +75,12 @@ class Rig:
         self.gate = gate
         self._announce = announce if announce is not None else _tell_nobody
         self._devices: Devices | None = None
-        self._fault: dict[str, Any] | None = {"code": "not_connected", "cause": "The rig was not opened yet."}
+        self._fault: JobProblem | None = JobProblem(
+            code="not_connected", cause="The rig was not opened yet.", remedy="Wait until it is open."
+        )
         # what the cameras were last set to, so that a reconnected one gets it again
         self._settings = {cam: first_settings(config, cam) for cam in CAMERAS}
-        self.scene: dict[str, Any] | None = None
+        self.scene: SceneReply | None = None
         self._watch: ReconnectWatch | None = None
         self._stage_reading = SharedReading(self._read_stage)
         self.controls = StageControls(lambda: self._ready().stage)
@@ -82,12 +99,12 @@ class Rig:
                 self._watch = ReconnectWatch(self._devices.pair, self._came_back)
                 self._watch.start()
             if self._devices.world is not None and self.scene is None:
-                self.scene = {"scene": "grid", "load": 0.0}
+                self.scene = SceneReply(scene="grid", load=0.0)
             if self.config.home_at_start:
                 self._home_at_start()
         except StereorigError as error:
             _log.exception("the rig could not be opened")
-            self._fault = problem_of(error).plain()
+            self._fault = problem_of(error)
             self._close_devices()
 
     def _home_at_start(self) -> None:
@@ -110,10 +127,9 @@ class Rig:
         self._close_devices()
         self.open()
         if self._fault is not None:
-            raise DeviceError(str(self._fault["cause"]), code=self._fault["code"], remedy=self._fault.get("remedy"))
+            raise DeviceError(self._fault.cause, code=self._fault.code, remedy=self._fault.remedy)
         if self.scene is not None:
-            scene = dict(self.scene)
-            self.set_scene(scene.pop("scene"), load=scene.pop("load"), **scene)
+            self.set_scene(self.scene.scene, load=self.scene.load, params=self.scene.model_extra)
 
     def _lost(self, cam: CameraName, error: CameraError) -> None:
         _log.warning("%s was lost: %s", cam, error)
@@ -133,14 +149,14 @@ class Rig:
             devices.close()
 
     @property
-    def fault(self) -> dict[str, Any] | None:
+    def fault(self) -> JobProblem | None:
         """Why the rig cannot be used, or None."""
         return self._fault
 
     def _ready(self) -> Devices:
         devices = self._devices
         if devices is None:
-            cause = self._fault["cause"] if self._fault else "The rig is closed."
+            cause = self._fault.cause if self._fault else "The rig is closed."
             raise DeviceError(
                 f"The rig is not connected: {cause}",
                 code="not_connected",
@@ -155,114 +171,95 @@ class Rig:
 
     # description ------------------------------------------------------------------------------------------------
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> RigReply:
         """Return everything a client wants to know before it does anything."""
         config = self.config
-        return {
-            "name": config.rig.name,
-            "description": config.rig.description,
-            "sim": config.rig.kind == "simulated",
-            "connected": self._devices is not None,
-            "fault": self._fault,
-            "holder": self.gate.holder,
-            "scene": self.scene,
-            "trigger": config.rig.trigger,
-            "max_skew_ms": config.rig.skew_bound_ms,
-            "target": config.target.model_dump(mode="json"),
-            "calibration_plan": config.calibration.model_dump(mode="json"),
-            "cameras": {cam: self.describe_camera(cam) for cam in CAMERAS},
-            "stage": self._describe_stage_or_fault(),
-        }
+        return RigReply(
+            name=config.rig.name,
+            description=config.rig.description,
+            sim=config.rig.kind == "simulated",
+            connected=self._devices is not None,
+            fault=self._fault,
+            holder=self.gate.holder,
+            scene=self.scene,
+            trigger=config.rig.trigger,
+            max_skew_ms=config.rig.skew_bound_ms,
+            target=NominalTarget.model_validate(config.target.model_dump(mode="json")),
+            calibration_plan=UsualPlan.model_validate(config.calibration.model_dump(mode="json")),
+            cameras={cam: self.describe_camera(cam) for cam in CAMERAS},
+            stage=self._describe_stage_or_fault(),
+        )
 
-    def describe_camera(self, cam: CameraName) -> dict[str, Any]:
+    def describe_camera(self, cam: CameraName) -> CameraReply:
         """Nominal data, the device's own description, and the settings it has."""
-        section = self.config.camera(cam)
-        shown: dict[str, Any] = {
-            "name": cam,
-            "nominal": section.model_dump(mode="json"),
-            "device": None,
-            "settings": None,
-        }
-        if self._devices is not None:
-            unit = self._devices.pair.units[cam]
-            shown["device"] = asdict(unit.description)
-            shown["settings"] = asdict(unit.settings)
-            shown["fault"] = None if unit.fault is None else problem_of(unit.fault).plain()
-            shown["reconnections"] = unit.reconnections
-        return shown
+        nominal = NominalCamera.model_validate(self.config.camera(cam).model_dump(mode="json"))
+        devices = self._devices
+        if devices is None:
+            return CameraReply(name=cam, nominal=nominal, device=None, settings=None)
+        unit = devices.pair.units[cam]
+        return CameraReply(
+            name=cam,
+            nominal=nominal,
+            device=CameraDevice.model_validate(asdict(unit.description)),
+            settings=CameraSettingsReply.model_validate(asdict(unit.settings)),
+            fault=None if unit.fault is None else problem_of(unit.fault),
+            reconnections=unit.reconnections,
+        )
 
     def identities(self) -> dict[str, dict[str, str]]:
-        """Model and serial number of each camera, for the records of what they took."""
-        described = {cam: self.pair.units[cam].description for cam in CAMERAS}
-        return {cam: {"model": found.model, "serial": found.serial} for cam, found in described.items()}
+        """Who each camera is, for the records of what they took."""
+        return {cam: identity_of(self.pair.units[cam].description) for cam in CAMERAS}
 
-    def record(self) -> dict[str, Any]:
-        """What a report wants to know of the rig that took a step: how it runs, and each camera's settings and lens."""
-        section = self.config.rig
-        cameras: dict[str, Any] = {}
-        for cam in CAMERAS:
-            has = self.pair.units[cam].settings
-            cameras[cam] = {
-                "exposure_ms": has.exposure_ms,
-                "gain_db": has.gain_db,
-                "frame_rate_hz": has.frame_rate_hz,
-                "pixel_format": has.pixel_format,
-                **self.config.camera(cam).facts().model_dump(mode="json", exclude_none=True),
-            }
-        return {
-            "name": section.name,
-            "simulated": section.kind == "simulated",
-            "trigger": section.trigger,
-            "frame_rate_hz": section.frame_rate_hz,
-            "max_skew_ms": section.skew_bound_ms,
-            "lighting": section.lighting,
-            "cameras": cameras,
-        }
+    def record(self) -> RigKept:
+        """What a report wants to know of the rig that took a step."""
+        section, units = self.config.rig, self.pair.units
+        return RigKept(
+            name=section.name,
+            simulated=section.kind == "simulated",
+            trigger=section.trigger,
+            frame_rate_hz=section.frame_rate_hz,
+            max_skew_ms=section.skew_bound_ms,
+            lighting=section.lighting,
+            cameras={cam: kept_camera(units[cam].settings, self.config.camera(cam).facts()) for cam in CAMERAS},
+        )
 
-    def _describe_stage_or_fault(self) -> dict[str, Any]:
+    def _describe_stage_or_fault(self) -> StageReply:
         # a silent stage must not hide the cameras
         try:
             return self.describe_stage()
         except StageError as error:
-            section = self.config.stage
-            return {
-                "driver": section.driver,
-                "identity": None,
-                "axes": [],
-                "zero_mm": section.zero_mm,
-                "fault": problem_of(error).plain(),
-            }
+            return self._no_stage(problem_of(error))
 
-    def describe_stage(self) -> dict[str, Any]:
+    def _no_stage(self, fault: JobProblem | None) -> StageReply:
+        section = self.config.stage
+        return StageReply(driver=section.driver, identity=None, axes=[], zero_mm=section.zero_mm, fault=fault)
+
+    def describe_stage(self) -> StageReply:
         """Identity, limits and state of each axis; who asks while others do shares their reading."""
         return self._stage_reading()
 
-    def _read_stage(self) -> dict[str, Any]:
-        section = self.config.stage
-        shown: dict[str, Any] = {
-            "driver": section.driver,
-            "identity": None,
-            "axes": [],
-            "zero_mm": section.zero_mm,
-            "fault": None,
-        }
-        devices = self._devices
+    def _read_stage(self) -> StageReply:
+        section, devices = self.config.stage, self._devices
         if devices is None:
-            return shown | {"fault": self._fault}
-        shown["identity"] = asdict(devices.stage.identify())
-        for axis in devices.stage.axes:
-            status = devices.stage.state(axis)
-            shown["axes"].append(
-                {
-                    **asdict(status),
-                    "state": status.state.value,
-                    "limits": asdict(devices.stage.limits(axis)),
-                    "dynamics": asdict(devices.stage.dynamics(axis)),
-                    "zero_mm": section.of_axis(axis).zero_mm,
-                    "cameras": [cam for cam in CAMERAS if self.config.camera(cam).stage_axis == axis],
-                }
-            )
-        return shown
+            return self._no_stage(self._fault)
+        return StageReply(
+            driver=section.driver,
+            identity=StageIdentityReply.model_validate(asdict(devices.stage.identify())),
+            axes=[self._read_axis(devices.stage, axis) for axis in devices.stage.axes],
+            zero_mm=section.zero_mm,
+            fault=None,
+        )
+
+    def _read_axis(self, stage: Stage, axis: int) -> AxisReply:
+        return AxisReply.model_validate(
+            {
+                **asdict(stage.state(axis)),
+                "limits": asdict(stage.limits(axis)),
+                "dynamics": asdict(stage.dynamics(axis)),
+                "zero_mm": self.config.stage.of_axis(axis).zero_mm,
+                "cameras": [cam for cam in CAMERAS if self.config.camera(cam).stage_axis == axis],
+            }
+        )
 
     # cameras ----------------------------------------------------------------------------------------------------
 
@@ -273,7 +270,7 @@ class Rig:
         self._settings[cam] = pair.units[cam].wanted
         return taken
 
-    def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> dict[str, Any]:
+    def set_scene(self, name: str, *, load: float = 0.0, params: Mapping[str, object] | None = None) -> SceneReply:
         """Put something else before a simulated rig's cameras."""
         world = self._ready().world
         if world is None:
@@ -282,11 +279,12 @@ class Rig:
                 code="not_simulated",
                 remedy="Start the service with a simulated rig's file.",
             )
+        more = dict(params or {})
         try:
-            world.set_scene(name, load=load, **params)
+            world.set_scene(name, load=load, **more)
         except (TypeError, ValueError) as error:
             raise InputError(f"Scene {name!r}: {error}.", code="scene_invalid") from error
-        self.scene = {"scene": name, "load": load, **params}
+        self.scene = SceneReply.model_validate({"scene": name, "load": load, **more})
         return self.scene
 
     # stage ------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from dataclasses import asdict
 
 from core.errors import DeviceError
 from drivers.stages.protocol import AxisState, Stage
+from server.rig.description import DynamicsReply, StageMessage
 from server.store.folder import now_utc
 
 _log = logging.getLogger("stereorig.rig")
@@ -27,7 +28,7 @@ class StageControls:
 
     def __init__(self, stage: Callable[[], Stage]) -> None:
         self._stage = stage
-        self._messages: deque[dict[str, object]] = deque(maxlen=_KEPT)
+        self._messages: deque[StageMessage] = deque(maxlen=_KEPT)
         self._next_message = 1
         self._collecting = threading.Lock()
         #: axis -> velocity and acceleration that were asked for, so that a reconnected stage gets them again
@@ -46,13 +47,11 @@ class StageControls:
             else:
                 stage.disable(axis)
 
-    def read_dynamics(self, axis: int) -> dict[str, object]:
+    def read_dynamics(self, axis: int) -> DynamicsReply:
         """Return velocity and acceleration as the controller has them."""
-        return asdict(self._stage().dynamics(axis))
+        return DynamicsReply.model_validate(asdict(self._stage().dynamics(axis)))
 
-    def set_dynamics(
-        self, axis: int, velocity_mm_s: float | None, acceleration_mm_s2: float | None
-    ) -> dict[str, object]:
+    def set_dynamics(self, axis: int, velocity_mm_s: float | None, acceleration_mm_s2: float | None) -> DynamicsReply:
         """Set velocity, acceleration or both and return what was read back; on the owner thread, with the hold."""
         taken = self._stage().set_dynamics(axis, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2)
         velocity, acceleration = self.dynamics.get(axis, (None, None))
@@ -60,7 +59,7 @@ class StageControls:
             velocity if velocity_mm_s is None else velocity_mm_s,
             acceleration if acceleration_mm_s2 is None else acceleration_mm_s2,
         )
-        return asdict(taken)
+        return DynamicsReply.model_validate(asdict(taken))
 
     def leave_configuration(self, axis: int) -> None:
         """Leave the configuration state, which writes the flash memory; on the owner thread, with the hold."""
@@ -76,10 +75,11 @@ class StageControls:
         with self._collecting:
             for message in stage.errors(ask=ask):
                 _log.warning("stage, axis %s: %s (%s)", message.axis or "-", message.text, message.code)
-                self._messages.append({"id": self._next_message, "utc": now_utc(), **asdict(message)})
+                said = {"id": self._next_message, "utc": now_utc(), **asdict(message)}
+                self._messages.append(StageMessage.model_validate(said))
                 self._next_message += 1
 
-    def messages(self) -> list[dict[str, object]]:
+    def messages(self) -> list[StageMessage]:
         """Return the controller's messages, oldest first, with the time at which they were read; none is lost by it.
 
         A controller that is silent or not connected adds none.

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from server.base.models import Document, JobState
 from server.base.problem import JobProblem
+from server.formats.records import Record
 
 
 class Progress(Document):
@@ -251,3 +252,20 @@ class WatchRecord(Document):
     active: bool = False
     last_value: float | None = None
     last_step: int | None = None
+
+
+class TrashEntry(Record, Document):
+    """Something that was deleted and can be restored."""
+
+    id: str = Field(description="Id in the trash.", examples=["x000001-3f09aa"])
+    kind: Literal["test", "step", "analysis", "calibration", "noise", "unknown"] = Field(description="What it was.")
+    test_id: str | None = Field(None, description="Its test, or itself.")
+    n: int | None = Field(None, description="Number of a step.")
+    analysis_id: str | None = Field(None, description="Id of an analysis.")
+    calibration_id: str | None = Field(None, description="Id of a calibration.")
+    noise_id: str | None = Field(None, description="Id of a noise measurement.")
+    name: str = Field("", description="As people called it.")
+    deleted_utc: str | None = Field(None, description="When it was deleted.")
+    deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
+    why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")
+    size_bytes: int | None = Field(None, description="Room that emptying frees.")

@@ -145,10 +145,10 @@ def _look_into_trash(folder: DataFolder) -> list[str]:
     for trash_id in trash.ids():
         folder.ids.seen(trash_id)
         try:
-            document = trash.entry(trash_id)
+            ids = trash.entry(trash_id).plain()
         except (FileFormatError, NotFoundError):
             continue  # `stereorig verify` and the list of the trash say so
         for name, letter in (("test_id", "t"), ("analysis_id", "a"), ("calibration_id", "c"), ("noise_id", "n")):
-            if is_id(str(document.get(name)), letter):
-                folder.ids.seen(str(document[name]))
+            if is_id(str(ids.get(name)), letter):
+                folder.ids.seen(str(ids[name]))
     return done

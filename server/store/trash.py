@@ -10,12 +10,15 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+from pydantic import ValidationError
 
 from core.errors import FileFormatError, StateError, StorageError
 from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, storage_error
+from server.store.documents import TrashEntry
 from server.store.durable import make_folder, read_json, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 from server.store.tests import MAX_STEPS, deleted_mark
@@ -44,30 +47,39 @@ class Trash:
         """Ids of all entries, in the order of their deletion."""
         return sorted(p.parent.name for p in self.root.glob(f"x*/{_CONTENT}") if is_id(p.parent.name, "x"))
 
-    def entry(self, trash_id: str) -> dict[str, Any]:
-        """Return ``trash.json`` of an entry: what it was, when and by whom it was deleted.
+    def entry(self, trash_id: str) -> TrashEntry:
+        """Return what an entry was, when and by whom it was deleted.
 
         Raises
         ------
         NotFoundError
             If there is none with this id.
+        FileFormatError
+            If ``trash.json`` cannot be read; ``trash_unreadable`` if it does not say what it was.
         """
+        try:
+            return TrashEntry.model_validate({"id": trash_id, **self._document(trash_id)})
+        except ValidationError as error:
+            raise _unreadable() from error
+
+    def _document(self, trash_id: str) -> Mapping[str, object]:
         folder = self.root / trash_id if is_id(trash_id, "x") else None
         if folder is None or not (folder / _CONTENT).is_dir():
             raise NotFoundError(f"There is nothing in the trash with the id {trash_id[:40]!r}.", what="trash")
-        return {"id": trash_id, **read_json(folder / "trash.json")}
+        return read_json(folder / "trash.json")
 
-    def entries(self) -> list[dict[str, Any]]:
+    def entries(self) -> list[TrashEntry]:
         """Return every entry, with its size; one whose description cannot be read says so."""
         found = []
         for trash_id in self.ids():
             try:
-                document = self.entry(trash_id)
+                entry = self.entry(trash_id)
             except NotFoundError:
                 continue  # emptied meanwhile
             except FileFormatError as error:
-                document = {"id": trash_id, "kind": "unknown", "name": error.cause}
-            found.append(document | {"size_bytes": _size_bytes(self.root / trash_id / _CONTENT)})
+                entry = TrashEntry(id=trash_id, kind="unknown", name=error.cause)
+            size_bytes = _size_bytes(self.root / trash_id / _CONTENT)
+            found.append(entry.model_copy(update={"size_bytes": size_bytes}))
         return found
 
     # in and out ------------------------------------------------------------------------------------------------
@@ -112,7 +124,7 @@ class Trash:
             raise
         return trash_id
 
-    def restore(self, trash_id: str) -> dict[str, Any]:
+    def restore(self, trash_id: str) -> TrashEntry:
         """Move an entry's content back to where it was; return what it is.
 
         Raises
@@ -122,8 +134,8 @@ class Trash:
         StateError
             ``place_taken`` if something lies there by now, ``parent_deleted`` if its test is not there.
         """
-        document = self.entry(trash_id)
-        place = self.place(document.get("kind"), document)
+        entry = self.entry(trash_id)
+        place = self.place(entry.kind, entry.plain())
         if place.exists():
             raise StateError(
                 f"{place.relative_to(self._data)} is there again.",
@@ -137,10 +149,10 @@ class Trash:
                 remedy="Restore the test first.",
             )
         _move(self.root / trash_id / _CONTENT, place)
-        if document["kind"] == "step":
+        if entry.kind == "step":
             deleted_mark(place).unlink(missing_ok=True)
         shutil.rmtree(self.root / trash_id, ignore_errors=True)
-        return document
+        return entry
 
     def remove(self, trash_id: str) -> None:
         """Remove an entry for good.
@@ -152,7 +164,7 @@ class Trash:
         StorageError
             When the disk does not let it go.
         """
-        self.entry(trash_id)
+        self._document(trash_id)
         entry = self.root / trash_id
         _move(entry / _CONTENT, entry / _DOOMED)
         try:
@@ -190,11 +202,15 @@ class Trash:
                 return folder / "analyses" / analysis
             if kind == "step" and n.isdecimal() and int(n) <= MAX_STEPS:
                 return folder / "steps" / f"{int(n):04d}"
-        raise FileFormatError(
-            "trash.json does not say what lies there.",
-            code="trash_unreadable",
-            remedy="Take the files out of the trash folder by hand.",
-        )
+        raise _unreadable()
+
+
+def _unreadable() -> FileFormatError:
+    return FileFormatError(
+        "trash.json does not say what lies there.",
+        code="trash_unreadable",
+        remedy="Take the files out of the trash folder by hand.",
+    )
 
 
 def _move(source: Path, target: Path) -> None:

@@ -85,7 +85,7 @@ class AnalysisRun:
             self._load(job)
         while True:
             self._measure(job)
-            if job.follows is None:
+            if job.work.follows is None:
                 break
             finishing = job.finishing.is_set()  # asked before looking: what landed before it is measured
             if self._take_new_steps():
@@ -117,15 +117,17 @@ class AnalysisRun:
         self._loaded = document
         self._tell(job)
 
-    def _tell(self, job: Job) -> None:
-        """Put what is finished into the job's result."""
+    def _tell(self, job: Job) -> dict[str, object]:
+        """Put what is finished into the job's result, and return it."""
         finished = [self._summaries[n] for n in self._document.steps if n in self._summaries]
-        job.result = {
+        told: dict[str, object] = {
             "analysis_id": self._document.id,
             "test_id": self._test_id,
             "steps_finished": [found.n for found in finished],
             "steps": [found.plain() for found in finished],
         }
+        job.result = told
+        return told
 
     def _measure(self, job: Job) -> None:
         steps = self._document.steps
@@ -238,11 +240,10 @@ class AnalysisRun:
         return bool(new)
 
     def _result(self, job: Job) -> dict[str, object]:
-        self._tell(job)
-        assert job.result is not None
+        found = self._tell(job)
         if self._failed:
             first = min(self._failed)
-            job.result["steps_failed"] = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
+            found["steps_failed"] = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
             raise StepsFailedError(
                 f"{len(self._failed)} of {len(self._document.steps)} steps failed; step {first}: "
                 f"{self._failed[first].cause}",
@@ -250,7 +251,7 @@ class AnalysisRun:
                 remedy=self._failed[first].remedy,
                 steps_failed=sorted(self._failed),
             )
-        return job.result
+        return found
 
 
 def task_of(
@@ -320,7 +321,7 @@ def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str
         steps=[step.plain() for step in found.steps],
         steps_failed={n: problem.plain() for n, problem in found.steps_failed.items()},
     ).document()
-    problem = None if job.problem is None else job.problem.plain()
+    problem = None if job.record.problem is None else job.record.problem.plain()
     summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": problem}
     service.tests.put_summary(test_id, analysis_id, summary)
     if state == "succeeded":

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.errors import InputError, StateError
-from core.settings import AnalysisSettings
+from core.settings import AnalysisSettings, NoiseRecord, StoredSettings
 from server.base.models import Ids
 from server.compute.region import make_grid
+from server.compute.seeds import check_seeds
 from server.formats.files import sha256_of
 from server.formats.images import decode_mask, read_image
+from server.formats.noise_json import load_noise
 from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
@@ -18,6 +20,7 @@ from server.results.staleness import stale_inputs
 from server.store.documents import AnalysisRecord
 from server.store.index import analysis_entry
 from server.workflows.analysis_run import AnalysisRun, calibration_changed, close
+from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 
 
@@ -97,6 +100,73 @@ def check_region(
     """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
     image = read_image(service.tests.step(test_id, reference).cam1)
     make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
+
+
+def begin(
+    service: Service,
+    test_id: str,
+    settings: StoredSettings,
+    request: RequestMark,
+    *,
+    kind: str,
+    label: str,
+    steps: list[int] | None,
+    follow: bool,
+    mask: bytes | None,
+    noise_id: str | None,
+) -> Ids:
+    """Check everything that can be checked now, make the analysis and its job.
+
+    Parameters
+    ----------
+    settings
+        Those asked for, without a noise model.
+    steps
+        Steps to measure; None: all after the reference.
+    follow
+        Go on with each step that is captured.
+    mask
+        Image file of camera 1's size, white where points may lie.
+    noise_id
+        Noise measurement that weighs the pixels.
+
+    Returns
+    -------
+    Ids
+        ``analysis_id`` and ``job_id``.
+    """
+    calibration = service.tests.calibration_file(test_id)
+    check_calibration(service, test_id, calibration)
+    measured = steps_to_measure(service, test_id, settings.reference, steps)
+    for n in measured:
+        check_same_cameras(calibration, service.tests.step(test_id, n).document.cameras, f"Step {n}")
+    noise = None if noise_id is None else service.noise.file(noise_id)
+    if noise is not None:
+        record = NoiseRecord.model_validate({"noise_id": noise_id, **load_noise(noise).record()})
+        settings = settings.model_copy(update={"noise": record})
+    check_region(service, test_id, measured[0], settings, mask)
+    if settings.seeds_cam2 is not None:
+        rows, cols = read_image(service.tests.step(test_id, measured[0]).cam2).shape
+        check_seeds(calibration, settings, (cols, rows))
+    service.require_room()
+    document = {
+        "kind": kind,
+        "label": label,
+        "settings": settings.model_dump(),
+        "steps": measured,
+        "follow": follow,
+        "software": software_version(),
+        "inputs": inputs_of(service, test_id, measured, calibration),
+        **request.document(),
+    }
+
+    def prepare(job: Job) -> Ids:
+        run = {"job_id": job.id, **request.document()}
+        stored = service.tests.create_analysis(test_id, document, mask, noise, run)
+        return {"analysis_id": stored.id}
+
+    job = submit(service, test_id, prepare, request, follow=follow)
+    return {"analysis_id": str(job.subject["analysis_id"]), "job_id": job.id}
 
 
 def submit(

@@ -190,8 +190,8 @@ def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, object]
 
 def close(service: Service, job: Job, calibration_id: str, state: str) -> None:
     """Leave a record of a calibration that did not come to be, and put the index right."""
-    if state != "succeeded" and job.problem is not None:
-        service.calibrations.put_failure(calibration_id, {**job.problem.plain(), "job_state": state})
+    if state != "succeeded" and job.record.problem is not None:
+        service.calibrations.put_failure(calibration_id, {**job.record.problem.plain(), "job_state": state})
     entry = calibration_entry(service.calibrations, calibration_id)
     service.catalog.put_entry("calibration", "", calibration_id, entry)
     service.hub.publish("calibration", {"calibration_id": calibration_id, "state": entry["state"]})

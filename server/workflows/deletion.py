@@ -8,13 +8,14 @@ from typing import Any
 from core.errors import StateError, StereorigError
 from server.base.models import Ids
 from server.jobs.job import ACTIVE
+from server.store.documents import TrashEntry
 from server.store.index import calibration_entry, entries_of_test
 from server.store.lost_jobs import LostJobs
 from server.store.trash import Kind
 from server.workflows.service import Service
 
 
-def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> dict[str, Any]:
+def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> TrashEntry:
     """Move something into the trash; return the trash's entry.
 
     Parameters
@@ -46,18 +47,18 @@ def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> dict[str, Any]
     return service.trash.entry(trash_id)
 
 
-def restore(service: Service, trash_id: str) -> dict[str, Any]:
+def restore(service: Service, trash_id: str) -> TrashEntry:
     """Move something back from the trash; return what it is; errors as `server.store.trash.Trash.restore`."""
     with service.tests.still():
-        document = service.trash.restore(trash_id)
-    if document["kind"] == "calibration":
-        entry = calibration_entry(service.calibrations, document["calibration_id"])
-        service.catalog.put_entry("calibration", "", document["calibration_id"], entry)
-    elif document["kind"] != "noise":
-        for known in entries_of_test(service.tests, document["test_id"], LostJobs(), []):
-            service.catalog.put_entry(*known)
-    service.hub.publish("restored", {k: v for k, v in document.items() if k in ("kind", "n") or k.endswith("_id")})
-    return document
+        entry = service.trash.restore(trash_id)
+    if entry.calibration_id is not None and entry.kind == "calibration":
+        known = calibration_entry(service.calibrations, entry.calibration_id)
+        service.catalog.put_entry("calibration", "", entry.calibration_id, known)
+    elif entry.test_id is not None and entry.kind != "noise":
+        for row in entries_of_test(service.tests, entry.test_id, LostJobs(), []):
+            service.catalog.put_entry(*row)
+    service.hub.publish("restored", {k: v for k, v in entry.plain().items() if k in ("kind", "n") or k.endswith("_id")})
+    return entry
 
 
 def _name(service: Service, kind: Kind, ids: Ids) -> str:
@@ -95,8 +96,8 @@ def _check_unused(service: Service, kind: Kind, ids: Ids) -> None:
         if service.jobs.is_active(job.id) and uses({**job.subject, **(job.result or {})}):
             raise _in_use(kind, f"by job {job.id} ({job.kind})", "Wait for the job or cancel it.", job_id=job.id)
     holder = service.gate.holder
-    if holder is not None and uses(holder):
-        raise _in_use(kind, f"by {holder['what']}", "Try again when that is done.")
+    if holder is not None and uses(holder.plain()):
+        raise _in_use(kind, f"by {holder.what}", "Try again when that is done.")
 
 
 def _in_use(kind: str, by: str, remedy: str, **more: Any) -> StateError:

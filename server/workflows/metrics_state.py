@@ -110,12 +110,11 @@ class StateCollector(Collector):
         places = GaugeMetricFamily("stereorig_axis_position_mm", "Position that was read back.", labels=["axis"])
         states = GaugeMetricFamily("stereorig_axis_state", "1 for the state the axis is in.", labels=["axis", "state"])
         try:
-            for axis in self._service.rig.describe_stage()["axes"]:
-                number = str(axis["axis"])
-                if axis["position_mm"] is not None:
-                    places.add_metric([number], axis["position_mm"])
+            for axis in self._service.rig.describe_stage().axes:
+                number = str(axis.axis)
+                places.add_metric([number], axis.position_mm)
                 for state in AxisState:
-                    states.add_metric([number, state.value], axis["state"] == state.value)
+                    states.add_metric([number, state.value], axis.state is state)
             answers.add_metric([], self._service.rig.fault is None)
         except DeviceError:
             answers.add_metric([], 0)

@@ -72,6 +72,6 @@ def fit(service: Service, job: Job, noise_id: str) -> dict[str, object]:
 
 def close(service: Service, job: Job, noise_id: str, state: str) -> None:
     """Leave a record of a measurement that did not come to be, and tell who listens."""
-    if state != "succeeded" and job.problem is not None:
-        service.noise.put_failure(noise_id, {**job.problem.plain(), "job_state": state})
+    if state != "succeeded" and job.record.problem is not None:
+        service.noise.put_failure(noise_id, {**job.record.problem.plain(), "job_state": state})
     service.hub.publish("noise", {"noise_id": noise_id, "state": service.noise.read(noise_id).state})

@@ -176,7 +176,7 @@ class Service:
         if self.closing:
             reasons.append({"code": "shutting_down", "cause": "The service is ending."})
         if self.rig.fault is not None:
-            reasons.append({"code": str(self.rig.fault["code"]), "cause": str(self.rig.fault["cause"])})
+            reasons.append({"code": self.rig.fault.code, "cause": self.rig.fault.cause})
         if not self.worker.ready.is_set():
             reasons.append({"code": "worker_starting", "cause": "The compute worker is starting."})
         try:
@@ -231,7 +231,7 @@ class Service:
             while self.rig.fault is None:
                 self.rig.stop()
                 holder = self.gate.holder
-                if holder is None or "job_id" not in holder or time.monotonic() > deadline:
+                if holder is None or holder.job_id is None or time.monotonic() > deadline:
                     return
                 time.sleep(0.02)
         except Exception:  # noqa: BLE001 - closing the rig tries again

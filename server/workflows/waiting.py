@@ -19,8 +19,7 @@ def run_task(
     """Run ``function(*args)`` outside; progress goes to the job, the job's cancellation to the task."""
     future = executor.submit(function, *args)
     future.on_progress = progress or job.progress
-    job.stop_waiting = future.request_stop
-    try:
+    with job.waiting(future.request_stop):
         while True:
             if job.cancelled:  # also where it was just before the future was known
                 future.request_stop()
@@ -30,9 +29,7 @@ def run_task(
                 if future.done():
                     raise
             except CancelledError:
-                raise Cancelled(f"The {job.kind} was cancelled.") from None
-    finally:
-        job.stop_waiting = None
+                raise Cancelled(f"The {job.record.kind} was cancelled.") from None
 
 
 def run_side_by_side(
@@ -63,25 +60,24 @@ def run_side_by_side(
     def shown(number: int) -> Progress:
         return lambda stage, done, of: progress(number, stage, min(done / of, 1.0) if of > 0 else 0.0)
 
-    job.stop_waiting = stop
-    try:
-        more = True
-        while more or running:
-            job.check()
-            while more and len(running) < executor.width:
-                number, make = next(tasks, (None, None))
-                if number is None or make is None:
-                    more = False
-                    break
-                future = executor.submit(function, make())
-                future.on_progress = shown(number)
-                running[future] = number
-            finished, _ = wait(list(running), timeout=0.05, return_when=FIRST_COMPLETED)
-            for one in finished:
-                if job.cancelled:
-                    break
-                ended(running.pop(one), one)  # type: ignore[call-overload]  # wait() forgets what it was given
-    finally:
-        stop()
-        job.stop_waiting = None
-        wait(list(running), timeout=_STOPPING_S)  # what a job leaves running would write after its end
+    with job.waiting(stop):
+        try:
+            more = True
+            while more or running:
+                job.check()
+                while more and len(running) < executor.width:
+                    number, make = next(tasks, (None, None))
+                    if number is None or make is None:
+                        more = False
+                        break
+                    future = executor.submit(function, make())
+                    future.on_progress = shown(number)
+                    running[future] = number
+                finished, _ = wait(list(running), timeout=0.05, return_when=FIRST_COMPLETED)
+                for one in finished:
+                    if job.cancelled:
+                        break
+                    ended(running.pop(one), one)  # type: ignore[call-overload]  # wait() forgets what it was given
+        finally:
+            stop()
+            wait(list(running), timeout=_STOPPING_S)  # what a job leaves running would write after its end

@@ -229,7 +229,7 @@ def test_a_job_that_ended_with_the_disk_full_never_reads_as_running(
     bench = Bench(tmp_path)
     go = threading.Event()
     job = bench.jobs.submit("analysis", "an analysis", {}, [Phase("compute", lambda _: go.wait(20) and None)])
-    while job.state == "queued":
+    while job.record.state == "queued":
         time.sleep(0.005)
 
     def full(*_: object) -> None:

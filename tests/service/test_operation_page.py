@@ -1,4 +1,4 @@
-"""docs/operation.md against the program: its metrics, limits, codes and commands are those that there are."""
+"""docs/how_to/operate.md against the program: its metrics, limits, codes and commands are those that there are."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from server.config.rig_file import ServiceSection
 from tests.support.requirements import ROOT
 from tests.support.service_rig import wait_for_rig
 
-PAGE = ROOT / "docs" / "operation.md"
+PAGE = ROOT / "docs" / "how_to" / "operate.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 
 
@@ -99,4 +99,4 @@ def test_what_it_says_to_run_in_a_container_is_what_the_file_says() -> None:
 
 
 def test_the_readme_leads_to_it() -> None:
-    assert "(docs/operation.md)" in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "(docs/how_to/operate.md)" in (ROOT / "README.md").read_text(encoding="utf-8")

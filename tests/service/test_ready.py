@@ -9,6 +9,7 @@ import httpx
 import pytest
 
 import server.store.folder
+from server.base.problem import JobProblem
 from server.workflows.service import Service
 from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, wait_for_job, wait_for_rig
@@ -38,7 +39,7 @@ def test_it_is_ready_once_rig_worker_and_disk_are(service: Service, client: http
 def test_a_lost_rig_is_a_reason(service: Service, client: httpx.Client) -> None:
     wait_for_rig(client)
     fault = service.rig._fault
-    service.rig._fault = {"code": "stage_lost", "cause": "The controller is silent."}
+    service.rig._fault = JobProblem(code="stage_lost", cause="The controller is silent.", remedy="Look.")
     try:
         answer = client.get("/readyz")
         assert answer.status_code == 503

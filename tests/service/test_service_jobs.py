@@ -53,7 +53,7 @@ def test_a_job_tells_stage_share_and_time_left(bench: Bench) -> None:
         return {"answer": float("nan")}
 
     job = bench.jobs.submit("walk", "a walk", {"x": 1}, compute(run))
-    while job.done < 1:
+    while job.document().progress.done < 1:
         time.sleep(0.005)
     document = bench.jobs.document(job.id).plain()
     assert document["state"] == "running"
@@ -165,7 +165,7 @@ def test_what_ran_at_a_crash_reads_interrupted_after_the_next_start(tmp_path: Pa
     go = threading.Event()
     running = first.jobs.submit("analysis", "an analysis", {}, compute(lambda _: go.wait(10) and None))
     queued = first.jobs.submit("analysis", "an analysis", {}, compute(lambda _: None))
-    while running.state == "queued":
+    while running.record.state == "queued":
         time.sleep(0.005)
     shutil.copytree(tmp_path, tmp_path / "copy", ignore=shutil.ignore_patterns("copy"))  # what a kill leaves behind
     go.set()
@@ -285,7 +285,7 @@ def test_killed_worker_fails_its_job_and_is_started_again(tmp_path: Path) -> Non
                 {},
                 compute(lambda j: {"n": run_task(service.worker, j, work.count, 500, 0.02)}),
             )
-            while job.done < 1:
+            while job.document().progress.done < 1:
                 time.sleep(0.01)
             pid = service.worker.pid
             subprocess.run(["kill", "-9", str(pid)], check=True)
@@ -301,7 +301,7 @@ def test_killed_worker_fails_its_job_and_is_started_again(tmp_path: Path) -> Non
             job = service.jobs.submit(
                 "analysis", "an analysis", {}, compute(lambda j: run_task(service.worker, j, work.count, 500, 0.02))
             )
-            while job.done < 1:
+            while job.document().progress.done < 1:
                 time.sleep(0.01)
             asked = time.monotonic()
             assert client.post(f"/api/v1/jobs/{job.id}/cancel").json()["state"] in ("cancelling", "cancelled")
@@ -407,7 +407,7 @@ def test_cancelled_raises_in_the_phase(bench: Bench) -> None:
             raise
 
     job = bench.jobs.submit("analysis", "an analysis", {}, compute(run))
-    while job.state == "queued":
+    while job.record.state == "queued":
         time.sleep(0.005)
     bench.jobs.cancel(job.id)
     assert bench.end_of(job)["state"] == "cancelled"

@@ -50,7 +50,7 @@ def tasks(inputs: Path, out: Path, **settings: Any) -> list[StepTask]:
         StepTask(
             folder=out,
             calibration=inputs / "calibration.json",
-            settings=body.stored(None),
+            settings=body.stored(),
             reference=steps[STEPS[0]],
             step=steps[n],
             previous=STEPS[k - 1] if k else None,

@@ -356,7 +356,7 @@ def test_a_rig_with_a_stuck_axis_opens_and_homes_the_other(tmp_path_factory: pyt
         opened.open()
         try:
             assert opened.fault is None
-            assert [axis["state"] for axis in opened.describe_stage()["axes"]] == ["ready", "configuration"]
+            assert [axis.state for axis in opened.describe_stage().axes] == ["ready", "configuration"]
             assert controller.flash_writes(2) == 0
         finally:
             opened.close()

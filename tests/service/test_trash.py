@@ -251,6 +251,20 @@ def test_a_trash_document_never_leads_out_of_the_data_folder(folder: DataFolder,
     folder.close()
 
 
+def test_a_document_that_says_nothing_is_listed_and_can_be_removed(
+    folder: DataFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = folder.root / "trash" / "x000001-abcdef"
+    (entry / "content").mkdir(parents=True)
+    (entry / "trash.json").write_text('{"kind": 7, "name": ["odd"]}')
+    (listed,) = Trash(folder.root).entries()
+    assert (listed.id, listed.kind) == ("x000001-abcdef", "unknown")
+    assert main(["trash", "empty", "--data", str(folder.root)]) == 0
+    assert "x000001-abcdef  unknown" in capsys.readouterr().out
+    assert not entry.exists()
+    folder.close()
+
+
 def test_the_command_lists_restores_and_empties(folder: DataFolder, capsys: pytest.CaptureFixture[str]) -> None:
     data = str(folder.root)
     one, two = small_test(folder), small_test(folder)

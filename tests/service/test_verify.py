@@ -178,7 +178,7 @@ def test_a_catalogue_that_is_gone_or_wrong_is_made_anew_and_every_difference_lis
 
 @pytest.mark.fault(5)
 def test_a_backup_as_the_operation_page_makes_it_is_whole(data: Path, tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "operation.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how_to" / "operate.md").read_text(encoding="utf-8")
     left_out = re.findall(r"--exclude='?([^' ]+)", page)
     assert "service.lock" in left_out
     (data / "tests" / ".test.json.12345678.part").write_text("{")  # written at that moment

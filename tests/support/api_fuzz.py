@@ -279,8 +279,8 @@ def fuzz(
         # and what all cases need comes back from the trash
         if response.status_code < 300 and case.operation.method.upper() == "DELETE":
             for entry in service.trash.entries():
-                if any(known.ids[name] == entry.get(name) for name in ("test_id", "calibration_id", "noise_id")):
-                    restore(service, entry["id"])
+                if any(known.ids[name] == getattr(entry, name) for name in ("test_id", "calibration_id", "noise_id")):
+                    restore(service, entry.id)
 
     if only:
         schema = schema.include(operation_id=only)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from fastapi.routing import APIRoute
+from pydantic.json_schema import JsonSchemaValue
 
 from server.api.protocol import problems
 
 #: Version of the API, apart from the program's own. While it begins with 0, the second number grows with what breaks
-#: clients; what they need not heed is free until the next release (docs/decisions/0021-api-description.md).
+#: clients; what they need not heed is free until the next release (docs/explanation/decisions/0019-api-description.md).
 API_VERSION = "0.2.0"
 
 _BODY_METHODS = ("post", "put", "patch")
@@ -58,6 +59,17 @@ _LINKS = {
 }
 
 
+#: a part of an OpenAPI document, in the form that the specification gives it
+Part = dict[str, Any]
+
+
+class Examples(TypedDict, total=False):
+    """What an operation was asked, by media type and summary, and what it answered, by status and media type."""
+
+    requests: dict[str, dict[str, object]]
+    replies: dict[str, dict[str, object]]
+
+
 def operation_id(route: APIRoute) -> str:
     """Return the id of an operation: the name of its function, so that generated clients read well."""
     return route.name
@@ -79,7 +91,7 @@ def _without_titles(node: Any) -> Any:
     }
 
 
-def describe(schema: dict[str, Any]) -> dict[str, Any]:
+def describe(schema: Part) -> Part:
     """Complete FastAPI's description: problems in place of its own errors, what the door answers, keys, tags.
 
     Parameters
@@ -116,7 +128,7 @@ def describe(schema: dict[str, Any]) -> dict[str, Any]:
     return schema
 
 
-def _link(schema: dict[str, Any]) -> None:
+def _link(schema: Part) -> None:
     """Say where the ids that an answer holds can be used."""
     operations = {o["operationId"]: o for path in schema["paths"].values() for o in path.values()}
     for source, known in _LINKS.items():
@@ -133,7 +145,7 @@ def _link(schema: dict[str, Any]) -> None:
         operations[source]["responses"][status]["links"] = links
 
 
-def _sendable(schema: dict[str, Any]) -> dict[str, Any]:
+def _sendable(schema: JsonSchemaValue) -> JsonSchemaValue:
     """Return a parameter's schema without null, which cannot be sent in a path, query or header."""
     forms = [form for form in schema.get("anyOf", ()) if form != {"type": "null"}]
     if len(forms) != 1:
@@ -142,7 +154,7 @@ def _sendable(schema: dict[str, Any]) -> dict[str, Any]:
     return {**forms[0], **rest}
 
 
-def _exemplify(operation: dict[str, Any], examples: dict[str, Any]) -> None:
+def _exemplify(operation: Part, examples: Examples) -> None:
     """Show what was sent and answered; say of other forms that they are text or bytes."""
     for media, values in examples.get("requests", {}).items():
         shown = {f"{k}": {"summary": text, "value": value} for k, (text, value) in enumerate(values.items(), 1)}
@@ -161,7 +173,7 @@ def _exemplify(operation: dict[str, Any], examples: dict[str, Any]) -> None:
                 content["example"] = found[media]
 
 
-def _complete(method: str, operation: dict[str, Any]) -> None:
+def _complete(method: str, operation: Part) -> None:
     responses = operation["responses"]
     for parameter in operation.get("parameters", ()):
         parameter["schema"] = _sendable(parameter["schema"])

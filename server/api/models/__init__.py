@@ -28,25 +28,17 @@ from server.api.models.jobs import Accepted, JobList, JobProblem, JobReply, Prog
 from server.api.models.noise import NoiseAccepted, NoiseList, NoiseModelReply, NoiseReply, NoiseRequest
 from server.api.models.rig import (
     AxesRequest,
+    CameraSet,
+    CamerasReply,
+    CameraStats,
     DynamicsPatch,
-    DynamicsReply,
     FlashConsent,
     HomeRequest,
     MoveRequest,
     SceneRequest,
     SettingsPatch,
-    StageMessage,
     StageMessages,
     StopReply,
-)
-from server.api.models.rig_replies import (
-    CameraReply,
-    CameraSet,
-    CamerasReply,
-    CameraStats,
-    RigReply,
-    SceneReply,
-    StageReply,
 )
 from server.api.models.tests import (
     BurstAccepted,
@@ -64,6 +56,7 @@ from server.api.models.tests import (
     WatchRequest,
 )
 from server.base.models import Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
+from server.rig.description import CameraReply, DynamicsReply, RigReply, SceneReply, StageMessage, StageReply
 
 __all__ = [
     "Accepted",

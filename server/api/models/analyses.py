@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from core import settings
-from core.settings import NoiseRecord, StoredSettings, disagreement
+from core.settings import StoredSettings, disagreement
 from server.api.models.jobs import Accepted, JobProblem
 from server.api.models.tests import AnalysisEntry
+from server.base.json_values import Nested
 from server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, not_both
+from server.formats.gauges.readings import (
+    AreaReading,
+    ExtensometerReading,
+    FrameReading,
+    LineReading,
+    PointReading,
+    RigidMotionReading,
+)
+from server.results.gauges.request import GaugeRequest
 
 
 class Region(settings.Region):
@@ -68,12 +78,12 @@ class AnalysisRequest(settings.AnalysisSettings):
             raise disagreement("give steps or follow, not both")
         return self
 
-    def stored(self, noise: NoiseRecord | None) -> StoredSettings:
-        """Return the settings as results keep them."""
+    def stored(self) -> StoredSettings:
+        """Return the settings as results keep them, without the noise model."""
         asked = self.model_dump(exclude={"kind", "label", "steps", "noise_id", "follow"})
         mask = asked["region"].pop("mask_png_base64")
         asked["region"]["mask"] = None if mask is None else "mask.png"
-        return StoredSettings.model_validate({**asked, "noise": noise})
+        return StoredSettings.model_validate(asked)
 
 
 class ContinueRequest(Request):
@@ -90,6 +100,25 @@ class AnalysisAccepted(Accepted):
     analysis_id: str = Field(description="Id of the analysis.", examples=["a000001-77d0b3"])
 
 
+class StepFigures(Reply):
+    """A field in a few numbers; `status`, `strain`, `patch` and further figures as in summary.json."""
+
+    n: int = Field(description="Number of the step.")
+    kind: Literal["shape", "displacement"] | None = Field(None, description="What was measured.")
+    points: int | None = Field(None, description="Points in the region.")
+    valid: int | None = Field(None, description="Points with values.")
+    valid_fraction: float | None = Field(None, description="Their share.")
+    status: dict[str, int] | None = Field(None, description="Points by status.")
+    wall_s: float | None = Field(None, description="Seconds that the step took.")
+
+
+class AnalysisSummary(Reply):
+    """What an analysis found; as summary.json."""
+
+    state: JobState = Field("interrupted", description="How its job ended.")
+    steps: list[StepFigures] = Field(default_factory=list, description="An entry a finished step, in their order.")
+
+
 class AnalysisReply(Reply):
     """An analysis: its settings, and what is finished."""
 
@@ -100,9 +129,9 @@ class AnalysisReply(Reply):
     job_id: str | None = Field(None, description="Its job; the last one, where it was continued.")
     follow: bool = Field(False, description="Whether it goes on with each step that lands.")
     steps: list[int] = Field(default_factory=list, description="Steps that it measures, the reference first.")
-    settings: dict[str, Any] = Field(description="Settings, fixed.")
+    settings: StoredSettings = Field(description="Settings, fixed.")
     steps_finished: list[int] = Field(description="Steps whose results can be read now.")
-    summary: dict[str, Any] | None = Field(None, description="Counts, residuals and timings of each step.")
+    summary: AnalysisSummary | None = Field(None, description="Counts, residuals and timings of each step.")
     stale: bool = Field(
         False, description="Whether steps, the reference or the calibration are gone or were replaced since."
     )
@@ -145,13 +174,13 @@ class FieldReply(Reply):
     shape: list[int] = Field(description="Rows and columns (and further axes).")
     rows: str = Field("", description="Rows of the grid, start:stop:step.")
     cols: str = Field("", description="Columns of the grid, start:stop:step.")
-    values: list[Any] = Field(description="Nested rows; null where the point failed.")
+    values: Nested = Field(description="Nested rows; null where the point failed.")
 
 
 class ProbeValue(Reply):
     """A number, or several, of a point."""
 
-    value: float | int | list[Any] | None = Field(description="The value; null where the point failed.")
+    value: float | int | Nested | None = Field(description="The value; null where the point failed.")
     units: str = Field(description="Its unit; `1` of what has none.", examples=["mm"])
 
 
@@ -173,11 +202,13 @@ class GaugeStep(Reply):
     kind: str = Field(description="`shape` or `displacement`.")
     label: str = Field(description="The step's label.")
     load_n: float | None = Field(None, description="The step's load in newton.")
-    rigid_motion: dict[str, Any] | None = Field(None, description="The motion that was taken out, with its covariance.")
-    points: list[dict[str, Any]] = Field(default_factory=list, description="Values at places.")
-    extensometers: list[dict[str, Any]] = Field(default_factory=list, description="Lengths, elongations, strains.")
-    lines: list[dict[str, Any]] = Field(default_factory=list, description="Values along lines; null where missing.")
-    areas: list[dict[str, Any]] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
+    rigid_motion: RigidMotionReading | None = Field(
+        None, description="The motion that was taken out, with its covariance."
+    )
+    points: list[PointReading] = Field(default_factory=list, description="Values at places.")
+    extensometers: list[ExtensometerReading] = Field(default_factory=list, description="Lengths, elongations, strains.")
+    lines: list[LineReading] = Field(default_factory=list, description="Values along lines; null where missing.")
+    areas: list[AreaReading] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
     problem: JobProblem | None = Field(None, description="Why the step has no readings.")
 
 
@@ -185,12 +216,12 @@ class GaugesReply(Reply):
     """Readings over the steps; each number with `value`, `sigma` (standard uncertainty) and `units`."""
 
     software_version: str = Field(description="Program that read them.")
-    settings: dict[str, Any] = Field(description="The request, with its defaults.")
+    settings: GaugeRequest = Field(description="The request, with its defaults.")
     inputs_sha256: dict[str, str] = Field(description="Checksum of each result file.")
     stale: bool = Field(False, description="Whether inputs or results are gone or were replaced since.")
     stale_reasons: list[str] = Field(default_factory=list, description="What is gone or was replaced.")
     frame: str = Field(description="Frame of all positions and displacements.")
     subset_px: float = Field(description="Subset of the measurement; tells which pixels neighbours share.")
     smoothing_window: int | None = Field(None, description="Points over which displacements were smoothed.")
-    alignment: dict[str, Any] | None = Field(None, description="The frame that was laid, and its uncertainty.")
+    alignment: FrameReading | None = Field(None, description="The frame that was laid, and its uncertainty.")
     steps: list[GaugeStep] = Field(description="Readings of each step.")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, with_config
+from typing_extensions import TypedDict
 
 from core.settings import Real, Whole
 from server.api.models.jobs import Accepted, JobProblem
+from server.base.json_values import Nested
 from server.base.models import Label, Listing, Number, Reply, Request
 
 
@@ -66,10 +68,19 @@ class ExpectedPoint(Reply):
     )
 
 
+class Assumed(Reply):
+    """What an expectation rests on."""
+
+    noise_px: float = Field(description="Standard deviation of an intersection's coordinate.", examples=[0.005])
+    line_model: str = Field(description="How lines are localised.", examples=["straight"])
+    roll_deg: float = Field(description="Turn of the target about the optical axis.", examples=[0.0])
+    text: str = Field(description="The same in a sentence.")
+
+
 class ExpectReply(Reply):
     """What a plan may be expected to leave uncertain."""
 
-    assumed: dict[str, Any] = Field(description="What was assumed: noise_px, line_model, roll_deg, and as a text.")
+    assumed: Assumed = Field(description="What was assumed.")
     parameters: dict[str, ExpectedNumber] = Field(description="Each parameter, as `cam1.phd_px`.")
     points: list[ExpectedPoint] = Field(description="The middle and the corners of the target's volume.")
     shape_rms_mm: float = Field(description="Rms error of shape over the volume, rigid motion taken out.")
@@ -140,10 +151,10 @@ class ViewResiduals(Reply):
     rbe_px: float | None = Field(description="Rms residual.")
     raz_mm: float | None = Field(description="Rms error in space.")
     nsce: float | None = Field(description="Normalised stereo calibration error.")
-    found_px: list[Any] = Field(
+    found_px: Nested = Field(
         description="Column and row where each intersection was found: rows of lines of pairs; null: not seen."
     )
-    residual_px: list[Any] = Field(description="Measured minus projected place, in the same order.")
+    residual_px: Nested = Field(description="Measured minus projected place, in the same order.")
 
 
 class ResidualsReply(Reply):
@@ -152,15 +163,27 @@ class ResidualsReply(Reply):
     views: list[ViewResiduals] = Field(description="Each view.")
 
 
+@with_config(extra="allow")
+class PlanReply(TypedDict, total=False):
+    """What was asked for; of an imported calibration its source instead of positions."""
+
+    created_utc: Annotated[str, Field(description="When it was begun or imported.")]
+    label: Annotated[str, Field(description="Free text.")]
+    positions_mm: Annotated[list[float], Field(description="Travels that are fitted.")]
+    held_out_mm: Annotated[list[float], Field(description="Travels that are kept for the check.")]
+    frames: Annotated[int, Field(description="Frames averaged at each position.")]
+    localiser: Annotated[Literal["profile", "paper"], Field(description="How lines are localised.")]
+    source: Annotated[str | None, Field(description="What an imported calibration was read as.")]
+    job_id: Annotated[str | None, Field(description="The job that takes or took it.")]
+
+
 class CalibrationReply(Reply):
     """A calibration: its plan, and once complete everything in calibration.json; what a verdict refused, too."""
 
     id: str = Field(description="Id.")
     state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")
-    plan: dict[str, Any] = Field(description="Positions, frames and localiser asked for.")
-    taken: list[dict[str, Any]] | None = Field(
-        None, description="Views taken, each as in GET /calibrations/{id}/views."
-    )
+    plan: PlanReply = Field(description="Positions, frames and localiser asked for.")
+    taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Why there is no calibration.")
     judgement: Judgement | None = Field(None, description="What somebody decided on it; null: nothing yet.")
 
@@ -168,10 +191,19 @@ class CalibrationReply(Reply):
 class CalibrationFile(Reply):
     """calibration.json, which `stereorig measure` reads; its statistics stand beside these."""
 
-    cam1: dict[str, Any] | None = Field(None, description="Camera 1: parameters, their standard deviations.")
-    cam2: dict[str, Any] | None = Field(None, description="Camera 2.")
+    cam1: dict[str, float] | None = Field(None, description="Camera 1: its parameters by name, the unit in the name.")
+    cam2: dict[str, float] | None = Field(None, description="Camera 2.")
     image_size_px: dict[str, list[int]] | None = Field(None, description="Width and height of each camera's images.")
-    imported: dict[str, Any] | None = Field(None, description="Another program's file, whole, in place of the above.")
+    imported: dict[str, object] | None = Field(
+        None, description="Another program's file, whole, in place of the above; its contents are that program's."
+    )
+
+
+class VerdictReply(Reply):
+    """What the program states of a calibration's quality."""
+
+    level: Literal["good", "warning", "failed"] = Field(description="The verdict.")
+    reasons: list[str] = Field(description="What it rests on.")
 
 
 class CalibrationEntry(Reply):
@@ -181,9 +213,7 @@ class CalibrationEntry(Reply):
     state: str = Field(description="`unfinished`, `failed` or `complete`.")
     label: str = Field(description="Free text.")
     created_utc: str = Field(description="When it was begun or imported.")
-    verdict: dict[str, Any] | None = Field(
-        description="`level`: `good`, `warning` or `failed`, with `reasons`; null: none, as of most imported ones."
-    )
+    verdict: VerdictReply | None = Field(description="Its verdict; null: none, as of most imported ones.")
     decision: str | None = Field(None, description="`accepted`, `discarded`; null: nobody decided.")
 
 

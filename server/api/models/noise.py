@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, with_config
+from typing_extensions import TypedDict
 
 from core.settings import Whole
-from server.api.models.jobs import Accepted
+from server.api.models.jobs import Accepted, JobProblem
 from server.base.models import Label, Listing, Reply, Request
 
 
@@ -45,13 +46,24 @@ class NoiseFile(Reply):
     cam2: NoiseModelReply | None = Field(None, description="Camera 2's model.")
 
 
+@with_config(extra="allow")
+class NoisePlanReply(TypedDict, total=False):
+    """What was asked for."""
+
+    created_utc: Annotated[str, Field(description="When it was begun.")]
+    label: Annotated[str, Field(description="Free text.")]
+    frames: Annotated[int, Field(description="Frames taken.")]
+    rig: Annotated[str, Field(description="Name of the rig.")]
+    job_id: Annotated[str | None, Field(description="The job that takes or took them.")]
+
+
 class NoiseReply(Reply):
     """A noise measurement."""
 
     id: str = Field(description="Id.")
     state: Literal["unfinished", "failed", "complete"] = Field(description="Where it is in its life.")
-    plan: dict[str, Any] = Field(description="What was asked for.")
-    problem: dict[str, Any] | None = Field(None, description="Why it has no models.")
+    plan: NoisePlanReply = Field(description="What was asked for.")
+    problem: JobProblem | None = Field(None, description="Why it has no models.")
     cam1: NoiseModelReply | None = Field(None, description="Camera 1's model.")
     cam2: NoiseModelReply | None = Field(None, description="Camera 2's model.")
 

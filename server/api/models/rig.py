@@ -1,4 +1,4 @@
-"""Cameras, stage and scene, as they travel."""
+"""Cameras, stage and scene, as they travel; what they say of themselves is in :mod:`server.rig.description`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from core.names import CameraName
 from core.settings import Real, Whole
-from server.base.models import AxisValues, Number, Reply, Request, any_of, one_of
+from drivers.acquisition.pairing import PairingAccount
+from drivers.cameras.protocol import FrameCounters
+from server.base.models import AxisValues, Number, Reply, Reported, Request, any_of, one_of
+from server.rig.description import CameraReply, CameraSettingsReply, StageMessage
 
 
 class SettingsPatch(Request):
@@ -81,16 +84,6 @@ class DynamicsPatch(Request):
         return self
 
 
-class DynamicsReply(Reply):
-    """How fast an axis moves, as read back from the controller."""
-
-    axis: int = Field(description="Axis number.")
-    velocity_mm_s: float = Field(description="Velocity of moves.")
-    acceleration_mm_s2: float = Field(description="Acceleration of moves.")
-    max_velocity_mm_s: float | None = Field(None, description="The greatest; null where the controller does not tell.")
-    max_acceleration_mm_s2: float | None = Field(None, description="The greatest; null where it does not tell.")
-
-
 class FlashConsent(Request):
     """Consent to what cannot be taken back."""
 
@@ -104,22 +97,6 @@ class FlashConsent(Request):
         if value is not True:
             raise ValueError("must be true")
         return value
-
-
-class StageMessage(Reply):
-    """Something that the controller had to say."""
-
-    id: int = Field(description="Grows by one with each message.")
-    utc: str = Field(description="When it was read.")
-    code: str = Field(description="The controller's own code.", examples=["103"])
-    text: str = Field(description="The controller's own words.", examples=["FOLLOWING ERROR THRESHOLD EXCEEDED"])
-    axis: int | None = Field(None, description="Axis that it concerns; null for none in particular.")
-
-
-class StageMessages(Reply):
-    """Messages of the controller, oldest first."""
-
-    messages: list[StageMessage] = Field(description="The last 200 at most.")
 
 
 class StopReply(Reply):
@@ -144,3 +121,54 @@ class SceneRequest(Request):
     params: dict[str, Number | list[Number]] = Field(
         default_factory=dict, description="Further parameters of the scene.", max_length=20
     )
+
+
+class CamerasReply(Reply):
+    """Both cameras."""
+
+    cameras: list[CameraReply] = Field(description="cam1, then cam2.")
+
+
+class CameraSet(Reply):
+    """What a camera took."""
+
+    name: CameraName = Field(description="Which camera.")
+    settings: CameraSettingsReply = Field(description="Every setting, as read back.")
+
+
+class FrameCounts(Reported, FrameCounters):
+    """What became of a camera's frames since it was opened."""
+
+
+class PairCounts(Reported, PairingAccount):
+    """What became of the triggers: triggered = paired + unpaired + incomplete + dropped."""
+
+
+class FrameQuality(Reply):
+    """What one image is worth."""
+
+    code: str = Field(description="`ok`, `saturated`, `dark`, `blank`, `low_texture` or `blurred`.", examples=["ok"])
+    mean_grey: float = Field(description="Mean grey level, counts.")
+    mean_share: float = Field(description="Mean grey level over full scale.")
+    saturated_share: float = Field(description="Share of pixels at full scale.")
+    contrast_grey: float = Field(description="Standard deviation of the grey levels, counts.")
+    texture_grey_per_px: float = Field(description="Median over tiles of the rms gradient, counts per pixel.")
+    focus: float = Field(description="How much of the gradient survives at the scale of a pixel; below 0.12 blurred.")
+
+
+class CameraStats(Reply):
+    """What became of a camera's frames, and the newest one's quality."""
+
+    name: CameraName = Field(description="Which camera.")
+    frames: FrameCounts = Field(description="Its frames since it was opened.")
+    driver: dict[str, int | float] = Field(description="The driver's own counts, by its own names.")
+    pairs: PairCounts = Field(description="Both cameras' triggers.")
+    sequence: int = Field(description="Number of the newest frame.")
+    quality: FrameQuality = Field(description="The newest frame.")
+    histogram: list[int] = Field(description="Pixels at each of 256 grey levels, the upper 8 bits of deeper images.")
+
+
+class StageMessages(Reply):
+    """Messages of the controller, oldest first."""
+
+    messages: list[StageMessage] = Field(description="The last 200 at most.")

@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
 from core.settings import Whole
 from server.base.models import Listing, Reply, Request
-
-
-class TrashEntry(Reply):
-    """Something that was deleted and can be restored."""
-
-    id: str = Field(description="Id in the trash.", examples=["x000001-3f09aa"])
-    kind: Literal["test", "step", "analysis", "calibration", "noise", "unknown"] = Field(description="What it was.")
-    name: str = Field("", description="As people called it.")
-    test_id: str | None = Field(None, description="Its test, or itself.")
-    n: int | None = Field(None, description="Number of a step.")
-    analysis_id: str | None = Field(None, description="Id of an analysis.")
-    calibration_id: str | None = Field(None, description="Id of a calibration.")
-    noise_id: str | None = Field(None, description="Id of a noise measurement.")
-    deleted_utc: str | None = Field(None, description="When it was deleted.")
-    deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
-    why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")
-    size_bytes: int | None = Field(None, description="Room that emptying frees.")
+from server.store.documents import TrashEntry
 
 
 class TrashList(Listing):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Header, Response
+from pydantic import BaseModel
 
 from core.errors import StateError
 
@@ -36,11 +37,16 @@ class PreconditionRequiredError(StateError):
 
 def etag_of(document: Any) -> str:
     """Return the entity tag of a document."""
+    if isinstance(document, BaseModel):
+        document = document.model_dump(exclude_unset=True)
     text = json.dumps(document, sort_keys=True, ensure_ascii=False, default=str)
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
 
 
-def tagged(response: Response, document: Mapping[str, object]) -> Mapping[str, object]:
+D = TypeVar("D", bound=Mapping[str, object] | BaseModel)
+
+
+def tagged(response: Response, document: D) -> D:
     """Return the document, and name its state in the answer's ETag."""
     response.headers["ETag"] = etag_of(document)
     return document

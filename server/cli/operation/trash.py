@@ -6,11 +6,11 @@ import argparse
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 from core.errors import InputError
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
+from server.store.documents import TrashEntry
 from server.store.folder import DataFolder
 from server.store.index import rebuild
 from server.store.noise import NoiseStore
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         return _empty(trash, args.ids, args.older_than)
     entries = trash.entries()
     if args.json:
-        print(json.dumps(entries, indent=1, ensure_ascii=False))
+        print(json.dumps([entry.plain() for entry in entries], indent=1, ensure_ascii=False))
     else:
         print("\n".join([_line(entry) for entry in entries] or ["the trash is empty"]))
     return 0
@@ -78,31 +78,31 @@ def _restore(data: Path, ids: list[str]) -> int:
 def _empty(trash: Trash, ids: list[str], older_than: float | None) -> int:
     for trash_id in ids:
         trash.entry(trash_id)  # nothing is removed if one of them is not there
-    entries = [entry for entry in trash.entries() if not ids or entry["id"] in ids]
+    entries = [entry for entry in trash.entries() if not ids or entry.id in ids]
     if older_than is not None:
         before = datetime.now(UTC) - timedelta(days=older_than)
         entries = [entry for entry in entries if _deleted_before(entry, before)]
     for entry in entries:
-        trash.remove(entry["id"])
+        trash.remove(entry.id)
         print(f"removed {_line(entry)}")
-    print(f"{sum(entry['size_bytes'] for entry in entries) / 2**20:.1f} MiB freed")
+    print(f"{sum(entry.size_bytes or 0 for entry in entries) / 2**20:.1f} MiB freed")
     return 0
 
 
-def _deleted_before(entry: dict[str, Any], moment: datetime) -> bool:
+def _deleted_before(entry: TrashEntry, moment: datetime) -> bool:
     try:
-        return datetime.fromisoformat(str(entry["deleted_utc"])) < moment
-    except (KeyError, ValueError):
+        return datetime.fromisoformat(entry.deleted_utc or "") < moment
+    except ValueError:
         return False  # nobody knows when
 
 
-def _what(entry: dict[str, Any]) -> str:
-    ids = [str(entry[name]) for name in ("test_id", "analysis_id", "calibration_id", "noise_id") if entry.get(name)]
-    number = f" step {entry['n']}" if entry.get("n") is not None else ""
-    return f"{entry['kind']} {' '.join(ids)}{number}"
+def _what(entry: TrashEntry) -> str:
+    ids = filter(None, (entry.test_id, entry.analysis_id, entry.calibration_id, entry.noise_id))
+    number = f" step {entry.n}" if entry.n is not None else ""
+    return f"{entry.kind} {' '.join(ids)}{number}"
 
 
-def _line(entry: dict[str, Any]) -> str:
-    size_mib = entry["size_bytes"] / 2**20
-    when = f"deleted {entry.get('deleted_utc')} by {entry.get('deleted_by')} ({entry.get('why')})"
-    return f"{entry['id']}  {_what(entry)}  {size_mib:.1f} MiB  {when}  {entry.get('name', '')}".rstrip()
+def _line(entry: TrashEntry) -> str:
+    size_mib = (entry.size_bytes or 0) / 2**20
+    when = f"deleted {entry.deleted_utc} by {entry.deleted_by} ({entry.why})"
+    return f"{entry.id}  {_what(entry)}  {size_mib:.1f} MiB  {when}  {entry.name}".rstrip()

@@ -1,8 +1,8 @@
-"""Measure every figure of docs/accuracy.md and write that page with its plots: ``make accuracy``.
+"""Measure every figure of docs/explanation/accuracy and write those pages with their plots: ``make accuracy``.
 
-Truth comes from the simulated rigs' formulas; pictures carry noise of 2 of 255 unless a row says noise-free.
-Options: ``--only NAME[,NAME]`` measures some sections (the page is then not written), ``--write`` puts these into the
-page as it is, ``--list`` names them.
+Truth comes from the simulated rigs' formulas; images carry noise of 2 of 255 unless a row says noise-free.
+Options: ``--only NAME[,NAME]`` measures some sections and writes nothing, ``--write`` puts these into their pages all
+the same, ``--list`` names them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import matplotlib as mpl
@@ -28,10 +27,8 @@ from tests.bench.accuracy import prefilter as accuracy_prefilter
 from tests.bench.accuracy import smoothing as accuracy_smoothing
 from tests.bench.accuracy import specimen as accuracy_specimen
 from tests.bench.accuracy import strain as accuracy_strain
-from tests.bench.accuracy.table import Row, Section
-
-FIGURES = Path(__file__).resolve().parents[3] / "docs" / "figures"
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "accuracy.md"
+from tests.bench.accuracy.pages import FIGURES, write_headlines, write_section
+from tests.bench.accuracy.table import Section
 
 SECTIONS: dict[str, Callable[[Path], Section]] = {
     "calibration": accuracy_calibration.calibration,
@@ -61,45 +58,6 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
 }
 
 
-@dataclass
-class _Page:
-    lines: list[str] = field(default_factory=list)
-
-    def add(self, section: Section) -> None:
-        self.lines += [f"## {section.title}", "", section.how, "", Row.header()]
-        self.lines += [row.markdown() for row in section.rows]
-        self.lines.append("")
-        for name, caption in section.figures:
-            self.lines += [f"![{caption}](figures/{name})", ""]
-        for note in section.notes:
-            self.lines += [note, ""]
-
-
-HEAD = """# Accuracy, measured
-
-Every figure on this page was measured by `make accuracy`, which writes the page anew; nothing is typed in. Pictures
-come from the simulated rigs (`sim/`): analytic surfaces and textures, each sub-pixel's ray solved with the surface,
-no image ever warped or interpolated. The noise is 2 of 255 grey levels unless a row says noise-free (then grey levels are not
-rounded either). 1 px is 33 um on the paper's rig. "At most" is what the project asks of itself.
-"""
-
-
-def _put_in(text: str, page: _Page) -> str:
-    """The page's text with some sections measured anew; one that was not there comes before the experiments."""
-    parts = ("\n" + text).split("\n## ")
-    new = ("\n" + "\n".join(page.lines)).split("\n## ")[1:]
-    for section in new:
-        title = section.split("\n", 1)[0]
-        same = [i for i, part in enumerate(parts) if part.split("\n", 1)[0] == title]
-        before = [i for i, part in enumerate(parts) if part.startswith("Clamped plate")] or [len(parts)]
-        section = section.rstrip() + "\n"
-        if same:
-            parts[same[0]] = section
-        else:
-            parts.insert(before[0], section)
-    return "\n## ".join(parts).lstrip("\n").rstrip() + "\n"
-
-
 def main() -> int:
     """Run the sections asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -112,7 +70,7 @@ def main() -> int:
         return 0
     wanted = [name for name in args.only.split(",") if name] or list(SECTIONS)
     FIGURES.mkdir(exist_ok=True)
-    page = _Page([HEAD])
+    write = args.write or not args.only
     missed = 0
     for name in wanted:
         start = time.perf_counter()
@@ -123,13 +81,10 @@ def main() -> int:
             missed += not row.met
         for note in section.notes:
             print("  " + note)
-        page.add(section)
-    if args.only and args.write:
-        PAGE.write_text(_put_in(PAGE.read_text(), page))
-        print(f"\nput into {PAGE}")
-    if not args.only:
-        PAGE.write_text("\n".join(page.lines).rstrip() + "\n")
-        print(f"\nwrote {PAGE}")
+        if write:
+            print(f"  put into {write_section(name, section)}")
+    if write:
+        write_headlines()
     print(f"\n{missed} figure(s) above their limit")
     return 0
 

@@ -185,7 +185,7 @@ def adversarial(figures: Path) -> Section:
         "Pictures that invite wrong matches",
         "A speckled plane that turns by 0.4 degrees, stretches by 0.4 % and moves by some 3 px, noise 2, on the modern rig (1200 x 1100 px, 36,381 points) and the "
         "paper's (15,851 points). The pair at t, in some cases the reference too, is spoiled as named. A point is wrong if its "
-        f"displacement is off by more than half a pixel's width on the surface or by more than {SIGMAS:g} of its own told standard deviations. What is to be kept: points whose "
+        f"displacement is off by more than half a pixel's width on the surface or by more than {SIGMAS:g} of its own reported standard deviations. What is to be kept: points whose "
         "subset every image shows, unless matches there scatter by more than a tenth of a pixel, so that half a pixel is within five standard deviations.",
         rows,
         [
@@ -237,7 +237,7 @@ def _calibrations(scene: _Scene) -> list[Row]:
         rows += [
             Row(f"calibration off by 1 px {name}: largest error of a displacement", float(np.nanmax(error)), "um"),
             Row("the same: mean error of Z", 1e3 * float(np.nanmean(np.abs(field.xyz_mm - here)[..., 2])), "um"),
-            Row(f"the same: told by the epipolar check, {check.level}", check.offset_px, "px"),
+            Row(f"the same: offset by the epipolar check, {check.level}", check.offset_px, "px"),
         ]
     return rows
 

@@ -151,7 +151,7 @@ def _rows(
                 1e3 * float(np.sqrt(np.mean(bias[:2] ** 2))),
                 "um",
             ),
-            Row(f"{name}: scatter over stated sigma", float(scatter), ""),
+            Row(f"{name}: empirical over reported standard deviation", float(scatter), ""),
         ]
     return rows
 

@@ -261,7 +261,7 @@ def bending(figures: Path) -> Section:
             ratio = 1e3 * choice.plane_error_mm / float(np.linalg.norm(bias))
             rows.append(
                 Row(
-                    f"bent to R = {radius:g} mm: plane patches' error, as the field tells it, over the true one",
+                    f"bent to R = {radius:g} mm: plane patches' error, as the field estimates it, over the true one",
                     ratio,
                     "",
                 )

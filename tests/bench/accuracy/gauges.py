@@ -85,7 +85,7 @@ def gauges(figures: Path) -> Section:
     for name in read[0]:
         values, sigmas = (np.array([getattr(r[name], part) for r in read]) for part in ("value", "sigma"))
         ratios.append(float(values.std(ddof=1) / np.sqrt(np.mean(sigmas**2))))
-        rows.append(Row(f"{name}: scatter over stated sigma", ratios[-1], "1"))
+        rows.append(Row(f"{name}: empirical over reported standard deviation", ratios[-1], "1"))
     rows.append(Row("all of these, root mean square", float(np.sqrt(np.mean(np.square(ratios)))), "1", 1.05))
     rows.append(_correlations(fields, figures / "accuracy_gauges.png"))
     return Section(

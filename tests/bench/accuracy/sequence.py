@@ -178,7 +178,7 @@ def updates(figures: Path) -> Section:
         ratio = noisy.told[n] / noisy.scatter[n]
         for name, value in zip("uvw", ratio, strict=True):
             rows.append(
-                Row(f"told over empirical sd of {name} after {n} update{'s' if n > 1 else ''}", float(value), "")
+                Row(f"reported over empirical sd of {name} after {n} update{'s' if n > 1 else ''}", float(value), "")
             )
     rows.append(
         Row("error without noise after 20 updates, u, v together, rms", float(np.hypot(*exact.error[20, :2])), "um")
@@ -204,7 +204,7 @@ def updates(figures: Path) -> Section:
                     "um",
                 )
             )
-            rows.append(Row(f"{name}, {NAMES[mode]}: told over true error there", float(told / error), ""))
+            rows.append(Row(f"{name}, {NAMES[mode]}: reported over true error there", float(told / error), ""))
     _draw(figures / "accuracy_updates.png", results)
     return Section(
         "Long sequences and later references",
@@ -213,11 +213,11 @@ def updates(figures: Path) -> Section:
         f"{SMALL_SEEDS} times with new noise. The others: {STEPS} steps, once; a pattern that fades goes over to another "
         "one by 5 degrees of a quarter turn in each step, after 18 steps nothing is left of it. Errors of u, v and w are taken together.",
         rows,
-        [("accuracy_updates.png", "Valid points, error and told error step by step: total, auto, incremental")],
+        [("accuracy_updates.png", "Valid points, error and reported error step by step: total, auto, incremental")],
         [
             "The noise of a step's images moves a point one way when the step is measured and the other way when it is the reference: "
             "it cancels, and 20 updates cost little. What does not cancel adds up: interpolation's bias, the same in each step if "
-            "the steps are alike (it is not part of the told error), and a change of the pattern itself, which draws points along in total correlation too.",
+            "the steps are alike (it is not part of the reported error), and a change of the pattern itself, which draws points along in total correlation too.",
             "At 100 % stretch a subset of the first reference covers 66 px, and those at the border leave the image; that is no reason for auto to update. In the "
             "fading pattern the points that auto lacks were refused before a reference failed, and came back against none: older ones match nothing.",
         ],
@@ -238,7 +238,7 @@ def _draw(path: Path, results: dict[str, dict[ReferenceUpdate, _Followed]]) -> N
         axes[0, column].set(title=name, ylim=(-5, 105))
         axes[2, column].set(xlabel="step", ylim=(0, 3))
         axes[2, column].axhline(1.0, color="0.7", lw=0.8, zorder=0)
-    for row, label in enumerate(("valid points, %", "error of u, v, w, rms, um", "told over true error")):
+    for row, label in enumerate(("valid points, %", "error of u, v, w, rms, um", "reported over true error")):
         axes[row, 0].set_ylabel(label)
     axes[0, 0].legend()
     figure.savefig(path, dpi=64)

@@ -117,7 +117,7 @@ def strain(figures: Path) -> Section:
     return Section(
         "Real specimen: strain and gauges",
         f"`d_specimen`, a bar in tension: `stereorig measure`, {SUBSET} px / {STEP} px, Green-Lagrange strain over 9 points, "
-        "then `stereorig gauge` on its results. Noise is told by the covariances, and seen in the field itself: fourth "
+        "then `stereorig gauge` on its results. Noise is reported by the covariances, and observed in the field itself: fourth "
         f"differences over {LAG} steps, which the deformation does not reach.",
         rows,
         [
@@ -129,11 +129,11 @@ def strain(figures: Path) -> Section:
         ],
         [
             "The three pairs are one at rest and two under load: there are no two frames of the same state, whose strain would "
-            "be zero. The noise is therefore seen in what changes from point to point in the first step; errors that neighbours "
+            "be zero. The noise is therefore observed in what changes from point to point in the first step; errors that neighbours "
             "have in common are not in it.",
-            "The covariances tell a quarter more noise than is seen: without a noise model (`--noise`) the residuals stand for it, and on "
+            "The covariances report a quarter more noise than is observed: without a noise model (`--noise`) the residuals stand for it, and on "
             "real pictures they also hold what differs between the pictures (blur, light) and does not scatter from point to point. What "
-            "is told is on the safe side.",
+            "is reported is on the safe side.",
             "Strain of gauge and patch come from the same pictures by different ways; they agree in the mean where the strain is "
             "even over a gauge. The specimen's true strain is not known.",
         ],
@@ -166,7 +166,7 @@ def _noise(field: Field) -> tuple[list[Row], dict[int, tuple[float, Float, Float
         sigma = field.sigma_mm[..., 3 + k]
         told = 1e3 * float(np.sqrt(np.nanmean(sigma**2)))
         ratio = seen_over_told(field.uvw_mm[..., k], sigma, np.ones((1, 1)), shared, STEP, LAG)
-        rows += [Row(f"noise of {name}, told", told, "um"), Row(f"noise of {name}, seen", ratio * told, "um")]
+        rows += [Row(f"noise of {name}, reported", told, "um"), Row(f"noise of {name}, observed", ratio * told, "um")]
     for window in WINDOWS:
         strain = surface_strain(field, StrainOptions(window=window), subset_px=SUBSET)
         whole = slice(window // 2, -(window // 2))
@@ -178,7 +178,7 @@ def _noise(field: Field) -> tuple[list[Row], dict[int, tuple[float, Float, Float
         curve[window] = (strain.gauge_mm, told, seen)
         for k, name in enumerate(NAMES):
             where = f"noise floor of {name}, {window} points ({strain.gauge_mm:.1f} mm)"
-            rows += [Row(f"{where}, told", told[k], "ue"), Row(f"{where}, seen", seen[k], "ue")]
+            rows += [Row(f"{where}, reported", told[k], "ue"), Row(f"{where}, observed", seen[k], "ue")]
     return rows, curve
 
 
@@ -203,8 +203,8 @@ def _plot_noise_and_history(
     fig, axes = plt.subplots(1, 2, figsize=(11, 4.0), layout="constrained")
     gauge = np.array([c[0] for c in curve.values()])
     for k, (name, colour) in enumerate(zip(NAMES, ("#2060a0", "#c04020"), strict=True)):
-        axes[0].loglog(gauge, [c[1][k] for c in curve.values()], "-", color=colour, lw=0.9, label=f"{name}, told")
-        axes[0].loglog(gauge, [c[2][k] for c in curve.values()], "o", color=colour, label=f"{name}, seen")
+        axes[0].loglog(gauge, [c[1][k] for c in curve.values()], "-", color=colour, lw=0.9, label=f"{name}, reported")
+        axes[0].loglog(gauge, [c[2][k] for c in curve.values()], "o", color=colour, label=f"{name}, observed")
     for window, (x, _, seen) in curve.items():
         axes[0].annotate(
             f"{window} points", (x, seen[1]), xytext=(-4, -12), textcoords="offset points", fontsize=7, ha="right"

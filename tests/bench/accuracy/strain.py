@@ -109,7 +109,7 @@ def strains(figures: Path) -> Section:
             ("accuracy_strain_noise.png", "Noise of exx against the gauge's width"),
         ],
         [
-            "The uncertainty that is told rests on the points' covariances and on the share of pixels that neighbouring subsets have in "
+            "The reported uncertainty rests on the points' covariances and on the share of pixels that neighbouring subsets have in "
             "common. Empirical scatter is that of repeated noisy pictures, point by point."
         ],
     )
@@ -196,7 +196,9 @@ def _noise(rig: Rig, repeats: int = 12) -> tuple[list[Row], dict[int, tuple[floa
                         "ue",
                     )
                 )
-                rows.append(Row(f"{name}, {window} points: told over empirical sd", float(told[k] / scatter[k]), ""))
+                rows.append(
+                    Row(f"{name}, {window} points: reported over empirical sd", float(told[k] / scatter[k]), "")
+                )
     patches = [s.patch for s in found]
     scatter = np.sqrt(np.mean(np.var([p[kept] for p in patches if p is not None], axis=0, ddof=1), axis=0))
     rows.append(Row(f"noise of the patches' own exx ({SUBSET} px)", MICRO * float(scatter[0]), "ue"))
@@ -219,7 +221,7 @@ def _plot_noise(path: Path, curve: dict[int, tuple[float, float, float]]) -> Non
     fig, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
     gauge, scatter, told = np.array(list(curve.values())).T
     ax.loglog(gauge, scatter, "o", label="scatter of repeated pictures")
-    ax.loglog(gauge, told, "k-", lw=0.8, label="told")
+    ax.loglog(gauge, told, "k-", lw=0.8, label="reported")
     for window, x, y in zip(curve, gauge, scatter, strict=True):
         ax.annotate(f"{window} points", (x, y), xytext=(4, 6), textcoords="offset points", fontsize=7)
     ax.set(

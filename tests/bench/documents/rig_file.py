@@ -1,12 +1,14 @@
-"""Writes docs/rig_file.md: every key of the rig file, from the model that reads it."""
+"""The page of the rig file: every key, from the model that reads it."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from server.config.reference import markdown
+from tests.bench.documents.prose import wrapped
+from tests.support.requirements import ROOT
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "rig_file.md"
+PAGE = ROOT / "docs" / "reference" / "rig_file.md"
 
-if __name__ == "__main__":
-    PAGE.write_text(markdown(), encoding="utf-8")
+
+def pages() -> dict[str, str]:
+    """Return the page by its path below docs/reference."""
+    return {PAGE.name: wrapped(markdown())}

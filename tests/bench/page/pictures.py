@@ -1,4 +1,4 @@
-"""Takes the pictures of the page that the README and docs/page.md show.
+"""Takes the pictures of the page that the README and docs/how_to/page.md show.
 
 Run from the repository's root::
 

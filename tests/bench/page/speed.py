@@ -2,7 +2,7 @@
 
 Run from the repository's root, on a machine that does nothing else::
 
-    python -m tests.bench.page.speed [--print]     # writes the figures into docs/page.md, or only prints them
+    python -m tests.bench.page.speed [--print]     # writes the figures into docs/explanation/page_speed.md, or only prints them
 
 The rig is config/sim_paper.toml, whose cameras are rendered by the service itself: the rendering is in its processor
 time. The browser runs on the same machine and is not.
@@ -25,10 +25,11 @@ import psutil
 from playwright.sync_api import Browser, Page
 
 from server.demo.process import running_service
+from tests.bench.documents.prose import wrapped
 from tests.bench.page.browser import browser, fresh_page
 from tests.bench.speed.scaling import RIG, ROOT, TEST, write_test
 
-PAGE = ROOT / "docs" / "page.md"
+PAGE = ROOT / "docs" / "explanation" / "page_speed.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 API = "/api/v1"
 PAINTS = 7
@@ -239,7 +240,9 @@ def table(figures: list[Figure], load: tuple[float, float]) -> str:
 def main() -> None:
     """Measure, and put the table into the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--print", action="store_true", dest="only_print", help="leave docs/page.md as it is")
+    parser.add_argument(
+        "--print", action="store_true", dest="only_print", help="leave docs/explanation/page_speed.md as it is"
+    )
     only_print = parser.parse_args().only_print
     load = os.getloadavg()[0]
     text = table(measure(), (load, os.getloadavg()[0]))
@@ -248,7 +251,7 @@ def main() -> None:
         return
     page = PAGE.read_text(encoding="utf-8")
     head, _, rest = page.partition(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+    PAGE.write_text(f"{head}{BEGIN}\n{wrapped(text)}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ stops it, and brings it back. Fifty readers ask for a plain document about once 
 and the worker analyses load steps all the time. The rig is config/sim_paper.toml; its motion controller stands in this process, where a
 stop's arrival on the wire is seen by the same clock. At the end every acknowledged step is read back from disk.
 
-    python -m tests.bench.reliability.load [--minutes 10] [--page]     # --page writes figures and plot into docs/reliability.md
+    python -m tests.bench.reliability.load [--minutes 10] [--page]     # --page writes figures and plot into docs/explanation/reliability.md
 """
 
 from __future__ import annotations
@@ -340,7 +340,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--json", type=Path, help="write everything that was seen to this file")
-    parser.add_argument("--page", action="store_true", help="write figures and plot into docs/reliability.md")
+    parser.add_argument(
+        "--page", action="store_true", help="write figures and plot into docs/explanation/reliability.md"
+    )
     args = parser.parse_args()
     os.environ["MALLOC_ARENA_MAX"] = "2"  # as the systemd unit gives it to a service that runs for days
     set_priority(-15)  # the controller in here is the instrument: its clock must not wait

@@ -1,4 +1,4 @@
-"""Writes the section on load of ``docs/reliability.md``, and its plot, from what a run showed."""
+"""Writes the section on load of ``docs/explanation/reliability.md``, and its plot, from what a run showed."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tests.bench.documents.prose import wrapped
 from tests.bench.reliability.load import PER_MINUTE, READERS, Load, percentile
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PAGE = DOCS / "reliability.md"
+PAGE = DOCS / "explanation" / "reliability.md"
 FIGURE = DOCS / "figures" / "load.png"
 BEGIN, END = "<!-- load: begin -->", "<!-- load: end -->"
 
@@ -128,7 +129,7 @@ def section(load: Load) -> str:
             f"Plain reads by what was read, p99: {kinds}. `rig` asks the motion controller over its line each time. The limits are meant for a "
             "machine that does nothing else; where a row says **missed**, look first at the share that other programs took.",
             "",
-            "![latencies and memory over the run](figures/load.png)",
+            "![latencies and memory over the run](../figures/load.png)",
             "",
         ]
     )
@@ -139,4 +140,4 @@ def write_page(load: Load) -> None:
     draw(load)
     text = PAGE.read_text(encoding="utf-8")
     head, rest = text.split(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}{section(load)}{END}{rest.split(END)[1]}", encoding="utf-8")
+    PAGE.write_text(f"{head}{BEGIN}{wrapped(section(load))}{END}{rest.split(END)[1]}", encoding="utf-8")

@@ -107,7 +107,7 @@ class StopTimes:
         return self.latencies_ms[max(int(np.ceil(share * len(self.latencies_ms))) - 1, 0)]
 
     def row(self) -> str:
-        """Return a row of the table in docs/hardware.md."""
+        """Return a row of the table in docs/explanation/reliability.md."""
         p50, p99, most = self.percentile(0.5), self.percentile(0.99), self.latencies_ms[-1]
         return f"| {len(self.latencies_ms)} | {self.busy_share:.0%} | {p50:.1f} | {p99:.1f} | {most:.1f} |"
 

@@ -350,7 +350,9 @@ def main() -> int:
     parser.add_argument("--usual", action="store_true", help="give starts from the shell no priority, as root too")
     parser.add_argument("--cold-every", type=int, default=COLD_EVERY, help="one start of so many is from the shell")
     parser.add_argument("--json", type=Path, help="write all figures there")
-    parser.add_argument("--write", action="store_true", help="write docs/reliability.md's section and figure")
+    parser.add_argument(
+        "--write", action="store_true", help="write docs/explanation/reliability.md's section and figure"
+    )
     parser.add_argument("--page", type=Path, nargs="+", metavar="FILE", help="write them from runs' JSON, kill nothing")
     args = parser.parse_args()
     if args.page is not None:

@@ -1,4 +1,4 @@
-"""The section on kills of docs/reliability.md, and its figure, from the figures of a run."""
+"""The section on kills of docs/explanation/reliability.md, and its figure, from the figures of a run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import matplotlib as mpl
 mpl.use("agg")
 import matplotlib.pyplot as plt
 
+from tests.bench.documents.prose import wrapped
+
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PAGE = DOCS / "reliability.md"
+PAGE = DOCS / "explanation" / "reliability.md"
 BEGIN, END = "<!-- kills: begin -->", "<!-- kills: end -->"
 FIGURE = "reliability_kills.png"
 _ACTS = {
@@ -28,7 +30,7 @@ _COUNTS = {
     "images read back": "of their images read back over HTTP and compared with the acknowledged SHA-256",
     "results": "results of analyses announced",
     "results read back": "of them read back and compared",
-    "complete, unacknowledged steps": "steps that were whole although nobody had an answer",
+    "complete, unacknowledged steps": "steps that were whole although no reply had been sent",
     "incomplete steps": "steps left incomplete, each one that had no answer",
     "jobs": "jobs acknowledged",
     "interrupted after a kill": "jobs that read `interrupted` after the restart",
@@ -74,7 +76,7 @@ def section(run: dict[str, Any]) -> str:
         "",
         _processor(run),
         "",
-        f"![Restart to ready](figures/{FIGURE})",
+        f"![Restart to ready](../figures/{FIGURE})",
     ]
     return "\n".join(lines)
 
@@ -169,5 +171,5 @@ def write_page(run: dict[str, Any]) -> None:
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{section(run)}\n{END}{after}", encoding="utf-8")
+    PAGE.write_text(f"{before}{BEGIN}\n{wrapped(section(run))}\n{END}{after}", encoding="utf-8")
     draw(run)

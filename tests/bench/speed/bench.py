@@ -1,6 +1,6 @@
 """Measure speed on this machine, beside a peer and beside the machine's own limits: ``make bench``.
 
-Writes ``docs/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` takes a few minutes: the
+Writes ``docs/explanation/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` takes a few minutes: the
 small rig only, no whole measurements. ``--quick`` and ``--only`` (some parts) print and leave the page as it is, unless ``--page`` is given.
 """
 

@@ -1,4 +1,4 @@
-"""Writes ``docs/performance.md`` and its plots from what the bench measured."""
+"""Writes ``docs/explanation/performance.md`` and its plots from what the bench measured."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.bench.accuracy.table import Row
+from tests.bench.documents.prose import wrapped
 from tests.bench.speed.assembly import HERE, LoopCount
 from tests.bench.speed.ceilings import Ceilings
 from tests.bench.speed.kernel import Costs, Rate
@@ -98,7 +99,7 @@ def save(figure: plt.Figure, name: str, caption: str) -> str:
     (DOCS / "figures").mkdir(exist_ok=True)
     figure.savefig(DOCS / "figures" / name, dpi=110)
     plt.close(figure)
-    return f"![{caption}](figures/{name})"
+    return f"![{caption}](../figures/{name})"
 
 
 # targets
@@ -510,7 +511,7 @@ ASSEMBLY_HOW = """Instructions of one turn of the innermost loop (eight pixels o
 it was run elsewhere. `haswell` and `znver3` have AVX2, the other two AVX-512. {gathers}; taps come as rows of four (`vmovups` and `vinsertf128`; a quintic's
 fifth and sixth taps as pairs). An instruction counts in one class; those with a place on the stack are counted besides."""
 
-HEAD = """# Performance, measured
+HEAD = """# Performance
 
 Everything on this page was measured by `make bench` in one run, which writes the page anew; nothing is typed in. Timings are those of this machine at that hour;
 ratios within the page travel better than figures.
@@ -522,7 +523,7 @@ def write_page(report: Report) -> Path:
     rows = [target_line(row) for row in targets(report)]
     sections: list[tuple[str, list[str]]] = [
         ("Machine", [*(f"- {fact}" for fact in machine())]),
-        ("What is asked, and what it is", [table(["what", "measured", "unit", "asked", "met"], rows)]),
+        ("Targets", [table(["what", "measured", "unit", "asked", "met"], rows)]),
         ("Beside pyvale", peer_text(report) if report.ours else []),
         ("One point", kernel_text(report) if report.rates else []),
         ("The machine's limits", machine_text(report) if report.ceilings else []),
@@ -534,6 +535,7 @@ def write_page(report: Report) -> Path:
         if parts:
             glue = "\n" if title == "Machine" else "\n\n"
             page += [f"## {title}\n", glue.join(parts) + "\n"]
-    path = DOCS / "performance.md"
-    path.write_text("\n".join(page).rstrip() + "\n")
+    path = DOCS / "explanation" / "performance.md"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(wrapped("\n".join(page)).rstrip() + "\n")
     return path

@@ -1,4 +1,4 @@
-"""Measures docs/scaling.md: one analysis by the service's own worker, and by Dask clusters of 1, 2 and 4 workers here.
+"""Measures docs/how_to/scale_on_dask.md: one analysis by the service's own worker, and by Dask clusters of 1, 2 and 4 workers here.
 
 Run from the repository's root, on a machine that does nothing else::
 
@@ -33,9 +33,10 @@ from server.demo.process import running_service
 from server.formats.images import encode_tiff
 from sim.rig import SimRig
 from sim.world import SimWorld
+from tests.bench.documents.prose import wrapped
 from tests.support.requirements import ROOT
 
-PAGE = ROOT / "docs" / "scaling.md"
+PAGE = ROOT / "docs" / "how_to" / "scale_on_dask.md"
 RIG = ROOT / "config" / "sim_paper.toml"
 STEPS = 17  # the reference and sixteen more
 TEST = "t000001-abcdef"
@@ -225,7 +226,7 @@ def main() -> None:
     text = PAGE.read_text(encoding="utf-8")
     head, _, rest = text.partition(BEGIN)
     tail = rest.partition(END)[2]
-    PAGE.write_text(f"{head}{BEGIN}\n{table(runs, points, load)}\n{END}{tail}", encoding="utf-8")
+    PAGE.write_text(f"{head}{BEGIN}\n{wrapped(table(runs, points, load))}\n{END}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What ``bench_sequence`` measured, as rows, sections and plots of ``docs/performance.md``."""
+"""What ``bench_sequence`` measured, as rows, sections and plots of ``docs/explanation/performance.md``."""
 
 from __future__ import annotations
 

@@ -44,7 +44,9 @@ export type GaugeReadings = Omit<Schemas["GaugeStep"], "lines" | "extensometers"
   areas?: { valid: number; points: number; values: { [variable: string]: { units: string } & { [S in "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max"]: number | null } } }[];
 };
 
-type Named<T> = { [Name in keyof Unnamed]: T extends Schemas[Name] ? (Schemas[Name] extends T ? Name : never) : never }[keyof Unnamed];
+// the same type, not merely one that fits: replies with few required fields fit each other
+type Same<A, B> = (<T>() => T extends A ? 1 : 2) extends (<T>() => T extends B ? 1 : 2) ? true : false;
+type Named<T> = { [Name in keyof Unnamed]: Same<T, Schemas[Name]> extends true ? Name : never }[keyof Unnamed];
 type Whole<T> = T extends unknown ? ([Named<T>] extends [never] ? T : Omit<T, keyof Unnamed[Named<T>]> & Unnamed[Named<T>]) : never;
 
 /** A model of the API by its name. */

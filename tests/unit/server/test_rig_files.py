@@ -28,7 +28,7 @@ def test_every_rig_file_is_good(path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_the_page_of_all_keys_is_up_to_date() -> None:
-    assert PAGE.read_text(encoding="utf-8") == markdown(), "run: python -m tests.bench.documents.rig_file"
+    assert PAGE.read_text(encoding="utf-8") == markdown(), "run: make reference"
 
 
 def test_every_key_of_the_model_stands_on_the_page_with_a_meaning() -> None:

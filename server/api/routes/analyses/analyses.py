@@ -7,21 +7,14 @@ import base64
 from fastapi import APIRouter
 
 from core.errors import RegionError
-from core.settings import NoiseRecord
 from server.api.models import AnalysisAccepted, AnalysisList, AnalysisReply, AnalysisRequest, ContinueRequest, Region
 from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.base.models import Ids, JobState
-from server.compute.seeds import check_seeds
-from server.formats.images import read_image
-from server.formats.noise_json import load_noise
-from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job
 from server.workflows import analysis_start
-from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
@@ -40,41 +33,18 @@ def create_analysis(
 
 
 def _begin(service: Service, test_id: str, body: AnalysisRequest, request: RequestMark) -> Ids:
-    """Check everything that can be checked now, make the analysis and its job; return both ids."""
-    calibration = service.tests.calibration_file(test_id)
-    analysis_start.check_calibration(service, test_id, calibration)
-    steps = analysis_start.steps_to_measure(service, test_id, body.reference, body.steps)
-    for n in steps:
-        check_same_cameras(calibration, service.tests.step(test_id, n).document.cameras, f"Step {n}")
-    mask = mask_of(body.region)
-    noise = None if body.noise_id is None else service.noise.file(body.noise_id)
-    record = (
-        None if noise is None else NoiseRecord.model_validate({"noise_id": body.noise_id, **load_noise(noise).record()})
+    return analysis_start.begin(
+        service,
+        test_id,
+        body.stored(),
+        request,
+        kind=body.kind,
+        label=body.label,
+        steps=body.steps,
+        follow=body.follow,
+        mask=mask_of(body.region),
+        noise_id=body.noise_id,
     )
-    settings = body.stored(record)
-    analysis_start.check_region(service, test_id, steps[0], settings, mask)
-    if body.seeds_cam2 is not None:
-        rows, cols = read_image(service.tests.step(test_id, steps[0]).cam2).shape
-        check_seeds(calibration, settings, (cols, rows))
-    service.require_room()
-    document = {
-        "kind": body.kind,
-        "label": body.label,
-        "settings": settings.model_dump(),
-        "steps": steps,
-        "follow": body.follow,
-        "software": software_version(),
-        "inputs": analysis_start.inputs_of(service, test_id, steps, calibration),
-        **request.document(),
-    }
-
-    def prepare(job: Job) -> Ids:
-        run = {"job_id": job.id, **request.document()}
-        stored = service.tests.create_analysis(test_id, document, mask, noise, run)
-        return {"analysis_id": stored.id}
-
-    job = analysis_start.submit(service, test_id, prepare, request, follow=body.follow)
-    return {"analysis_id": str(job.subject["analysis_id"]), "job_id": job.id}
 
 
 def mask_of(region: Region) -> bytes | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
@@ -70,7 +70,7 @@ def read(
     format: Annotated[  # noqa: A002
         Literal["json", "csv", "mat"], Query(description="mat: a MATLAB file; its columns are those of the CSV table.")
     ] = "json",
-) -> dict[str, Any] | Response:
+) -> dict[str, object] | Response:
     """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored."""
     steps = service.tests.finished_steps(test_id, analysis_id)
     readings = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)

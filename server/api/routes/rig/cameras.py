@@ -42,7 +42,7 @@ _BOUNDARY = "frame"
 @router.get("/rig", summary="The rig: cameras, stage, target, who holds it", response_model_exclude_unset=True)
 def get_rig(service: ServiceDep) -> RigReply:
     """Return everything a client wants to know before it does anything."""
-    return RigReply.model_validate(service.rig.describe())
+    return service.rig.describe()
 
 
 @router.post("/rig/reconnect", summary="Open cameras and stage again", status_code=202, responses=errors(409, 503, 507))
@@ -52,7 +52,7 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
     def run(job: Job) -> Mapping[str, object]:
         job.progress("reconnecting", 0, 1)
         service.rig.reconnect()
-        return {"rig": service.rig.describe()["name"]}
+        return {"rig": service.config.rig.name}
 
     def make() -> Ids:
         job = service.jobs.submit(
@@ -74,21 +74,21 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
 def put_scene(service: ServiceDep, body: SceneRequest) -> SceneReply:
     """Put the grid, a plate, a panel ... before the cameras; only on simulated rigs."""
     with service.gate.hold("a change of the scene"):
-        scene = service.rig.set_scene(body.scene, load=body.load, **body.params)
-    service.hub.publish("scene", scene)
-    return SceneReply.model_validate(scene)
+        scene = service.rig.set_scene(body.scene, load=body.load, params=body.params)
+    service.hub.publish("scene", scene.model_dump())
+    return scene
 
 
 @router.get("/cameras", summary="Both cameras", response_model_exclude_unset=True)
 def get_cameras(service: ServiceDep) -> CamerasReply:
     """Return nominal data, the devices' own descriptions and their settings."""
-    return CamerasReply.model_validate({"cameras": [service.rig.describe_camera(cam) for cam in CAMERAS]})
+    return CamerasReply(cameras=[service.rig.describe_camera(cam) for cam in CAMERAS])
 
 
 @router.get("/cameras/{cam}", summary="One camera", response_model_exclude_unset=True, responses=errors(422))
 def get_camera(service: ServiceDep, cam: Camera, response: Response) -> CameraReply:
     """Return nominal data, the device's own description and its settings."""
-    return CameraReply.model_validate(tagged(response, service.rig.describe_camera(cam)))
+    return tagged(response, service.rig.describe_camera(cam))
 
 
 @router.patch("/cameras/{cam}", summary="Change a camera's settings", responses=errors(409, 412, 422, 503))

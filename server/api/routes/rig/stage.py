@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -34,6 +34,7 @@ from server.jobs.job import Job, Phase
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/stage", tags=["stage"])
+Run = Callable[[Job], Mapping[str, object]]
 AxisNumber = Annotated[int, Path(ge=1, le=31, description="Number of an axis.")]
 
 
@@ -42,7 +43,7 @@ AxisNumber = Annotated[int, Path(ge=1, le=31, description="Number of an axis.")]
 )
 def get_stage(service: ServiceDep) -> StageReply:
     """Read the controller; works while a move runs."""
-    return StageReply.model_validate(service.rig.describe_stage())
+    return service.rig.describe_stage()
 
 
 @router.post("/moves", summary="Move axes", status_code=202, responses=errors(409, 422, 503, 507))
@@ -120,7 +121,7 @@ def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> 
     return str(made["job_id"])
 
 
-def _motion(service: Service, sent: RequestMark, kind: str, what: str, subject: dict[str, Any], run: Any) -> str:
+def _motion(service: Service, sent: RequestMark, kind: str, what: str, subject: Mapping[str, object], run: Run) -> str:
     job = service.jobs.submit(kind, what, subject, [Phase("hardware", run)], on_cancel=service.stop_job, request=sent)
     return job.id
 
@@ -130,8 +131,8 @@ async def stop(request: Request) -> StopReply:
     """Stop at once: waits for no job and no lock, and cancels the hardware job if one runs."""
     service = get_service(request)
     answer = await _halt(service, service.stop_thread, service.rig.stop)
-    service.metrics.stop_s.observe(answer["elapsed_ms"] / 1e3)
-    return StopReply.model_validate(answer)
+    service.metrics.stop_s.observe(answer.elapsed_ms / 1e3)
+    return answer
 
 
 @router.post("/abort", summary="Stop every axis and switch the motors off, always", responses=errors(503))
@@ -139,10 +140,10 @@ async def abort(request: Request) -> StopReply:
     """Stop as in an emergency: as `/stage/stop`, with the controller's emergency stop, and without power afterwards."""
     service = get_service(request)
     # it waits until the motors are off, behind which no stop must wait
-    return StopReply.model_validate(await _halt(service, service.abort_thread, service.rig.controls.abort))
+    return await _halt(service, service.abort_thread, service.rig.controls.abort)
 
 
-async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[], None]) -> dict[str, Any]:
+async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[], None]) -> StopReply:
     arrived = time.perf_counter()
     cancelled = service.jobs.cancel_hardware()
     await asyncio.get_running_loop().run_in_executor(thread, halt)
@@ -150,13 +151,13 @@ async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[],
     if cancelled is not None:
         service.stop_until_released(cancelled)
     service.hub.publish("stage", {"stopped": True, "cancelled_job": cancelled})
-    return {"stopped": True, "elapsed_ms": round(elapsed_ms, 3), "cancelled_job": cancelled}
+    return StopReply(stopped=True, elapsed_ms=round(elapsed_ms, 3), cancelled_job=cancelled)
 
 
 @router.post("/enable", summary="Switch motors on", response_model_exclude_unset=True, responses=errors(409, 422, 503))
 def enable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
     """Switch motors on, and return the stage as it is then. An SMC100's are switched on by homing the first time."""
-    return StageReply.model_validate(_switch(service, body, on=True))
+    return _switch(service, body, on=True)
 
 
 @router.post(
@@ -164,10 +165,10 @@ def enable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
 )
 def disable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
     """Switch motors off, and return the stage as it is then; refused while a job uses it."""
-    return StageReply.model_validate(_switch(service, body, on=False))
+    return _switch(service, body, on=False)
 
 
-def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> dict[str, Any]:
+def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> StageReply:
     axes = tuple(body.axes) if body is not None and body.axes else service.config.axes
     service.rig.check_axes(axes)
     with service.gate.hold(f"the switching of motors {list(axes)}"):
@@ -179,7 +180,7 @@ def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> dict[str
 def get_axis(service: ServiceDep, axis: AxisNumber, response: Response) -> DynamicsReply:
     """Read both back from the controller; the header ETag names this state of them."""
     service.rig.check_axes((axis,))
-    return DynamicsReply.model_validate(tagged(response, service.rig.controls.read_dynamics(axis)))
+    return tagged(response, service.rig.controls.read_dynamics(axis))
 
 
 @router.patch("/axes/{axis}", summary="Set an axis' velocity and acceleration", responses=errors(409, 412, 422, 503))
@@ -197,7 +198,7 @@ def patch_axis(
             now = etag_of(service.gate.call(lambda: controls.read_dynamics(axis)))
             require_match(if_match, now, f"axis {axis}")
         taken = service.gate.call(lambda: controls.set_dynamics(axis, body.velocity_mm_s, body.acceleration_mm_s2))
-        return DynamicsReply.model_validate(tagged(response, taken))
+        return tagged(response, taken)
 
 
 @router.post(
@@ -227,4 +228,4 @@ def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsen
 @router.get("/messages", summary="What the controller had to say")
 def get_messages(service: ServiceDep) -> StageMessages:
     """Empty the controller's error queue and return the last 200 messages with their texts; reading loses none."""
-    return StageMessages.model_validate({"messages": service.rig.controls.messages()})
+    return StageMessages(messages=service.rig.controls.messages())

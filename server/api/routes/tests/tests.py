@@ -10,7 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, Response
 from pydantic import TypeAdapter, ValidationError
 
-from core.errors import InputError, StateError
+from core.errors import InputError
 from server.api.models import (
     BurstAccepted,
     Channels,
@@ -38,9 +38,9 @@ from server.jobs.idempotency import RequestMark
 from server.store.documents import StepFacts
 from server.store.index import step_entry, test_entry
 from server.workflows.burst import start_burst
-from server.workflows.calibration_review import check_not_discarded, newest_accepted
 from server.workflows.capture import capture_step, import_step
 from server.workflows.service import Service
+from server.workflows.test_start import create
 
 router = APIRouter(prefix="/tests", tags=["tests"])
 _CHANNELS: TypeAdapter[dict[str, float]] = TypeAdapter(Channels)
@@ -61,25 +61,7 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
     request = mark("tests", key, body)
 
     def make() -> Ids:
-        path = None
-        calibration_id = newest_accepted(service) if body.calibration_id == "accepted" else body.calibration_id
-        if calibration_id is not None:
-            path = service.calibrations.path(calibration_id) / "calibration.json"
-            state = service.calibrations.read(calibration_id).state
-            if state != "complete":
-                raise StateError(
-                    f"Calibration {calibration_id} is {state}.",
-                    code="calibration_not_complete",
-                    remedy="Use a complete calibration.",
-                    state=state,
-                )
-            check_not_discarded(service, calibration_id)
-        document = service.tests.create(
-            {**body.model_dump(), "calibration_id": calibration_id, **request.document()}, path
-        )
-        service.catalog.put_entry("test", "", document.id, test_entry(document))
-        service.hub.publish("test", {"test_id": document.id})
-        return {"test_id": document.id}
+        return create(service, body.model_dump(), request)
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return TestReply.model_validate(_reply(service, str(made["test_id"])))

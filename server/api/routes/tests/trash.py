@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 
-from server.api.models.trash import ExportedReply, ExportedRequest, TrashEntry, TrashList
+from server.api.models.trash import ExportedReply, ExportedRequest, TrashList
 from server.api.protocol.dependencies import AnalysisId, CalibrationId, ServiceDep, StepNumber, TestId, person_name
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.api.routes.calibrations.noise import NoiseId
 from server.store.copies import acknowledge_export
+from server.store.documents import TrashEntry
 from server.store.trash import Kind
 from server.workflows.deletion import delete, restore
 from server.workflows.service import Service
@@ -21,51 +22,51 @@ TrashId = Annotated[str, Path(max_length=40, description="Id in the trash.")]
 _ERRORS = errors(404, 409, 507)
 
 
-def _delete(service: Service, request: Request, kind: Kind, **ids: Any) -> dict[str, Any]:
+def _delete(service: Service, request: Request, kind: Kind, **ids: str | int | float) -> TrashEntry:
     return delete(service, kind, ids, by=person_name(request))
 
 
 @router.delete("/tests/{test_id}", summary="Delete a test", responses=_ERRORS)
 def delete_test(service: ServiceDep, request: Request, test_id: TestId) -> TrashEntry:
     """Move a test with its steps and analyses into the trash; refused while a job or a capture uses it."""
-    return TrashEntry.model_validate(_delete(service, request, "test", test_id=test_id))
+    return _delete(service, request, "test", test_id=test_id)
 
 
 @router.delete("/tests/{test_id}/steps/{n}", summary="Delete a step", responses=_ERRORS | errors(422))
 def delete_step(service: ServiceDep, request: Request, test_id: TestId, n: StepNumber) -> TrashEntry:
     """Move a step into the trash; its number is not given again, and analyses that used it read `stale`."""
-    return TrashEntry.model_validate(_delete(service, request, "step", test_id=test_id, n=n))
+    return _delete(service, request, "step", test_id=test_id, n=n)
 
 
 @router.delete("/tests/{test_id}/analyses/{analysis_id:plain_id}", summary="Delete an analysis", responses=_ERRORS)
 def delete_analysis(service: ServiceDep, request: Request, test_id: TestId, analysis_id: AnalysisId) -> TrashEntry:
     """Move an analysis with its results into the trash; refused while its job runs."""
-    return TrashEntry.model_validate(_delete(service, request, "analysis", test_id=test_id, analysis_id=analysis_id))
+    return _delete(service, request, "analysis", test_id=test_id, analysis_id=analysis_id)
 
 
 @router.delete("/calibrations/{calibration_id}", summary="Delete a calibration", responses=_ERRORS)
 def delete_calibration(service: ServiceDep, request: Request, calibration_id: CalibrationId) -> TrashEntry:
     """Move a calibration into the trash; tests made with it keep their own copy."""
-    return TrashEntry.model_validate(_delete(service, request, "calibration", calibration_id=calibration_id))
+    return _delete(service, request, "calibration", calibration_id=calibration_id)
 
 
 @router.delete("/noise/{noise_id}", summary="Delete a noise measurement", responses=_ERRORS)
 def delete_noise(service: ServiceDep, request: Request, noise_id: NoiseId) -> TrashEntry:
     """Move a noise measurement into the trash; analyses made with it keep their own copy."""
-    return TrashEntry.model_validate(_delete(service, request, "noise", noise_id=noise_id))
+    return _delete(service, request, "noise", noise_id=noise_id)
 
 
 @router.get("/trash", summary="What was deleted, oldest first", responses=errors(422))
 def list_trash(service: ServiceDep, page: PageDep) -> TrashList:
     """Return what lies in the trash, with the room that it takes."""
-    trash = page.of(sorted(service.trash.entries(), key=lambda t: str(t["id"])), lambda t: str(t["id"]))
-    return TrashList.model_validate({"trash": trash, "next_cursor": page.next_cursor})
+    trash = page.of(sorted(service.trash.entries(), key=lambda entry: entry.id), lambda entry: entry.id)
+    return TrashList(trash=trash, next_cursor=page.next_cursor)
 
 
 @router.post("/trash/{trash_id}/restore", summary="Restore from the trash", responses=_ERRORS)
 def restore_trash(service: ServiceDep, trash_id: TrashId) -> TrashEntry:
     """Move it back to where it was; refused if something lies there by now, or its test is in the trash too."""
-    return TrashEntry.model_validate(restore(service, trash_id))
+    return restore(service, trash_id)
 
 
 @router.delete(

@@ -1,0 +1,171 @@
+"""What the rig, its cameras and its stage say of themselves: the API's replies, and what records keep of them.
+
+A device's own fields are declared by its driver's classes (`drivers.cameras.protocol`, `drivers.stages.protocol`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+
+from core.names import CameraName
+from drivers.cameras.protocol import CameraDescription, CameraIdentity, CameraSettings
+from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, AxisStatus, ControllerMessage, StageIdentity
+from server.base.models import Document, Reply, Reported
+from server.base.problem import JobProblem
+from server.config.camera_facts import CameraFacts
+from server.config.rig_file import CalibrationSection, CameraSection, TargetSection
+from server.jobs.hardware import Holder
+
+# the rig file ------------------------------------------------------------------------------------------------------
+
+
+class NominalCamera(CameraSection):
+    """What the rig file says of a camera."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class NominalTarget(TargetSection):
+    """What the rig file says of the target."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class UsualPlan(CalibrationSection):
+    """The rig file's plan of a calibration."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+# cameras -----------------------------------------------------------------------------------------------------------
+
+
+class CameraDevice(Reported, CameraDescription):
+    """Who a camera is and what it can do, as it says itself; ranges are null where it has no such setting."""
+
+
+class CameraSettingsReply(Reported, CameraSettings):
+    """Settings as read back from a camera; null where it has no such setting."""
+
+
+class CameraReply(Reply):
+    """One camera of the rig."""
+
+    name: CameraName = Field(description="Which camera.")
+    nominal: NominalCamera = Field(description="What the rig file says.")
+    device: CameraDevice | None = Field(description="What the device says; null while it is not connected.")
+    settings: CameraSettingsReply | None = Field(description="Its settings as read back; null while not connected.")
+    fault: JobProblem | None = Field(None, description="Why it cannot be used now; null: it can.")
+    reconnections: int = Field(0, description="How often it was lost and connected again.")
+
+
+# stage -------------------------------------------------------------------------------------------------------------
+
+
+class AxisLimitsReply(Reported, AxisLimits):
+    """Where an axis may go."""
+
+
+class DynamicsReply(Reply, AxisDynamics):
+    """How fast an axis moves, as read back from the controller."""
+
+
+class AxisReply(Reported, AxisStatus):
+    """One axis, as read from the controller."""
+
+    limits: AxisLimitsReply = Field(description="Where it may go.")
+    dynamics: DynamicsReply = Field(description="How fast it moves.")
+    zero_mm: float = Field(description="Position of dZ = 0.")
+    cameras: list[CameraName] = Field(description="Cameras that it moves.")
+
+
+class AxisIdentityReply(Reported, AxisIdentity):
+    """What stands on an axis."""
+
+
+class StageIdentityReply(Reported, StageIdentity):
+    """Who the motion controller is."""
+
+    axes: tuple[AxisIdentityReply, ...] = Field(description="What stands on each axis.")
+
+
+class StageReply(Reply):
+    """The stage."""
+
+    driver: str = Field(description="Protocol of the controller.", examples=["esp301"])
+    identity: StageIdentityReply | None = Field(description="Who the controller is; null while it does not answer.")
+    axes: list[AxisReply] = Field(description="Every axis; empty while the controller does not answer.")
+    zero_mm: float = Field(description="Position of dZ = 0 of axes that have none of their own.")
+    fault: JobProblem | None = Field(description="Why it cannot be used; null: it can.")
+
+
+class StageMessage(Reply, ControllerMessage):
+    """Something that the controller had to say."""
+
+    id: int = Field(description="Grows by one with each message.")
+    utc: str = Field(description="When it was read.")
+
+
+# the rig -----------------------------------------------------------------------------------------------------------
+
+
+class SceneReply(Reply):
+    """What stands before a simulated rig's cameras; parameters of the scene stand beside these two."""
+
+    scene: str = Field(description="Name of the scene.", examples=["plate"])
+    load: float = Field(description="kPa for `plate`, kN for `panel`, per cent for `strip`, a share for `block`.")
+
+
+class RigReply(Reply):
+    """Everything that a client wants to know before it does anything."""
+
+    name: str = Field(description="Name of the rig.")
+    description: str = Field(description="Free text of the rig file.")
+    sim: bool = Field(description="Whether it is a simulated rig.")
+    connected: bool = Field(description="Whether cameras and stage are open.")
+    fault: JobProblem | None = Field(description="Why the rig cannot be used; null: it can.")
+    holder: Holder | None = Field(description="What holds the hardware now; null: nothing.")
+    scene: SceneReply | None = Field(description="What a simulated rig sees; null on a real one.")
+    trigger: Literal["free", "software", "hardware"] = Field(description="What starts the exposures.")
+    max_skew_ms: float = Field(description="A pair whose exposures began further apart is refused.")
+    target: NominalTarget = Field(description="The grid.")
+    calibration_plan: UsualPlan = Field(description="The usual plan of a calibration.")
+    cameras: dict[CameraName, CameraReply] = Field(description="Both cameras, by name.")
+    stage: StageReply = Field(description="The stage.")
+
+
+# records -----------------------------------------------------------------------------------------------------------
+
+#: of the settings, what a step's record keeps
+_KEPT_SETTINGS = ("exposure_ms", "gain_db", "frame_rate_hz", "pixel_format")
+
+
+class CameraKept(CameraFacts, CameraSettings):
+    """A camera as a step's record keeps it: how it was set, and what only people know of it."""
+
+
+class RigKept(Document):
+    """What a report wants to know of the rig that took a step: how it runs, and each camera's settings and lens."""
+
+    name: str
+    simulated: bool
+    trigger: str
+    frame_rate_hz: float | None
+    max_skew_ms: float
+    lighting: str | None
+    cameras: dict[CameraName, CameraKept]
+
+
+def identity_of(description: CameraDescription) -> dict[str, str]:
+    """Return who a camera is, for the records of what it took."""
+    return {name: getattr(description, name) for name in CameraIdentity.__dataclass_fields__}
+
+
+def kept_camera(settings: CameraSettings, facts: CameraFacts) -> CameraKept:
+    """Return what a step's record keeps of a camera; a fact that nobody told is not there."""
+    has = asdict(settings)
+    told = facts.model_dump(mode="json", exclude_none=True)
+    return CameraKept.model_validate({**{name: has[name] for name in _KEPT_SETTINGS}, **told})

@@ -1,0 +1,128 @@
+"""Every command of the tutorial is run as it stands there, against a served rig, and what it measures is the truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from server.demo.process import running_service
+from tests.support.document_scripts import WRITTEN, blocks, one_block, run
+from tests.support.requirements import ROOT
+from tests.support.service_rig import true_cameras, wait_for_rig
+
+pytestmark = pytest.mark.timeout(400)
+API = "/api/v1"
+NO_CURL = "curl not found: apt install curl to run the tutorial's scripts"
+RIG = ROOT / "config" / "sim_paper.toml"
+SCRIPT, FILES = "docs/tutorial/script.md", "docs/tutorial/files.md"
+# what the scripts say of the plate: the paper's, in mm and N/mm^2, and the last pressure in kPa
+RADIUS, THICKNESS, MODULUS, POISSON, PRESSURE = 13.385, 0.762, 71.0e3, 0.334, 689.0
+
+
+def script(language: str, like: str) -> str:
+    """Return the tutorial's one block in a language that has this in it: ten lines at most."""
+    found = one_block(SCRIPT, language, like)
+    assert WRITTEN in found
+    assert len([line for line in found.splitlines() if line.strip()]) <= 10
+    return found
+
+
+def at(client: httpx.Client, text: str) -> str:
+    """Return a script with the address of the service that runs here."""
+    return text.replace(WRITTEN, str(client.base_url).rstrip("/"))
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """A service of its own process, with a calibration: the simulated cameras' own parameters."""
+    folder = tmp_path_factory.mktemp("tutorial")
+    with (
+        running_service(RIG, folder / "data", folder / "service.log") as url,
+        httpx.Client(base_url=url, timeout=60.0, trust_env=False) as made,
+    ):
+        wait_for_rig(made)
+        cameras = json.dumps(true_cameras(RIG.read_text(encoding="utf-8")))
+        sent = made.post(f"{API}/calibrations:import", files={"file": ("true.json", cameras)})
+        assert sent.status_code == 201, sent.text
+        yield made
+
+
+def is_the_plate(client: httpx.Client, w_mm: Any) -> None:
+    """Assert that this is W of the newest analysis, and the textbook's: a clamped plate's deflection."""
+    test_id = client.get(f"{API}/tests").json()["tests"][-1]["id"]
+    test = client.get(f"{API}/tests/{test_id}").json()
+    assert [step["label"] for step in test["steps"]] == ["0 kPa", "344.5 kPa", "689 kPa"]
+    path = f"{API}/tests/{test_id}/analyses/{test['analyses'][-1]['id']}/steps/2/fields"
+    x, y, told = (
+        np.array(client.get(f"{path}/{name}").json()["values"], dtype=float) for name in ("x_mm", "y_mm", "w_mm")
+    )
+    np.testing.assert_allclose(w_mm, told.reshape(np.shape(w_mm)), rtol=1e-6)
+    stiffness = MODULUS * THICKNESS**3 / (12 * (1 - POISSON**2))
+    deflection = PRESSURE * 1e-3 * RADIUS**4 / (64 * stiffness)
+    true = -deflection * np.clip(1 - (np.hypot(x, y) / RADIUS) ** 2, 0, None) ** 2
+    assert np.isfinite(told).mean() > 0.99
+    assert np.abs(told).max() > 0.1
+    assert np.sqrt(np.nanmean((told - true) ** 2)) < 1e-3  # mm
+
+
+def test_ten_lines_of_curl(client: httpx.Client, tmp_path: Path) -> None:
+    if shutil.which("curl") is None:
+        pytest.skip(NO_CURL)
+    done = run(["bash", "-euc", at(client, script("sh", "curl"))], tmp_path)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "w.csv").open(encoding="utf-8-sig") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    is_the_plate(client, [float(row["w_mm"] or "nan") for row in rows])
+
+
+def test_ten_lines_of_python(client: httpx.Client, tmp_path: Path) -> None:
+    text = at(client, script("python", "httpx"))
+    (tmp_path / "script.py").write_text(
+        f"{text}\nimport json\njson.dump(w_mm, open('w.json', 'w'))\n", encoding="utf-8"
+    )
+    done = run([sys.executable, "script.py"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    is_the_plate(client, np.array(json.loads((tmp_path / "w.json").read_text(encoding="utf-8")), dtype=float))
+
+
+def test_the_calibration_by_script(client: httpx.Client, tmp_path: Path) -> None:
+    if shutil.which("curl") is None:
+        pytest.skip(NO_CURL)
+    before = len(client.get(f"{API}/calibrations").json()["calibrations"])
+    done = run(["bash", "-euc", at(client, one_block(SCRIPT, "bash", "calibrations"))], tmp_path)
+    assert done.returncode == 0, done.stderr
+    made = client.get(f"{API}/calibrations").json()["calibrations"]
+    assert len(made) == before + 1
+    assert (made[-1]["verdict"]["level"], made[-1]["decision"]) == ("good", "accepted")
+    assert re.search(r"^good$", done.stdout, re.MULTILINE)
+
+
+def test_from_files(client: httpx.Client, tmp_path: Path) -> None:
+    if shutil.which("curl") is None:
+        pytest.skip(NO_CURL)
+    for block in blocks(FILES, "bash"):
+        done = run(["bash", "-euc", at(client, block)], tmp_path)
+        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
+    (tmp_path / "read.py").write_text(one_block(FILES, "python", "netCDF4"), encoding="utf-8")
+    done = run([sys.executable, "read.py"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == pytest.approx(-0.117, abs=0.001)  # mm, as the page says
+    assert json.loads((tmp_path / "calibration.json").read_text())["verdict"]["level"] == "good"
+    with (tmp_path / "gauges.csv").open(encoding="utf-8-sig") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    strain = [
+        float(r["value"]) for r in rows if r["gauge"] == "across" and r["quantity"] == "strain" and r["step"] == "2"
+    ]
+    assert strain == [pytest.approx(0.00084, abs=0.00005)]
+    assert list((tmp_path / "maps").glob("*exx.png"))
+    assert (tmp_path / "paraview" / "result.pvd").exists()

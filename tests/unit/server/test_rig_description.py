@@ -1,0 +1,73 @@
+"""What a driver's classes declare is what the API replies and what records keep."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+
+from core.names import CAMERAS
+from drivers.acquisition.pairing import PairingAccount
+from drivers.cameras.protocol import CameraDescription, CameraSettings, FoundDevice, FrameCounters
+from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, AxisStatus, ControllerMessage, StageIdentity
+from server.api.models.rig import FrameCounts, PairCounts
+from server.base.models import Reply, Reported
+from server.config.camera_facts import CameraFacts, LensFacts
+from server.rig import description as said
+from server.rig.devices import ListedDevice
+from tests.support.service_rig import tiny_config
+
+
+@pytest.mark.parametrize(
+    ("declared", "reply"),
+    [
+        (CameraDescription, said.CameraDevice),
+        (CameraSettings, said.CameraSettingsReply),
+        (FoundDevice, ListedDevice),
+        (FrameCounters, FrameCounts),
+        (PairingAccount, PairCounts),
+        (AxisIdentity, said.AxisIdentityReply),
+        (StageIdentity, said.StageIdentityReply),
+        (AxisLimits, said.AxisLimitsReply),
+        (AxisDynamics, said.DynamicsReply),
+        (AxisStatus, said.AxisReply),
+        (ControllerMessage, said.StageMessage),
+    ],
+)
+def test_each_field_of_a_driver_is_replied_with_its_meaning(declared: type, reply: type[Reply]) -> None:
+    schema = reply.model_json_schema(mode="serialization")
+    for field in fields(declared):
+        assert schema["properties"][field.name]["description"]
+    if issubclass(reply, Reported):
+        assert schema["required"] == list(schema["properties"])
+
+
+def test_a_record_keeps_settings_that_were_not_had_and_no_fact_that_nobody_told() -> None:
+    settings = CameraSettings(exposure_ms=5.0, bit_depth=8, features={"BlackLevel": 4.0})
+    kept = said.kept_camera(settings, CameraFacts(maker="Basler", lens=LensFacts(f_number=8.0)))
+    assert kept.model_dump(exclude_unset=True) == {
+        "exposure_ms": 5.0,
+        "gain_db": None,
+        "frame_rate_hz": None,
+        "pixel_format": None,
+        "maker": "Basler",
+        "lens": {"f_number": 8.0},
+    }
+
+
+def test_a_rig_that_is_not_open_yet_says_so() -> None:
+    from server.jobs.hardware import HardwareGate
+    from server.rig import Rig
+
+    gate = HardwareGate()
+    rig = Rig(tiny_config(), gate)
+    try:
+        shown = rig.describe().model_dump(exclude_unset=True)
+    finally:
+        gate.close()
+    assert shown["connected"] is False
+    assert shown["fault"]["code"] == shown["stage"]["fault"]["code"] == "not_connected"
+    assert shown["fault"]["remedy"]
+    for cam in CAMERAS:
+        assert shown["cameras"][cam]["device"] is None
+        assert "fault" not in shown["cameras"][cam]
