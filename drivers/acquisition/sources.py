@@ -34,7 +34,7 @@ class PairSource(Protocol):
     def next_pair(self, check: Check | None = None) -> Pair:
         """Return a pair exposed after this call; ``check`` may raise while it waits."""
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Make the units' latest frames new."""
 
     def account(self) -> PairingAccount:
@@ -97,7 +97,7 @@ class TriggeredPairs:
             remedy="Capture again; POST /rig/reconnect if it comes back.",
         )
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Fire once; a missing pair is no fault here."""
         with contextlib.suppress(CameraError):
             self.next_pair()
@@ -258,7 +258,7 @@ class StreamedPairs:
             return self._capture_timeout_s
         return 2.0 + max(10.0 * unit.period_s + unit.description.latency_s for unit in self._units.values())
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Do nothing: frames come by themselves."""
         for cam in CAMERAS:
             _ = self._units[cam].reader

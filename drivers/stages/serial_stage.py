@@ -1,6 +1,6 @@
 """Common parts of the serial stage drivers: checks before a byte is sent, one-sided arrival, waiting, stopping.
 
-A driver adds only its controller's commands, see `drivers.stages.words`.
+A driver adds only its controller's commands, see `drivers.stages.commands`.
 
 A stop takes no lock. It sets a number of its own on the axes it concerns, and then writes. A motion notes these numbers
 when it is asked for, and looks at them again after each command that starts movement: whichever of the two was first on
@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from core.errors import StageError
+from drivers.stages.commands import ControllerCommands
 from drivers.stages.protocol import (
     AxisDynamics,
     AxisLimits,
@@ -41,7 +42,6 @@ from drivers.stages.refusals import (
     tighten,
 )
 from drivers.stages.serial_line import SerialLine
-from drivers.stages.words import ControllerWords
 
 _POLL_S = 0.02
 # An axis that reports motion without moving for this long has jammed
@@ -54,7 +54,7 @@ _MESSAGES = 100
 _REST_S = 3.0
 
 
-class SerialStage(ControllerWords):
+class SerialStage(ControllerCommands):
     """Base of the stage drivers; see `drivers.stages.protocol.Stage` for its interface."""
 
     def __init__(self, line: SerialLine, options: Mapping[int, AxisOptions]) -> None:

@@ -59,7 +59,7 @@ def ways_cut(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | 
     return out
 
 
-def points_seen(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
+def connected_points(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
     """Return (m, n) True for the windows' points that are connected to their centres over valid points alone.
 
     ``there`` is the padded grid, ``here`` (m,) the centres' flat indices in it. The way goes from cell to cell. Over a

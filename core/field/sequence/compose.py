@@ -42,7 +42,7 @@ class Totals:
     G: Float
 
     @property
-    def now_cam1_mm(self) -> Float:
+    def current_cam1_mm(self) -> Float:
         """(n, 3) the points at the step, camera 1's frame."""
         return np.asarray(self.G[:, :, 0] / self.w[:, :1])
 
@@ -61,7 +61,7 @@ class Totals:
         """(n, 3) inverse depth at the step over camera 1's image: its value at (x, y) is the product with (x, y, 1)."""
         tangents = point_slopes(self.w, self.G)
         normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
-        return np.asarray(normal / np.sum(normal * self.now_cam1_mm, axis=1)[:, None])
+        return np.asarray(normal / np.sum(normal * self.current_cam1_mm, axis=1)[:, None])
 
 
 def image_slopes(G: Float) -> Float:
@@ -132,7 +132,7 @@ def since(start: Totals, now: Totals, plane: Float) -> Float:
 
     ``plane`` (n, 3) is the segment's ``w`` about the points' own rays.
     """
-    P = now.now_cam1_mm
+    P = now.current_cam1_mm
     tangents = point_slopes(now.w, now.G) @ _inverse(start.image_slopes)
     first = plane[:, :1] * P
     rest = P[:, :, None] * plane[:, None, 1:] + plane[:, :1, None] * tangents

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from drivers.stages.protocol import AxisStatus, ControllerMessage, StageIdentity
 
 
-class ControllerWords(ABC):
+class ControllerCommands(ABC):
     """Commands and replies of one family of controllers."""
 
     def _check_unit(self, axis: int) -> None:  # noqa: B027 - few controllers need it
