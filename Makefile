@@ -22,7 +22,7 @@ help:
 	@echo "make test    the whole behaviour at normal depth (WORKERS=1: one file at a time)"
 	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
-	@echo "make check   lint, format check, types, import walls; lint and types of the page's scripts"
+	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
@@ -76,6 +76,7 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m numpydoc lint $$(git ls-files 'core/*.py' 'drivers/*.py' 'sim/*.py')
 
 # The page runs as it lies in server/static; Node is for its check alone. Without Node that is said, and fails in CI only.
 PAGE := tests/page/node_modules/.installed

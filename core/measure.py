@@ -19,12 +19,12 @@ from core.field.growth.state import Image, prepare
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
-from core.field.sequence.reference_steps import Earlier, Updating
+from core.field.sequence.reference_steps import PreviousStep, Updating
 from core.field.settings import MeasureOptions
 from core.progress import CancelToken, Progress
 from core.settings import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
 
-__all__ = ["Earlier", "MeasureOptions", "ReferencePair", "Updating", "measure_motion", "measure_shape"]
+__all__ = ["MeasureOptions", "PreviousStep", "ReferencePair", "Updating", "measure_motion", "measure_shape"]
 
 
 @dataclass(frozen=True, eq=False)

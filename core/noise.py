@@ -291,7 +291,7 @@ def _still(difference: Float, basis: Float, free: Bool) -> tuple[Float, float, f
 
 
 class _Bins(NamedTuple):
-    """Mean grey levels, variances and their standard deviations by bins; excess of the steep pixels and its own standard deviation."""
+    """Mean grey levels, variances and their standard deviations by bins; excess of the steep pixels with its own."""
 
     levels: Float
     variances: Float

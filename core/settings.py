@@ -128,7 +128,7 @@ class StrainSettings(Settings):
     order: Literal[1, 2] = Field(
         1, description="Fit planes or quadratics; they differ only where an edge, a hole or a cut takes points away."
     )
-    tensor: StrainTensor = Field("green_lagrange", description="Which strain is told.")
+    tensor: StrainTensor = Field("green_lagrange", description="Which strain is reported.")
 
     @model_validator(mode="after")
     def _odd(self) -> Self:
@@ -145,8 +145,8 @@ class AnalysisSettings(Settings):
     patch: PatchSetting = Field(
         DEFAULT_PATCH,
         description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about "
-        "twice the noise; auto takes stretch or curved, whichever errs less on the field in all, shape and motion "
-        "apart; each step's summary has the choice and its reason under patch.",
+        "twice the noise; auto takes stretch or curved, whichever has the smaller total error, shape and motion "
+        "separately; each step's summary has the choice and its reason under patch.",
     )
     interpolation: Interpolation = Field(DEFAULT_INTERPOLATION, description="B-spline order.")
     prefilter_px: Annotated[Real, Field(ge=0.0, le=PREFILTER_OF_SUBSET * SUBSET_PX.high)] = Field(
@@ -196,7 +196,7 @@ class AnalysisSettings(Settings):
     def _agree(self) -> Self:
         require_odd(subset_px=self.subset_px, smoothing_window=self.smoothing_window)
         if self.seeds_cam2 is not None and len(self.seeds_cam2) != len(self.seeds or []):
-            raise disagreement(f"seeds_cam2 has {len(self.seeds_cam2)} places for {len(self.seeds or [])} seeds")
+            raise disagreement(f"seeds_cam2 has {len(self.seeds_cam2)} positions for {len(self.seeds or [])} seeds")
         if self.prefilter_px > PREFILTER_OF_SUBSET * self.subset_px:
             raise disagreement(f"prefilter_px must be at most a quarter of subset_px, {self.subset_px}")
         return self

@@ -22,7 +22,7 @@ _MIN_LINES = 5  # three inner lines each way: the fewest that show a lens's curv
 class GridTarget:
     """Description of the calibration grid.
 
-    Parameters
+    Attributes
     ----------
     pitch_mm
         Distance of neighbouring lines.

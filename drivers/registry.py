@@ -38,7 +38,7 @@ def make_camera(driver: str, options: CameraOptions) -> FrameGrabber:
 
 
 def discover_cameras(driver: str) -> list[FoundDevice]:
-    """List the cameras that one driver sees, also those that it cannot use; raises as `make_camera`."""
+    """List the cameras that one driver finds, also those that it cannot use; raises as `make_camera`."""
     found: list[FoundDevice] = _camera_driver(driver).discover()
     return found
 
@@ -81,12 +81,12 @@ def open_stage(
     record
         File for a transcript of the wire.
     timeout_s
-        How long a reply may take.
+        Longest time of a reply.
 
     Raises
     ------
     StageError
-        ``unknown_driver``, or what opening brings up.
+        ``unknown_driver``, or an error of opening.
     """
     if driver not in STAGE_DRIVERS:
         raise StageError(

@@ -1,4 +1,4 @@
-"""The scenes by name: what stands in front of the cameras, and in which state.
+"""The scenes by name: specimen and load state.
 
 ======  ==================================================  =================================================
 name    what                                                load
@@ -39,7 +39,7 @@ SCENE_NAMES = ("grid", "steel", "plate", "panel", "block", "strip", "sphere")
 BLOCK_TRANSLATION_MM = (0.20, -0.15, 0.25)
 BLOCK_ROTATION_RAD = (0.01, -0.015, 0.03)
 _LAY_RAD = 0.35  # the steel's lay against the vertical
-_STEEL_SEED, _SPECKLE_SEED = 1, 2  # keep the random numbers of one rig apart
+_STEEL_SEED, _SPECKLE_SEED = 1, 2  # separate streams of random numbers of one rig
 _BACKLIT, _CHROME, _BEHIND = 0.9, 0.03, 0.04
 
 

@@ -1,7 +1,7 @@
 """Compiled formulas of the surfaces, over arrays of material points; see `sim.surface`.
 
-Every surface kernel writes ``out`` (9, n): place x, y, z and tangents xs, ys, zs, xt, yt, zt of the points (s, t).
-They are plain loops without calls that pass arrays on: such calls cost ten times what the formulas do.
+Every surface kernel writes ``out`` (9, n): position x, y, z and tangents xs, ys, zs, xt, yt, zt of the points (s, t).
+They are plain loops without calls that pass arrays on: such calls take ten times as long as the formulas.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from numba import njit
 
 from core.arrays import Float
 
-_SPHERE_REACH_RAD: Final = 1.4  # beyond it a sphere is seen too flatly to be worth a texture
+_SPHERE_REACH_RAD: Final = 1.4  # beyond it a sphere is seen too obliquely for a texture
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def meet_plane(par: Float, pose: Float, nx: Float, ny: Float, s: Float, t: Float) -> None:
-    """Where rays meet a plane, ``par`` = [a11, a12, a21, a22]: linear equations in (s, t). NaN behind the camera."""
+    """Meet rays with a plane, ``par`` = [a11, a12, a21, a22]: linear equations in (s, t). NaN behind the camera."""
     for i in range(nx.size):
         ax, ay = pose[0, 0] - nx[i] * pose[2, 0], pose[0, 1] - nx[i] * pose[2, 1]
         bx, by = pose[1, 0] - ny[i] * pose[2, 0], pose[1, 1] - ny[i] * pose[2, 1]
@@ -33,7 +33,7 @@ def meet_plane(par: Float, pose: Float, nx: Float, ny: Float, s: Float, t: Float
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def newton_step(pose: Float, nx: Float, ny: Float, at: Float, s: Float, t: Float, step: Float) -> float:
-    """Move (s, t) by one Newton step from the places and tangents ``at``; return the longest, NaN ones aside.
+    """Move (s, t) by one Newton step from the positions and tangents ``at``; return the longest, NaN excluded.
 
     A point that lies behind the camera becomes NaN.
     """
@@ -149,7 +149,7 @@ def cracked_panel(par: Float, s: Float, t: Float, lip: Float, out: Float) -> Non
     ux, vy = 0.25 * (kappa + 1.0) * stress, 0.25 * (3.0 - kappa) * stress
     for i in range(s.size):
         x, y = s[i], t[i]
-        # root = sqrt(z^2 - a^2) with its cut along the crack, continued across it on the lip asked for
+        # root = sqrt(z^2 - a^2) with its cut along the crack, continued across it on the lip given
         zeta = complex(x, y + 0.0)  # no negative zero, whose root lies on the other lip
         root = np.sqrt(zeta - a) * np.sqrt(zeta + a)
         if abs(x) < a and (y < 0.0) == (lip[i] > 0.0):
@@ -170,7 +170,7 @@ def cracked_panel(par: Float, s: Float, t: Float, lip: Float, out: Float) -> Non
         cs, ss = np.cos(wave_x * x), np.sin(wave_x * x)
         ct, st = np.cos(wave_y * y), np.sin(wave_y * y)
         z, zs, zt = bow * cs * ct, -bow * wave_x * ss * ct, -bow * wave_y * cs * st
-        # crests above and below the crack, and lips that part out of plane
+        # crests above and below the crack, and lips that separate out of plane
         qy = y * y / ly2
         bell = np.exp(-x * x / lx2 - qy)
         crest = buckle / peak * bell

@@ -23,12 +23,12 @@ _NICE = 5
 
 # A trigger call within this time of another camera's belongs to the same pulse
 _SAME_PULSE_S = 1.0
-# Frames that wait for somebody to take them; a real grabber's ring is as short
+# Frames that wait to be taken; a real grabber's ring is as short
 _RING = 16
 
 
 class Exposer(Protocol):
-    """What a simulated camera needs of the world; `sim.world.SimWorld` is one."""
+    """The world as a simulated camera uses it; `sim.world.SimWorld` is one."""
 
     def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         """Return the digitised image of this moment."""
@@ -44,9 +44,9 @@ class Pulse:
 
 @dataclass
 class GrabberFaults:
-    """What is wrong with a camera; every value may be set while it runs.
+    """Faults of a camera; every value may be set while it runs.
 
-    Parameters
+    Attributes
     ----------
     drop
         So many of the next frames never arrive, though they were counted.
@@ -59,7 +59,7 @@ class GrabberFaults:
     busy
         Opening fails, as when another program holds the camera.
     gone
-        The camera says that it is gone, and cannot be opened.
+        The camera reports that it is gone, and cannot be opened.
     skew_ms
         Delay of this camera's exposures.
     """
@@ -76,7 +76,7 @@ class GrabberFaults:
 class TriggerLine:
     """One line to all cameras of a rig: the first camera's software trigger makes the pulse, the others join it.
 
-    So the exposures of a pair begin at the same instant, however late the second call comes.
+    So the exposures of a pair begin at the same instant, at any delay of the second call.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class TriggerLine:
             return pulse
 
     def faults_of(self, cam: str) -> GrabberFaults:
-        """What is wrong with a camera: it stays wrong when a new grabber is made for it."""
+        """Faults of a camera: they persist when a new grabber is made for it."""
         return self._faults.setdefault(cam, GrabberFaults())
 
     def hold(self, cam: str, holder: object) -> bool:
@@ -120,7 +120,7 @@ class TriggerLine:
                 del self._holders[cam]
 
     def fire(self, cam: str) -> Pulse:
-        """Join the newest pulse if this camera has not seen it yet, else make one."""
+        """Join the newest pulse if this camera has not used it yet, else make one."""
         with self._lock:
             now = time.monotonic_ns()
             pulse = self._newest
@@ -145,9 +145,9 @@ class SimFrameGrabber:
     Parameters
     ----------
     world
-        Who makes the images. Cameras of one world hang on one trigger line.
+        The world that renders the images. Cameras of one world share one trigger line.
     cam
-        Which of its cameras.
+        Name of the camera.
     image_size_px, bit_depth
         Width and height, and significant bits; taken from the world's rig when left out.
     line
@@ -157,7 +157,7 @@ class SimFrameGrabber:
     sequence_bits, first_sequence
         Width of the frame counter and where it starts, to meet its wrap.
     latency_s
-        How long rendering may take: the watchdog must allow for it.
+        Longest time of rendering: the watchdog must allow for it.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class SimFrameGrabber:
         self._open = True
 
     def describe(self) -> CameraDescription:
-        """Say who the camera is."""
+        """Return the camera's identity."""
         self._check_there()
         return self._description
 
@@ -277,7 +277,7 @@ class SimFrameGrabber:
             self._line.listen(self._cam, self._orders)
 
     def disarm(self) -> None:
-        """Stop delivering; an exposure in progress is finished and thrown away."""
+        """Stop delivering; an exposure in progress is finished and discarded."""
         thread, self._thread = self._thread, None
         if thread is not None:
             self._line.listen(self._cam, None)
@@ -336,7 +336,7 @@ class SimFrameGrabber:
         ending, orders, frames = self._ending, self._orders, self._frames
         number = itertools.count(1)
         due = time.monotonic()
-        # a camera draws its own pictures; ours must not take the processor from those who handle them
+        # a real camera needs no processor of the host; rendering must not take it from the frames' handling
         with contextlib.suppress(OSError, AttributeError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while not ending.is_set():
@@ -368,7 +368,7 @@ class SimFrameGrabber:
                 gain_db=self._settings.gain_db or 0.0,
                 rng=self._rng,
             )
-        except Exception as error:  # noqa: BLE001  # the thread's owner is told, whatever it was
+        except Exception as error:  # noqa: BLE001  # reported to the thread's owner, whatever it was
             fault = CameraError(f"{self._cam} made no image: {error}", remedy="Check the simulated scene.")
             fault.__cause__ = error
             self._put(fault, frames)

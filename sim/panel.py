@@ -8,13 +8,13 @@ In the plane: the exact field of a crack in an infinite sheet under uniaxial ten
     2 G u = (kappa-1)/2 Re F - y Im F' - (kappa+1)/4 S x,   F = S sqrt(z^2 - a^2),  z = x + i y,
     2 G v = (kappa+1)/2 Im F - y Re F' + (3-kappa)/4 S y,   kappa = (3-nu)/(1+nu),
 
-whose lips open to the ellipse 4 S sqrt(a^2 - x^2) / E. Between the lips one sees the dark gap.
+whose lips open to the ellipse 4 S sqrt(a^2 - x^2) / E. Between the lips is the dark gap.
 
 Out of the plane: a plausible model, made of closed formulas (no claim to be the paper's plate):
 
     z = -bow(P) cos(pi x / Lx) cos(pi y / Ly)                               bow(P) = bow0 / (1 + P / Ps): straightens
-        -A(P) (c0 + (y/ly)^2) exp(-(y/ly)^2 - (x/lx)^2) / peak              one crest above, one below the crack
-        +lip A(P) Im sqrt(z^2 - a^2) / a exp(-(y/ly)^2 - (x/lx)^2)          the lips part, each to its own side
+        -A(P) (c0 + (y/ly)^2) exp(-(y/ly)^2 - (x/lx)^2) / peak              one crest above, one below the crack +lip
+        A(P) Im sqrt(z^2 - a^2) / a exp(-(y/ly)^2 - (x/lx)^2)          the lips separate, each to its own side
 
 with A(P) = A1 (f(P/Pc - 1) - f(-1)), f(x) = sqrt((x + sqrt(x^2 + 0.1^2)) / 2): the pitchfork of a slightly imperfect
 panel, next to nothing below Pc and growing with the square root above. At P = 0 only the bow is there: the reference
@@ -37,7 +37,7 @@ _IMPERFECTION = 0.1
 class CrackedPanel:
     """Dimensions, material and out-of-plane model; a 2024-T3 sheet of 305 x 2.3 mm with a crack of 102 mm by default.
 
-    Parameters
+    Attributes
     ----------
     half_crack_mm, width_mm, thickness_mm
         a, W, t.
@@ -71,7 +71,7 @@ class CrackedPanel:
         return load_kn * 1e3 / (self.width_mm * self.thickness_mm)
 
     def bow_at_mm(self, load_kn: float) -> float:
-        """Height of the bow that the load leaves."""
+        """Height of the bow under the load."""
         return self.bow_mm / (1.0 + load_kn / self.straightening_kn)
 
     def buckle_at_mm(self, load_kn: float) -> float:

@@ -1,4 +1,4 @@
-"""The clamped circular plate under pressure, Eq. (18), with the large-deflection term where it is wanted.
+"""The clamped circular plate under pressure, Eq. (18), with the large-deflection term as an option.
 
 Deflection w(r) = w0 (1 - (r/a)^2)^2 towards the cameras (-z). Linear theory: w0 = q a^4 / (64 D), D = E t^3 / (12 (1
 - nu^2)).
@@ -32,14 +32,14 @@ PAPER_PRESSURES_KPA = tuple(round(68.9 * n, 1) for n in range(1, 11))
 class CircularPlate:
     """The plate's dimensions and material; the paper's by default.
 
-    Parameters
+    Attributes
     ----------
     radius_mm, thickness_mm
         Clamped radius a and thickness t.
     youngs_modulus_mpa, poisson
         E in N/mm^2, nu.
     large_deflection
-        Whether the membrane carries its share.
+        True to include the membrane's stiffness.
     """
 
     radius_mm: float = 13.385
@@ -73,7 +73,7 @@ class CircularPlate:
         return float(4.0 * energy * 3.0 * 12.0 / 64.0)
 
     def centre_deflection_mm(self, pressure_kpa: float) -> float:
-        """w0 at a pressure; negative pressures push the other way."""
+        """Return w0 at a pressure; negative pressures push the other way."""
         from scipy.optimize import brentq  # slow to load, and not every start needs it
 
         linear = pressure_kpa * 1e-3 * self.radius_mm**4 / (64.0 * self.bending_stiffness_nmm)
@@ -84,7 +84,7 @@ class CircularPlate:
         return float(np.copysign(size, linear))
 
     def deflection_mm(self, r_mm: ArrayLike, pressure_kpa: float) -> Float:
-        """w(r), towards the cameras, zero beyond the clamping."""
+        """Return w(r), towards the cameras, zero beyond the clamping."""
         q = np.minimum((np.asarray(r_mm, dtype=np.float64) / self.radius_mm) ** 2, 1.0)
         return np.asarray(self.centre_deflection_mm(pressure_kpa) * (1.0 - q) ** 2)
 
@@ -95,7 +95,9 @@ class CircularPlate:
         return np.asarray(scale * (1.0 - 3.0 * q)), np.asarray(scale * (1.0 - q))
 
     def face_strain(self, r_mm: ArrayLike, pressure_kpa: float) -> tuple[Float, Float]:
-        """Green-Lagrange strain of the face, radial and hoop: with the face's u(r) and w(r),
+        """Return the Green-Lagrange strain of the face, radial and hoop.
+
+        With the face's u(r) and w(r),
 
         E_r = u' + (u'^2 + w'^2) / 2,  E_t = u/r + (u/r)^2 / 2.
 
@@ -113,7 +115,7 @@ class CircularPlate:
         return np.asarray(u_r + 0.5 * (u_r**2 + slope**2)), np.asarray(u_t + 0.5 * u_t**2)
 
     def _slope_per_mm(self, pressure_kpa: float) -> float:
-        """w0 / a^2, to which all of the plate's curvatures are in proportion."""
+        """Return w0 / a^2, to which all of the plate's curvatures are in proportion."""
         return self.centre_deflection_mm(pressure_kpa) / self.radius_mm**2
 
     def surface(self, pressure_kpa: float) -> Surface:

@@ -1,4 +1,4 @@
-"""The renderer: what light falls on each pixel, from formulas alone.
+"""The renderer: brightness of each pixel, from formulas alone.
 
 No image is ever warped or interpolated. For every sample point of the sensor, a regular lattice of ``samples`` x
 ``samples`` in a pixel, the ray is solved with the deformed surface (`sim.surface`) and the texture's formula is
@@ -35,9 +35,9 @@ _BAND_ROWS: Final = 32  # rows of one piece of work: small enough for the cache,
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How to integrate.
+    """Options of the integration.
 
-    Parameters
+    Attributes
     ----------
     blur_px
         Standard deviation of the lens's Gaussian blur.
@@ -65,9 +65,9 @@ def render(
     Parameters
     ----------
     scene
-        What is to be seen.
+        The scene.
     camera
-        By whom, at its present place.
+        The camera, at its present position.
     size_px
         Columns and rows of the image.
     options
@@ -141,7 +141,7 @@ def pixel_weights(samples: int, blur_px: float) -> Float:
 
 
 def material_points(scene: Scene, camera: Camera, xy_px: ArrayLike) -> tuple[Float, Float]:
-    """Material points (..., 2) that pixels (..., 2) see, NaN where they see none, and the crack's lip (...), +-1."""
+    """Return material points (..., 2) at pixels (..., 2), NaN where there is none, and the crack's lip (...), +-1."""
     xy = np.asarray(xy_px, dtype=np.float64)
     n = camera.lens.normalised_from_image(xy).xy.reshape(-1, 2)
     s, t, lip = scene.surface.hit(

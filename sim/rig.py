@@ -1,8 +1,7 @@
-"""What a simulated rig is made of, read from a rig file's tables.
+"""Description of a simulated rig, read from a rig file's tables.
 
-The rig file says what its user knows under ``[cam1]`` and ``[cam2]`` and what is true under ``[sim]``. This module
-takes the plain tables, as ``tomllib`` gives them, and makes frozen descriptions; it does not care for the parts that
-it does not need.
+The rig file has nominal values under ``[cam1]`` and ``[cam2]`` and true ones under ``[sim]``. This module converts the
+plain tables, as ``tomllib`` gives them, to frozen descriptions; other parts are ignored.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from sim.sensor import Lighting, Sensor
 class SimCamera:
     """One true camera with its sensor, its light and its stage axis.
 
-    Parameters
+    Attributes
     ----------
     camera
         The true camera at dz = 0.
     size_px
         Columns and rows.
     sensor, lighting
-        See there.
+        See :mod:`sim.sensor`.
     exposure_ms
         Exposure at which brightness 1 is full scale.
     stage_axis, stage_sign, stage_zero_mm
@@ -52,7 +51,7 @@ class SimCamera:
     axis_tilt_rad: tuple[float, float] = (0.0, 0.0)
 
     def at(self, position_mm: float) -> Camera:
-        """Return the true camera when its stage axis truly stands at ``position_mm``."""
+        """Return the true camera with its stage axis truly at ``position_mm``."""
         dz = self.stage_sign * (position_mm - self.stage_zero_mm)
         about_x, about_y = self.axis_tilt_rad
         direction = np.array([np.sin(about_y), -np.sin(about_x) * np.cos(about_y), np.cos(about_x) * np.cos(about_y)])
@@ -73,9 +72,9 @@ class SimTarget:
 
 @dataclass(frozen=True, kw_only=True)
 class SimRig:
-    """Everything true about a simulated rig.
+    """True description of a simulated rig.
 
-    Parameters
+    Attributes
     ----------
     name
         From ``[rig]``.
@@ -107,8 +106,7 @@ class SimRig:
 
     @staticmethod
     def from_dict(tables: Mapping[str, Any]) -> SimRig:
-        """Read a rig file's tables: ``rig``, ``cam1``, ``cam2``, ``target`` and ``sim`` with ``sim.cam1``,
-        ``sim.cam2``.
+        """Read a rig file's tables ``rig``, ``cam1``, ``cam2``, ``target`` and ``sim`` with ``sim.cam1``, ``sim.cam2``.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""A scene: analytic surface, texture in material coordinates, and where the body stands."""
+"""A scene: analytic surface, texture in material coordinates, and the body's pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UPRIGHT = RigidTransform(
 class Scene:
     """One state of one specimen.
 
-    Parameters
+    Attributes
     ----------
     name
         Of the scene.

@@ -1,11 +1,11 @@
-"""From brightness to grey levels: lighting, photons, electrons, the converter.
+"""Conversion of brightness to grey levels: lighting, photons, electrons, the converter.
 
     electrons = full_well * brightness * exposure / nominal exposure
     grey      = (electrons + shot noise + read noise) / full_well * (2^bits - 1) * 10^(gain_db / 20)
 
-rounded, and clipped to what the converter can say. Shot noise is the Gaussian of variance = electrons, which photons
-follow to within the read noise from a few dozen electrons up. Noise grows with gain, signal-to-noise with exposure,
-as in a real camera.
+rounded, and clipped to the converter's range. Shot noise is the Gaussian of variance = electrons, which photons follow
+to within the read noise from a few dozen electrons up. Noise grows with gain, signal-to-noise with exposure, as in a
+real camera.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from core.arrays import Float, Float32
 class Sensor:
     """Noise and converter.
 
-    Parameters
+    Attributes
     ----------
     bit_depth
         8 gives uint8 images, 9 to 16 give uint16, right-aligned.
@@ -79,7 +79,7 @@ class Lighting:
 
     (u, v) run from -1 to 1 across the image. It varies so slowly that it is taken at the pixels' centres.
 
-    Parameters
+    Attributes
     ----------
     gain
         Overall.

@@ -1,16 +1,15 @@
-"""Analytic surfaces and their deformation: material point (s, t) -> place in the body's frame, and the way back from
-a ray.
+"""Analytic surfaces and their deformation: from material point (s, t) to the body's frame, and back from a ray.
 
 The body's frame has z pointing away from the cameras, like the system frame; a scene's pose puts the body into the
-system frame. (s, t) are material coordinates in mm: they name a material point for ever, and the texture is written
-in them.
+system frame. (s, t) are material coordinates in mm: they identify a material point in all states, and the texture is
+defined in them.
 
-All formulas are closed. The kernels take flat numbers and whole arrays; `sim.plate`, `sim.panel` and `sim.steel` say
-where the numbers come from. For a ray (nx, ny, 1) in the camera's frame the material point that it meets solves
+All formulas are closed. The kernels take flat numbers and whole arrays; they come from `sim.plate`, `sim.panel` and
+`sim.steel`. For a ray (nx, ny, 1) in the camera's frame the material point that it meets solves
 
     X_cam(s, t) - nx Z_cam(s, t) = 0,  Y_cam(s, t) - ny Z_cam(s, t) = 0
 
-by Newton's method with the surface's own tangents, from where the ray meets the body's plane z = 0.
+by Newton's method with the surface's own tangents, from the ray's intersection with the body's plane z = 0.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _CHUNK: Final = 4096  # rays solved together: their tangents stay in the cache
 class Surface:
     """A surface in one state of deformation, in the flat form that the kernels take.
 
-    Parameters
+    Attributes
     ----------
     kind
         ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL`` or ``SPHERE``.
@@ -57,16 +56,16 @@ class Surface:
     fine: Float = field(default_factory=_NO_TABLE.copy)
 
     def place(self, st_mm: ArrayLike, lip: ArrayLike = 1.0) -> Float:
-        """Places (..., 3) in the body's frame of material points (..., 2); ``lip`` +-1 picks a crack's lip."""
+        """Return body positions (..., 3) of material points (..., 2); ``lip`` +-1 picks a crack's lip."""
         return self._evaluated(st_mm, lip)[..., :3]
 
     def tangents(self, st_mm: ArrayLike, lip: ArrayLike = 1.0) -> Float:
-        """d(place) / d(s, t), (..., 3, 2), at material points (..., 2)."""
+        """Return d(position) / d(s, t), (..., 3, 2), at material points (..., 2)."""
         values = self._evaluated(st_mm, lip)
         return np.stack([values[..., 3:6], values[..., 6:9]], axis=-1)
 
     def hit(self, pose: Float, nx: Float, ny: Float) -> tuple[Float, Float, Float]:
-        """Material coordinates s, t and lip (n,) that rays (nx, ny, 1) meet; NaN where they meet nothing.
+        """Return material coordinates s, t and lip (n,) that rays (nx, ny, 1) meet; NaN where they meet nothing.
 
         Parameters
         ----------
@@ -107,7 +106,7 @@ class Surface:
         lip[beyond] = np.where(t[beyond] >= 0.0, 1.0, -1.0)
 
     def _newton(self, pose: Float, nx: Float, ny: Float, s: Float, t: Float, lip: Float) -> None:
-        """Move (s, t) to where the rays meet the surface; NaN where that does not converge."""
+        """Move (s, t) to the rays' intersections with the surface; NaN where that does not converge."""
         values = np.empty((9, nx.size))
         step = np.empty(nx.size)
         for _ in range(_STEPS):
@@ -143,10 +142,10 @@ _SMOOTH: Final[dict[int, Callable[[Float, Float, Float, Float], None]]] = {
 
 
 def flat(in_plane: ArrayLike = ((1.0, 0.0), (0.0, 1.0))) -> Surface:
-    """A plane, z = 0, whose material points lie at ``in_plane @ (s, t)``."""
+    """Return a plane, z = 0, whose material points lie at ``in_plane @ (s, t)``."""
     return Surface(kind=FLAT, parameters=np.asarray(in_plane, dtype=np.float64).reshape(4).copy())
 
 
 def sphere(radius_mm: float) -> Surface:
-    """A sphere whose pole touches z = 0 and bulges towards the cameras; (s, t) are arc lengths from the pole."""
+    """Return a sphere whose pole touches z = 0 and bulges towards the cameras; (s, t) are arc lengths from the pole."""
     return Surface(kind=SPHERE, parameters=np.array([radius_mm]))

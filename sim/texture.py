@@ -1,11 +1,11 @@
 """Analytic textures in material coordinates: speckle, line grid, fiducial dots.
 
-A texture answers one question: how bright is the material point (s, t), in mm on the undeformed surface. It is a
-formula with a seed, so it has no resolution and no edge, and a point keeps its brightness however the surface moves.
+A texture is the brightness of the material point (s, t), in mm on the undeformed surface. It is a formula with a seed,
+so it has no resolution and no edge, and a point keeps its brightness under any motion.
 
-Speckle: the material plane is divided into square cells; each holds one dark disc whose place and radius come from a
-hash of the cell's indices. The union of the discs, with soft rims, is the paint. The rim is the C2 quintic step over
-a stated width.
+Speckle: the material plane is divided into square cells; each holds one dark disc whose position and radius come from a
+hash of the cell's indices. The union of the discs, with soft rims, is the paint. The rim is the C2 quintic step over a
+stated width.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MIX_C: Final = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S21, _S42 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(21), np.uint64(42)
 _MASK21: Final = np.uint64((1 << 21) - 1)
 _EDGE_REACH_SD: Final = 6.0  # a line's soft edge ends here, with 1e-9 left
-_FAR_MM: Final = 1e9  # beyond it a cell's index is no whole number any more
+_FAR_MM: Final = 1e9  # beyond it a cell's index is not exact
 _UNIT: Final = 1.0 / float(1 << 21)
 
 
@@ -43,16 +43,16 @@ _UNIT: Final = 1.0 / float(1 << 21)
 class Texture:
     """A texture in the flat form that the kernels take.
 
-    Parameters
+    Attributes
     ----------
     kind
         ``SPECKLE``, ``GRID`` or ``DOTS``.
     parameters
         Numbers of that kind, see :func:`speckle`, :func:`line_grid`, :func:`dots`.
     nodes_mm
-        (n_b, n_a, 2) places of the grid's intersections; unused by the others.
+        (n_b, n_a, 2) positions of the grid's intersections; unused by the others.
     finest_mm
-        Width of the finest feature's rim (one standard deviation or more); tells how finely to sample.
+        Width of the finest feature's rim (one standard deviation or more); determines the sampling.
     """
 
     kind: int
@@ -115,18 +115,20 @@ def line_grid(
     dark: float = 0.1,
     bright: float = 0.8,
 ) -> Texture:
-    """The calibration target: two families of lines through nodes that miss their places by up to the tolerance.
+    """Return the calibration target: two families of lines through nodes with errors up to the tolerance.
 
-    Every node is off by an independent amount, uniform within +-tolerance in s and in t, and lines run straight from
-    node to node. (Uniform +-4 um is the reading of "toleranced to 4 um" that makes the 0.087 px at 33 um/px that is
-    known for it.) Lines end at the outermost crossings; beyond lies bright glass (dark for bright lines).
+    Every node has an independent error, uniform within +-tolerance in s and in t, and lines run straight from node to
+    node. (Uniform +-4 um is the reading of "toleranced to 4 um" that makes the 0.087 px at 33 um/px that is known for
+    it.) Lines end at the outermost crossings; beyond lies bright glass (dark for bright lines).
 
     Parameters
     ----------
-    pitch_mm, line_width_mm
-        Spacing and width of lines.
+    pitch_mm
+        Spacing of lines.
     lines
-        How many lines are crossed walking along s and along t; the origin is at the centre of the full set.
+        Numbers of lines crossed walking along s and along t; the origin is at the centre of the full set.
+    line_width_mm
+        Width of lines.
     node_tolerance_mm
         Half width of the uniform distribution of the nodes' errors, each axis.
     dark_lines
@@ -252,7 +254,7 @@ def _dots(par: Float, s: Float, t: Float, out: Float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _line_cover(par: Float, nodes: Float, across: float, along: float, family: int) -> float:
-    """How far the point lies under a line of family 0 (they cross s) or 1 (they cross t): 0 outside, 1 inside."""
+    """Return the coverage of a point by lines of family 0 (they cross s) or 1 (they cross t): 0 outside, 1 inside."""
     pitch, half, sd = par[0], par[1], par[2]
     n_line = nodes.shape[1] if family == 0 else nodes.shape[0]
     n_along = nodes.shape[0] if family == 0 else nodes.shape[1]
@@ -261,7 +263,7 @@ def _line_cover(par: Float, nodes: Float, across: float, along: float, family: i
         return 0.0
     seg = min(max(int(np.floor(along / pitch + 0.5 * (n_along - 1))), 0), n_along - 2)
     other = 1 - family
-    # the segment between the displaced nodes that really spans this place
+    # the segment between the displaced nodes at this position
     if seg > 0 and along < _node(nodes, line, seg, family, other):
         seg -= 1
     elif seg < n_along - 2 and along > _node(nodes, line, seg + 1, family, other):

@@ -1,7 +1,7 @@
-"""What a perfect measurement would say, from the scene's formulas and the true camera alone.
+"""True values of a measurement, from the scene's formulas and the true camera alone.
 
-Nothing here knows of correlation. A pixel of camera 1 in the reference state names a material point; its place,
-normal and later place follow from the surface's formulas.
+Independent of correlation. A pixel of camera 1 in the reference state identifies a material point; its position, normal
+and later position follow from the surface's formulas.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from sim.scene import Scene
 
 @dataclass(frozen=True)
 class Truth:
-    """True values at pixels of camera 1, reference state; NaN where the pixel sees no surface.
+    """True values at pixels of camera 1, reference state; NaN where the pixel shows no surface.
 
     Attributes
     ----------
     st_mm
         (..., 2) material coordinates.
     xyz_mm
-        (..., 3) place in the reference state, system frame.
+        (..., 3) position in the reference state, system frame.
     normal_sys
         (..., 3) unit normal in the reference state, pointing away from camera 1.
     uvw_mm
@@ -53,7 +53,7 @@ def truth_at(reference: Scene, camera1: Camera, xy_px: ArrayLike, *, now: Scene 
     reference
         Scene in the reference state.
     camera1
-        The true camera at its place (dz = 0 usually).
+        The true camera at its position (dz = 0 usually).
     xy_px
         Pixels, any real numbers.
     now
@@ -102,12 +102,12 @@ def _frame(tangents: Float) -> tuple[Float, Float]:
 
 @dataclass(frozen=True)
 class SubsetPlane:
-    """The surface as a subset sees it, at each subset's centre.
+    """Best plane of the surface over each subset, at its centre.
 
     Attributes
     ----------
     xyz_mm
-        (n, 3) where the subset's best plane meets the centre pixel's ray, system frame.
+        (n, 3) intersection of the subset's best plane with the centre pixel's ray, system frame.
     normal_sys
         (n, 3) its unit normal, pointing away from camera 1.
     """
@@ -119,7 +119,7 @@ class SubsetPlane:
 def subset_planes(
     scene: Scene, camera1: Camera, xy_px: ArrayLike, subset_px: int, *, weights: ArrayLike | None = None
 ) -> SubsetPlane:
-    """Fit a plane to the true surface over each subset's pixels: a surface 'as the subset sees it'.
+    """Fit a plane to the true surface over each subset's pixels.
 
     A plane is linear in inverse depth over the undistorted image, so that is what is fitted, by least squares over
     the subset's pixels, as a matching with a plane patch does to first order.
@@ -133,8 +133,8 @@ def subset_planes(
     subset_px
         Width of the square subset, odd.
     weights
-        (subset_px, subset_px) or (n, subset_px, subset_px): how much each pixel counts (the squared grey-level gradient
-        along the epipolar line, say); all alike when left out.
+        (subset_px, subset_px) or (n, subset_px, subset_px) weights of the pixels (the squared grey-level gradient along
+        the epipolar line, say); all alike when left out.
     """
     centre = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
     if subset_px < 3 or subset_px % 2 == 0:

@@ -1,8 +1,8 @@
-"""The simulated world: cameras on their stages before a scene, exposed whenever somebody asks.
+"""The simulated world: cameras on their stages before a scene, exposed on demand.
 
-Grabbers and controllers meet here. The world asks where the stages truly stand, renders what each camera would see
-from there, and adds fresh noise to every exposure. Brightness is kept per camera, scene and position, so that averaging
-frames or looking at a resting rig costs noise only.
+It connects grabbers and controllers. It takes the stages' true positions, renders each camera's view from there, and
+adds fresh noise to every exposure. Brightness is kept per camera, scene and position, so that further frames of a
+resting rig need new noise only.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SimWorld:
         self._position_mm = position_mm
         self._options = RenderOptions(blur_px=rig.blur_px, threads=threads)
         self._state = threading.Lock()  # scene, tilts and cache; never held while rendering
-        self._rendering = {name: threading.Lock() for name in CAMERAS}  # so that nobody renders the same twice
+        self._rendering = {name: threading.Lock() for name in CAMERAS}  # so that no view is rendered twice
         self._scene = make_scene(rig, "grid")
         self._scene_key: tuple[Any, ...] = ("grid", 0.0)
         self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERAS}
@@ -61,12 +61,12 @@ class SimWorld:
 
     @property
     def rig(self) -> SimRig:
-        """What the world was made from."""
+        """The rig of the world."""
         return self._rig
 
     @property
     def scene(self) -> Scene:
-        """What stands before the cameras now."""
+        """The scene before the cameras."""
         with self._state:
             return self._scene
 
@@ -75,7 +75,7 @@ class SimWorld:
         scene = make_scene(self._rig, name, load=load, **params)
         with self._state:
             self._scene = scene
-            # going back to a state finds what was rendered of it
+            # the renderings of a state are found again when it returns
             self._scene_key = (name, float(load), *sorted((k, repr(v)) for k, v in params.items()))
 
     def set_axis_tilt(self, cam: CameraName, tilt_rad: tuple[float, float]) -> None:
@@ -84,13 +84,13 @@ class SimWorld:
             self._cameras[cam] = replace(self._cameras[cam], axis_tilt_rad=tilt_rad)
 
     def true_camera(self, cam: CameraName) -> Camera:
-        """Return the camera where its stage now stands."""
+        """Return the camera at its stage's present position."""
         with self._state:
             sim = self._sim_camera(cam)
         return sim.at(self._position_mm(sim.stage_axis))
 
     def true_pair(self) -> StereoPair:
-        """Return the true pair with both stages at their zero: what a calibration ought to find."""
+        """Return the true pair with both stages at their zero: the truth of a calibration."""
         return StereoPair(*(self._rig.camera(name).camera for name in CAMERAS))
 
     def truth(
@@ -104,7 +104,7 @@ class SimWorld:
     def expose(
         self, cam: CameraName, *, exposure_ms: float, gain_db: float = 0.0, rng: np.random.Generator | None
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Take an image now: scene and stage as they are, noise anew; without noise when ``rng`` is None."""
+        """Return an image of the present scene and stage position; with fresh noise unless ``rng`` is None."""
         brightness, sim = self._brightness(cam)
         return sim.sensor.expose(brightness, rng, exposure=exposure_ms / sim.exposure_ms, gain_db=gain_db)
 

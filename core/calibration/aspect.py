@@ -36,7 +36,7 @@ _MIN_SCALE_CHANGE = 1e-3
 class AspectResult:
     """The measured aspect ratio.
 
-    Parameters
+    Attributes
     ----------
     aspect, sigma
         The best value and its standard deviation: the refined one where there is one, else the first.

@@ -24,7 +24,7 @@ from core.target import GridTarget
 class ImageOfTarget:
     """One image of the target as the camera gave it.
 
-    Parameters
+    Attributes
     ----------
     camera, dz_mm
         The camera, and its read-back travel along its own optical axis, mm, positive away from the target.

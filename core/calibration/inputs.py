@@ -38,7 +38,7 @@ class TargetLike(Protocol):
 class NominalCamera:
     """Nominal data of a camera before it is calibrated.
 
-    Parameters
+    Attributes
     ----------
     image_size_px
         (width, height).
@@ -65,7 +65,7 @@ class NominalCamera:
 class CalibrationView:
     """The target's inner intersections in one image.
 
-    Parameters
+    Attributes
     ----------
     camera
         The camera's name.
@@ -105,7 +105,7 @@ class CalibrationView:
 class CalibrationOptions:
     """Settings of a calibration.
 
-    Parameters
+    Attributes
     ----------
     held_out_mm
         Positions left out of the fit and used for the check.

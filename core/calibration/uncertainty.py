@@ -52,7 +52,7 @@ class VolumeUncertainty:
 
 
 def point_derivatives(pair: StereoPair, points_mm: Float) -> Float:
-    """d(triangulated point) / d(parameters of both cameras) at fixed image points, (n, 3, 24).
+    """Return d(triangulated point) / d(parameters of both cameras) at fixed image points, (n, 3, 24).
 
     Least-squares triangulation: with A = d(images)/d(point), the point moves by -(A'A)^-1 A' B. Columns of the axis
     tilts are zero, since measuring happens at dZ = 0.

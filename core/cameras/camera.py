@@ -32,7 +32,7 @@ class SpacePoints(NamedTuple):
 class RigidTransform:
     """``x_b = rotation x_a + translation_mm``; named ``b_from_a`` where it is used.
 
-    Parameters
+    Attributes
     ----------
     rotation
         (3, 3) proper rotation.
@@ -107,7 +107,7 @@ def angles_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
 class Camera:
     """One calibrated camera.
 
-    Parameters
+    Attributes
     ----------
     lens
         Intrinsic part.
@@ -186,13 +186,13 @@ class Camera:
         return project_cam(self.lens, self.cam_from_sys.apply(points_sys_mm))
 
     def point_jacobian(self, points_sys_mm: ArrayLike) -> Float:
-        """d(image px) / d(X_sys, Y_sys, Z_sys) in px/mm, (..., 2, 3)."""
+        """Return d(image px) / d(X_sys, Y_sys, Z_sys) in px/mm, (..., 2, 3)."""
         p = self.cam_from_sys.apply(points_sys_mm)
         n = p[..., :2] / p[..., 2:]
         return np.asarray(self.lens.image_jacobian(n) @ _normalised_jacobian(p) @ self.cam_from_sys.rotation)
 
     def ten_parameter_jacobian(self, points_sys_mm: ArrayLike) -> Float:
-        """d(image px) / d(:data:`TEN_PARAMETER_NAMES`), (..., 2, 10), for a camera with the paper's lens."""
+        """Return d(image px) / d(:data:`TEN_PARAMETER_NAMES`), (..., 2, 10), for a camera with the paper's lens."""
         if not isinstance(self.lens, SeidelLens):
             raise TypeError(f"a {type(self.lens).__name__} has no ten-parameter form")
         points = np.asarray(points_sys_mm, dtype=np.float64)
@@ -245,7 +245,7 @@ def project_cam(lens: LensModel, points_cam_mm: ArrayLike) -> MappedPoints:
 
 
 def _normalised_jacobian(points_cam_mm: Float) -> Float:
-    """d(X/Z, Y/Z) / d(X, Y, Z), (..., 2, 3)."""
+    """Return d(X/Z, Y/Z) / d(X, Y, Z), (..., 2, 3)."""
     z = points_cam_mm[..., 2]
     jac = np.zeros((*points_cam_mm.shape[:-1], 2, 3))
     jac[..., 0, 0] = 1.0 / z

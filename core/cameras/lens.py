@@ -62,11 +62,11 @@ class LensModel(Protocol):
         ...
 
     def image_jacobian(self, xy_norm: ArrayLike) -> Float:
-        """d(image px) / d(normalised), (..., 2, 2), at normalised points (..., 2)."""
+        """Return d(image px) / d(normalised), (..., 2, 2), at normalised points (..., 2)."""
         ...
 
     def parameter_jacobian(self, xy_norm: ArrayLike) -> Float:
-        """d(image px) / d(parameters), (..., 2, n), at normalised points (..., 2)."""
+        """Return d(image px) / d(parameters), (..., 2, n), at normalised points (..., 2)."""
         ...
 
     def kernel_parameters(self) -> Float:
@@ -82,7 +82,7 @@ class LensModel(Protocol):
 class SeidelLens:
     """The paper's lens and sensor: five intrinsic parameters, Eqs. (5) to (8).
 
-    Parameters
+    Attributes
     ----------
     phd_px
         Pinhole distance in column pitches.

@@ -68,7 +68,6 @@ class StereoPair:
         return SpacePoints(np.where(valid[..., None], mid, np.nan), valid)
 
     def image2_at_depth(self, xy1_px: ArrayLike, z_cam1_mm: ArrayLike) -> Float:
-        """Image coordinates in camera 2 of the point on camera 1's ray at depth ``z_cam1_mm``; NaN outside its
-        domain."""
+        """Project the point on camera 1's ray at depth ``z_cam1_mm`` into camera 2; NaN outside its domain."""
         p = self.cam1.rays_cam(xy1_px).xyz_mm * np.asarray(z_cam1_mm, dtype=np.float64)[..., None]
         return project_cam(self.cam2.lens, self.cam2_from_cam1.apply(p)).xy

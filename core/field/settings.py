@@ -26,7 +26,7 @@ from core.settings import (
 class MeasureOptions:
     """Settings of the measurement of a field.
 
-    Parameters
+    Attributes
     ----------
     subset_px
         Width of the square subset.

@@ -16,7 +16,7 @@ from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, steps_px
 from core.field.points.smoothing_record import Order, Smoothing, check_smoothing, whole_weights
-from core.field.region.window import fit_terms, points_seen, ways_cut, window_offsets
+from core.field.region.window import connected_points, fit_terms, ways_cut, window_offsets
 
 _AT_ONCE = 1024
 _FIRM = 1e-9
@@ -84,7 +84,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     for first in range(0, len(rows), _AT_ONCE):
         r, k = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
         here = (r + half) * width + k + half
-        seen = points_seen(there, here, None if crossed is None else crossed[r, k], half)
+        seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
         weights, raw = _reduced_weights(seen, half, order, rho)
         n_raw += int(raw.sum())
         found[r, k] = _sums(padded.take(here[:, None] + reach, axis=0), weights, rho)

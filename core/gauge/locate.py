@@ -84,7 +84,7 @@ def _refined(field: Field, wanted: Float, xy_px: Float, slopes: Float) -> Float:
 
 
 def _slope(corners: Float, t: Float) -> Float:
-    """d(X, Y) / d(across, down) (n, 2, 2) of bilinear cells."""
+    """Return d(X, Y) / d(across, down) (n, 2, 2) of bilinear cells."""
     a, b, c, d = (corners[:, k] for k in range(4))
     u, v = t[:, :1], t[:, 1:]
     return np.stack([(1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)], axis=-1)

@@ -1,5 +1,4 @@
-"""Grid detection from nothing but the target's description: section 3.2.2's image processing, and a better
-localiser."""
+"""Grid detection from the target's description alone: section 3.2.2's image processing, and a better localiser."""
 
 from core.grid.detect import detect_grid
 from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, Localiser

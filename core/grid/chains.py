@@ -26,7 +26,7 @@ _MIN_SHARE = 0.25  # of the longest line's seen length; shorter ones are clutter
 class CoarseLine:
     """One line: parabola across its mean direction.
 
-    Parameters
+    Attributes
     ----------
     centre_px, direction
         (2,) reference point and unit vector.
@@ -54,8 +54,7 @@ class CoarseLine:
 
 
 def link(pieces: Pieces) -> list[CoarseLine]:
-    """Join pieces that prolong each other: a line grows from its heaviest piece, outwards, by the pieces that lie on
-    it."""
+    """Join pieces that prolong each other: a line grows from its heaviest piece outwards."""
     n = len(pieces)
     if n < 3:
         return []
@@ -130,7 +129,7 @@ def _fit(pieces: Pieces) -> CoarseLine:
 class Chain:
     """Lines of one family in order.
 
-    Parameters
+    Attributes
     ----------
     lines, number
         The lines, and (n,) their numbers from 0; a number may be missing.

@@ -40,7 +40,7 @@ def check_lattice(lattice: Lattice, target: GridTarget, size_px: tuple[int, int]
     segments = polylines(lattice.nodes_px)
     if abs(rotation_deg - 45.0) > np.degrees(options.max_rotation_rad):
         raise TargetError(
-            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 are needed to distinguish its axes",
+            f"the grid is turned by {rotation_deg:.1f} degrees in the image; 45 +- 20 distinguish its axes",
             code="target_rotated",
             remedy="Turn the grid (or the camera) until its lines run at about 45 degrees to the rows.",
             rotation_deg=rotation_deg,

@@ -27,7 +27,7 @@ _BLURS = 4.0
 class Parabolas:
     """One non-oblique parabola a line.
 
-    Parameters
+    Attributes
     ----------
     steep
         (n,) True where x is a function of y.
@@ -195,7 +195,7 @@ def _local(parabolas: Parabolas, part: slice, x: Float, family_axis: int) -> tup
 
 
 def _value(parabolas: Parabolas, part: slice, x: Float, *, family_axis: int) -> tuple[Float, Float]:
-    """v - c(u) at the points, (n_a, n_b), and its gradient in x and y."""
+    """Return v - c(u) at the points, (n_a, n_b), and its gradient in x and y."""
     u, v = _local(parabolas, part, x, family_axis)
     c = parabolas.coefficients[part]
     steep = parabolas.steep[part]

@@ -1,5 +1,4 @@
-"""Detection of the grid in one image: coarse lattice, sub-pixel pieces, lines, intersections, and every check on
-the way."""
+"""Detection of the grid in one image: coarse lattice, sub-pixel pieces, lines, intersections, and checks."""
 
 from __future__ import annotations
 

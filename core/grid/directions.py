@@ -1,7 +1,7 @@
 """Straight pieces of lines in a binary picture, sorted by direction.
 
 The structure tensor gives each dark pixel's direction and, by its coherence, a measure of its certainty: at a crossing
-there is no clear direction, so that lines are divided into the pieces between crossings. The pieces' directions show the
+there is no clear direction, so that lines are divided into the pieces between crossings. Their directions show the
 families.
 """
 
@@ -28,7 +28,7 @@ _PEAK_SHARE = 0.08  # of the strongest direction; weaker ones are not half of a 
 class Pieces:
     """Straight pieces in full-size pixels.
 
-    Parameters
+    Attributes
     ----------
     centre_px
         (n, 2).
@@ -55,7 +55,7 @@ class Pieces:
 class Directions:
     """Direction of each dark pixel, and the picture's main directions.
 
-    Parameters
+    Attributes
     ----------
     angle_rad
         (rows, columns) direction along the line in [0, pi); y points down.

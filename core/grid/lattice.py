@@ -30,7 +30,7 @@ _STRAY_END = 0.1  # of the pitch; an end line that deviates by more is an edge o
 class Lattice:
     """Numbered lines and their intersections.
 
-    Parameters
+    Attributes
     ----------
     nodes_px
         (m_a, m_b, 2) intersections of the lines found, straight from the coarse lines, or predicted where a line

@@ -36,7 +36,7 @@ _MORE_TERMS_GAIN = 60.0  # fall of chi^2 that five more terms must bring; five w
 class LinePoints:
     """Sub-pixel points on lines.
 
-    Parameters
+    Attributes
     ----------
     xy_px
         (n, 2).
@@ -60,7 +60,7 @@ class LinePoints:
 class LineFit:
     """Lines of both families under one model.
 
-    Parameters
+    Attributes
     ----------
     nodes_px
         (n_a, n_b, 2) all intersections.
@@ -84,14 +84,14 @@ class LineFit:
 
 @dataclass(frozen=True)
 class _Distortion:
-    """v = u + sum D_m f_m(u), in units of half the image's diagonal about its centre."""
+    """Distortion v = u + sum D_m f_m(u), in units of half the image's diagonal about its centre."""
 
     centre_px: Float
     scale_px: float
     D: Float
 
     def terms(self, u: Float) -> Float:
-        """f_m(u), (..., 2, m)."""
+        """Return f_m(u), (..., 2, m)."""
         return _terms(u, len(self.D))
 
     def correct(self, xy_px: Float) -> Float:

@@ -22,7 +22,7 @@ _STRIP_SHARE = 0.45
 class PieceTable:
     """All pieces of a lattice, family a first.
 
-    Parameters
+    Attributes
     ----------
     rows
         (n, len(INPUTS)) for :func:`core.grid.profile.fit_pieces`.

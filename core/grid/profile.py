@@ -1,5 +1,4 @@
-"""Maximum-likelihood fit of one piece of a line: the profile that a straight line of known width leaves in square
-pixels.
+"""Maximum-likelihood fit of one piece of a line, by the profile of a straight line in square pixels.
 
 A line of width w, blurred by a Gaussian of standard deviation s and integrated over square pixels, crosses the
 piece's normal (n_x, n_y) with the profile
@@ -139,8 +138,7 @@ def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) 
 
 @njit(cache=True, nogil=True)
 def _search(image: Float32, piece: Float, guard: float, sign: float) -> float:
-    """Position of the deepest mean profile of the strip within the search range; matched with a box of the line's
-    width."""
+    """Find the deepest mean profile of the strip in the search range, by a box of the line's width."""
     search = piece[16]
     reach = search + 2.0 + piece[14]
     n_bin = 2 * int(np.ceil(2.0 * reach)) + 1

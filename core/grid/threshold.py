@@ -27,7 +27,7 @@ _COARSE_SIDE_PX = 720.0
 class LinePicture:
     """Thin lines of an image, at the coarse scale.
 
-    Parameters
+    Attributes
     ----------
     depth
         (rows, columns) float32, depth of each pixel below its ground, grey levels (never negative).

@@ -18,7 +18,7 @@ LineModel = Literal["straight", "parabola", "local"]
 class GridOptions:
     """Options of grid detection.
 
-    Parameters
+    Attributes
     ----------
     line_model
         Model of a line through its pieces. ``straight``: all lines are straight but for one common lens distortion,
@@ -53,7 +53,7 @@ class GridView:
     physical corner the same index as long as both images are upright. A turned or mirrored image is detected in the
     calibration, whose angles then disagree with the nominal rig.
 
-    Parameters
+    Attributes
     ----------
     target
         The description it was found by.
@@ -134,7 +134,7 @@ class GridView:
 class GridOverlay:
     """Polylines to lay over the image.
 
-    Parameters
+    Attributes
     ----------
     pieces_px, pieces_used
         (n, 2, 2) line pieces, and (n,) True where used.

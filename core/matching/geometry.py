@@ -164,8 +164,7 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
 
 
 def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance: ArrayLike) -> Float:
-    """Return the covariance (N, 3, 3) of XYZ in mm^2, system frame, from a shape fit's (N, 2, 2) of (w0, epipolar
-    offset).
+    """Return the covariance (N, 3, 3) of XYZ, mm^2, system frame, from a shape fit's (N, 2, 2).
 
     The pixel is exact by definition, so the point can only move along its ray: the matrix has rank one.
     """

@@ -18,7 +18,7 @@ SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
 class MatchOptions:
     """Options of :func:`core.matching.fit_shape` and :func:`core.matching.fit_motion`.
 
-    Parameters
+    Attributes
     ----------
     subset_px
         Width and height of the square subset in camera 1, px.

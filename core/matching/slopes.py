@@ -178,8 +178,7 @@ def _floor(spectra: Float) -> float:
 
 
 def _interpolation_error(side: int, order: int) -> Float:
-    """Return the interpolation error of each frequency (side, side // 2 + 1): share of its power, mean over the
-    phase."""
+    """Return the interpolation error (side, side // 2 + 1) by frequency: share of its power, mean over the phase."""
 
     def along(w: Float) -> Float:
         if order == 3:

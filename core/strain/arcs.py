@@ -56,8 +56,7 @@ def whole_second_derivatives(values: Float, half: int) -> Float:
 
 
 def second_weights(seen: Bool, half: int) -> Float:
-    """Return weights (m, 3, n) of the windows' connected points in these derivatives; zero where they determine
-    none."""
+    """Return weights (m, 3, n) of the windows' connected points in these derivatives; zero where undetermined."""
     A = fit_terms(window_offsets(half)[0], half, 2)
     n, terms = A.shape
     normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)

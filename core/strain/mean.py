@@ -20,8 +20,7 @@ from core.strain.window import plane_weights
 
 
 def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> Float:
-    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN for an area without
-    strain.
+    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN without strain.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from core.settings import STRAIN_TENSORS, STRAIN_WINDOW, StrainSettings, StrainT
 class StrainOptions:
     """Options of the computation of strain from a field of displacements.
 
-    Parameters
+    Attributes
     ----------
     window
         Points across the square window, odd. The virtual strain gauge is (window - 1) spacing + subset wide.

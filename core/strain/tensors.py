@@ -107,10 +107,12 @@ def strain_slopes(frame: Float, gradient: Float, tensor: StrainTensor, per_mm: F
 
     Parameters
     ----------
-    frame, gradient, tensor, strain
+    frame, gradient, tensor
         As in :func:`strain_covariance`.
     per_mm
         (n, 2, 2) steps of column and row (first index) per mm along the frame's axes (second).
+    strain
+        (n, 3) the strain itself.
     """
     A = _pulls(frame, gradient, tensor)
     along = A[:, :, None, None, :] * np.swapaxes(per_mm, -1, -2)[:, None, :, :, None]  # (n, i, j, a, 6)

@@ -15,7 +15,7 @@ from scipy import ndimage
 from core.arrays import Bool, Float
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
-from core.field.region.window import fit_terms, points_seen, steps_of, ways_cut, window_offsets
+from core.field.region.window import connected_points, fit_terms, steps_of, ways_cut, window_offsets
 from core.strain.arcs import reduced_moments, second_weights, third_moments, whole_second_derivatives
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
@@ -98,7 +98,7 @@ def window_slopes(
     for first in range(0, len(rows), _AT_ONCE):
         r, k = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
         here = (r + half) * width + k + half
-        seen = points_seen(there, here, None if crossed is None else crossed[r, k], half)
+        seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
         found, weights = _weights(seen, half, options)
         # from the centre's values on, so that no digits are lost
         data = padded.take(here[:, None] + reach, axis=0) - values[r, k][:, None, :]

@@ -1,1 +1,1 @@
-"""From two streams of frames to pairs: reader threads, frame counters, clocks, pairing."""
+"""Pairs of frames from two streams: reader threads, frame counters, clocks, pairing."""

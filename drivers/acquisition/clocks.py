@@ -1,9 +1,9 @@
 """A camera's clock brought to the host's, so that exposures of cameras without a common clock can be compared.
 
 A frame arrives some time after its exposure began: read-out, transmission, the host's own delays. The device's clock
-does not know these, and runs beside the host's with a constant offset and a few ppm of drift. The smallest ``arrival -
-device time`` of the last frames is that offset and the shortest delay there is; what a frame was late beyond it is
-jitter, and drops out. Two cameras of one model share the shortest delay, so it drops out of their skew too.
+does not include these, and has a constant offset to the host's and a few ppm of drift. The smallest ``arrival - device
+time`` of the last frames is that offset and the shortest delay there is; what a frame was late beyond it is jitter, and
+drops out. Two cameras of one model share the shortest delay, so it drops out of their skew too.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Pairing by frame number for cameras on one trigger line whose counters did not start together.
 
 Both cameras count their frames, but one may have been armed a pulse earlier. The first two frames that began within
-half a period fix how the numbers belong together; from then on numbers decide, and late or jittering arrivals do no
-harm. A camera that missed a pulse does not count it: from there its numbers are off by one, which shows as a skew of a
-whole period. Such a pair is refused, and the numbers are aligned anew.
+half a period fix the offset of the numbers; from then on numbers decide, and late or jittering arrivals have no effect.
+A camera that missed a pulse does not count it: from there its numbers differ by one, which shows as a skew of a whole
+period. Such a pair is refused, and the numbers are aligned anew.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class AlignedPairing:
 
     @property
     def account(self) -> PairingAccount:
-        """What became of the pulses whose fate is known."""
+        """Counters of the closed pulses."""
         now = self._finder.account if self._numbers is None else self._numbers.account
         return _sum(self._earlier, now)
 
@@ -63,11 +63,11 @@ class AlignedPairing:
             self._earlier = _sum(self._earlier, self._numbers.finish())
             self._numbers = None
             self._finder = self._new_finder()
-            return None  # two frames of two pulses: counted as paired and refused, and nobody's pair
+            return None  # two frames of two pulses: counted as paired and refused, and not delivered
         return pair
 
     def finish(self) -> PairingAccount:
-        """Close all and return what became of each pulse."""
+        """Close all and return the counters of the pulses."""
         (self._finder if self._numbers is None else self._numbers).finish()
         return self.account
 

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Arrival(StrEnum):
-    """What a frame number says about its frame."""
+    """Place of a frame in the sequence, by its number."""
 
     NEXT = "next"  # newer than all before; `Reading.missing` frames were skipped
     DUPLICATE = "duplicate"
@@ -16,16 +16,16 @@ class Arrival(StrEnum):
 
 @dataclass(frozen=True)
 class Reading:
-    """One frame number understood.
+    """Reading of one frame number.
 
-    Parameters
+    Attributes
     ----------
     arrival
         See there.
     number
         The counter as it would be without its wrap, from the first frame's own number on.
     missing
-        How many numbers were skipped before this one.
+        Number of frames skipped before this one.
     """
 
     arrival: Arrival
@@ -54,7 +54,7 @@ class SequenceReader:
         self._recent: set[int] = set()
 
     def read(self, raw: int) -> Reading:
-        """Understand the next frame number as the device gave it."""
+        """Read the next frame number as the device gave it."""
         if not 0 <= raw - self._first < self._size:
             raise ValueError(f"frame number {raw} is outside the counter's range")
         if self._newest is None:
@@ -71,6 +71,6 @@ class SequenceReader:
         if step < 0:
             return Reading(Arrival.LATE, number)
         self._newest = number
-        # what lies further back than this cannot be told from a late frame any more, which is refused just the same
+        # further back than this it cannot be distinguished from a late frame, which is refused too
         self._recent = {known for known in self._recent if known > number - 64}
         return Reading(Arrival.NEXT, number, step - 1)

@@ -1,4 +1,4 @@
-"""Making pairs of two cameras' frames, in one place, so that every trigger has one fate and one only.
+"""Pairing of two cameras' frames: every trigger has exactly one outcome.
 
 ::
 
@@ -25,7 +25,7 @@ from drivers.cameras.protocol import Frame, FrameStatus
 class Pair:
     """Two frames of one trigger.
 
-    Parameters
+    Attributes
     ----------
     cam1, cam2
         The frames.
@@ -34,7 +34,7 @@ class Pair:
     skew_ms
         Beginning of camera 2's exposure minus that of camera 1.
     max_skew_ms
-        What the rig allows.
+        Largest skew that the rig allows.
     """
 
     cam1: Frame
@@ -48,11 +48,11 @@ class Pair:
 
     @property
     def accepted(self) -> bool:
-        """Whether it may be measured with."""
+        """True if its skew is within the limit."""
         return abs(self.skew_ms) <= self.max_skew_ms
 
     def require(self) -> Pair:
-        """Return the pair itself; code ``skew_too_large`` when it may not be measured with."""
+        """Return the pair itself; code ``skew_too_large`` when its skew is above the limit."""
         if not self.accepted:
             raise CameraError(
                 f"The exposures of pair {self.number} began {abs(self.skew_ms):.3f} ms apart, "
@@ -67,7 +67,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairingAccount:
-    """What became of the triggers: triggered = paired + unpaired + incomplete + dropped."""
+    """Counters of the triggers: triggered = paired + unpaired + incomplete + dropped."""
 
     triggered: Annotated[int, Field(description="Occasions on which a pair was due.")] = 0
     paired: Annotated[int, Field(description="Both frames came.")] = 0
@@ -78,7 +78,7 @@ class PairingAccount:
     late: Annotated[int, Field(description="Frames that came after their occasion was given up.")] = 0
 
     def as_dict(self) -> dict[str, int]:
-        """Names and numbers, for reports."""
+        """Return names and numbers, for reports."""
         return asdict(self)
 
 
@@ -105,7 +105,7 @@ class _Pairing:
 
     @property
     def account(self) -> PairingAccount:
-        """What became of the triggers that are closed."""
+        """Counters of the closed triggers."""
         fates = ("paired", "unpaired", "incomplete", "dropped")
         return PairingAccount(triggered=sum(self._counts.get(name, 0) for name in fates), **self._counts)
 
@@ -140,7 +140,7 @@ class NumberPairing(_Pairing):
     max_skew_ms
         Above it a pair is made and counted, but not accepted.
     common_clock
-        Whether the device times of both cameras may be compared; else skew is that of the exposures brought to the
+        True if the device times of both cameras may be compared; else skew is that of the exposures converted to the
         host's clock, or of the arrival at the host where that was not done.
     origin
         Frame number, in each camera, of the first trigger; its trigger number in pairing by trigger (cam1's counts).
@@ -167,7 +167,7 @@ class NumberPairing(_Pairing):
         self._seen = 0  # every number below was triggered
 
     def triggered(self, count: int) -> None:
-        """Say that ``count`` triggers were fired up to now; those whose frames never come are then known too."""
+        """Record that ``count`` triggers were fired up to now; those whose frames never come are then counted too."""
         self._see(count)
 
     def feed(self, cam: CameraName, frame: Frame) -> Pair | None:
@@ -203,7 +203,7 @@ class NumberPairing(_Pairing):
         return pair
 
     def finish(self) -> PairingAccount:
-        """Close all triggers and return what became of each."""
+        """Close all triggers and return their counters."""
         self._close_below(self._seen)
         return self.account
 
@@ -229,7 +229,7 @@ class NumberPairing(_Pairing):
 class TimePairing(_Pairing):
     """Pairs by time, for cameras without a common trigger: frames that began within half a period belong together.
 
-    ``triggered`` is then the number of occasions on which a frame was seen or known to be missing.
+    ``triggered`` is then the number of frames or pairs that came or are known to be missing.
 
     Parameters
     ----------
@@ -271,12 +271,12 @@ class TimePairing(_Pairing):
         return None
 
     def missing(self, count: int) -> None:
-        """Say that both cameras lost so many frames, as their counters show."""
+        """Record that both cameras lost so many frames, as their counters show."""
         for _ in range(count):
             self._count("dropped")
 
     def finish(self) -> PairingAccount:
-        """Close what still waits and return what became of each."""
+        """Close waiting frames and return the counters."""
         for cam in CAMERAS:
             while self._waiting[cam]:
                 self._close(cam)

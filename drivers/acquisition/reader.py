@@ -1,9 +1,9 @@
-"""One thread a camera that takes frames from the grabber, refuses what is no measurement image, and keeps count.
+"""One thread a camera that takes frames from the grabber, refuses frames that are no measurement images, and counts.
 
-What happened to every frame number since `CameraReader.start` is in the counters: ``delivered + overrun + dropped +
-incomplete`` is how far the camera's counter went. Repeats and late frames come on top, since their numbers are already
-counted. The watchdog is ours: a camera that is silent for three frame periods (0.4 s at least) is lost, whatever its
-library thinks.
+Every frame number since `CameraReader.start` is in the counters: ``delivered + overrun + dropped + incomplete`` is the
+advance of the camera's counter. Repeats and late frames are additional, since their numbers are already counted. A
+watchdog of its own declares a camera lost that is silent for three frame periods (0.4 s at least), regardless of its
+library.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ class CameraReader:
     buffer_frames
         Frames that may wait for the consumer; when it is too slow, the oldest is thrown away and counted.
     sequence
-        How to read the camera's counter.
+        Reader of the camera's counter.
     compare_pixels
         Also refuse a frame whose pixels equal the last frame's: a stale buffer under a new number. Not for cameras
         that can deliver the same picture twice, such as noise-free simulated ones.
     pass_incomplete
-        Hand incomplete frames on too, with their status, so that pairing can say what became of their triggers.
+        Deliver incomplete frames too, with their status, so that pairing can count their triggers.
     on_fault
         Called once, from the reader's thread, when the camera is lost.
     """
@@ -91,13 +91,13 @@ class CameraReader:
 
     @property
     def counters(self) -> FrameCounters:
-        """What became of the frames so far."""
+        """Counters of the frames so far."""
         with self._changed:
             return self._counters
 
     @property
     def fault(self) -> CameraError | None:
-        """Why the camera was lost, or None."""
+        """Error by which the camera was lost, or None."""
         with self._changed:
             return self._fault
 
@@ -146,7 +146,7 @@ class CameraReader:
     def _raise_fault(self) -> None:
         fault = self.fault
         if fault is not None:
-            # the same fault may be asked for many times: each caller gets an error of its own
+            # the same fault may be raised many times: each caller gets an error of its own
             raise CameraError(fault.cause, code=fault.code, remedy=fault.remedy, **fault.context)
 
     def _run(self) -> None:

@@ -19,7 +19,7 @@ from drivers.cameras.protocol import Frame, FrameStatus
 Check = Callable[[], None]
 Units = Mapping[CameraName, CameraUnit]
 
-# A frame that was lost or damaged on its way is asked for again; a camera that is dead is not
+# A frame that was lost or damaged on its way is triggered again; a camera that is lost is not
 _ATTEMPTS = 3
 _SLICE_S = 0.1
 _KEPT_PAIRS = 8
@@ -34,18 +34,18 @@ class PairSource(Protocol):
     def next_pair(self, check: Check | None = None) -> Pair:
         """Return a pair exposed after this call; ``check`` may raise while it waits."""
 
-    def look(self) -> None:
-        """See to it that the units' latest frames are new."""
+    def refresh(self) -> None:
+        """Make the units' latest frames new."""
 
     def account(self) -> PairingAccount:
-        """What became of every trigger so far."""
+        """Counters of all triggers so far."""
 
     def stop(self) -> None:
         """End it; the account stays."""
 
 
 def common_clock(units: Units) -> bool:
-    """Whether the device times of both cameras may be compared."""
+    """True if the device times of both cameras may be compared."""
     one, two = (units[cam].description.clock for cam in CAMERAS)
     return one != "" and one == two
 
@@ -60,7 +60,7 @@ class TriggeredPairs:
         self._origin = 0
 
     def start(self) -> None:
-        """Nothing to do: frames come when they are asked for."""
+        """Do nothing: frames come when they are triggered."""
 
     def next_pair(self, check: Check | None = None) -> Pair:
         """See `PairSource`.
@@ -75,7 +75,7 @@ class TriggeredPairs:
             if check is not None:
                 check()
             numbers, fired = self._fire(), time.monotonic()
-            # a camera that answered none of them is lost: the watchdog is let speak first
+            # a camera that answered none of them is lost: the watchdog raises its error first
             periods = 1.0 if attempt < _ATTEMPTS - 1 else 2.0
             made: Pair | None = None
             for cam in CAMERAS:
@@ -97,15 +97,15 @@ class TriggeredPairs:
             remedy="Capture again; POST /rig/reconnect if it comes back.",
         )
 
-    def look(self) -> None:
-        """Fire once; a pair that does not come to be is no fault here."""
+    def refresh(self) -> None:
+        """Fire once; a missing pair is no fault here."""
         with contextlib.suppress(CameraError):
             self.next_pair()
         for cam in CAMERAS:
             _ = self._units[cam].reader
 
     def account(self) -> PairingAccount:
-        """What became of every trigger."""
+        """Counters of all triggers."""
         return PairingAccount() if self._pairing is None else self._pairing.account
 
     def stop(self) -> None:
@@ -138,7 +138,7 @@ class TriggeredPairs:
         return numbers
 
     def _collect(self, cam: CameraName, number: int, fired: float, periods: float) -> tuple[Pair | None, bool]:
-        """Take a camera's frames up to that of one trigger; whether the last of them was incomplete."""
+        """Take a camera's frames up to that of one trigger; return True if the last of them was incomplete."""
         unit, pairing = self._units[cam], self._pairing
         assert pairing is not None
         deadline = fired + periods * unit.patience_s
@@ -154,7 +154,7 @@ class TriggeredPairs:
             if whole:
                 unit.latest = frame
             if frame.trigger is None and not whole:
-                return made, True  # damaged beyond knowing which trigger it belongs to
+                return made, True  # damaged so that its trigger is not known
             made = pairing.feed(cam, frame) or made
             if frame.trigger is None or frame.trigger >= number:
                 return made, not whole
@@ -172,7 +172,7 @@ class StreamedPairs:
     max_skew_ms
         Above it a pair is refused.
     capture_timeout_s
-        How long a capture waits for a pulse where no rate is known.
+        Longest wait of a capture for a pulse where no rate is known.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class StreamedPairs:
                         self._pairs.append(pair)
                         self._changed.notify_all()
         except CameraError:
-            pass  # the unit knows why, and says so to who asks
+            pass  # the unit raises the reason to its callers
         with self._changed:
             self._changed.notify_all()
 
@@ -250,7 +250,7 @@ class StreamedPairs:
 
     @property
     def _regular(self) -> bool:
-        """Whether frames come by themselves, at a known rate."""
+        """True if frames come by themselves, at a known rate."""
         return all(unit.trigger == "free" or unit.rate_hz is not None for unit in self._units.values())
 
     def _limit_s(self) -> float:
@@ -258,13 +258,13 @@ class StreamedPairs:
             return self._capture_timeout_s
         return 2.0 + max(10.0 * unit.period_s + unit.description.latency_s for unit in self._units.values())
 
-    def look(self) -> None:
-        """Nothing to do: frames come by themselves."""
+    def refresh(self) -> None:
+        """Do nothing: frames come by themselves."""
         for cam in CAMERAS:
             _ = self._units[cam].reader
 
     def account(self) -> PairingAccount:
-        """What became of every occasion."""
+        """Counters of all pairs and missing frames."""
         with self._changed:
             return self._pairing.account
 

@@ -1,4 +1,4 @@
-"""One camera of the rig: its grabber, its reader thread, the settings it has, and its way back after a loss."""
+"""One camera of the rig: its grabber, its reader thread, its settings, and its reconnection after a loss."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CameraUnit:
     make
         Makes a new grabber of the camera: the handle of a lost one never works again.
     trigger
-        What starts its exposures.
+        Trigger mode of its exposures.
     rate_hz
         Rate in free run, or of the pulses of a hardware trigger; ``None`` when pulses come irregularly, and then their
         absence means nothing.
@@ -69,13 +69,13 @@ class CameraUnit:
         self.reconnections = 0
 
     def open(self, settings: CameraSettings) -> None:
-        """Connect, check who it is, push settings, arm.
+        """Connect, check its identity, push settings, arm.
 
         Raises
         ------
         CameraError
             ``wrong_camera`` when another serial number answers, ``image_size_mismatch`` when its images have another
-            size than the rig file says, or what the device brings up.
+            size than the rig file says, or an error of the device.
         """
         wanted = replace(settings, trigger=self.trigger)
         if self.trigger == "free" and self.rate_hz is not None:
@@ -121,7 +121,7 @@ class CameraUnit:
         Raises
         ------
         CameraError
-            ``settings_not_restored`` when it does not take what it had before, or what the device brings up.
+            ``settings_not_restored`` when it does not take what it had before, or an error of the device.
         """
         had = self.settings
         self.release()
@@ -156,7 +156,7 @@ class CameraUnit:
 
     @property
     def patience_s(self) -> float:
-        """How long a frame that was triggered may take."""
+        """Longest time of a triggered frame."""
         return self.period_s + self.description.latency_s
 
     def _start(self) -> None:
@@ -190,7 +190,7 @@ class CameraUnit:
 
     @property
     def reader(self) -> CameraReader:
-        """The running reader; raises why there is none."""
+        """Return the running reader; raise the reason where there is none."""
         reader, fault = self._reader, self._fault
         if reader is None or fault is not None:
             cause = f"{self.name} is not armed." if fault is None else fault.cause
@@ -204,16 +204,16 @@ class CameraUnit:
 
     @property
     def wanted(self) -> CameraSettings:
-        """What was asked for so far, which a camera that comes back is given again."""
+        """Settings requested so far, which a reconnected camera is given again."""
         return self._wanted
 
     @property
     def fault(self) -> CameraError | None:
-        """Why the camera cannot be used, or None."""
+        """Error for which the camera cannot be used, or None."""
         return self._fault
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Change settings; the camera is armed again afterwards, whatever happens."""
+        """Change settings; the camera is armed again afterwards in any case."""
         _ = self.reader
         self._stop()
         try:
@@ -229,7 +229,7 @@ class CameraUnit:
         return self.settings
 
     def counters(self) -> dict[str, int]:
-        """What became of the frames since the camera was opened."""
+        """Return the counters of the frames since the camera was opened."""
         reader = self._reader
         now = FrameCounters() if reader is None else reader.counters
         old = self._earlier.as_dict()
@@ -250,7 +250,7 @@ class CameraUnit:
 
 
 def _differences(had: CameraSettings, has: CameraSettings) -> list[str]:
-    """Settings that are not what they were, as texts."""
+    """Return the settings that have changed, as texts."""
     before, now = asdict(had), asdict(has)
     features: dict[str, Any] = before.pop("features") or {}
     features_now: dict[str, Any] = now.pop("features") or {}

@@ -1,4 +1,4 @@
-"""From the bytes that a GenICam camera sends to gray values, right-aligned in uint8 or uint16.
+"""Gray values, right-aligned in uint8 or uint16, from the bytes that a GenICam camera sends.
 
 Names and codes are those of the Pixel Format Naming Convention (PFNC). Layouts, with ``P`` a pixel and the highest bit
 written first:
@@ -7,16 +7,16 @@ written first:
 ``Mono8``                 one byte a pixel
 ``Mono10/12/14/16``       two bytes a pixel, little-endian, significant bits right-aligned
 ``Mono10p/12p/14p``       one stream of bits, the lowest first: pixel i fills bits ``n i`` to ``n i + n - 1``, bit b
-                          lies in byte ``b // 8`` at place ``b % 8``
+                          lies in byte ``b // 8`` at bit ``b % 8``
 ``Mono12Packed``          GigE Vision 1.x, two pixels in three bytes: ``P0[11..4]``, ``P1[3..0] P0[3..0]``,
                           ``P1[11..4]``
 ``Mono10Packed``          GigE Vision 1.x, two pixels in three bytes: ``P0[9..2]``, ``- - P1[1..0] - - P0[1..0]``,
                           ``P1[9..2]``
 ========================  ==============================================================================================
 
-Packed pixels run on from the end of one line into the next, also within a byte, unless lines are padded: then each
-line begins at a byte of its own. A camera says so by its line padding, or by sending as many bytes as whole lines need;
-where both ways come to the same number of bytes, they run on.
+Packed pixels run on from the end of one line into the next, also within a byte, unless lines are padded: then each line
+begins at a byte of its own. It shows in the camera's line padding, or in as many bytes as whole lines need; where both
+ways come to the same number of bytes, they run on.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ Layout = Literal["bytes", "words", "lsb", "msb"]
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """How gray values lie in a camera's bytes.
+    """Layout of gray values in a camera's bytes.
 
-    Parameters
+    Attributes
     ----------
     name, code
         As PFNC has them.

@@ -1,6 +1,6 @@
-"""What every camera driver delivers and promises: frames, settings, counters and the grabber protocol.
+"""Interface of the camera drivers: frames, settings, counters and the grabber protocol.
 
-What a camera says of itself is declared here, each field with its meaning; replies and records of the service derive
+The description of a camera is declared here, each field with its meaning; replies and records of the service derive
 from these classes.
 """
 
@@ -25,7 +25,7 @@ Range = tuple[float, float]
 
 
 class FrameStatus(StrEnum):
-    """Whether the pixels of a frame may be used."""
+    """Usability of a frame's pixels."""
 
     OK = "ok"
     INCOMPLETE = "incomplete"  # lines or packets are missing; never delivered as a measurement image
@@ -33,9 +33,9 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One digitised image and where it stands in its camera's sequence.
+    """One digitised image and its number in its camera's sequence.
 
-    Parameters
+    Attributes
     ----------
     pixels
         Gray image, shape (rows, columns), uint8 up to 8 bit and uint16 above; significant bits right-aligned.
@@ -48,11 +48,11 @@ class Frame:
     host_ns
         Arrival by the host's monotonic clock, in ns.
     status
-        Anything but ``OK`` is counted and thrown away by the reader.
+        Anything but ``OK`` is counted and discarded by the reader.
     trigger
         Number of the trigger that made this frame, where the device or driver knows it; pairs are made by it.
     exposed_ns
-        Start of the exposure brought to the host's monotonic clock (`drivers.acquisition.clocks`), set by the reader.
+        Start of the exposure converted to the host's monotonic clock (`drivers.acquisition.clocks`), set by the reader.
     """
 
     pixels: Pixels
@@ -82,7 +82,7 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """Settings as asked for; ``None`` leaves what the device has. `FrameGrabber.configure` returns what it took.
+    """Settings as requested; ``None`` leaves the device's own. `FrameGrabber.configure` returns them as read back.
 
     Read back, they are the device's own, which may round them; ``None`` where it has no such setting. Of ``bit_depth``
     the driver takes the plainest pixel format that carries it; ``pixel_format`` names one: ``Mono12Packed`` (GenICam),
@@ -106,9 +106,9 @@ class CameraSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
-    """How a driver reaches its camera and uses it: what is set once, when it is opened.
+    """Connection of a driver to its camera: options that are set once, when it is opened.
 
-    Parameters
+    Attributes
     ----------
     device
         The driver's name of the device, as `discover` lists it: an Aravis id or IP address, ``/dev/video0``, or a
@@ -136,11 +136,9 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundDevice:
-    """A device that discovery saw."""
+    """A device found by discovery."""
 
-    kind: Annotated[
-        Literal["camera", "serial"], Field(description="What it may be used as; a serial port may hold anything.")
-    ]
+    kind: Annotated[Literal["camera", "serial"], Field(description="Possible use; a serial port may hold anything.")]
     driver: Annotated[
         str, Field(description="`driver` for the rig file; empty for a serial port.", examples=["aravis"])
     ]
@@ -161,7 +159,7 @@ class FoundDevice:
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """Which camera it is, as records of what it took keep it."""
+    """Identity of a camera, as stored with its images."""
 
     model: Annotated[str, Field(description="Model.", examples=["simulated camera"])]
     serial: Annotated[str, Field(description="Serial number.")]
@@ -169,7 +167,7 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class CameraDescription(CameraIdentity):
-    """Who the camera is and what it can do; a range is ``None`` where the device has no such setting.
+    """Identity and abilities of a camera; a range is ``None`` where the device has no such setting.
 
     ``latency_s`` is for the watchdog: zero but for cameras that render. ``clock`` names the clock of
     ``Frame.device_ns`` (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
@@ -200,7 +198,7 @@ class CameraDescription(CameraIdentity):
 
 @dataclass(frozen=True)
 class FrameCounters:
-    """What became of every frame a camera announced since it was opened."""
+    """Counters of the frames that a camera announced since it was opened."""
 
     delivered: Annotated[int, Field(description="Frames that came whole.")] = 0
     overrun: Annotated[int, Field(description="Thrown away because nobody took them in time.")] = 0
@@ -211,7 +209,7 @@ class FrameCounters:
     out_of_order: Annotated[int, Field(description="Arrived after a later one.")] = 0
 
     def as_dict(self) -> dict[str, int]:
-        """Names and numbers, for reports."""
+        """Return names and numbers, for reports."""
         return asdict(self)
 
 
@@ -227,13 +225,13 @@ class FrameGrabber(Protocol):
         """Connect. Raises `CameraError` (``camera_lost``, ``camera_busy``) when it cannot."""
 
     def describe(self) -> CameraDescription:
-        """Say who the camera is and what it can do; ranges may depend on what was configured."""
+        """Return the camera's identity and abilities; ranges may depend on its settings."""
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Set what is not ``None`` and return every setting as read back from the device.
 
         A value outside the device's range is refused with code ``out_of_range`` before anything is changed; a setting
-        or feature that the device does not have with ``unknown_feature``; what cannot be changed while armed with
+        or feature that the device does not have with ``unknown_feature``; one that cannot be changed while armed with
         ``armed``.
         """
 
@@ -249,7 +247,7 @@ class FrameGrabber(Protocol):
     def next_frame(self, timeout_s: float) -> Frame | None:
         """Wait for the next frame, complete or not; ``None`` when none came in time.
 
-        Raises `CameraError` with code ``camera_lost`` when the device says that it is gone.
+        Raises `CameraError` with code ``camera_lost`` when the device reports that it is gone.
         """
 
     def statistics(self) -> dict[str, int | float]:

@@ -1,9 +1,9 @@
 """Newport ESP300 and ESP301: up to three axes on one line.
 
-Commands end in CR, replies in CR LF. A reply does not say which question it answers, so the line is brought back into
-step by asking for the version, whose reply cannot be mistaken. The controller keeps ten errors in a queue: three digits
-belong to an axis (``103``: axis 1, following error), fewer to none. It cannot say whether an axis was homed: the driver
-remembers what it homed itself, and forgets it when the line was lost.
+Commands end in CR, replies in CR LF. A reply does not name its question, so the line is synchronised again by asking
+for the version, whose reply is unmistakable. The controller keeps ten errors in a queue: three digits belong to an axis
+(``103``: axis 1, following error), fewer to none. It does not report if an axis was homed: the driver keeps the axes
+that it homed itself, and clears them when the line was lost.
 
 References
 ----------
@@ -69,7 +69,7 @@ class ESP301Stage(SerialStage):
     record
         File for a transcript of the wire.
     timeout_s
-        How long a reply may take.
+        Longest time of a reply.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class ESP301Stage(SerialStage):
         return self._ask(axis, "TP") * self._mm_per_unit[axis]
 
     def _read_status(self, axis: int) -> AxisStatus:
-        # motion first: what is read after "done" is then the end of the motion
+        # motion first: a position read after "done" is then the end of the motion
         moving = not self._line.query(f"{axis}MD?", _flag)
         motor_on = self._line.query(f"{axis}MO?", _flag)
         position = self._read_position_mm(axis)
@@ -211,12 +211,12 @@ class ESP301Stage(SerialStage):
     def _ask_greatest(self, axis: int, word: str, scale: float) -> float | None:
         try:
             return self._ask(axis, word) * scale
-        except StageError:  # a firmware that does not know the question
+        except StageError:  # a firmware without this query
             return None
 
     def _drain_errors(self, _axis: int | None = None) -> list[ControllerMessage]:
         found: list[ControllerMessage] = []
-        for _ in range(2 * _QUEUE_LENGTH):  # bounded: a controller that fills its queue forever must not hold us
+        for _ in range(2 * _QUEUE_LENGTH):  # bounded: a controller may fill its queue without end
             message = self._line.query("TB?", _message)
             if message is None:
                 break

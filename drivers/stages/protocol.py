@@ -1,10 +1,10 @@
-"""What every stage driver promises: the stage protocol, its options and its results.
+"""Interface of the stage drivers: the stage protocol, its options and its results.
 
 A stage is one controller, or one chain of controllers on one serial line, with numbered axes. Positions are in
-millimetres in the controller's own coordinates, whose zero homing defines. Whatever enters a computation is a position
-that was read back, never one that was commanded.
+millimetres in the controller's own coordinates, whose zero homing defines. Computations use positions that were read
+back, never commanded ones.
 
-What a stage says of itself is declared here, each field with its meaning; replies of the service derive from these
+The description of a stage is declared here, each field with its meaning; replies of the service derive from these
 classes.
 """
 
@@ -19,9 +19,9 @@ from pydantic import Field
 
 
 class AxisState(StrEnum):
-    """What an axis is doing or lacks."""
+    """State of an axis."""
 
-    NOT_HOMED = "not_homed"  # its position means nothing yet
+    NOT_HOMED = "not_homed"  # its position is not defined yet
     MOTOR_OFF = "motor_off"
     HOMING = "homing"
     MOVING = "moving"
@@ -32,9 +32,9 @@ class AxisState(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class AxisOptions:
-    """How one axis is used; comes from the rig file.
+    """Options of one axis, from the rig file.
 
-    Parameters
+    Attributes
     ----------
     soft_limits_mm
         (low, high); can only tighten the controller's own travel limits.
@@ -49,10 +49,10 @@ class AxisOptions:
     tolerance_mm
         A read-back position further from the target than this is a fault.
     assume_homed
-        Trust the controller's position although this driver did not home it. The ESP301 cannot say whether it was
-        homed, so the user must.
+        Trust the controller's position although this driver did not home it. The ESP301 does not report if it was
+        homed, so the user must state it.
     home_mode
-        ESP301: how home is searched (parameter of OR); ``None`` for the driver's usual one. The SMC100 family keeps
+        ESP301: mode of the home search (parameter of OR); ``None`` for the driver's usual one. The SMC100 family keeps
         its home search type (HT) in its configuration.
     """
 
@@ -69,7 +69,7 @@ class AxisOptions:
 
 @dataclass(frozen=True)
 class AxisIdentity:
-    """What is connected to one axis, in the controller's words."""
+    """Stage connected to one axis, in the controller's words."""
 
     axis: Annotated[int, Field(description="Axis number.")]
     model: Annotated[str, Field(description="Model of the actuator.")]
@@ -79,7 +79,7 @@ class AxisIdentity:
 
 @dataclass(frozen=True)
 class StageIdentity:
-    """Who the controller is."""
+    """Identity of the controller."""
 
     driver: Annotated[str, Field(description="Protocol.", examples=["esp301"])]
     model: Annotated[str, Field(description="Model.")]
@@ -90,7 +90,7 @@ class StageIdentity:
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """Where an axis may go: the controller's travel, and the tighter of that and the rig file's soft limits."""
+    """Travel of an axis: the controller's, and the tighter of that and the rig file's soft limits."""
 
     low_mm: Annotated[float, Field(description="Lowest position, the tighter of the controller's and the rig file's.")]
     high_mm: Annotated[float, Field(description="Highest position.")]
@@ -100,7 +100,7 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class AxisDynamics:
-    """How fast an axis moves, as read back from the controller."""
+    """Speeds of an axis, as read back from the controller."""
 
     axis: Annotated[int, Field(description="Axis number.")]
     velocity_mm_s: Annotated[float, Field(description="Velocity of moves.")]
@@ -115,7 +115,7 @@ class AxisDynamics:
 
 @dataclass(frozen=True)
 class AxisStatus:
-    """State of one axis, all read from the controller in one go except ``homed`` where it cannot say."""
+    """State of one axis, all read from the controller in one go except ``homed`` where it does not report it."""
 
     axis: Annotated[int, Field(description="Axis number.")]
     state: Annotated[AxisState, Field(description="What it is doing or lacks.", examples=["ready"])]
@@ -139,7 +139,7 @@ class ControllerMessage:
 
 @dataclass(frozen=True)
 class MoveResult:
-    """Where an axis was sent and where it stands, read back after settling."""
+    """Target of an axis and its position, read back after settling."""
 
     axis: int
     target_mm: float
@@ -153,11 +153,11 @@ class Stage(Protocol):
 
     Errors are `core.errors.StageError` with one of these codes: ``out_of_limits`` (also NaN and infinite targets: no
     byte went out), ``not_homed``, ``motor_off``, ``motion_fault`` (limit switch, stall, following error, position not
-    reached: the axis was stopped), ``stage_stopped`` (somebody called `stop` during or before the motion),
-    ``stage_lost`` (silence or garbage: the position is unknown), ``stage_refused`` (the controller's own error),
-    ``out_of_range`` (a velocity or acceleration that the controller cannot do), ``configuration_state`` (an SMC100
-    that a program left in its configuration state), ``unit_not_length``, ``units_changed`` (an ESP301's axis that
-    counts in something else than when it was opened), ``invalid_axis``.
+    reached: the axis was stopped), ``stage_stopped`` (`stop` was called during or before the motion), ``stage_lost``
+    (silence or garbage: the position is unknown), ``stage_refused`` (the controller's own error), ``out_of_range`` (a
+    velocity or acceleration that the controller cannot do), ``configuration_state`` (an SMC100 that a program left in
+    its configuration state), ``unit_not_length``, ``units_changed`` (an ESP301's axis that counts in another unit than
+    when it was opened), ``invalid_axis``.
     """
 
     @property
@@ -167,14 +167,14 @@ class Stage(Protocol):
     def open(self) -> None:
         """Connect, identify, read units and limits, set and read back velocities.
 
-        Moves nothing; what moves already, since an earlier program died, is stopped.
+        Moves nothing; an axis that moves already, since an earlier program died, is stopped.
         """
 
     def close(self) -> None:
         """Release the line; an axis that this driver is moving is stopped first. Safe to call twice."""
 
     def identify(self) -> StageIdentity:
-        """Say who answers, for example ``ESP301 Version 3.09``."""
+        """Return the controller's identity, for example ``ESP301 Version 3.09``."""
 
     def enable(self, axis: int) -> None:
         """Switch the motor on."""
@@ -206,7 +206,7 @@ class Stage(Protocol):
     def set_dynamics(
         self, axis: int, *, velocity_mm_s: float | None = None, acceleration_mm_s2: float | None = None
     ) -> AxisDynamics:
-        """Set what is given, and return what the controller took."""
+        """Set the values given, and return those that the controller took."""
 
     def leave_configuration(self, axis: int) -> None:
         """Leave an SMC100's configuration state, which writes its flash memory; never done unasked."""
@@ -218,10 +218,10 @@ class Stage(Protocol):
         """Read the state; works while another thread waits in a move."""
 
     def limits(self, axis: int) -> AxisLimits:
-        """Where the axis may go."""
+        """Limits of the axis."""
 
     def errors(self, *, ask: bool = True) -> tuple[ControllerMessage, ...]:
-        """Empty the controller's error queue and return it, together with what earlier calls took from it unread.
+        """Empty the controller's error queue and return it, with messages that earlier calls took from it unread.
 
         With ``ask=False`` only the latter: nothing goes over the line.
         """

@@ -1,4 +1,4 @@
-"""What every stage driver refuses in the same words: wrong states, and values at which no byte goes out."""
+"""Errors common to all stage drivers: wrong states, and values for which no byte is sent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from drivers.stages.protocol import AxisLimits, AxisOptions
 
 
 def configuration_state(axis: int) -> StageError:
-    """Say that an axis was left in the SMC100's configuration state."""
+    """Return the error of an axis that was left in the SMC100's configuration state."""
     return StageError(
         f"Axis {axis} is in CONFIGURATION state, in which a program left it (PW1): it refuses every motion.",
         code="configuration_state",
@@ -20,7 +20,7 @@ def configuration_state(axis: int) -> StageError:
 
 
 def not_in_configuration(axis: int) -> StageError:
-    """Say that there is no configuration state to leave."""
+    """Return the error of an axis that is not in its configuration state."""
     return StageError(
         f"Axis {axis} is not in CONFIGURATION state.",
         code="not_in_configuration",
@@ -30,7 +30,7 @@ def not_in_configuration(axis: int) -> StageError:
 
 
 def check_dynamic(axis: int, what: str, value: object, most: float | None) -> None:
-    """Refuse a velocity or an acceleration that is no positive number or above the controller's greatest.
+    """Raise an error for a velocity or an acceleration that is no positive number or above the controller's greatest.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def check_dynamic(axis: int, what: str, value: object, most: float | None) -> No
 
 
 def not_homed(axis: int) -> StageError:
-    """Say that nobody knows where an axis stands."""
+    """Return the error of an axis whose position is not known."""
     return StageError(
         f"Axis {axis} was not homed, its position means nothing.",
         code="not_homed",
@@ -60,12 +60,12 @@ def not_homed(axis: int) -> StageError:
 
 
 def motor_off(axis: int) -> StageError:
-    """Say that an axis has no power."""
+    """Return the error of an axis without power."""
     return StageError(f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis)
 
 
 def motion_fault(axis: int, what: str) -> StageError:
-    """Say what became of a motion."""
+    """Return the error of a motion that failed."""
     return StageError(
         f"Axis {axis} {what}.",
         code="motion_fault",
@@ -75,7 +75,7 @@ def motion_fault(axis: int, what: str) -> StageError:
 
 
 def check_number(axis: int, value: object) -> float:
-    """Return a position or a distance, or raise ``out_of_limits`` at what is no finite number."""
+    """Return a position or a distance, or raise ``out_of_limits`` if it is no finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise StageError(
             f"Axis {axis} cannot move to {value!r}: not a finite number.",
@@ -87,7 +87,7 @@ def check_number(axis: int, value: object) -> float:
 
 
 def check_target(axis: int, target: object, limits: AxisLimits) -> float:
-    """Return a target, or raise ``out_of_limits`` at one where the axis may not go."""
+    """Return a target, or raise ``out_of_limits`` at one outside the limits."""
     goal = check_number(axis, target)
     if not limits.low_mm <= goal <= limits.high_mm:
         raise StageError(
@@ -103,7 +103,7 @@ def check_target(axis: int, target: object, limits: AxisLimits) -> float:
 
 
 def detour(axis: int, option: AxisOptions, limits: AxisLimits, here_mm: float, goal_mm: float) -> float | None:
-    """Where to go first so that the last stretch takes up the backlash; ``None`` when the way there does it."""
+    """Return the intermediate target that takes up the backlash; ``None`` when the direct way does."""
     sign = 1.0 if option.approach_from == "below" else -1.0
     if option.backlash_mm == 0 or sign * (goal_mm - here_mm) >= option.backlash_mm:
         return None
@@ -121,7 +121,7 @@ def detour(axis: int, option: AxisOptions, limits: AxisLimits, here_mm: float, g
 
 
 def tighten(axis: int, soft: tuple[float, float] | None, low_mm: float, high_mm: float) -> AxisLimits:
-    """Return the limits that controller and rig file leave, or raise ``out_of_limits`` when that is nothing."""
+    """Return the limits of controller and rig file together, or raise ``out_of_limits`` when no travel is left."""
     low, high = (low_mm, high_mm) if soft is None else (max(low_mm, soft[0]), min(high_mm, soft[1]))
     if not low < high:
         raise StageError(

@@ -1,8 +1,8 @@
 """One serial line that several threads share: commands, queries with recovery, and a way for stop around every lock.
 
-Any URL that pyserial opens will do: a port, ``socket://host:port``, ``rfc2217://host:port``. Replies may end in CR,
-LF or both; stray NUL bytes and empty lines are thrown away. A query that brings nothing that makes sense is asked once
-more after the line was flushed; a command is written once and never again.
+Any URL that pyserial opens will do: a port, ``socket://host:port``, ``rfc2217://host:port``. Replies may end in CR, LF
+or both; stray NUL bytes and empty lines are discarded. A query without a valid reply is asked once more after the line
+was flushed; a command is written once and never again.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from drivers.stages.transcript import Transcript
 T = TypeVar("T")
 FlowControl = Literal["hardware", "software", "none"]
 
-# Longest time the flush listens to a line that never falls silent
+# Longest time of a flush on a line that never falls silent
 _FLUSH_LIMIT_S = 1.0
 # A reply longer than this is noise: the longest true one is an error text below 100 characters
 _LONGEST_REPLY = 512
@@ -34,7 +34,7 @@ class SerialLine:
     Parameters
     ----------
     url
-        What `serial.serial_for_url` takes.
+        URL for `serial.serial_for_url`.
     terminator
         Ends every command.
     baudrate
@@ -42,19 +42,19 @@ class SerialLine:
     flow_control
         ``hardware`` (RTS and CTS), ``software`` (XON and XOFF) or ``none``; likewise.
     timeout_s
-        How long a query waits for a reply that makes sense.
+        Longest wait of a query for a valid reply.
     quiet_s
         The line counts as flushed when nothing came for this long.
     resync
-        For controllers whose replies do not say which question they answer: a harmless query and a test for its reply.
-        It is asked after a flush, and all that comes before its reply is a late answer to something older.
+        For controllers whose replies do not name their question: a harmless query and a test for its reply. It is asked
+        after a flush, and all that comes before its reply is a late answer to something older.
     record
         File that gets a transcript of the wire, see `drivers.stages.transcript`.
 
     Attributes
     ----------
     losses
-        How often the controller was found lost; drivers compare it to know what they must no longer believe.
+        Number of losses of the controller; drivers compare it to discard values from before a loss.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class SerialLine:
 
     @property
     def is_open(self) -> bool:
-        """Whether the line is open; says nothing about who listens at the other end."""
+        """True if the line is open; independent of the device at the other end."""
         return self._port is not None
 
     def open(self) -> None:
@@ -143,7 +143,7 @@ class SerialLine:
             record.close()
 
     def command(self, text: str) -> None:
-        """Write a command that has no reply; written once, whatever happens."""
+        """Write a command that has no reply; written once in any case."""
         with self._lock:
             if self._dirty:
                 self._flush()
@@ -158,7 +158,7 @@ class SerialLine:
         self._write(2 * (text.encode("ascii") + self._terminator), "!")
 
     def query(self, text: str, parse: Callable[[str], T], *, timeout_s: float | None = None) -> T:
-        """Ask and return ``parse(reply)``; ``parse`` raises ValueError at what is no answer to this question.
+        """Ask and return ``parse(reply)``; ``parse`` raises ValueError for a text that is no answer to this question.
 
         Raises
         ------
@@ -209,7 +209,7 @@ class SerialLine:
             self._pending += self._read()
 
     def _flush(self) -> None:
-        """Throw away what comes until the line is quiet, then make sure that the next reply belongs to its question."""
+        """Discard input until the line is quiet, then make sure that the next reply belongs to its question."""
         limit = time.monotonic() + _FLUSH_LIMIT_S
         while self._read() and time.monotonic() < limit:
             pass

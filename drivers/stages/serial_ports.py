@@ -1,4 +1,4 @@
-"""Serial ports of this machine and what keeps one from being used, found out without opening any.
+"""Serial ports of this machine and their problems, found without opening any.
 
 Opening a port moves its modem lines, and a byte sent to an unknown device may set a machine in motion. So everything
 here comes from the system's own tables: sysfs, the access rights, open files, locks and the kernel's consoles.
@@ -20,7 +20,7 @@ from serial.tools import list_ports
 from core.errors import StageError
 from drivers.cameras.protocol import FoundDevice
 
-# USB ids that say what is likely behind the port; Newport's are those that Linux' ftdi_sio driver knows
+# USB ids of devices that are likely behind the port; Newport's are those of Linux' ftdi_sio driver
 _NEWPORT = 0x104D
 _HINTS: dict[tuple[int, int | None], str] = {
     (_NEWPORT, 0x3002): "Newport CONEX-CC: driver conex-cc",
@@ -37,12 +37,12 @@ _HINTS: dict[tuple[int, int | None], str] = {
 def discover_ports(
     *, proc: Path = Path("/proc"), dev: Path = Path("/dev"), locks: Path = Path("/var/lock")
 ) -> list[FoundDevice]:
-    """List serial ports with what is wrong with each.
+    """List serial ports with their problems.
 
     Parameters
     ----------
     proc, dev, locks
-        Where the system's tables lie.
+        Paths of the system's tables.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def discover_ports(
 
 
 def port_problem(path: str, *, proc: Path = Path("/proc"), locks: Path = Path("/var/lock")) -> str | None:
-    """Say what keeps this program from using a port, with what to do about it; ``None`` when nothing is known."""
+    """Return the problem for which a port cannot be used, with the remedy; ``None`` when none is known."""
     try:
         there = os.stat(path)  # noqa: PTH116  # follows a link below /dev/serial, as opening would
     except OSError as error:

@@ -1,6 +1,6 @@
-"""What all serial stage drivers have in common: checks before a byte goes out, one-sided arrival, waiting, stopping.
+"""Common parts of the serial stage drivers: checks before a byte is sent, one-sided arrival, waiting, stopping.
 
-A driver adds only its controller's words, see `drivers.stages.words`.
+A driver adds only its controller's commands, see `drivers.stages.commands`.
 
 A stop takes no lock. It sets a number of its own on the axes it concerns, and then writes. A motion notes these numbers
 when it is asked for, and looks at them again after each command that starts movement: whichever of the two was first on
@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from core.errors import StageError
+from drivers.stages.commands import ControllerCommands
 from drivers.stages.protocol import (
     AxisDynamics,
     AxisLimits,
@@ -41,21 +42,20 @@ from drivers.stages.refusals import (
     tighten,
 )
 from drivers.stages.serial_line import SerialLine
-from drivers.stages.words import ControllerWords
 
 _POLL_S = 0.02
-# An axis that says it moves and stays where it is for this long has jammed
+# An axis that reports motion without moving for this long has jammed
 _JAM_S = 1.0
 # Added to the computed travel time before a motion counts as overdue
 _MARGIN_S = 5.0
-# Messages kept for `errors`; nobody may ever ask for them
+# Messages kept for `errors`, which may never be called
 _MESSAGES = 100
-# How long an axis may take to come to rest after a stop
+# Longest time of an axis to come to rest after a stop
 _REST_S = 3.0
 
 
-class SerialStage(ControllerWords):
-    """Base of the stage drivers; see `drivers.stages.protocol.Stage` for what callers may expect."""
+class SerialStage(ControllerCommands):
+    """Base of the stage drivers; see `drivers.stages.protocol.Stage` for its interface."""
 
     def __init__(self, line: SerialLine, options: Mapping[int, AxisOptions]) -> None:
         self._line = line
@@ -76,7 +76,7 @@ class SerialStage(ControllerWords):
         return tuple(sorted(self._options))
 
     def open(self) -> None:
-        """Connect, identify, read limits, set and read back velocities; stop what moves already."""
+        """Connect, identify, read limits, set and read back velocities; stop axes that move already."""
         with self._motion_lock:
             self._line.open()
             try:
@@ -90,7 +90,7 @@ class SerialStage(ControllerWords):
                 raise
 
     def close(self) -> None:
-        """Release the line; what this driver is moving is stopped first."""
+        """Release the line; axes that this driver is moving are stopped first."""
         if self._line.is_open:
             try:
                 if self._moving:
@@ -99,7 +99,7 @@ class SerialStage(ControllerWords):
                 self._line.close()
 
     def identify(self) -> StageIdentity:
-        """Say who answers, as read when the stage was opened."""
+        """Return the controller's identity, as read when the stage was opened."""
         if self._identity is None:
             raise StageError(
                 f"The stage on {self._line.url} was not opened.", code="stage_lost", remedy="Connect the stage first."
@@ -107,7 +107,7 @@ class SerialStage(ControllerWords):
         return self._identity
 
     def limits(self, axis: int) -> AxisLimits:
-        """Where the axis may go."""
+        """Limits of the axis."""
         self._check_axis(axis)
         if axis not in self._limits:
             self.identify()
@@ -125,7 +125,7 @@ class SerialStage(ControllerWords):
 
     def errors(self, *, ask: bool = True) -> tuple[ControllerMessage, ...]:
         """Empty the controller's error queue."""
-        if ask and not self._moving:  # a motion reads the queue itself, and must find there what went wrong with it
+        if ask and not self._moving:  # a motion reads the queue itself, and must find its own errors there
             self._keep(self._drain_errors())
         found, self._messages = self._messages, []
         return tuple(found)
@@ -138,7 +138,7 @@ class SerialStage(ControllerWords):
         self._line.urgent(self._stop_text(axis))
 
     def abort(self) -> None:
-        """Stop all axes as in an emergency, then see to it that their motors are off."""
+        """Stop all axes as in an emergency, then make sure that their motors are off."""
         self._mark_stopped(self.axes)
         self._line.urgent(self._abort_text())
         rest = time.monotonic() + _REST_S
@@ -154,7 +154,7 @@ class SerialStage(ControllerWords):
             self._stops[axis] = number
 
     def _stop_left_over(self) -> None:
-        """Stop what an earlier program left moving when it died; nobody waits for it any more."""
+        """Stop motions that an earlier program left when it died; no caller waits for them any more."""
         moving = [axis for axis in self.axes if self._read_status(axis).moving]
         for axis in moving:
             self._line.urgent(self._stop_text(axis))
@@ -174,7 +174,7 @@ class SerialStage(ControllerWords):
     def set_dynamics(
         self, axis: int, *, velocity_mm_s: float | None = None, acceleration_mm_s2: float | None = None
     ) -> AxisDynamics:
-        """Set velocity, acceleration or both, and return what the controller took; homing keeps them."""
+        """Set velocity, acceleration or both, and return the values that the controller took; homing keeps them."""
         known = self.dynamics(axis)
         for what, value, most in (
             ("velocity", velocity_mm_s, known.max_velocity_mm_s),
@@ -259,11 +259,11 @@ class SerialStage(ControllerWords):
             for axis in axes
             if (mm := detour(axis, self._options[axis], self.limits(axis), here[axis], goals[axis])) is not None
         }
-        self._keep(self._drain_errors())  # what is found afterwards was caused by this motion
+        self._keep(self._drain_errors())  # errors found afterwards were caused by this motion
         with self._stopped_on_error(axes):
             if detours:
-                self._leg(here, detours, noted)
-            self._leg({**here, **detours}, goals, noted)
+                self._move_together(here, detours, noted)
+            self._move_together({**here, **detours}, goals, noted)
             time.sleep(max(self._options[axis].settle_ms for axis in axes) / 1000)
             self._check_not_stopped(noted)
             results = {}
@@ -274,7 +274,7 @@ class SerialStage(ControllerWords):
                 results[axis] = MoveResult(axis, goal, there, time.monotonic() - start)
         return results
 
-    def _leg(self, here: Mapping[int, float], goals: Mapping[int, float], noted: Mapping[int, int]) -> None:
+    def _move_together(self, here: Mapping[int, float], goals: Mapping[int, float], noted: Mapping[int, int]) -> None:
         longest = 0.0
         for axis, goal in goals.items():
             self._check_not_stopped(noted)
@@ -317,7 +317,7 @@ class SerialStage(ControllerWords):
                 time.sleep(_POLL_S)
         # A stop that came between the last question and its answer brought the axes to rest, not their goal
         self._check_not_stopped(noted)
-        # Once every axis rests, what went wrong on the way stands in the error queue
+        # Once every axis rests, the errors of the motion are in the error queue
         bad = self._new_errors(axes)
         if bad:
             raise motion_fault(bad[0].axis or axes[0], "; ".join(f"{message.text} ({message.code})" for message in bad))
@@ -385,7 +385,7 @@ class SerialStage(ControllerWords):
             self._moving.difference_update(axes)
 
     def _new_errors(self, axes: tuple[int, ...]) -> list[ControllerMessage]:
-        """Empty the error queue into `errors`, and return what concerns these axes or no axis in particular."""
+        """Empty the error queue into `errors`, and return the messages of these axes or of no axis in particular."""
         found = [message for axis in axes for message in self._drain_errors(axis)]
         self._keep(found)
         return [message for message in found if message.axis is None or message.axis in axes]

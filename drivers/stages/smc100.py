@@ -1,13 +1,13 @@
 """Newport SMC100 (CC and PP) and CONEX-CC: one axis a controller, up to 31 on one line, by address.
 
-Commands and replies end in CR LF, and a reply repeats address and command, so it always says what it answers. The
-controller knows itself whether it was homed; it refuses with a letter (``H``: not allowed in NOT REFERENCED state) and
-reports faults of the motion as bits beside its state. What follows a first command on a line is dropped, so each
-command has its own. A NUL byte on the line means that the motor's power was cut and came back.
+Commands and replies end in CR LF, and a reply repeats address and command, so it always names its question. The
+controller reports if it was homed; it refuses with a letter (``H``: not allowed in NOT REFERENCED state) and reports
+faults of the motion as bits beside its state. Further commands on a line are dropped, so each command has its own line.
+A NUL byte on the line means that the motor's power was cut and came back.
 
 Two traps. Homing is possible in NOT REFERENCED state only: a controller that holds its reference just moves to zero.
 And in CONFIGURATION state, which a program may have left it in, it refuses every motion; leaving that state writes its
-flash memory, which bears a hundred writes, so this is never done without being asked for.
+flash memory, which bears a hundred writes, so this is only done on request.
 
 References
 ----------
@@ -76,7 +76,7 @@ class SMC100Stage(SerialStage):
     record
         File for a transcript of the wire.
     timeout_s
-        How long a reply may take.
+        Longest time of a reply.
     """
 
     _driver = "smc100"
@@ -164,7 +164,7 @@ class SMC100Stage(SerialStage):
         return AxisStatus(axis, state, self._read_position_mm(axis), motor_on, homed, moving, detail)
 
     def _fresh_errors(self, axis: int, errors: int) -> list[ControllerMessage]:
-        """Tell the faults that were not there at the last look; some models clear them on reading, some do not."""
+        """Return the faults since the last reading; some models clear them on reading, some do not."""
         fresh = errors & ~self._known_errors.get(axis, 0)
         self._known_errors[axis] = errors
         return [
@@ -210,7 +210,7 @@ class SMC100Stage(SerialStage):
         return "ST" if axis is None else f"{axis}ST"
 
     def _abort_text(self) -> str:
-        return "ST"  # it knows no harder one; the motors follow when all is at rest
+        return "ST"  # it has no harder one; the motors follow when all is at rest
 
     def _check_settable(self, axis: int) -> None:
         status = self._read_status(axis)
@@ -234,7 +234,7 @@ class SMC100Stage(SerialStage):
 
 
 class ConexCCStage(SMC100Stage):
-    """Driver for the CONEX-CC: the SMC100's words over USB at 921600 baud, whose version says ``CONEX-CC``.
+    """Driver for the CONEX-CC: the SMC100's commands over USB at 921600 baud, with the version ``CONEX-CC``.
 
     Parameters are those of `SMC100Stage`.
     """

@@ -1,4 +1,4 @@
-"""A transcript of what went over a serial line, for users who report trouble: plain text, one line a write or read.
+"""A transcript of the traffic on a serial line, for users who report trouble: plain text, one line a write or read.
 
 Each line holds the time (UTC), seconds since the line was opened by a clock that never steps, a direction and the
 bytes: ``>`` to the controller, ``!`` to the controller around every queue (a stop), ``<`` from it, ``#`` a remark.
@@ -32,7 +32,7 @@ class Transcript:
     path
         File to append to.
     title
-        Said at the head of each file.
+        Text at the head of each file.
     limit_bytes
         Size at which a new file is begun.
     """
@@ -66,7 +66,7 @@ class Transcript:
         return self
 
     def note(self, mark: str, data: bytes) -> None:
-        """Add what was written or read; never raises."""
+        """Add bytes written or read; never raises."""
         self._write(f"{mark} {data!r}")
 
     def remark(self, text: str) -> None:
@@ -117,7 +117,7 @@ class Transcript:
             except OSError:
                 self._broken = True
                 return
-            # the number stays: another thread may be about to write to it
+            # the descriptor stays: another thread may be about to write to it
             os.dup2(fresh, self._fd, inheritable=False)
             os.close(fresh)
             self._size = 0

@@ -23,7 +23,7 @@ from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
 from core.field.settings import MeasureOptions
-from core.measure import Earlier, ReferencePair, Updating
+from core.measure import PreviousStep, ReferencePair, Updating
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
@@ -160,7 +160,7 @@ class SequenceMeasurement:
             shape = self._field(self.reference.n)
             earlier = None
             if previous is not None and previous != self.reference.n:
-                earlier = Earlier(previous, self._field(previous))
+                earlier = PreviousStep(previous, self._field(previous))
             images = images or self.read(step)
             result = self._updating(shape).measure(images, earlier, **more)
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)

@@ -194,7 +194,7 @@ class CameraPair:
             raise StateError("The cameras are capturing and have no live frame yet.", code="camera_busy")
         try:
             if unit.latest is frame:  # else somebody else looked meanwhile
-                self._source.look()
+                self._source.refresh()
         finally:
             self._lock.release()
         frame = unit.latest

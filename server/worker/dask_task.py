@@ -141,7 +141,7 @@ _kept: tempfile.TemporaryDirectory[str] | None = None
 
 
 def _folder() -> Path:
-    """This process' own folder; it goes with the process."""
+    """Return the process' own folder; it goes with the process."""
     global _kept
     if _kept is None:
         _kept = tempfile.TemporaryDirectory(prefix="stereorig-")

@@ -1,8 +1,7 @@
-"""One simulated axis: where its motor is at any moment, and where the load is that the motor pushes.
+"""One simulated axis: positions of its motor and of the load that the motor pushes, at any moment.
 
-The encoder sits on the motor. Between the motor and the load lies what a real stage has: lost motion, a wrong screw
-pitch and an axis that points elsewhere than meant. Controllers report the encoder, the simulated world asks for the
-load.
+The encoder sits on the motor. Between the motor and the load are the errors of a real stage: lost motion, a wrong screw
+pitch and a misaligned axis. Controllers report the encoder, the simulated world uses the load.
 """
 
 from __future__ import annotations
@@ -94,22 +93,23 @@ def brake(position_mm: float, velocity_now_mm_s: float, now_s: float, ramp_mm_s2
 
 @dataclass
 class AxisFaults:
-    """What is wrong with an axis; every value may be set while it runs.
+    """Faults of an axis; every value may be set while it runs.
 
-    Parameters
+    Attributes
     ----------
     backlash_mm
-        Lost motion between motor and load. A load that was last pushed upwards stands where the motor does.
+        Lost motion between motor and load. A load that was last pushed upwards is at the motor's position.
     scale_error
-        The load moves ``1 + scale_error`` times what the encoder says (a wrong screw pitch).
+        The load moves ``1 + scale_error`` times the encoder's motion (a wrong screw pitch).
     tilt
         Sideways motion of the load per mm along the axis, in two directions across it (misalignment, in rad).
     jam_mm
-        ``(low, high)``: the motor cannot leave this range although told to.
+        ``(low, high)``: the motor cannot leave this range.
     jam_kind
-        What the controller sees of a jam: ``following_error`` (it trips), or ``silent`` (it believes the motion ended).
+        Effect of a jam on the controller: ``following_error`` (it trips), or ``silent`` (the motion ends without an
+        error).
     limit_switches_mm
-        ``(low, high)`` where the hardware limit switches sit.
+        ``(low, high)`` positions of the hardware limit switches.
     """
 
     backlash_mm: float = 0.0
@@ -135,7 +135,7 @@ class SimAxis:
     resolution_mm
         One encoder count.
     start_mm
-        Where the motor stands at power-on, measured from home; the encoder reads 0 there until homed.
+        Position of the motor at power-on, measured from home; the encoder reads 0 there until homed.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class SimAxis:
             self._offset_mm = 0.0
 
     def define_position(self, encoder_mm: float) -> None:
-        """Let the encoder read this value where the motor stands now."""
+        """Let the encoder read this value at the motor's present position."""
         with self._lock:
             self._advance()
             self._offset_mm = self._motor_mm - encoder_mm
@@ -200,20 +200,20 @@ class SimAxis:
 
     @property
     def moving(self) -> bool:
-        """Whether a motion is going on."""
+        """True during a motion."""
         with self._lock:
             return self._advance() < self._profile.end_s
 
     @property
     def encoder_mm(self) -> float:
-        """What the controller reads, rounded to counts."""
+        """Encoder position as the controller reads it, rounded to counts."""
         with self._lock:
             self._advance()
             return round((self._motor_mm - self._offset_mm) / self.resolution_mm) * self.resolution_mm
 
     @property
     def velocity_now_mm_s(self) -> float:
-        """Speed of the motion going on."""
+        """Speed of the present motion."""
         with self._lock:
             return self._profile.at(self._advance())[1]
 
@@ -224,18 +224,18 @@ class SimAxis:
             return self._profile.goal_mm - self._offset_mm
 
     def true_position_mm(self) -> float:
-        """Where the load is along its axis, measured from home."""
+        """Position of the load along its axis, measured from home."""
         with self._lock:
             self._advance()
             return self._load_mm * (1.0 + self.faults.scale_error)
 
     def true_displacement_mm(self) -> tuple[float, float, float]:
-        """Where the load is in space: across, across, along; measured from home."""
+        """Position of the load in space: across, across, along; measured from home."""
         along = self.true_position_mm()
         return (self.faults.tilt[0] * along, self.faults.tilt[1] * along, along)
 
     def take_trouble(self) -> Trouble | None:
-        """Say what went wrong since this was last asked."""
+        """Return the fault since the last call, if any."""
         with self._lock:
             self._advance()
             trouble, self._trouble = self._trouble, None
@@ -257,6 +257,6 @@ class SimAxis:
             self._profile = Profile((), motor, -math.inf)
         self._motor_mm = motor
         # A load with play: the motor pushes it upwards at once, downwards only after the lost motion. Motion between
-        # two calls has one direction, so this is exact however seldom it is called.
+        # two calls has one direction, so this is exact for any interval between calls.
         self._load_mm = min(max(self._load_mm, motor), motor + self.faults.backlash_mm)
         return now

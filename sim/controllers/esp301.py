@@ -1,8 +1,8 @@
-"""A simulated ESP301: three axes, its words, its error queue, on three `SimAxis`.
+"""A simulated ESP301: three axes, its commands, its error queue, on three `SimAxis`.
 
-It knows what the driver and the usual third-party drivers say: identification, motor power, homing, moves, stop, abort,
-velocities, limits, units and errors. Commands may be joined by semicolons; each query has a reply of its own, ended by
-CR LF. The list of error texts is the manual's (appendix A).
+It supports the commands of the driver and the usual third-party drivers: identification, motor power, homing, moves,
+stop, abort, velocities, limits, units and errors. Commands may be joined by semicolons; each query has a reply of its
+own, ended by CR LF. The list of error texts is the manual's (appendix A).
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class _Axis(WireAxis):
 
 @dataclass(frozen=True)
 class _Setting:
-    """A value that a word shows and sets: its name, of the motor or of the axis, and the error where it is refused."""
+    """A value that a command shows and sets: its name, of motor or axis, and the error where it is refused."""
 
     name: str
     allowed: Callable[[_Axis, float], bool] = lambda _axis, _value: True
@@ -115,10 +115,10 @@ _SETTINGS = {
 class SimESP301(WireController):
     """The simulated controller.
 
-    Parameters
+    Attributes
     ----------
     axes
-        How many axes, 1 to 3.
+        Number of axes, 1 to 3.
     motion
         See `sim.controllers.wire.Motion`.
     """
@@ -267,7 +267,7 @@ class SimESP301(WireController):
         return None
 
     def _ws(self, _number: int, axis: _Axis, parameter: str) -> str | None:
-        """Hold what follows back until the axis rests; as with the real one, even a stop waits behind it."""
+        """Delay the following commands until the axis rests; as with the real one, even a stop waits behind it."""
         after_s = float(parameter or 0.0) / 1000 / self.clock.time_scale
         while axis.motor.moving:
             time.sleep(0.001)

@@ -20,7 +20,7 @@ def make_controller(driver: str, axes: Sequence[int], **motion: Unpack[Motion]) 
         ``esp301``, ``smc100`` or ``conex-cc``; a wrong one raises `StageError` with code ``unknown_driver``.
     axes
         Axis numbers; addresses for the SMC100 and the CONEX-CC.
-    motion
+    **motion
         See `sim.controllers.wire.Motion`.
     """
     if driver == "esp301":

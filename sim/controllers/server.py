@@ -1,6 +1,6 @@
 """Serve a simulated controller on a loopback TCP port or a pty, so that real drivers open it as a serial URL.
 
-Loopback only: the simulated controller moves nothing real, but nothing outside this machine has any business with it.
+Loopback only: the simulated controller moves nothing real, but it is for clients on this machine alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ControllerServer:
     Parameters
     ----------
     controller
-        Who answers.
+        The controller that answers.
     transport
         ``socket`` (any number of clients) or ``pty``.
     port
@@ -82,7 +82,7 @@ class ControllerServer:
             self._thread.join()
 
     def hang_up(self) -> None:
-        """Drop every TCP client, as when the cable is pulled out of a terminal server; back when they are dropped."""
+        """Drop every TCP client, as when the cable is pulled out of a terminal server; return when they are dropped."""
         self._hung_up.clear()
         os.write(self._wake_write, b"h")
         self._hung_up.wait(10.0)

@@ -51,7 +51,7 @@ _DISABLE = (0x3C, 0x3D)
 
 Model = Literal["SMC100CC", "SMC100PP", "CONEX-CC"]
 _VERSIONS: dict[Model, str] = {"SMC100CC": "1.2.0", "SMC100PP": "1.2.0", "CONEX-CC": "2.0.1"}
-# configuration that this one only keeps: word -> (default, lowest, highest), as in the SMC100PP's manual
+# configuration that is only stored: word -> (default, lowest, highest), as in the SMC100PP's manual
 _KEPT = {
     "BA": (0.0, 0.0, 1e12),
     "BH": (0.0, 0.0, 1e12),
@@ -96,12 +96,12 @@ class _Unit(WireAxis):
 class SimSMC100(WireController):
     """The simulated chain.
 
-    Parameters
+    Attributes
     ----------
     addresses
         Addresses on the chain, 1 to 31.
     model
-        What each controller says it is.
+        Model that each controller reports.
     motion
         See `sim.controllers.wire.Motion`.
     """
@@ -285,7 +285,7 @@ class SimSMC100(WireController):
             raise _Refusal(unit.group())
         value, (_, low, high) = float(parameter), _KEPT[word]
         other = _COMPENSATIONS.get(word)
-        # zero is no value that a compensation can be set to: the other one switches it off
+        # zero is no value that a compensation can be set to: the other command switches it off
         if not low <= value <= high or (other is not None and value == 0):
             raise _Refusal("C")
         unit.kept[word] = value

@@ -13,9 +13,9 @@ from sim.controllers.axis import SimAxis, SimClock
 
 @dataclass
 class LineFaults:
-    """What is wrong with the line; every value may be set while it runs.
+    """Faults of the line; every value may be set while it runs.
 
-    Parameters
+    Attributes
     ----------
     silent
         Commands are carried out, replies never come.
@@ -42,7 +42,7 @@ class LineFaults:
     delay_s: float = 0.0
 
     def apply(self, reply: bytes) -> bytes:
-        """Return what of a reply really goes out."""
+        """Return the bytes of a reply that are sent."""
         if not reply or self.silent or self.deaf:
             return b""
         if self.lose_replies > 0:
@@ -59,18 +59,18 @@ class LineFaults:
 
 
 class Motion(TypedDict, total=False):
-    """How the axes of a controller move.
+    """Motion parameters of a controller's axes.
 
-    Parameters
+    Attributes
     ----------
     travel_mm
         (low, high) software limits that it reports, measured from home; -50 to 50.
     velocity_mm_s, acceleration_mm_s2
         Power-on values, 10 and 40; up to four and ten times as much can be set.
     time_scale
-        How many times faster than real the axes run; the speeds that it reports stay those of the stage.
+        Factor by which the axes run faster than real ones; the reported speeds stay those of the stage.
     start_mm
-        Where the axes stand at power-on, from home.
+        Positions of the axes at power-on, from home.
     """
 
     travel_mm: tuple[float, float]
@@ -129,7 +129,7 @@ class WireController(ABC):
             return b""
         text = line.decode("ascii", errors="replace").strip("\r\n")
         with self._lock:
-            if len(self.received) >= _MOST_RECEIVED:  # one that stands in a service is asked for weeks
+            if len(self.received) >= _MOST_RECEIVED:  # in a service it receives commands for weeks
                 del self.received[: _MOST_RECEIVED // 2]
             self.received.append(Received(time.monotonic(), text))
             reply = self.line_faults.apply(self._execute(text))
@@ -150,9 +150,9 @@ class WireController(ABC):
         """Give access to an axis and its faults."""
 
     def true_position_mm(self, axis: int) -> float:
-        """Where the load of an axis really is along its axis, in mm from home."""
+        """Return the true position of an axis' load along its axis, in mm from home."""
         return self.axis(axis).true_position_mm()
 
     def true_displacement_mm(self, axis: int) -> tuple[float, float, float]:
-        """Where the load of an axis really is: across, across, along the axis, in mm from home."""
+        """Return the true position of an axis' load: across, across, along the axis, in mm from home."""
         return self.axis(axis).true_displacement_mm()

@@ -62,7 +62,7 @@ def test_stretched_copies_keep_their_places() -> None:
         found = scattered_motion(copy, plain)
         assert len(found.xy_px) > 100
         assert (found.xy_px >= box[:2]).all()
-        apart = np.linalg.norm(found.xy_px - found.xy_now_px, axis=1)
+        apart = np.linalg.norm(found.xy_px - found.xy_current_px, axis=1)
         assert np.median(apart) < 0.4
 
 

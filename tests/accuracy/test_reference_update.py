@@ -16,7 +16,7 @@ from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals, common_share, follow, since, totals_of
-from core.measure import Earlier, MeasureOptions, ReferencePair
+from core.measure import MeasureOptions, PreviousStep, ReferencePair
 from core.status import PointStatus
 from tests.bench.accuracy.paper_rig import turn
 from tests.support import field_bench
@@ -49,7 +49,7 @@ def matrix(rays: np.ndarray, w: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.
 
 def plane_seen_later(start: Totals) -> tuple[np.ndarray, np.ndarray]:
     """Rays to the moved points, and their planes about these, by central differences along the plane."""
-    P = start.now_cam1_mm
+    P = start.current_cam1_mm
     rays = P / P[:, 2:]
     plane = start.plane
     return rays, np.column_stack([(plane * rays).sum(axis=1), plane[:, 0], plane[:, 1]])
@@ -334,7 +334,7 @@ def test_a_leg_that_begins_with_an_open_crack_reaches_over_neither_lip() -> None
         field_of=lambda k: fields[k],
     )
     for n in (1, 2):
-        fields[n] = sequence.measure(images[n], Earlier(1, fields[1]) if n == 2 else None)
+        fields[n] = sequence.measure(images[n], PreviousStep(1, fields[1]) if n == 2 else None)
     assert fields[2].references is not None
     assert fields[2].references.step == 1
     away = np.array([min(np.hypot(*(line - p).T)) for p in grid.xy_px.reshape(-1, 2)]).reshape(grid.shape)

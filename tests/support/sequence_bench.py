@@ -13,7 +13,7 @@ from core.cameras.camera import RigidTransform
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
-from core.measure import Earlier, MeasureOptions, ReferencePair
+from core.measure import MeasureOptions, PreviousStep, ReferencePair
 from core.settings import ReferenceUpdate
 from server.formats.results.reading import read_field
 from server.formats.results.writing import Provenance, write_field
@@ -85,7 +85,7 @@ def measure(
         shape, grid, options, reference_update=mode, images_of=lambda k: pairs[k], field_of=lambda k: fields[k]
     )
     for n in range(1, len(pairs)):
-        fields[n] = sequence.measure(pairs[n], None if n == 1 else Earlier(n - 1, fields[n - 1]))
+        fields[n] = sequence.measure(pairs[n], None if n == 1 else PreviousStep(n - 1, fields[n - 1]))
     return fields
 
 
@@ -105,4 +105,4 @@ def measure_from_files(
     sequence = reference.sequence(
         field_of(0), GRID, OPTIONS, reference_update=mode, images_of=lambda k: pairs[k], field_of=field_of
     )
-    return sequence.measure(pairs[n], Earlier(n - 1, field_of(n - 1)))
+    return sequence.measure(pairs[n], PreviousStep(n - 1, field_of(n - 1)))

@@ -30,14 +30,14 @@ class PositionCheck:
         (v,) per view; the seen ones take the nominal standoff as their scale.
     standoff_mm
         Distance at dZ = 0 that the declared positions imply.
-    scatter_mm
+    residual_mm
         Root mean square residual of the straight line, in declared millimetres.
     """
 
     declared_mm: Float
     seen_mm: Float
     standoff_mm: float
-    scatter_mm: float
+    residual_mm: float
 
 
 def image_scale(view: CalibrationView, nodes_mm: Float, aspect: float) -> tuple[float, float]:

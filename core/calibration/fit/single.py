@@ -33,7 +33,8 @@ def fit_single(
 
     Returns
     -------
-    (10,) parameters.
+    Float
+        (10,) parameters.
 
     Raises
     ------

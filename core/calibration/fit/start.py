@@ -13,7 +13,8 @@ def affine_of_view(view: CalibrationView, nodes_mm: Float, aspect: float) -> tup
 
     Returns
     -------
-    A (2, 2) in px/mm, and b (2,) in px (rows still divided by the aspect ratio).
+    A, b
+        (2, 2) in px/mm, and (2,) in px (rows still divided by the aspect ratio).
     """
     found = view.found
     xy = view.xy_px[found] / [1.0, aspect]

@@ -36,8 +36,7 @@ def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], su
 
 
 def reject_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
-    """Reject points, OUTSIDE_IMAGE, whose patch lies so near to an image's border that the blur lacks neighbours
-    there."""
+    """Reject points, OUTSIDE_IMAGE, with a patch so near to an image's border that the blur lacks neighbours."""
     ok = np.flatnonzero(points.ok)
     off = leaves_an_image(fitter, xy_px[ok], xy_px[ok], points.take(ok), margin_px=blur.edge_px)
     rejected = np.zeros(len(points.status), bool)

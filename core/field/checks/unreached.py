@@ -64,8 +64,7 @@ def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: Point
 
 
 def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float) -> Bool:
-    """Return (n,) True where a point (n, 3), camera 1's frame, lies outside an image or nearer to its border than
-    allowed."""
+    """Return (n,) True where a point (n, 3), camera 1's frame, lies outside an image or too near to its border."""
     pose, lens1, lens2 = fitter.pair.cam2_from_cam1, fitter.pair.cam1.lens, fitter.pair.cam2.lens
     views = [(pose.apply(before), lens2, fitter.ref2.shape)]
     if now is not None:

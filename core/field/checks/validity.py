@@ -37,7 +37,7 @@ _TREND_POINTS = 3000  # for a trend of seven terms: its standard deviation is th
 class ValidityOptions:
     """Limits of the validity checks.
 
-    Parameters
+    Attributes
     ----------
     epipolar_sigmas
         Allowed distance from the field's smooth epipolar offset, in its robust standard deviations.

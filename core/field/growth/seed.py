@@ -113,18 +113,18 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
     features = features_of(wanted, scale)
     raise_if_cancelled(inputs.cancel)
     shape = ScatteredShape.empty() if known_w is not None else scattered_shape(pair, *features[:2])
-    motion = shape_now = None
+    motion = current_shape = None
     if inputs.current:
         motion = scattered_motion(features[0], features[-2])
         raise_if_cancelled(inputs.cancel)
-        shape_now = scattered_shape(pair, *features[-2:])
+        current_shape = scattered_shape(pair, *features[-2:])
     elif len(shape.xy_px) < _MIN_MATCHES:
         return 0
 
     def put_seeds(motion: ScatteredMotion | None) -> int:
         usable = inputs.usable & ~inputs.repeating
         return seeds_from_matches(
-            state.fitter, state.points, inputs.xy_px, usable, shape, motion, shape_now, inputs.known_w
+            state.fitter, state.points, inputs.xy_px, usable, shape, motion, current_shape, inputs.known_w
         )
 
     found = put_seeds(motion)

@@ -117,10 +117,9 @@ class MeasureImage:
         return out
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
-        """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box or the whole
-        image.
+        """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box.
 
-        Computed on the first call; zero structure where there is one grey level.
+        None: in the whole image. Computed on the first call; zero structure where there is one grey level.
         """
         if box not in self._contrast:
             pixels = self.pixels
@@ -202,15 +201,15 @@ def different(a: MeasureImage, b: MeasureImage) -> None:
         )
 
 
-def refuse_stale(ref1: MeasureImage, ref2: MeasureImage, now1: MeasureImage, now2: MeasureImage) -> None:
+def refuse_stale(ref1: MeasureImage, ref2: MeasureImage, current1: MeasureImage, current2: MeasureImage) -> None:
     """Raise ``stale_image`` if one camera's current image alone is its reference image, grey level by grey level.
 
     No camera takes the same noise twice: that image was never renewed. Matched with the other camera's it would give a
     smooth and wrong motion. Both cameras' references together are accepted: a test with zero motion.
     """
-    stale = [_same(ref, now) for ref, now in ((ref1, now1), (ref2, now2))]
+    stale = [_same(ref, now) for ref, now in ((ref1, current1), (ref2, current2))]
     if stale[0] != stale[1]:
-        old = now1 if stale[0] else now2
+        old = current1 if stale[0] else current2
         raise ImageError(
             f"{old.name} is its reference image, grey level by grey level, and the other camera's is not.",
             code="stale_image",

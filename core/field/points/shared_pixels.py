@@ -27,7 +27,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 class SharedPixels:
     """Correlation of two points' errors over the distance of their subsets' centres.
 
-    Parameters
+    Attributes
     ----------
     subset_px
         Width of the square subset.
@@ -74,8 +74,7 @@ class SharedPixels:
         return self._smoothed(products, dx_px, dy_px) / self._smoothed(products, 0.0, 0.0)
 
     def correlation_with_position(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
-        """Return the decrease of the covariance of a position and a displacement with their points' distance, 1 at
-        zero."""
+        """Return the decrease of the covariance of position and displacement with their points' distance, 1 at zero."""
         if self.smoothing is None:
             return self._of_subsets(dx_px, dy_px)
         of = self.smoothing
@@ -83,8 +82,7 @@ class SharedPixels:
         return self._smoothed(weights, dx_px, dy_px) / self._smoothed(weights, 0.0, 0.0)
 
     def factors(self, dx_px: ArrayLike, dy_px: ArrayLike, n: int) -> Float:
-        """Return (..., n, n), the decrease of each element of a covariance of X Y Z (U V W) with distance, 1 at
-        zero."""
+        """Return (..., n, n), the decrease of a covariance of X Y Z (U V W) with distance, by element; 1 at zero."""
         own = self.positions.correlation(dx_px, dy_px)
         out = np.empty((*own.shape, n, n))
         out[...] = own[..., None, None]

@@ -105,8 +105,7 @@ def weight_square(window: int, order: int) -> Float:
 
 @lru_cache(maxsize=8)
 def weight_products(window: int, order: int) -> Float:
-    """Return (2 window - 1, 2 window - 1) sums over a window's pairs of points by their distance in rows and
-    columns."""
+    """Return (2 window - 1, 2 window - 1) sums over pairs of a window's points, by distance in rows and columns."""
     from scipy.signal import correlate  # slow to load, and not every start needs it
 
     square = weight_square(window, order)

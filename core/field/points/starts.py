@@ -52,7 +52,7 @@ def move_matrix(G: Float, offset: Float) -> Float:
     return moved
 
 
-def position_now(w: Float, G: Float) -> Float:
+def current_position(w: Float, G: Float) -> Float:
     """Return the points' current positions, (n, 3) mm in camera 1's frame."""
     return np.asarray(G[..., :, 0] / w[..., :1])
 

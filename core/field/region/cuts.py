@@ -1,5 +1,7 @@
-"""Cuts: lines that no subset, neighbour or start value crosses. A crack is an open line, a hole's border a closed
-one."""
+"""Cuts: lines that no subset, neighbour or start value crosses.
+
+A crack is an open line, a hole's border a closed one.
+"""
 
 from __future__ import annotations
 

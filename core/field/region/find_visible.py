@@ -30,7 +30,7 @@ def with_visibility(grid: PointGrid, subset_px: int) -> PointGrid:
     return replace(grid, visibility=_find(grid, subset_px))
 
 
-def patches_seen(
+def visible_patches(
     grid: PointGrid, points: NDArray[np.intp], width: int, margin_px: float, at_once: int
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.uint8]]]:
     """Yield points with a partly invisible square of ``width`` px about them, and the visible pixels of it.

@@ -50,8 +50,10 @@ def _sort(keys, network):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _order(keys):
-    """Turn the bits of float32 into int32 of the same order, or back: those of negative numbers are in reverse
-    order."""
+    """Turn the bits of float32 into int32 of the same order, or back.
+
+    Those of negative numbers are in reverse order.
+    """
     for s in range(keys.shape[0]):
         for k in range(_BLOCK):
             keys[s, k] ^= (keys[s, k] >> 31) & np.int32(0x7FFFFFFF)

@@ -96,8 +96,7 @@ class Visibility:
         return out
 
     def separated_at(self, dr: int, dc: int) -> Bool:
-        """Return (n,) True where the neighbour ``dr`` rows and ``dc`` columns away, up to two, is separated from a
-        point."""
+        """Return (n,) True where the neighbour ``dr`` rows and ``dc`` columns away, up to two, is separated."""
         wide = 2 * REACH + 1
         index = (dr + REACH) * wide + dc + REACH
         bit = index - (1 if index > wide * wide // 2 else 0)

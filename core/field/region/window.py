@@ -15,8 +15,7 @@ from core.field.region.cuts import Cuts, crosses
 
 @lru_cache(maxsize=8)
 def window_offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next towards the
-    centre."""
+    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next inwards."""
     side = np.arange(-half, half + 1)
     row, col = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
     ring = np.maximum(np.abs(row), np.abs(col))
@@ -60,7 +59,7 @@ def ways_cut(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | 
     return out
 
 
-def points_seen(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
+def connected_points(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
     """Return (m, n) True for the windows' points that are connected to their centres over valid points alone.
 
     ``there`` is the padded grid, ``here`` (m,) the centres' flat indices in it. The way goes from cell to cell. Over a

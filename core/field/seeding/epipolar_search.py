@@ -23,8 +23,7 @@ _BLOCK = 512
 
 
 def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int], *, step_px: float = 1.0) -> Float:
-    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,) inside camera 2's image, ``step_px`` from one
-    another there."""
+    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,), every ``step_px`` inside camera 2's image."""
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     if not np.isfinite(ray).all():
         return np.zeros(0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
-from core.field.points.starts import position_now
+from core.field.points.starts import current_position
 from core.field.region.trend import smooth_terms
 from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
@@ -21,7 +21,9 @@ _ROUNDS = 4
 _WORTH = 0.5  # share of the sample's own motion that may be left unexplained
 
 
-def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], w_now: Float, G_now: Float) -> Float:
+def predict(
+    pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], w_current: Float, G_current: Float
+) -> Float:
     """Return start values of G (n, 3, k): the previous step's, moved as the sample moved.
 
     Parameters
@@ -34,13 +36,13 @@ def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], 
         (n, 3, k) at the previous step, NaN where it is not known.
     sample
         (m,) indices of the points that were fitted.
-    w_now, G_now
+    w_current, G_current
         (m, 3 or more), (m, 3, k) their fitted unknowns.
     """
     if len(sample) < _LINEAR_FROM:
         return G
     terms = smooth_terms(xy_px)[:, : 6 if len(sample) >= _QUADRATIC_FROM else 3]
-    design, change = terms[sample], G_now - G[sample]
+    design, change = terms[sample], G_current - G[sample]
     weight = np.ones(len(sample))
     for _ in range(_ROUNDS):
         root = np.sqrt(weight)[:, None]
@@ -51,14 +53,14 @@ def predict(pair: StereoPair, xy_px: Float, G: Float, sample: NDArray[np.intp], 
         reach = BIWEIGHT_REACH * MAD_TO_SIGMA * max(float(np.median(left)), 1e-15)
         weight = biweight((left / reach) ** 2)
     moved = G + (terms @ solution).reshape(G.shape)
-    seen = [_images(pair, w_now, g) for g in (G_now, G[sample], moved[sample])]
+    seen = [_images(pair, w_current, g) for g in (G_current, G[sample], moved[sample])]
     before, after = (float(np.median(np.linalg.norm(seen[0] - s, axis=-1).max(axis=0))) for s in seen[1:])
     return moved if after < _WORTH * before else G
 
 
 def _images(pair: StereoPair, w: Float, G: Float) -> Float:
     """Current image coordinates of the points in both cameras, (2, m, 2) px."""
-    here = position_now(w, G)
+    here = current_position(w, G)
     there = pair.cam2_from_cam1.apply(here)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.stack(

@@ -53,7 +53,7 @@ class ScatteredMotion:
     """Matches between camera 1's reference and current images that agree with their neighbours; (n, 2) px each."""
 
     xy_px: Float
-    xy_now_px: Float
+    xy_current_px: Float
     scale: int = 1
 
 
@@ -87,22 +87,22 @@ def scattered_shape(pair: StereoPair, features1: Features, features2: Features) 
     return ScatteredShape(xy1[right], w0[right], scale)
 
 
-def scattered_motion(features_ref: Features, features_now: Features) -> ScatteredMotion:
+def scattered_motion(features_ref: Features, current_features: Features) -> ScatteredMotion:
     """Match one camera's reference and current images and keep the matches that agree with their neighbours."""
-    pairs = match(features_ref, features_now)
-    xy, now = features_ref.xy_px[pairs[:, 0]], features_now.xy_px[pairs[:, 1]]
+    pairs = match(features_ref, current_features)
+    xy, now = features_ref.xy_px[pairs[:, 0]], current_features.xy_px[pairs[:, 1]]
     if len(xy) < _MIN_MATCHES:
         return ScatteredMotion(xy[:0], now[:0])
-    scale = max(features_ref.scale, features_now.scale)
+    scale = max(features_ref.scale, current_features.scale)
     right = consistent(xy, now, tolerance=2.0 * _MOTION_TOLERANCE_PX * _looser(scale))
     return ScatteredMotion(xy[right], now[right], scale)
 
 
-def stretched_motion(image: NDArray[Any], box: Box, features_now: Features, scale: int) -> ScatteredMotion:
-    """Match stretched copies of camera 1's reference image with its current image; the copy with most matches
-    counts."""
+def stretched_motion(image: NDArray[Any], box: Box, current_features: Features, scale: int) -> ScatteredMotion:
+    """Match stretched copies of camera 1's reference image with its current one; the copy with most matches counts."""
     tries = [
-        scattered_motion(stretched_features(image, box, stretch, scale=scale), features_now) for stretch in stretches()
+        scattered_motion(stretched_features(image, box, stretch, scale=scale), current_features)
+        for stretch in stretches()
     ]
     return max(tries, key=lambda motion: len(motion.xy_px))
 
@@ -140,28 +140,31 @@ def motion_starts(
     pair: StereoPair,
     w: Float,
     motion: ScatteredMotion,
-    shape_now: ScatteredShape,
+    current_shape: ScatteredShape,
     xy_px: Float,
     are_separated: AreSeparated | None = None,
 ) -> Starts:
-    """Return start values at positions ``xy_px`` with known shape ``w`` (n, 3), from matches in time and between
-    cameras.
+    """Return starts at positions ``xy_px`` with known shape ``w`` (n, 3), from matches in time and between cameras.
 
     ``are_separated`` as in :func:`shape_starts`, in the reference image.
     """
     G = np.full((len(xy_px), 3, 3), np.nan)
-    if len(motion.xy_px) < 4 or len(shape_now.xy_px) < 4 or len(xy_px) == 0:
+    if len(motion.xy_px) < 4 or len(current_shape.xy_px) < 4 or len(xy_px) == 0:
         return Starts(w, G)
     tolerance = _MOTION_TOLERANCE_PX * _looser(motion.scale)
-    fits = robust_local_fits(xy_px, motion.xy_px, motion.xy_now_px, tolerance=tolerance, are_separated=are_separated)
+    fits = robust_local_fits(
+        xy_px, motion.xy_px, motion.xy_current_px, tolerance=tolerance, are_separated=are_separated
+    )
     known = np.isfinite(fits.value).all(axis=1)
     if known.any():
-        w_now = shape_starts(pair, shape_now, fits.value[known]).w
-        G[known] = combine(pair, w[known], xy_px[known], fits.value[known], fits.slope[known], w_now)
+        w_current = shape_starts(pair, current_shape, fits.value[known]).w
+        G[known] = combine(pair, w[known], xy_px[known], fits.value[known], fits.slope[known], w_current)
     return Starts(w, G)
 
 
-def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_px: Float, w_now: Float) -> Float:
+def combine(
+    pair: StereoPair, w: Float, xy_px: Float, xy_current_px: Float, affine_px: Float, w_current: Float
+) -> Float:
     """Return ``G`` (n, 3, 3) from the reference shape, the patch's current position in camera 1, and the shape there.
 
     Parameters
@@ -170,27 +173,27 @@ def combine(pair: StereoPair, w: Float, xy_px: Float, xy_now_px: Float, affine_p
         The calibrated cameras.
     w
         (n, 3) reference shape.
-    xy_px, xy_now_px
+    xy_px, xy_current_px
         (n, 2) the point in camera 1's reference and current images.
     affine_px
         (n, 2, 2) derivative of camera 1's current image over its reference image.
-    w_now
-        (n, 3) current shape about ``xy_now_px``.
+    w_current
+        (n, 3) current shape about ``xy_current_px``.
     """
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
-    now = pair.cam1.rays_cam(xy_now_px).xyz_mm
+    now = pair.cam1.rays_cam(xy_current_px).xyz_mm
     J = pair.cam1.lens.image_jacobian(ray[:, :2])
-    J_now = pair.cam1.lens.image_jacobian(now[:, :2])
-    usable = np.isfinite(J_now).all(axis=(1, 2)) & np.isfinite(affine_px).all(axis=(1, 2))
+    J_current = pair.cam1.lens.image_jacobian(now[:, :2])
+    usable = np.isfinite(J_current).all(axis=(1, 2)) & np.isfinite(affine_px).all(axis=(1, 2))
     A = np.full_like(J, np.nan)
-    A[usable] = np.linalg.solve(J_now[usable], affine_px[usable] @ J[usable])
+    A[usable] = np.linalg.solve(J_current[usable], affine_px[usable] @ J[usable])
     # the current point is (now + A X, 1) / w_now(A X); G (1, X, Y) is w(X, Y) times it, to first order
     G = np.empty((len(w), 3, 3))
-    G[:, :, 0] = (w[:, :1] / w_now[:, :1]) * now
+    G[:, :, 0] = (w[:, :1] / w_current[:, :1]) * now
     for j in range(2):
-        slope = np.einsum("ni,ni->n", w_now[:, 1:], A[:, :, j])
-        G[:, :, 1 + j] = now * (w[:, 1 + j] / w_now[:, 0] - w[:, 0] * slope / w_now[:, 0] ** 2)[:, None]
-        G[:, :2, 1 + j] += A[:, :, j] * (w[:, 0] / w_now[:, 0])[:, None]
+        slope = np.einsum("ni,ni->n", w_current[:, 1:], A[:, :, j])
+        G[:, :, 1 + j] = now * (w[:, 1 + j] / w_current[:, 0] - w[:, 0] * slope / w_current[:, 0] ** 2)[:, None]
+        G[:, :2, 1 + j] += A[:, :, j] * (w[:, 0] / w_current[:, 0])[:, None]
     return G
 
 

@@ -42,14 +42,14 @@ class Seed:
         (x, y) in camera 1's reference image.
     xy2_px
         The same point in camera 2's reference image, where known.
-    xy_now_px, xy2_now_px
+    xy_current_px, xy2_current_px
         The same point in camera 1's and camera 2's current image, where known (both or neither).
     """
 
     xy_px: tuple[float, float]
     xy2_px: tuple[float, float] | None = None
-    xy_now_px: tuple[float, float] | None = None
-    xy2_now_px: tuple[float, float] | None = None
+    xy_current_px: tuple[float, float] | None = None
+    xy2_current_px: tuple[float, float] | None = None
 
 
 def seeds_of(settings: AnalysisSettings) -> list[Seed] | None:
@@ -77,7 +77,7 @@ def as_seeds(seeds: Sequence[Seed | Sequence[float]] | NDArray[Any]) -> tuple[Se
             if values.shape != (2,):
                 raise RegionError(f"a seed needs x and y, got {s}.", code="seed_invalid", remedy="Give x and y in px.")
             seed = Seed((float(values[0]), float(values[1])))
-        for xy in (seed.xy_px, seed.xy2_px, seed.xy_now_px, seed.xy2_now_px):
+        for xy in (seed.xy_px, seed.xy2_px, seed.xy_current_px, seed.xy2_current_px):
             if xy is not None and not np.isfinite(xy).all():
                 raise RegionError(f"the seed {seed.xy_px} holds a number that is not finite.", code="seed_invalid")
         out.append(seed)
@@ -164,7 +164,7 @@ def seeds_from_matches(
     usable: Bool,
     shape: ScatteredShape,
     motion: ScatteredMotion | None,
-    shape_now: ScatteredShape | None,
+    current_shape: ScatteredShape | None,
     known_w: Float | None,
 ) -> int:
     """Put refined seeds into ``points``, spread over the region; return the number of valid ones.
@@ -189,7 +189,7 @@ def seeds_from_matches(
             xy_px[index],
             shape,
             motion,
-            shape_now,
+            current_shape,
             None if known_w is None else known_w[index],
             fitter.visibility,
         )
@@ -213,20 +213,19 @@ def starts_at(
     xy_px: Float,
     shape: ScatteredShape,
     motion: ScatteredMotion | None,
-    shape_now: ScatteredShape | None,
+    current_shape: ScatteredShape | None,
     known_w: Float | None,
     visibility: Visibility | None = None,
 ) -> Starts:
-    """Return start values at positions from the matches not separated from them, with the measured shape where
-    known."""
+    """Return starts at positions from the matches not separated from them, with the measured shape where known."""
     are_separated = None if visibility is None else visibility.are_separated
     w = shape_starts(pair, shape, xy_px, are_separated).w
     if known_w is not None:
         measured = np.isfinite(known_w).all(axis=1)
         w[measured] = known_w[measured, :3]
-    if motion is None or shape_now is None:
+    if motion is None or current_shape is None:
         return Starts(w)
-    return motion_starts(pair, w, motion, shape_now, xy_px, are_separated)
+    return motion_starts(pair, w, motion, current_shape, xy_px, are_separated)
 
 
 def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_px: Float) -> PointFits:
@@ -254,7 +253,7 @@ def sweep_shape(fitter: Fitter, image1: NDArray[Any], image2: NDArray[Any], xy_p
     return fits.take(np.array([best]))
 
 
-def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: int, candidates: int = 3) -> Float:
+def find_template(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: int, candidates: int = 3) -> Float:
     """Find a patch in camera 1's current image, by normalised cross-correlation over the whole image; (m, 2) px."""
     half = subset_px  # twice the subset: one that moved without turning much
     rows, cols = ref1.shape
@@ -275,18 +274,17 @@ def template_now(ref1: ImageData, cur1: ImageData, xy_px: Float, *, subset_px: i
 
 
 def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
-    """Find one point's motion from its shape ``w`` (3,): at its reference position, then by template and depth
-    search."""
+    """Find one point's motion from its shape ``w`` (3,): at rest, then by template and depth search."""
     if fitter.cur1 is None or fitter.cur2 is None:
         raise ValueError("search_motion needs current images")
     position = xy_px[None]
     still = fitter.fit(position, w[None], no_motion(fitter.pair, position))
     tries = [still]
-    for now in template_now(fitter.ref1, fitter.cur1, xy_px, subset_px=fitter.options.subset_px):
-        w_now, _ = sweep(
+    for now in find_template(fitter.ref1, fitter.cur1, xy_px, subset_px=fitter.options.subset_px):
+        w_current, _ = sweep(
             fitter.pair, fitter.cur1.pixels, fitter.cur2.pixels, now, subset_px=max(fitter.options.subset_px, 25)
         )
-        m = len(w_now)
+        m = len(w_current)
         if m:
             G = combine(
                 fitter.pair,
@@ -294,7 +292,7 @@ def search_motion(fitter: Fitter, xy_px: Float, w: Float) -> PointFits:
                 np.tile(position, (m, 1)),
                 np.tile(now, (m, 1)),
                 np.tile(np.eye(2), (m, 1, 1)),
-                w_now,
+                w_current,
             )
             tries.append(fitter.fit(np.tile(position, (m, 1)), np.tile(w, (m, 1)), G))
     best = max(((float(t.quality.max()), i) for i, t in enumerate(tries)), key=lambda item: item[0])[1]

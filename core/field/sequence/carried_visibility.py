@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
-from core.field.region.find_visible import MARGIN_PX, patches_seen
+from core.field.region.find_visible import MARGIN_PX, visible_patches
 from core.field.region.region import PointGrid
 from core.field.region.visibility import Visibility
 from core.matching.arguments import VisiblePixels
@@ -103,7 +103,7 @@ def carry_visibility(
     offsets = np.arange(subset_px) - subset_px // 2
     v, u = (a.ravel() for a in np.meshgrid(offsets, offsets, indexing="ij"))
     square = np.stack([u, v], axis=-1).astype(np.float64)
-    for index, seen in patches_seen(grid, has, wide, margin, _AT_ONCE):
+    for index, seen in visible_patches(grid, has, wide, margin, _AT_ONCE):
         d = square + (pixel[index] - position_px[index])[:, None]
         at = xy[index][:, None] + np.einsum("nij,nkj->nki", back[index], d)
         corner = np.floor(xy[index] - 0.5 * (wide - 1) + 0.5)

@@ -42,7 +42,7 @@ class Totals:
     G: Float
 
     @property
-    def now_cam1_mm(self) -> Float:
+    def current_cam1_mm(self) -> Float:
         """(n, 3) the points at the step, camera 1's frame."""
         return np.asarray(self.G[:, :, 0] / self.w[:, :1])
 
@@ -61,12 +61,11 @@ class Totals:
         """(n, 3) inverse depth at the step over camera 1's image: its value at (x, y) is the product with (x, y, 1)."""
         tangents = point_slopes(self.w, self.G)
         normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
-        return np.asarray(normal / np.sum(normal * self.now_cam1_mm, axis=1)[:, None])
+        return np.asarray(normal / np.sum(normal * self.current_cam1_mm, axis=1)[:, None])
 
 
 def image_slopes(G: Float) -> Float:
-    """Return (n, 2, 2), derivative of camera 1's current image over its reference image, in the middle of the
-    patches."""
+    """Return (n, 2, 2), derivative of camera 1's current image over its reference, in the middle of the patches."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     return np.asarray((G[:, :2, 1:3] - seen[:, :, None] * G[:, 2:, 1:3]) / G[:, 2, 0, None, None])
 
@@ -120,8 +119,7 @@ def _rotations(vectors: Float) -> Float:
 
 
 def follow(start: Totals, w: Float, G: Float) -> Totals:
-    """Return the totals (n) after a segment with the unknowns ``w`` (n, 3), ``G`` (n, 3, 3) about the points' own
-    rays."""
+    """Return the totals (n) after a segment's ``w`` (n, 3), ``G`` (n, 3, 3), about the points' own rays."""
     P = G[:, :, 0] / w[:, :1]
     tangents = point_slopes(w, G) @ start.image_slopes
     first = start.w[:, :1] * P
@@ -134,7 +132,7 @@ def since(start: Totals, now: Totals, plane: Float) -> Float:
 
     ``plane`` (n, 3) is the segment's ``w`` about the points' own rays.
     """
-    P = now.now_cam1_mm
+    P = now.current_cam1_mm
     tangents = point_slopes(now.w, now.G) @ _inverse(start.image_slopes)
     first = plane[:, :1] * P
     rest = P[:, :, None] * plane[:, None, 1:] + plane[:, :1, None] * tangents
@@ -192,8 +190,7 @@ def in_step(a: Float, b: Float) -> Float:
 
 
 def position_covariance(G: Float, covariance: Float) -> Float:
-    """Return the covariance (n, 2, 2) of positions in camera 1's current image, normalised, from that of (w0, G,
-    offset)."""
+    """Return the covariance (n, 2, 2) of camera 1's current image positions, normalised, from (w0, G, offset)."""
     seen = G[:, :2, 0] / G[:, 2:, 0]
     J = np.zeros((len(G), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0

@@ -88,9 +88,9 @@ def propagate(
     seen, slopes = G[:, :2, 0] / G[:, 2:, 0], image_slopes(G)
     to_px = pair.cam1.lens.image_jacobian(seen)
     from_px = np.linalg.inv(pair.cam1.lens.image_jacobian(pair.cam1.rays_cam(position_px).xyz_mm[:, :2]))
-    now_px = pair.cam1.lens.image_from_normalised(seen).xy
-    middle_px = now_px - np.einsum("nij,nj->ni", to_px @ slopes, offset)
-    common, samples = common_share(to_px @ slopes @ from_px, np.rint(now_px) - middle_px, subset_px)
+    current_px = pair.cam1.lens.image_from_normalised(seen).xy
+    middle_px = current_px - np.einsum("nij,nj->ni", to_px @ slopes, offset)
+    common, samples = common_share(to_px @ slopes @ from_px, np.rint(current_px) - middle_px, subset_px)
     left = np.maximum(0.5 * (1.0 + samples) - common + slope_share, 0.0) * (1.0 - pattern)
     return Propagated(
         before.noise + left[:, None, None] * own, in_step(before.pattern, pattern[:, None, None] * own)
@@ -121,13 +121,12 @@ def pattern_share(zncc: Float) -> Float:
 
 
 def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> Propagated:
-    """Return the covariance propagated to a segment that begins at a field matched against the first reference,
-    px^2."""
+    """Return the covariance, px^2, propagated to a segment that begins at a field of the first reference."""
     n = len(totals.w)
     C = field.covariance.reshape(n, 6, 6).astype(np.float32).astype(np.float64)
     R = pair.cam1.cam_from_sys.rotation
     mm = R @ (C[:, :3, :3] + C[:, :3, 3:] + C[:, 3:, :3] + C[:, 3:, 3:]) @ R.T
-    P, seen = totals.now_cam1_mm, totals.seen
+    P, seen = totals.current_cam1_mm, totals.seen
     J = np.zeros((n, 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0
     J[:, :, 2] = -seen

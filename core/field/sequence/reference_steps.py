@@ -53,7 +53,7 @@ _BY_THE_MATCH = (
 
 
 @dataclass(frozen=True)
-class Earlier:
+class PreviousStep:
     """The step measured before: its number and its field."""
 
     step: int
@@ -67,13 +67,13 @@ class Updating:
     ----------
     pair, reference, shape, grid, options
         Cameras, the first reference's images and shape, points and settings.
-    first
-        The first reference's number.
     mode
         ``never``, ``auto`` or ``always``.
     images_of, field_of
         Functions that return images and field of an earlier step, by its number. The field as measured or as read from
         its file.
+    first
+        The first reference's number.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Updating:
     def measure(
         self,
         images: Pair,
-        earlier: Earlier | None,
+        previous: PreviousStep | None,
         *,
         seeds: Seeds | None = None,
         progress: Progress | None = None,
@@ -110,7 +110,7 @@ class Updating:
         ----------
         images
             Both cameras' images.
-        earlier
+        previous
             The step before; None for the first one after the reference.
         seeds, progress, cancel
             As in :func:`core.measure.measure_motion`.
@@ -120,25 +120,25 @@ class Updating:
         MeasurementError, InputError, Cancelled
             As :func:`core.measure.measure_motion`.
         """
-        step = _Step(images, earlier, seeds, progress, cancel)
-        if earlier is None or self._mode == "never":
+        step = _Step(images, previous, seeds, progress, cancel)
+        if previous is None or self._mode == "never":
             return self._total(step)
         if self._mode == "always":
-            return self._against(earlier.step, step)
-        current = self._first if earlier.field.references is None else earlier.field.references.step
+            return self._against(previous.step, step)
+        reference = self._first if previous.field.references is None else previous.field.references.step
         try:
-            field = self._against(current, step)
+            field = self._against(reference, step)
         except SeedError:
-            if current == earlier.step:
+            if reference == previous.step:
                 raise
-            return self._against(earlier.step, step)
-        if current == earlier.step or not _fails(field, earlier.field, self._held_by(current)):
+            return self._against(previous.step, step)
+        if reference == previous.step or not _fails(field, previous.field, self._held_by(reference)):
             return field
         try:
-            updated = self._against(earlier.step, step)
+            updated = self._against(previous.step, step)
         except MeasurementError:
             return field
-        return updated if _finds_it(updated, field, earlier.field) else field
+        return updated if _finds_it(updated, field, previous.field) else field
 
     def _held_by(self, step: int) -> Bool:
         return self._shape.valid if step == self._first else self._segment(step).has.reshape(self._grid.shape)
@@ -150,7 +150,7 @@ class Updating:
 
     def _total(self, step: _Step) -> Field:
         inputs = self._inputs(self._reference, self._grid, step, step.progress)
-        previous = None if step.earlier is None else step.earlier.field
+        previous = None if step.previous is None else step.previous.field
         return motion_field(inputs, self._shape, previous, step.seeds)
 
     def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
@@ -205,15 +205,15 @@ class Updating:
         )
 
     def _by_segment(self, reference: int, step: _Step) -> Field:
-        assert step.earlier is not None
+        assert step.previous is not None
         segment = self._segment(reference)
         state = measure_segment(
             segment,
             *step.images,
             pair=self._pair,
             options=self._options,
-            previous=step.earlier.field,
-            previous_step=step.earlier.step,
+            previous=step.previous.field,
+            previous_step=step.previous.step,
             progress=step.progress,
             cancel=step.cancel,
         )
@@ -254,7 +254,7 @@ class _Step:
     """Inputs of one step."""
 
     images: Pair
-    earlier: Earlier | None
+    previous: PreviousStep | None
     seeds: Seeds | None
     progress: Progress | None
     cancel: CancelToken | None

@@ -106,8 +106,7 @@ class Segment:
     def total(
         self, fits: PointFits, index: NDArray[np.intp], pattern: Float, *, pair: StereoPair, subset_px: int
     ) -> tuple[PointFits, Propagated]:
-        """Return totals of points ``index`` measured by a fitter of this segment, and their propagated covariance,
-        px^2.
+        """Return totals of points ``index`` fitted in this segment, and their propagated covariance, px^2.
 
         ``pattern`` (m,) is their :func:`pattern_share`.
         """

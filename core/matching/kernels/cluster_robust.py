@@ -124,8 +124,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
 
     @kernel(f"{degree}_{images}", inline="always")
     def cluster_robust_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
-        """Compute the covariance (``last`` squared numbers) of the last unknowns at a fitted point; return status, and
-        0."""
+        """Compute the covariance (``last`` squared numbers) of a fitted point's last unknowns; return status, and 0."""
         subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
         fit_space, part, scores, pull, z, sums = space
         ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _ = fit_space

@@ -104,14 +104,13 @@ def best_correlation(levels, images):
 
 @inner
 def unlike_noise(levels, images, n, unknowns):
-    """Variance by which the noisiest image exceeds the estimate of the least noisy comparison; zero where all are
-    alike.
+    """Return the variance by which the noisiest image exceeds the estimate of the least noisy comparison.
 
-    The weights assume equal noise of all images. Where one has clearly more (less light, blur, a surface that changed),
-    the variance of the unknowns that depend on it is the mean of its variance and the reference's, as estimated by its
-    own comparison; so the covariance is that of the noisiest comparison. That image's contrast is noise in part, so its
-    residuals, brought to the reference's contrast, are smaller than the noise: by its correlation over the best one,
-    which gives the effect of the reference's own noise on a correlation.
+    Zero where all are alike. The weights assume equal noise of all images. Where one has clearly more (less light,
+    blur, a surface that changed), the variance of the unknowns that depend on it is the mean of its variance and the
+    reference's, as estimated by its own comparison; so the covariance is that of the noisiest comparison. That image's
+    contrast is noise in part, so its residuals, brought to the reference's contrast, are smaller than the noise: by its
+    correlation over the best one, which gives the effect of the reference's own noise on a correlation.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
     best = best_correlation(levels, images)

@@ -189,8 +189,7 @@ class PointKernels(NamedTuple):
 
 
 def make_point(degree: int, images: int) -> PointKernels:
-    """Compile the common parts of the fits, for patches of this degree (1 plane, 2 curved) and one or three
-    comparisons."""
+    """Compile the common parts of the fits, for patches of a degree (1 plane, 2 curved), one or three comparisons."""
     few = len(monomials(degree))
     each = 4 if images == 3 else 1  # unknowns a monomial: w_j, and G_0j, G_1j, G_2j
     unknowns = each * few + 1
@@ -259,8 +258,7 @@ def make_point(degree: int, images: int) -> PointKernels:
 
     @kernel(made_for)
     def jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
-        """Compute the effect of each unknown on the patch, px in the reference, as coefficients of ``columns``; False
-        if singular.
+        """Compute each unknown's effect on the patch, reference px, as coefficients of ``columns``; False if singular.
 
         ``slopes`` are d(px) / d(ray) of camera 1 at the point.
         """
@@ -347,8 +345,7 @@ def make_point(degree: int, images: int) -> PointKernels:
 
     @kernel(made_for)
     def moves_of(columns, step, moves):
-        """Compute each image's motion of the patch (coefficients) for a step; return the largest corner motion, camera
-        1 px.
+        """Compute each image's motion of the patch for a step; return the largest corner motion, camera 1 px.
 
         The sum of the coefficients' sizes bounds it.
         """

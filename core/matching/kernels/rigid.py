@@ -88,7 +88,7 @@ def rigid_columns(xc, yc, w, rotation, G):
 
 @inner
 def rigid_chain(xc, yc, w, rotation, G, chain):
-    """d(thirteen unknowns) / d(w1, w2, rotation vector, w0, G0, e), (13, 10), at the present state."""
+    """Compute d(thirteen unknowns) / d(w1, w2, rotation vector, w0, G0, e), (13, 10), at the present state."""
     for i in range(13):
         for j in range(N_RIGID):
             chain[i, j] = 0.0

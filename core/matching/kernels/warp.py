@@ -75,7 +75,7 @@ def lens_expansion(lens, u, v):
 
 @njit(nogil=True, error_model="numpy")
 def lens_jacobian(lens, u, v):
-    """d(image px) / d(normalised) at (u, v): the four entries row by row."""
+    """Return d(image px) / d(normalised) at (u, v): the four entries row by row."""
     near = lens_expansion(lens, u, v)
     l1, h11, h12, h22 = near.l1, near.h11, near.h12, near.h22
     a11 = h11 + 2.0 * l1 * u * u

@@ -32,13 +32,13 @@ class ArrivalClock:
 
     def _look(self) -> int:
         # the thread may be put aside between both looks: the quickest of three counts
-        looks = []
+        readings = []
         for _ in range(3):
             before = self._steady_ns()
             wall = self._wall_ns()
             after = self._steady_ns()
-            looks.append((after - before, wall - (before + after) // 2))
-        return min(looks)[1]
+            readings.append((after - before, wall - (before + after) // 2))
+        return min(readings)[1]
 
     def watch(self) -> None:
         """Look at the clocks; to be called often."""

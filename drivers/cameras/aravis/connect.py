@@ -37,13 +37,13 @@ def connect(device: Device, options: CameraOptions, on_lost: Callable[[], None])
         try:
             _set_packet_size(device, options.packet_size_bytes)
         except CameraError as error:
-            # a camera that does not let its packet size be asked for may have one that works
+            # a camera whose packet size cannot be read may have one that works
             if error.code != "unknown_feature" or options.packet_size_bytes is not None:
                 raise
 
 
 def _ready(device: Device, name: str) -> str:
-    """What to open; a camera that cannot be opened is refused here, since Aravis would take 2.5 s for that."""
+    """Return the id to open; a camera that cannot be opened is refused here, since Aravis would take 2.5 s for that."""
     if _is_address(name):
         _check_control(device, control_state(name))
         return name

@@ -1,4 +1,4 @@
-"""Who a camera is and what it can do, and its IEEE 1588 clock."""
+"""Identity and abilities of a camera, and its IEEE 1588 clock."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from drivers.cameras.protocol import CameraDescription
 # names of SFNC 2 and, older, of GigE Vision's own features
 PTP_ENABLE = ("PtpEnable", "GevIEEE1588")
 _PTP_STATUS = ("PtpStatus", "GevIEEE1588Status")
-_PTP_LATCH = "PtpDataSetLatch"  # makes the values below those of this moment
+_PTP_LATCH = "PtpDataSetLatch"  # latches the values below
 _PTP_MASTER_ID = ("PtpGrandmasterClockID", "PtpParentClockID", "GevIEEE1588ParentClockId")
 _PTP_OWN_ID = ("PtpClockID", "GevIEEE1588ClockId")
 _FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 
 
 def describe(device: Device, features: Features, control: CameraControl) -> CameraDescription:
-    """Ask the camera for everything that `CameraDescription` tells."""
+    """Read everything in `CameraDescription` from the camera."""
     formats = control.formats()
     firmware = features.first(*_FIRMWARE)
     return CameraDescription(
@@ -56,7 +56,7 @@ def _extra(device: Device, features: Features) -> dict[str, str]:
 def _counter_range(device: Device, features: Features) -> tuple[int, int]:
     if not device.is_gige:
         return 0, 2**64 - 1
-    # block numbers of 16 bit leave zero out; the camera must be told to use the 64 bit ones
+    # block numbers of 16 bit leave zero out; the camera must be set to use the 64 bit ones
     extended = features.first("GevGVSPExtendedIDMode")
     wide = extended is not None and features.read(extended) == "On"
     return 1, 2**64 - 1 if wide else 2**16 - 1
@@ -86,8 +86,8 @@ def switch_ptp_on(device: Device, features: Features) -> None:
 def ptp_clock(features: Features) -> str:
     """Name of the clock that rules the camera's, or an empty string.
 
-    Only where IEEE 1588 is on, the camera says that it follows a master or is one, and says which: two cameras'
-    times may be compared when both name the same.
+    Only where IEEE 1588 is on and the camera reports that it follows a master or is one, and which: two cameras' times
+    may be compared when both name the same.
     """
     enable, status = features.first(*PTP_ENABLE), features.first(*_PTP_STATUS)
     if enable is None or status is None or features.read(enable) is not True:

@@ -1,7 +1,7 @@
-"""The only holder of a camera's handle, so that letting go of it surely ends the connection.
+"""The only holder of a camera's handle, so that its release ends the connection.
 
-Aravis keeps a camera under control as long as its object lives. An error that somebody keeps also keeps the local
-variables of the functions it came through: none of ours has the handle among them, only this class's attributes have.
+Aravis keeps a camera under control as long as its object lives. An error that is kept also keeps the local variables of
+the functions it came through: none of these functions has the handle among them, only this class's attributes have.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Device:
     Parameters
     ----------
     options
-        Which camera.
+        Name of the camera.
     check
         Called before each question; raises when the camera was closed in the meantime.
     """
@@ -59,15 +59,15 @@ class Device:
             # Of a GigE camera it would come from a thread of Aravis that the handle's end waits for: letting go of the
             # handle during the signal would let that thread wait for itself, which ends the program.
             self._handler = self._handle.connect("control-lost", lambda _device: on_lost())
-        self.stop()  # what a program that crashed, or a connection that broke, has left running
+        self.stop()  # an acquisition left running by a program that crashed, or a connection that broke
 
     def in_control(self) -> bool:
-        """Whether the camera is still ours, as far as Aravis knows; does not ask it."""
+        """True if the camera is still under control, as far as Aravis knows; does not ask it."""
         handle = self._handle
         return handle is not None and (not self.is_gige or bool(handle.is_controller()))
 
     def drop(self) -> None:
-        """Let go of the camera, and give up its control; takes 2.5 s where it does not answer."""
+        """Release the camera and its control; takes 2.5 s where it does not answer."""
         if self._handle is not None and self._handler is not None:
             self._handle.disconnect(self._handler)
             self._handler = None
@@ -76,12 +76,12 @@ class Device:
 
     @property
     def is_gige(self) -> bool:
-        """Whether it is a GigE Vision camera."""
+        """True for a GigE Vision camera."""
         return isinstance(self._handle, aravis().GvDevice)
 
     @property
     def protocol(self) -> str:
-        """What it speaks, as far as it is one of these."""
+        """Its protocol, as far as it is one of these."""
         if self.is_gige:
             return "GigE Vision"
         # a library that was built without USB has no such class
@@ -121,7 +121,7 @@ class Device:
         if self._camera is not None:
             try:
                 self._camera.stop_acquisition()
-            except glib_error():  # it is not there, or not ours any more
+            except glib_error():  # it is not there, or not under control any more
                 return
 
     def say(self, method: str) -> str:
@@ -146,7 +146,7 @@ class Device:
         return str(self._handle.get_device_address().get_address().to_string())
 
     def translated(self, error: Any, name: object = None, value: object = None) -> CameraError:
-        """An error of Aravis as one of ours."""
+        """Return an error of Aravis as one of the project's."""
         text = str(error.message)
         if error.domain == "arv-gc-error-quark":
             codes = aravis().GcError
@@ -163,7 +163,7 @@ class Device:
         return CameraError(f"{self.name}: {text}.", code="camera_lost", remedy=_RECONNECT, camera=self.name)
 
     def busy(self) -> CameraError:
-        """The error of a camera that another program controls."""
+        """Return the error of a camera that another program controls."""
         return CameraError(
             f"Another program controls {self.name}.",
             code="camera_busy",
@@ -172,11 +172,11 @@ class Device:
         )
 
     def lost(self, why: str) -> CameraError:
-        """The error of a camera that cannot be used any more."""
+        """Return the error of a camera that cannot be used any more."""
         return CameraError(f"{self.name} {why}.", code="camera_lost", remedy=_RECONNECT, camera=self.name)
 
     def out_of_range(self, name: object, value: object, allowed: str) -> CameraError:
-        """The refusal of a value, saying what would do."""
+        """Return the error for a value that is refused, with the allowed ones."""
         return CameraError(
             f"{self.name} cannot set {name} to {value!r}, only {allowed}.",
             code="out_of_range",
@@ -186,7 +186,7 @@ class Device:
         )
 
     def unknown(self, name: object, why: str) -> CameraError:
-        """The refusal of a feature or setting that the camera does not have."""
+        """Return the error for a feature or setting that the camera does not have."""
         return CameraError(
             f"{self.name}: {name} {why}.",
             code="unknown_feature",

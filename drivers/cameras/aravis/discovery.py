@@ -1,4 +1,4 @@
-"""The cameras that Aravis sees, and finding the one that a rig file names."""
+"""Discovery of the cameras that Aravis finds, and search for the one that a rig file names."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def _listed() -> Iterator[ListedCamera]:
 def discover() -> list[FoundDevice]:
     """List the GigE Vision and USB3 Vision cameras that answer; takes a second.
 
-    ``problem`` says of a GigE Vision camera that it is in use or that its address cannot be reached; of a USB3 Vision
-    camera neither can be told without opening it.
+    ``problem`` of a GigE Vision camera: it is in use, or its address cannot be reached; of a USB3 Vision camera neither
+    is known without opening it.
 
     Raises
     ------

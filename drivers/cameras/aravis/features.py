@@ -1,4 +1,4 @@
-"""GenICam features of one camera by name: kinds, ranges and increments asked for, every refusal in our own words."""
+"""GenICam features of one camera by name: kinds, ranges and increments, and errors in the project's words."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.cameras.protocol import FeatureValue
 
 Kind = Literal["command", "enumeration", "boolean", "float", "integer", "string"]
 
-# the first class that a node has says what it is: an enumeration can be read as an integer as well
+# the first class of a node is its kind: an enumeration can be read as an integer as well
 _KINDS: tuple[tuple[str, Kind], ...] = (
     ("GcCommand", "command"),
     ("GcEnumeration", "enumeration"),
@@ -21,7 +21,7 @@ _KINDS: tuple[tuple[str, Kind], ...] = (
     ("GcInteger", "integer"),
     ("GcString", "string"),
 )
-# features that standard cameras have and that some descriptions forget to put into a category
+# features of standard cameras that some descriptions do not put into a category
 _OUTSIDE_CATEGORIES = ("Gain", "GainRaw", "GainAuto", "ExposureAuto", "BlackLevel", "BlackLevelRaw")
 
 
@@ -70,7 +70,7 @@ class Features:
         return tuple(names)
 
     def kind(self, name: str) -> Kind | None:
-        """What kind of feature it is; None when the camera has none of that name."""
+        """Return the kind of a feature; None when the camera has none of that name."""
         if name not in self._kinds:
             node = self._device.node(name)
             classes = [] if node is None else [k for c, k in _KINDS if isinstance(node, getattr(aravis(), c))]
@@ -78,7 +78,7 @@ class Features:
         return self._kinds[name]
 
     def has(self, name: str) -> bool:
-        """Whether the camera has it and it can be used now."""
+        """Return True if the camera has it and it can be used now."""
         if self.kind(name) is None:
             return False
         return bool(self._device.ask("is_feature_available", name))
@@ -88,18 +88,18 @@ class Features:
         return next((name for name in names if self.has(name)), None)
 
     def writable(self, name: str) -> bool:
-        """Whether the camera has it and lets it be written at all."""
+        """Return True if the camera has it and it can be written at all."""
         if not self.has(name):
             return False
         mode = self._device.ask("get_feature_access_mode", name)
         return bool(mode != aravis().GcAccessMode.RO)
 
     def locked(self, name: str) -> bool:
-        """Whether it must not be written now."""
+        """Return True if it must not be written now."""
         return self.kind(name) is not None and bool(self._device.ask_node(name, "is_locked"))
 
     def unit(self, name: str) -> str:
-        """Unit that the camera's description gives, or an empty string."""
+        """Return the unit in the camera's description, or an empty string."""
         return str(self._device.ask_node(name, "get_unit") or "") if self.kind(name) in ("float", "integer") else ""
 
     def read(self, name: str) -> FeatureValue:
@@ -145,14 +145,14 @@ class Features:
         return Bounds(float(low), float(high), step if 1e-300 < step < math.inf else None)
 
     def check_value(self, name: str, value: FeatureValue, shown: str | None = None, scale: float = 1.0) -> FeatureValue:
-        """Return the value as the feature takes it, or refuse it with ``out_of_range`` and what would do.
+        """Return the value as the feature takes it, or raise ``out_of_range`` with the allowed values.
 
         Parameters
         ----------
         name, value
             Feature, and value in the camera's unit.
         shown, scale
-            For the error text: the setting's name, and how many of the camera's units are one of its units.
+            For the error text: the setting's name, and the number of the camera's units in one of its units.
         """
         kind = self._known(name)
         shown = shown or name

@@ -9,7 +9,7 @@ from core.errors import CameraError
 from drivers.cameras.aravis.session import Session
 from drivers.cameras.protocol import CameraDescription, CameraOptions, CameraSettings, Frame
 
-# How long `close` waits for the camera to be released; what takes longer goes on in a thread of its own
+# Longest wait of `close` for the camera's release; a longer release goes on in a thread of its own
 _CLOSE_S = 0.4
 # A camera that is released by this process in the background may be free a moment later
 _RELEASE_S = 0.5
@@ -66,7 +66,7 @@ class AravisGrabber:
         )
 
     def describe(self) -> CameraDescription:
-        """Say who the camera is and what it can do, as of the last `open`, `configure` or `arm`."""
+        """Return the camera's identity and abilities, as of the last `open`, `configure` or `arm`."""
         return self._opened().description
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
@@ -78,7 +78,7 @@ class AravisGrabber:
         self._opened().arm()
 
     def disarm(self) -> None:
-        """Stop delivering; frames that wait are thrown away."""
+        """Stop delivering; waiting frames are discarded."""
         session = self._session
         if session is not None:
             session.disarm()

@@ -1,7 +1,7 @@
-"""Two questions about a GigE Vision camera that Aravis does not answer: who controls it, and how long packets may be.
+"""Two data of a GigE Vision camera that Aravis does not give: its controlling program, and the length of packets.
 
-Aravis can only tell who controls a camera by trying to take control itself, for 2.5 s. Reading the register that says
-so disturbs nobody.
+Aravis can only find out if a camera is controlled by trying to take control itself, for 2.5 s. Reading the register
+disturbs no other program.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _IP_MTU = 14  # Linux; Python has no name for it
 
 
 class ControlState(StrEnum):
-    """Who controls a camera."""
+    """Control of a camera."""
 
     FREE = "free"
     HELD = "held"
@@ -28,7 +28,7 @@ class ControlState(StrEnum):
 
 
 def control_state(address: str, *, timeout_s: float = 0.3, attempts: int = 2) -> ControlState:
-    """Ask the GigE Vision camera at an IP address whether a program controls it."""
+    """Ask the GigE Vision camera at an IP address for the program that controls it."""
     for number in range(1, attempts + 1):
         question = struct.pack(">BBHHHI", _KEY, _ANSWER_WANTED, _READ_REGISTER, 4, number, _CONTROL_CHANNEL_PRIVILEGE)
         try:
@@ -54,7 +54,7 @@ def control_state(address: str, *, timeout_s: float = 0.3, attempts: int = 2) ->
 
 
 def longest_packet(address: str) -> int | None:
-    """Return how many bytes an IP packet to or from this address may have undivided (MTU); None if that is unknown."""
+    """Return the largest undivided IP packet to or from this address, in bytes (MTU); None if not known."""
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             line.connect((address, _PORT))  # sends nothing

@@ -1,4 +1,4 @@
-"""The Aravis library, loaded when it is first needed, and its errors as ours.
+"""The Aravis library, loaded when it is first needed, and its errors as the project's.
 
 PyGObject has no types and is in the extra ``[aravis]`` only: nothing else in the project imports it.
 """

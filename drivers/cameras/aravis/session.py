@@ -22,7 +22,7 @@ from drivers.cameras.protocol import CameraDescription, CameraOptions, CameraSet
 _LATENCY_S = 1.0
 # What a camera may need to stop: one and a half frames, within these limits
 _SHORTEST_S, _LONGEST_S = 0.05, 1.5
-# A disarmed camera has no frames; a wait looks this often whether it was armed
+# A disarmed camera has no frames; a wait checks this often if it was armed
 _IDLE_S = 0.02
 #: features that change the size of a frame or what starts it, and so cannot change while frames come
 _NOT_WHILE_ARMED = ("PixelFormat", "Width", "Height", "Binning", "Decimation", "Chunk", "GevSCPS", "Trigger")
@@ -36,7 +36,7 @@ class Session:
     Parameters
     ----------
     options
-        Which camera, and how.
+        Name of the camera, and its options.
     """
 
     description: CameraDescription
@@ -138,8 +138,8 @@ class Session:
                 raise
 
     def _await_standstill(self) -> None:
-        # a camera that was told to stop finishes its frame first; one that does not get so far goes on sending to the
-        # stream that is gone
+        # a stopped camera finishes its frame first; without the time for it, it goes on sending to the stream that is
+        # gone
         rate = self._settings.frame_rate_hz
         frame_s = max(1.0 / rate if rate else 0.0, (self._settings.exposure_ms or 0.0) / 1000.0)
         left = self._stopped_s + min(1.5 * frame_s + _SHORTEST_S, _LONGEST_S) - time.monotonic()
@@ -152,7 +152,7 @@ class Session:
         stream = self._stream
         if stream is None:
             return
-        stream.end()  # waits end at once, whoever is asking the camera
+        stream.end()  # waits end at once, also while another thread asks the camera
         thread = threading.Thread(target=self._end_stream, name=f"disarm {self._device.name}", daemon=True)
         thread.start()
         while thread.is_alive() and not self._why_lost and not self._ended.is_set():

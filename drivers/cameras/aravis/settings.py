@@ -1,4 +1,4 @@
-"""Our settings as GenICam features: applied all or none, and read back.
+"""Camera settings as GenICam features: applied all or none, and read back.
 
 Ranges depend on each other (a longer exposure lowers the highest frame rate), so settings are not checked beforehand
 but one by one, each just before it is written; one that is refused waits for the others and is tried again. If one
@@ -82,7 +82,7 @@ class CameraControl:
             if whole is not None:
                 largest = max(largest, features.read_number(whole))
             elif sensor is not None and features.has(offset):
-                # the limit of the width is what the present offset leaves of the whole
+                # the limit of the width is the whole less the present offset
                 largest = max(largest, min(features.read_number(sensor), largest + features.read_number(offset)))
             size.append(int(largest))
         return size[0], size[1]
@@ -101,7 +101,7 @@ class CameraControl:
         return tuple(modes)
 
     def _gain_in_db(self) -> bool:
-        # GainRaw counts steps of the camera's own; Gain is in decibels unless the camera says something else
+        # GainRaw counts steps of the camera's own; Gain is in decibels unless the camera has another unit
         return self._features.has("Gain") and self._features.unit("Gain").strip().lower() in ("", "db")
 
     # ---- reading
@@ -251,10 +251,10 @@ class CameraControl:
         undo.write("Gain", self._checked("Gain", gain_db, "gain_db"))
 
     def _checked(self, name: str, value: float, shown: str, scale: float = 1.0) -> FeatureValue:
-        """The value in the camera's unit, as its feature takes it."""
+        """Return the value in the camera's unit, as its feature takes it."""
         value = float(value) * scale
         if self._features.kind(name) == "integer" and math.isfinite(value):
-            # a camera that takes whole microseconds has no others: what it really has is read back
+            # a camera that takes whole microseconds has no others: the true value is read back
             value = round(value)
         bounds = self._features.bounds(name)
         for limit in (bounds.low, bounds.high):
@@ -348,7 +348,7 @@ class CameraControl:
 
 
 class _Undo:
-    """Writes features and remembers what they were."""
+    """Writes features and keeps their former values."""
 
     def __init__(self, features: Features) -> None:
         self._features = features

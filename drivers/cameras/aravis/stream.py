@@ -1,4 +1,4 @@
-"""The stream of one armed camera: buffers that go round, and what Aravis counts about them."""
+"""The stream of one armed camera: its ring of buffers, and Aravis' counters of them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class CameraStream:
     name
         The camera's, for error texts.
     region_px, pixel_format
-        What the camera is set to, for frames that come without their header.
+        Present settings of the camera, for frames that come without their header.
     """
 
     def __init__(self, name: str, *, region_px: tuple[int, int, int, int], pixel_format: PixelFormat) -> None:
@@ -88,7 +88,7 @@ class CameraStream:
 
     @contextmanager
     def _in_use(self, *, even_ended: bool = False) -> Iterator[Any]:
-        """The stream, or None once it has ended; it is not freed in between.
+        """Return the stream, or None once it has ended; it is not freed in between.
 
         Freeing waits for the camera, so it must happen in the thread that calls `release` and in no other.
         """
@@ -166,7 +166,7 @@ class CameraStream:
         )
 
     def statistics(self) -> dict[str, int | float]:
-        """What Aravis counted; does not ask the camera."""
+        """Return Aravis' counters; does not ask the camera."""
         counts: dict[str, int | float] = {"headerless_frames": self.headerless}
         with self._in_use(even_ended=True) as stream:
             if stream is not None:
@@ -207,7 +207,7 @@ def _give_back(stream: Any, buffer: Any) -> None:
 
 
 def _pixels(buffer: Any, pixel_format: PixelFormat) -> Pixels | None:
-    """The image in a complete buffer; None when it is shorter than it should be after all."""
+    """Return the image in a complete buffer; None when it is too short after all."""
     width, height = int(buffer.get_image_width()), int(buffer.get_image_height())
     if buffer.get_payload_type() == aravis().BufferPayloadType.MULTIPART:
         data = np.frombuffer(buffer.get_image_data(), np.uint8)

@@ -1,4 +1,4 @@
-"""Which software trigger made which frame."""
+"""Assignment of frames to software triggers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class TriggerNumbers:
     whose number is n higher to the trigger n later: so a frame that is lost on its way does not shift those after it.
 
     Two things are assumed. The first frame after arming is not lost without a trace, unless the camera begins to count
-    at 1 with each arming or goes on from where it stood, which both can be told. And the camera makes a frame of every
+    at 1 with each arming or continues its count, which both can be detected. And the camera makes a frame of every
     trigger; most ignore one that comes while they are busy, without counting it. Where either is wrong, frames seem to
     come long after their triggers: a frame that would be later than ``patience_s`` is given to the next trigger that it
     can belong to, and the frames after it follow. Below that, pairs made by such numbers are a trigger apart, which
@@ -95,7 +95,7 @@ class TriggerNumbers:
         return trigger if self._armed_at < trigger <= self._fired else None
 
     def _lost_before(self, number: int, fired: int, damaged: int) -> int:
-        """How many frames were lost before the first that came after arming."""
+        """Return the number of frames lost before the first that came after arming."""
         begins = [number - self._first]  # the counter began anew
         if self._newest is not None:
             begins.append((number - self._newest - 1) % self._size)  # it went on

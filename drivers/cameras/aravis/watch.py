@@ -1,7 +1,7 @@
 """A watch over a GigE Vision camera that sends nothing because nothing is asked of it.
 
-Aravis notices the loss of a camera after 8 s. A camera that waits for triggers is silent anyway, so its silence tells
-nothing; but one that is there answers when it is asked who controls it.
+Aravis notices the loss of a camera after 8 s. A camera that waits for triggers is silent anyway, so its silence shows
+nothing; but a connected one answers questions about its control.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drivers.cameras.aravis.gvcp import ControlState, control_state
 _PAUSE_S = 0.08
 _ANSWER_S = 0.12
 # Lost after this long without answer or frame, and so many questions: if this program itself was held up, time alone
-# tells nothing
+# shows nothing
 _PATIENCE_S = 0.5
 _QUESTIONS = 3
 
@@ -30,7 +30,7 @@ class Watch:
     last_sign_s
         When the last frame came, by the monotonic clock: frames are signs of life too.
     in_control
-        Whether the camera is still ours as far as is known without asking it.
+        Function that returns True if the camera is still under control, as far as is known without asking it.
     on_lost
         Called once with the reason, from the watch's thread.
     """

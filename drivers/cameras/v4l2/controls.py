@@ -1,6 +1,6 @@
-"""Controls by name: what a device has, whether it can take a value, and what it took.
+"""Controls by name: those of a device, their ranges, and their values as set and read back.
 
-V4L2 clamps in silence: what is out of range, off the step or no item of a menu is therefore refused here, before
+V4L2 clamps in silence: a value out of range, off the step or no item of a menu is therefore refused here, before
 anything is written, and each control is read back after it was written.
 """
 
@@ -43,12 +43,12 @@ class Control:
 
     @property
     def is_button(self) -> bool:
-        """Whether it is pressed rather than set."""
+        """True if it is pressed rather than set."""
         return self.kind == v.CTRL_TYPE_BUTTON
 
     @property
     def settable(self) -> bool:
-        """Whether a setting may name it."""
+        """True if a setting may name it."""
         return (self.is_button or self.kind in _READABLE) and not self.flags & v.CTRL_FLAG_READ_ONLY
 
 
@@ -77,7 +77,7 @@ class Controls:
 
     @property
     def settable_names(self) -> tuple[str, ...]:
-        """What a setting may name."""
+        """Names that a setting may have."""
         return tuple(name for name in self._numbers if self.find(name).settable)
 
     def find(self, name: str) -> Control:
@@ -124,12 +124,12 @@ class Controls:
         return found
 
     def check(self, name: str, value: FeatureValue) -> tuple[Control, Raw]:
-        """Understand a value for a control without touching it.
+        """Convert a value for a control without setting it.
 
         Raises
         ------
         CameraError
-            ``unknown_feature``; ``read_only``; ``out_of_range`` with what it would take.
+            ``unknown_feature``; ``read_only``; ``out_of_range`` with the allowed values.
         """
         control = self.find(name)
         if not control.settable:
@@ -205,13 +205,13 @@ class Controls:
         control, raw
             As `check` returned them.
         exact
-            Whether another value afterwards is an error, or left for the caller to read.
+            True if another value afterwards is an error; False leaves it for the caller to read.
 
         Raises
         ------
         CameraError
-            ``setting_not_taken`` when the device has another value afterwards, or says that the control has no effect
-            as things are; ``armed`` when it cannot be changed while frames come.
+            ``setting_not_taken`` when the device has another value afterwards, or reports that the control has no
+            effect at present; ``armed`` when it cannot be changed while frames come.
         """
         try:
             self._exchange(v.VIDIOC_S_EXT_CTRLS, control, raw)
@@ -227,7 +227,7 @@ class Controls:
                 "Switch off what sets it by itself (automatic exposure, gain, white balance, focus) first.",
             )
         if control.flags & v.CTRL_FLAG_VOLATILE:
-            return  # the device changes it by itself: what it reads says nothing about what it took
+            return  # the device changes it by itself: the value read back is not the one set
         taken = self.get(control)
         if exact and taken != raw:
             raise self._not_taken(

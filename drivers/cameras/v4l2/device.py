@@ -1,7 +1,7 @@
-"""One open video device: its requests, its errors in the project's words, and who may still be using it.
+"""One open video device: its requests, its errors in the project's words, and its users.
 
-`Device.close` may come from any thread while another one waits in a request or for a frame. The descriptor is given
-back by whoever leaves last, so that no number is ever used after the kernel gave it to another file.
+`Device.close` may come from any thread while another one waits in a request or for a frame. The last user gives the
+descriptor back, so that no number is ever used after the kernel gave it to another file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Device:
         self._closing = False
 
     def open(self) -> Self:
-        """Open it and ask what it is.
+        """Open it and read its identity.
 
         Raises
         ------
@@ -67,13 +67,13 @@ class Device:
 
     @property
     def capabilities(self) -> int:
-        """What this node can do, as ``V4L2_CAP_`` bits."""
+        """Abilities of this node, as ``V4L2_CAP_`` bits."""
         known = self.capability
         return known.device_caps if known.capabilities & v.CAP_DEVICE_CAPS else known.capabilities
 
     @property
     def closing(self) -> bool:
-        """Whether `close` was called."""
+        """True once `close` was called."""
         return self._closing
 
     @contextmanager
@@ -102,7 +102,7 @@ class Device:
             return
 
     def close(self) -> None:
-        """Wake whoever waits and release the device; safe to call twice and from any thread."""
+        """End all waits and release the device; safe to call twice and from any thread."""
         with self._lock:
             first, self._closing = not self._closing, True
             idle = self._users == 0
@@ -135,7 +135,7 @@ class Device:
         return self.fault(error, "be opened")
 
     def fault(self, error: OSError, what: str) -> CameraError:
-        """Say in the project's words why the device could not do ``what``."""
+        """Return the error, in the project's words, for a request ``what`` that the device refused."""
         text = f"{self.path} cannot {what} ({error.strerror}, {errno.errorcode.get(error.errno or 0, error.errno)})"
         if error.errno in _GONE:
             return CameraError(

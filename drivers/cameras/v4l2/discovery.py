@@ -1,4 +1,4 @@
-"""Who a video device is, and which of them are cameras that can be measured with."""
+"""Identity of video devices, and discovery of those that are usable cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LINKS = (Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path"))
 
 @dataclass(frozen=True)
 class Identity:
-    """Who a device is. ``serial`` is the maker's where the bus knows it, else the place on the bus."""
+    """Identity of a device. ``serial`` is the maker's where the bus has it, else the position on the bus."""
 
     model: str
     serial: str
@@ -28,7 +28,7 @@ class Identity:
 
 
 def identity(path: str, capability: v.Capability) -> Identity:
-    """Put together what the driver and the bus say about a device."""
+    """Return the identity of a device from its driver and its bus."""
     bus_info = capability.bus_info.decode("utf-8", "replace")
     extra = {
         "bus_info": bus_info,
@@ -48,7 +48,7 @@ def identity(path: str, capability: v.Capability) -> Identity:
 
 
 def _parents(path: str) -> list[Path]:
-    """The device's folders in sysfs, from its own to the bus's root."""
+    """Return the device's folders in sysfs, from its own to the bus's root."""
     try:
         own = (_SYS / Path(path).resolve().name / "device").resolve(strict=True)
     except OSError:
@@ -64,7 +64,7 @@ def _word(file: Path) -> str:
 
 
 def discover() -> list[FoundDevice]:
-    """List the capture devices, also those that cannot be used, with what is wrong with them."""
+    """List the capture devices, also those that cannot be used, with their problems."""
     nodes = sorted(Path("/dev").glob("video[0-9]*"), key=lambda node: int(re.sub(r"\D", "", node.name) or 0))
     return [found for node in nodes if (found := _examined(node)) is not None]
 
@@ -120,7 +120,7 @@ def _text(error: CameraError) -> str:
 
 
 def _stable_name(node: Path, *, has_serial: bool) -> str:
-    """A link that still means this device after a restart; without a serial number, the link by its socket.
+    """Return a link that names this device after a restart too; without a serial number, the link by its socket.
 
     Two cameras of one model without serial numbers share one name by id, which then means either of them.
     """

@@ -1,7 +1,7 @@
-"""Pixel formats that carry brightness, and how their lines become right-aligned gray values.
+"""Pixel formats that carry brightness, and their conversion to right-aligned gray values.
 
 Byte layouts are those of the kernel's documentation (luma-only formats, packed and semi-planar YUV). Colour patterns
-(Bayer), RGB and compressed formats are left out on purpose: what they deliver is not the brightness that was measured.
+(Bayer), RGB and compressed formats are left out on purpose: they do not deliver the measured brightness.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Bytes = NDArray[np.uint8]
 class GrayFormat:
     """One pixel format with a brightness that can be read.
 
-    Parameters
+    Attributes
     ----------
     code
-        The kernel's four characters as a number; bit 31 says big-endian.
+        The kernel's four characters as a number; bit 31: big-endian.
     bit_depth
         Significant bits a pixel.
     group_px, group_bytes
@@ -52,7 +52,7 @@ class GrayFormat:
         return fourcc_name(self.code)
 
     def row_bytes(self, width: int) -> int:
-        """Bytes of one line without what the device pads it with."""
+        """Bytes of one line without padding."""
         return -(-width // self.group_px) * self.group_bytes
 
     def image_bytes(self, width: int, height: int, stride: int) -> int:

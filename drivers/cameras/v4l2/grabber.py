@@ -46,7 +46,7 @@ class V4L2Grabber:
         self._flags = 0
 
     def open(self) -> None:
-        """Open the node and find out what it can do.
+        """Open the node and read its abilities.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class V4L2Grabber:
             yield device, setup
 
     def describe(self) -> CameraDescription:
-        """Say who the camera is and what it can do with its present format."""
+        """Return the camera's identity and its abilities with its present format."""
         with self._opened() as (device, setup):
             known = identity(device.path, device.capability)
             return CameraDescription(
@@ -109,7 +109,7 @@ class V4L2Grabber:
         ------
         CameraError
             ``out_of_range``, ``unknown_feature``, ``read_only`` before anything was changed; ``armed``;
-            ``setting_not_taken`` when the device has something else than it was asked for.
+            ``setting_not_taken`` when the device has another value than the one set.
         """
         with self._opened() as (_, setup):
             setup.apply(settings, armed=self._stream is not None)
@@ -166,7 +166,7 @@ class V4L2Grabber:
                     return None
 
     def statistics(self) -> dict[str, int | float]:
-        """Buffers in the ring, frames taken out, and what was wrong with them."""
+        """Return the counters of buffers in the ring, frames taken out, and damaged ones."""
         return asdict(self._counts)
 
     def close(self) -> None:

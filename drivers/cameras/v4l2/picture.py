@@ -1,7 +1,7 @@
-"""What pictures a device sends: pixel format, size, region and rate, tried before they are set and read back after.
+"""Picture of a device: pixel format, size, region and rate, tried before they are set and read back after.
 
-The kernel's habit is to change what it cannot do into what it can, without a word. Everything here is therefore
-compared with what was asked for.
+The kernel changes impossible values into possible ones without an error. All values are therefore compared with the
+requested ones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _RATE_TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Layout:
-    """How one frame lies in memory."""
+    """Layout of one frame in memory."""
 
     code: int
     width: int
@@ -42,7 +42,7 @@ class Layout:
 
     @property
     def gray(self) -> GrayFormat | None:
-        """How to read it; ``None`` for formats without a brightness of their own."""
+        """Its reader; ``None`` for formats without a brightness of their own."""
         return BY_CODE.get(self.code)
 
 
@@ -55,7 +55,7 @@ class Rates:
     single: tuple[Fraction, ...] = ()
 
     def holds(self, rate_hz: float) -> bool:
-        """Whether a rate lies in the range; the device may round it inside."""
+        """Return True if a rate lies in the range; the device may round it inside."""
         return self.lowest * (1 - _RATE_TOLERANCE) <= rate_hz <= self.highest * (1 + _RATE_TOLERANCE)
 
 
@@ -72,7 +72,7 @@ class Picture:
         )
 
     def _list(self, request: int, entry: _Entry) -> Iterator[_Entry]:
-        for index in range(4096):  # a driver that never says that it was the last one must not hold us for ever
+        for index in range(4096):  # bounded: a driver may never report the last one
             entry.index = index
             try:
                 self._device.ioctl(request, entry)
@@ -84,7 +84,7 @@ class Picture:
 
     @property
     def gray_formats(self) -> tuple[GrayFormat, ...]:
-        """What of its formats can be read, the plainest first."""
+        """Readable formats of the device, the plainest first."""
         return tuple(known for known in GRAY_FORMATS if known.code in self.codes)
 
     def other_formats(self) -> tuple[str, ...]:
@@ -136,15 +136,15 @@ class Picture:
         return wanted
 
     def tried(self, code: int, width: int, height: int) -> Layout:
-        """What the device would make of a format, without setting it."""
+        """Return the format that the device would take, without setting it."""
         return self._layout(self._format(v.VIDIOC_TRY_FMT, self._asking(code, width, height), "try a format"))
 
     def set(self, code: int, width: int, height: int) -> Layout:
-        """Set a format and return what the device took."""
+        """Set a format and return the one that the device took."""
         return self._layout(self._format(v.VIDIOC_S_FMT, self._asking(code, width, height), "set its format"))
 
     def sizes(self, code: int) -> str:
-        """Sizes that a format comes in, as a text; empty where the device does not tell them."""
+        """Sizes that a format comes in, as a text; empty where the device does not list them."""
         found: list[str] = []
         for entry in self._list(v.VIDIOC_ENUM_FRAMESIZES, v.FrmSizeEnum(pixel_format=code)):
             if entry.type == v.FRMSIZE_TYPE_DISCRETE:
@@ -156,7 +156,7 @@ class Picture:
         return ", ".join(found)
 
     def rates(self, code: int, width: int, height: int) -> Rates | None:
-        """Frame rates of a format and size; ``None`` where the device does not tell them."""
+        """Frame rates of a format and size; ``None`` where the device does not list them."""
         single: list[Fraction] = []
         for entry in self._list(
             v.VIDIOC_ENUM_FRAMEINTERVALS, v.FrmIvalEnum(pixel_format=code, width=width, height=height)
@@ -172,7 +172,7 @@ class Picture:
         return Rates(float(1 / single[-1]), float(1 / single[0]), tuple(single)) if single else None
 
     def period(self) -> Fraction | None:
-        """Time from frame to frame in s; ``None`` where the device cannot say or has no such setting."""
+        """Time from frame to frame in s; ``None`` where the device does not report it or has no such setting."""
         parm = self._parm()
         if parm is None:
             return None
@@ -190,11 +190,11 @@ class Picture:
 
     @property
     def has_rate(self) -> bool:
-        """Whether the frame rate can be set."""
+        """True if the frame rate can be set."""
         return self._parm() is not None
 
     def set_rate(self, rate_hz: float, rates: Rates | None) -> None:
-        """Ask for a rate; `period` says what came of it."""
+        """Set a rate; `period` returns the one taken."""
         period = Fraction(1 / rate_hz).limit_denominator(1_000_000)
         if rates is not None and rates.single:
             period = min(rates.single, key=lambda one: abs(float(1 / one) - rate_hz))
@@ -212,7 +212,7 @@ class Picture:
         if present is None or bounds is None or min(bounds[2:]) < 1:
             return None
         before = self.layout()
-        try:  # many devices tell a rectangle that they cannot change
+        try:  # many devices report a rectangle that they cannot change
             self._cut(present)
         except OSError as error:
             if error.errno != errno.EBUSY:
@@ -223,12 +223,12 @@ class Picture:
         return bounds[2], bounds[3]
 
     def crop(self) -> Region | None:
-        """The rectangle that is cut out now, from the corner of the bounds."""
+        """Return the present rectangle, from the corner of the bounds."""
         here = self._selection(v.SEL_TGT_CROP)
         return None if here is None else (here[0] - self._origin[0], here[1] - self._origin[1], here[2], here[3])
 
     def cut(self, region: Region) -> Region | None:
-        """Set the rectangle and return what the device took."""
+        """Set the rectangle and return the one that the device took."""
         try:
             self._cut((region[0] + self._origin[0], region[1] + self._origin[1], region[2], region[3]))
         except OSError as error:
@@ -260,7 +260,7 @@ class Picture:
             self._device.ioctl(v.VIDIOC_REQBUFS, v.RequestBuffers(0, self.buffer_type, v.MEMORY_MMAP))
 
     def require_readable(self, layout: Layout) -> GrayFormat:
-        """Return how to read a format; code ``frame_format`` when it cannot be measured with."""
+        """Return the reader of a format; code ``frame_format`` when there is none."""
         path = self._device.path
         gray = layout.gray
         if gray is None:

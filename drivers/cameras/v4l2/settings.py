@@ -16,7 +16,7 @@ from drivers.cameras.v4l2.triggers import Triggers
 
 # V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us
 _EXPOSURES_PER_MS = 10
-# Where a device does not tell its rates, one further off than this is not the one that was asked for
+# Where a device does not list its rates, one further off than this is not the one requested
 _RATE_OFF = 0.01
 _MANUAL = (v.EXPOSURE_MANUAL, v.EXPOSURE_SHUTTER_PRIORITY)
 
@@ -32,7 +32,7 @@ class _Shape:
 
 
 class Setup:
-    """How one device is set up."""
+    """Settings of one device."""
 
     def __init__(self, device: Device, picture: Picture, controls: Controls, options: CameraOptions) -> None:
         self.picture = picture
@@ -44,7 +44,7 @@ class Setup:
         self._armed = False
 
     def image_size(self) -> tuple[int, int]:
-        """The whole image: what a region may be cut out of, or where none can be, what the present format sends."""
+        """Return the whole image: the bounds of a region, or where none can be set, the present format's image."""
         if self._bounds is not None:
             return self._bounds
         layout = self.picture.layout()
@@ -64,7 +64,7 @@ class Setup:
         return None if rates is None or rates.lowest == rates.highest else (rates.lowest, rates.highest)
 
     def notes(self) -> dict[str, str]:
-        """What a user may want to know besides."""
+        """Further data of the camera for the user."""
         layout = self.picture.layout()
         found = {"image_sizes": self.picture.sizes(layout.code)}
         other = self.picture.other_formats()
@@ -109,7 +109,7 @@ class Setup:
         for control, raw in triggers:
             self.controls.put(control, raw)
         for control, raw in exposure:
-            # a camera may round an exposure further than its steps tell: what it took is read back
+            # a camera may round an exposure further than its steps: the value taken is read back
             self.controls.put(control, raw, exact=control.number != v.CID_EXPOSURE_ABSOLUTE)
         for name, control, raw in features:
             self.controls.put(control, raw)
@@ -125,7 +125,7 @@ class Setup:
         if rates is None and (taken is None or abs(float(1 / taken) / rate_hz - 1) > _RATE_OFF):
             if before is not None:
                 self.picture.set_rate(float(1 / before), None)
-            now = "no rate that it tells" if taken is None else f"{float(1 / taken):g} Hz"
+            now = "no rate that it reports" if taken is None else f"{float(1 / taken):g} Hz"
             raise CameraError(
                 f"{self._device.path} was asked for {rate_hz:g} Hz and took {now}.",
                 code="setting_not_taken",
@@ -145,7 +145,7 @@ class Setup:
         layout = self.picture.layout()
         gray = self._checked_format(settings, layout)
         if settings.region_px is None:
-            if layout.gray is None:  # the present size belongs to a format that nobody chose
+            if layout.gray is None:  # the present size belongs to a format that was not requested
                 width, height = self._tried_size(gray, layout.width, layout.height, layout)
                 return _Shape(gray, width, height, None)
             self._checked_size(gray, layout.width, layout.height, layout)
@@ -253,7 +253,7 @@ class Setup:
         try:
             taken = crop
             if shape.region is not None:
-                # the format first: what can be cut out may depend on it
+                # the format first: the possible regions may depend on it
                 self.picture.set(shape.gray.code, before.width, before.height)
                 taken = self.picture.cut(shape.region)
             layout = self.picture.set(shape.gray.code, shape.width, shape.height)
@@ -275,7 +275,7 @@ class Setup:
             raise
 
     def read(self) -> CameraSettings:
-        """Read every setting back from the device; what it sets by itself at this moment is unknown."""
+        """Read every setting back from the device; values that it sets by itself are unknown."""
         layout = self.picture.layout()
         period = self.picture.period()
         gray = layout.gray

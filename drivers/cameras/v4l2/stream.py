@@ -1,4 +1,4 @@
-"""Frames out of the kernel's ring of buffers, which are mapped into memory and given back as soon as they were read."""
+"""Frames from the kernel's ring of buffers, which are mapped into memory and given back as soon as they were read."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from drivers.cameras.v4l2 import structures as v
 from drivers.cameras.v4l2.device import Device
 from drivers.cameras.v4l2.picture import Layout, Picture
 
-# A stamp of the monotonic clock that lies further from the frame's arrival than this is not what it says it is
+# A stamp of the monotonic clock that lies further from the frame's arrival than this is wrong
 _ODD_STAMP_NS = 1_000_000_000
 _BUSY_S = 0.2
 
 
 @dataclass
 class Counts:
-    """What became of the buffers since the camera was opened."""
+    """Counters of the buffers since the camera was opened."""
 
     buffers: int = 0  # in the ring now
     frames: int = 0  # taken out
@@ -45,7 +45,7 @@ def _new_buffer(picture: Picture, index: int) -> v.Buffer:
 
 
 def _request(device: Device, picture: Picture, count: int) -> int:
-    """Ask for buffers and return how many there are; waits a moment for one who only looked, as `discover` does."""
+    """Ask for buffers and return their number; waits a moment for a short user of the device, such as `discover`."""
     end = time.monotonic() + _BUSY_S
     while True:
         request = v.RequestBuffers(count, picture.buffer_type, v.MEMORY_MMAP)
@@ -60,7 +60,7 @@ def _request(device: Device, picture: Picture, count: int) -> int:
 
 
 def probe_flags(device: Device, picture: Picture) -> int:
-    """Ask for a buffer and give it back: says whose clock stamps the frames, and whether another program streams.
+    """Ask for a buffer and give it back; return the clock of the frames' stamps, or raise if another program streams.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def probe_flags(device: Device, picture: Picture) -> int:
     except OSError as error:
         if error.errno in (errno.EBUSY, errno.ENODEV, errno.ENXIO, errno.EIO):
             raise device.fault(error, "stream") from error
-        return 0  # not with the format that it has now; arming will say why
+        return 0  # not with its present format; arming raises the reason
     return buffer.flags
 
 
@@ -87,7 +87,7 @@ def clock_of(flags: int) -> str:
 
 
 def stamped_at(flags: int) -> str:
-    """What the stamp marks: the start of the exposure, or the end of the frame's last line."""
+    """Return the event of the stamp: the start of the exposure, or the end of the frame's last line."""
     return "start of exposure" if flags & v.BUF_FLAG_TSTAMP_SRC_MASK == v.BUF_FLAG_TSTAMP_SRC_SOE else "end of frame"
 
 
@@ -144,8 +144,8 @@ class Stream:
         Raises
         ------
         CameraError
-            ``camera_lost`` when the device is gone or its stream broke; ``frame_format`` when its pixels are not what
-            it says.
+            ``camera_lost`` when the device is gone or its stream broke; ``frame_format`` when its pixels are not of the
+            stated format.
         """
         with self._lock:
             if not self.running:
@@ -163,7 +163,7 @@ class Stream:
             try:
                 return self._frame(buffer, host_ns)
             finally:
-                # what the kernel says about it now must not cost the frame that is already here
+                # an error of the kernel now must not lose the frame that is already here
                 with suppress(CameraError):
                     self._requeue()
 
@@ -180,7 +180,7 @@ class Stream:
 
     def _broken(self, error: OSError) -> CameraError:
         fault = self._device.fault(error, "deliver frames")
-        if fault.code == "camera_fault":  # whatever it was, no frame will come of this stream any more
+        if fault.code == "camera_fault":  # in any case, no frame will come of this stream any more
             fault.code = "camera_lost"
         return fault
 
@@ -207,7 +207,7 @@ class Stream:
             memory = np.zeros(needed, np.uint8)
         pixels = gray.pixels(memory, layout.width, layout.height, self._stride)
         if status is not FrameStatus.OK:
-            # what is missing still shows an older frame's lines
+            # missing lines still show those of an older frame
             pixels[max(used, 0) // self._stride :] = 0
         elif pixels.dtype == np.uint16 and gray.bit_depth < 16 and int(pixels.max()) >= 1 << gray.bit_depth:
             raise CameraError(
@@ -224,7 +224,7 @@ class Stream:
         with self._lock:
             self.running = False
             for one in self._maps:
-                # after an error somebody may still look at the pixels: the mapping then ends with him
+                # after an error the pixels may still be in use: the mapping then ends with the last user
                 with suppress(BufferError):
                     one.close()
             self._maps.clear()

@@ -23,12 +23,12 @@ class Triggers:
 
     @property
     def modes(self) -> tuple[TriggerMode, ...]:
-        """Free run, and what the options say how to reach."""
+        """Free run, and the modes of the options."""
         modes: tuple[TriggerMode, ...] = ("software", "hardware")
         return ("free", *(mode for mode in modes if mode in self._features))
 
     def checked(self, mode: TriggerMode | None) -> list[tuple[Control, Raw]]:
-        """Return what to set for a mode, without touching it; nothing for ``None``."""
+        """Return the controls to set for a mode, without setting them; none for ``None``."""
         if mode is None:
             return []
         if mode not in self.modes:
@@ -57,7 +57,7 @@ class Triggers:
         return buttons[0]
 
     def mode(self) -> TriggerMode | None:
-        """The mode whose controls stand as its features say; of several, the one that names most of them."""
+        """Return the mode whose controls have the values of its features; of several, the one that names most."""
         standing: list[tuple[int, bool, TriggerMode]] = []
         for mode in self.modes:
             wanted = [self._controls.check(name, value) for name, value in self._features_of(mode).items()]
@@ -67,7 +67,7 @@ class Triggers:
         return max(standing, key=lambda one: one[:2])[2] if standing else None
 
     def settle(self, mode: TriggerMode) -> None:
-        """Say that its controls were set; code ``setting_not_taken`` when they say otherwise."""
+        """Check the controls of a mode after they were set; code ``setting_not_taken`` when they have other values."""
         self._asked = mode
         now = self.mode()
         if now != mode:

@@ -1,4 +1,4 @@
-"""``stereorig doctor``: is the bench in order?"""
+"""``stereorig doctor``: checks of the bench."""
 
 from __future__ import annotations
 

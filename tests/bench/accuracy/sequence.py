@@ -14,7 +14,7 @@ from core.errors import MeasurementError
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
-from core.measure import Earlier, MeasureOptions, ReferencePair
+from core.measure import MeasureOptions, PreviousStep, ReferencePair
 from core.settings import REFERENCE_UPDATES, ReferenceUpdate
 from sim.scene import Scene
 from tests.bench.accuracy.paper_rig import BRIGHT, DARK, Rig, plane_scene, true_points, turn
@@ -120,7 +120,7 @@ def _measure(rig: Rig, clean: list[list[Float]], mode: ReferenceUpdate, seed: in
     )
     for n in range(1, len(pairs)):
         try:
-            fields[n] = sequence.measure(pairs[n], None if n == 1 else Earlier(n - 1, fields[n - 1]))
+            fields[n] = sequence.measure(pairs[n], None if n == 1 else PreviousStep(n - 1, fields[n - 1]))
         except MeasurementError:
             break
         if not fields[n].valid.any():

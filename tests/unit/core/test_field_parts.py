@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from core.field.checks.validity import ValidityOptions, apply_validity_checks, neighbour_disagreement
 from core.field.points.features import detect, match
 from core.field.points.fitter import PointFits
-from core.field.points.starts import faces_both_cameras, move_matrix, move_w, position_now
+from core.field.points.starts import current_position, faces_both_cameras, move_matrix, move_w
 from core.field.region.neighbours import compare_with_neighbours, sorting_network
 from core.field.seeding.epipolar_search import sweep
 from core.field.seeding.local_fit import consistent, robust_local_fits
@@ -98,9 +98,9 @@ def test_start_values_from_an_image_map_put_the_patch_where_a_rigid_motion_puts_
         moved = rigid(other - points.mean(0), rotvec, shift + points.mean(0))
         affine[:, :, j] = (pair().cam1.lens.image_from_normalised(moved[:, :2] / moved[:, 2:]).xy - xy_now) / 0.01
     G = combine(pair(), w, XY, xy_now, affine, w_now)
-    np.testing.assert_allclose(position_now(w, G), now, atol=1e-9)
+    np.testing.assert_allclose(current_position(w, G), now, atol=1e-9)
     offset = RAYS[1:, :2] - RAYS[:-1, :2]
-    carried = position_now(move_w(w[:-1], offset), move_matrix(G[:-1], offset))
+    carried = current_position(move_w(w[:-1], offset), move_matrix(G[:-1], offset))
     np.testing.assert_allclose(carried, now[1:], atol=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""The words that a stage driver must know of its controller; `SerialStage` builds everything on them."""
+"""Commands of a controller, as a stage driver defines them; `SerialStage` is built on them."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from abc import ABC, abstractmethod
 from drivers.stages.protocol import AxisStatus, ControllerMessage, StageIdentity
 
 
-class ControllerWords(ABC):
-    """What one family of controllers is told, and what it answers."""
+class ControllerCommands(ABC):
+    """Commands and replies of one family of controllers."""
 
     def _check_unit(self, axis: int) -> None:  # noqa: B027 - few controllers need it
-        """Make sure that positions still mean what they did at opening, where a controller can change that."""
+        """Check that units are those at opening, where a controller can change them."""
 
     def _check_settable(self, axis: int) -> None:  # noqa: B027
-        """Refuse new velocities in a state in which the controller takes none."""
+        """Raise an error for new velocities in a state in which the controller takes none."""
 
     def _distrust(self, axis: int) -> None:  # noqa: B027
-        """Forget that an axis was taken for homed."""
+        """Mark an axis as not homed."""
 
     def _greatest(self, axis: int) -> tuple[float | None, float | None]:  # noqa: ARG002
-        """Give the greatest velocity and acceleration that the controller allows, where it tells them."""
+        """Return the greatest velocity and acceleration that the controller allows, where it reports them."""
         return None, None
 
     @abstractmethod
     def _connect(self) -> StageIdentity:
-        """Find out who answers; called with the line open."""
+        """Read the controller's identity; called with the line open."""
 
     @abstractmethod
     def _read_travel_mm(self, axis: int) -> tuple[float, float]:
@@ -37,11 +37,11 @@ class ControllerWords(ABC):
 
     @abstractmethod
     def _read_position_mm(self, axis: int) -> float:
-        """Read where the axis is."""
+        """Read the position of the axis."""
 
     @abstractmethod
     def _read_status(self, axis: int) -> AxisStatus:
-        """Read what the axis does."""
+        """Read the state of the axis."""
 
     @abstractmethod
     def _switch_motor(self, axis: int, *, on: bool) -> None:
@@ -49,7 +49,7 @@ class ControllerWords(ABC):
 
     @abstractmethod
     def _start_homing(self, axis: int) -> None:
-        """Write the homing command, once, and raise what the controller has against it."""
+        """Write the homing command, once, and raise the controller's error if it refuses."""
 
     @abstractmethod
     def _finish_homing(self, axis: int) -> None:
@@ -61,11 +61,11 @@ class ControllerWords(ABC):
 
     @abstractmethod
     def _stop_text(self, axis: int | None) -> str:
-        """Give the stop command for one axis or all."""
+        """Return the stop command for one axis or all."""
 
     @abstractmethod
     def _abort_text(self) -> str:
-        """Give the command for an emergency stop of everything."""
+        """Return the command for an emergency stop of all axes."""
 
     @abstractmethod
     def _drain_errors(self, axis: int | None = None) -> list[ControllerMessage]:
