@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 from pydantic_core import PydanticCustomError
 
-PatchSetting = Literal["stretch", "rigid", "curved", "auto"]
+PatchSetting = Literal["affine", "rigid", "quadratic", "auto"]
+#: earlier names of patches, still accepted
+EARLIER_PATCHES = {"stretch": "affine", "curved": "quadratic"}
 PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
 Interpolation = Literal["cubic", "quintic"]
 INTERPOLATIONS: tuple[Interpolation, ...] = get_args(Interpolation)
@@ -45,7 +47,7 @@ class Range(NamedTuple):
 
 #: below 9 px a subset holds too few pixels for its twelve unknowns; above 401 px the kernels' sums lose digits
 SUBSET_PX = Range(9, 401, True, 33)
-STEP_PX = Range(1, 1000, False, 10)
+SPACING_PX = Range(1, 1000, False, 10)
 STRAIN_WINDOW = Range(3, 101, True, 9)
 #: no default window: displacements are smoothed only on request
 SMOOTHING_WINDOW = Range(3, 51, True, 5)
@@ -64,6 +66,11 @@ def _a_number(value: Any) -> Any:
     return value
 
 
+def patch_name(value: Any) -> Any:
+    """Return a patch setting's name of today."""
+    return EARLIER_PATCHES.get(value, value) if isinstance(value, str) else value
+
+
 #: the type keeps null, which every multipleOf holds for, from being excluded
 ODD: JsonDict = {"not": {"type": "integer", "multipleOf": 2}}
 Real = Annotated[float, BeforeValidator(_a_number)]
@@ -72,7 +79,7 @@ Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
 SubsetPx = Annotated[
     Whole, Field(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Subset size, odd.", json_schema_extra=ODD)
 ]
-StepPx = Annotated[Whole, Field(ge=STEP_PX.low, le=STEP_PX.high, description="Distance of neighbouring points.")]
+SpacingPx = Annotated[Whole, Field(ge=SPACING_PX.low, le=SPACING_PX.high)]
 PixelPosition = tuple[Pixel, Pixel]
 Rectangle = tuple[Pixel, Pixel, Pixel, Pixel]
 
@@ -120,7 +127,7 @@ class Region(Settings):
 
 
 class StrainSettings(Settings):
-    """Strain over a virtual gauge, (window - 1) step_px + subset_px wide."""
+    """Strain over a virtual gauge, (window - 1) spacing_px + subset_px wide."""
 
     window: Annotated[Whole, Field(ge=STRAIN_WINDOW.low, le=STRAIN_WINDOW.high)] = Field(
         STRAIN_WINDOW.default, description="Points across the gauge, odd.", json_schema_extra=ODD
@@ -141,11 +148,15 @@ class AnalysisSettings(Settings):
 
     region: Region = Field(description="Where points may lie.")
     subset_px: SubsetPx = SUBSET_PX.default
-    step_px: StepPx = STEP_PX.default
-    patch: PatchSetting = Field(
+    spacing_px: SpacingPx = Field(
+        SPACING_PX.default,
+        validation_alias=AliasChoices("spacing_px", "step_px"),  # the second is its earlier name
+        description="Distance of neighbouring points.",
+    )
+    patch: Annotated[PatchSetting, BeforeValidator(patch_name)] = Field(
         DEFAULT_PATCH,
-        description="Patch model: stretch and rigid are planes; curved has a second-order shape and motion and about "
-        "twice the noise; auto takes stretch or curved, whichever has the smaller total error, shape and motion "
+        description="Patch model: affine and rigid are planes; quadratic has a second-order shape and motion and about "
+        "twice the noise; auto takes affine or quadratic, whichever has the smaller total error, shape and motion "
         "separately; each step's summary has the choice and its reason under patch.",
     )
     interpolation: Interpolation = Field(DEFAULT_INTERPOLATION, description="B-spline order.")

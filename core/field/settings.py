@@ -88,5 +88,5 @@ class MeasureOptions:
 
     def match_options(self) -> MatchOptions:
         """Return the point-level options, with plane patches: curved ones start from their results."""
-        patch: Patch = "rigid" if self.patch == "rigid" else "stretch"
+        patch: Patch = "rigid" if self.patch == "rigid" else "affine"
         return MatchOptions(subset_px=self.subset_px, patch=patch, interpolation=self.interpolation)

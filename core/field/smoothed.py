@@ -99,7 +99,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     record = Smoothing(
         window=window,
         order=order,
-        step_px=step[0],
+        spacing_px=step[0],
         subset_px=subset_px,
         resolution_px=resolution_px,
         resolution_mm=None if np.isnan(mm_per_px) else resolution_px * mm_per_px,

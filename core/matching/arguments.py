@@ -64,7 +64,7 @@ def points_of(xy_px: ArrayLike) -> tuple[Float, int]:
 
 def degree_of(options: MatchOptions) -> tuple[int, int]:
     """Degree of the patch and number of its monomials."""
-    return (2, 6) if options.patch == "curved" else (1, 3)
+    return (2, 6) if options.patch == "quadratic" else (1, 3)
 
 
 def starts_of(name: str, values: ArrayLike, shape: tuple[int, ...], terms: int) -> Float:

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from core.errors import InputError
 from core.settings import SUBSET_PX, Interpolation
 
-Patch = Literal["rigid", "stretch", "curved"]
+Patch = Literal["rigid", "affine", "quadratic"]
 PATCHES: tuple[Patch, ...] = get_args(Patch)
 
 SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
@@ -41,7 +41,7 @@ class MatchOptions:
     """
 
     subset_px: int = SUBSET_PX.default
-    patch: Patch = "stretch"
+    patch: Patch = "affine"
     interpolation: Interpolation = "quintic"
     max_iterations: int = 30
     tolerance_px: float = 1e-3
@@ -53,7 +53,7 @@ class MatchOptions:
             raise InputError(f"subset_px is {self.subset_px}, it must be {SUBSET_PX}.", code="option_out_of_range")
         if self.patch not in PATCHES:
             raise InputError(
-                f"patch is {self.patch!r}, it must be 'rigid', 'stretch' or 'curved'.", code="option_out_of_range"
+                f"patch is {self.patch!r}, it must be 'rigid', 'affine' or 'quadratic'.", code="option_out_of_range"
             )
         if self.interpolation not in SPLINE_ORDER:
             raise InputError(

@@ -40,7 +40,7 @@ class StrainField:
     ----------
     options
         Options of its computation.
-    step_px
+    spacing_px
         Distance of neighbouring points.
     subset_px
         Width of the subset that the displacements were measured with.
@@ -61,7 +61,7 @@ class StrainField:
     """
 
     options: StrainOptions
-    step_px: float
+    spacing_px: float
     subset_px: int
     gauge_px: float
     gauge_mm: float

@@ -68,15 +68,15 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     covariance = np.full((*field.shape, 3, 3), np.nan)
     strain[good] = found
     covariance[good] = strain_covariance(frame, gradient, options.tensor, around, spread, found)
-    step_px = _step(field)
+    spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
-    gauge_px = (options.window - 1) * step_px + shared.reach_px
+    gauge_px = (options.window - 1) * spacing_px + shared.reach_px
     return StrainField(
         options=options,
-        step_px=step_px,
+        spacing_px=spacing_px,
         subset_px=subset_px,
         gauge_px=gauge_px,
-        gauge_mm=float(gauge_px / step_px * np.median(np.sqrt(area))) if good.any() else np.nan,
+        gauge_mm=float(gauge_px / spacing_px * np.median(np.sqrt(area))) if good.any() else np.nan,
         status=status,
         strain=strain,
         covariance=covariance,

@@ -28,7 +28,7 @@ class CompileAside:
     """
 
     def __init__(self, patch: str) -> None:
-        self._degree = "curved" if patch == "curved" else "plane"
+        self._degree = "quadratic" if patch == "quadratic" else "plane"
         self._process: subprocess.Popen[bytes] | None = None
         from core.threads import available_threads  # loads numba
 
@@ -89,10 +89,10 @@ def main() -> int:
         z0_mm=100.0,
     )
     picture = np.random.default_rng(1).normal(128.0, 20.0, (64, 64))
-    options = MatchOptions(subset_px=21, patch="curved" if sys.argv[1] == "curved" else "stretch")
+    options = MatchOptions(subset_px=21, patch="quadratic" if sys.argv[1] == "quadratic" else "affine")
     pair, xy, start = StereoPair(camera, camera), [[32.0, 32.0]], [[np.nan] * 3]
     fit_motion(pair, picture, picture, picture, picture, xy, start, None, options)
-    terms = 6 if options.patch == "curved" else 3
+    terms = 6 if options.patch == "quadratic" else 3
     w, G = np.full((1, terms), np.nan), np.full((1, 3, terms), np.nan)
     cluster_robust_covariance(pair, [picture] * 4, xy, w, G, 0.0, options)
     return 0

@@ -124,10 +124,10 @@ def warm_up(threads: int) -> None:
         "z0_mm": 100.0,
     }
     pair = StereoPair(Camera.from_paper(**common, x0_mm=0.0), Camera.from_paper(**common, x0_mm=-0.6))
-    grid = PointGrid.rectangle(40.0, 40.0, 88.0, 88.0, step_px=8.0)
+    grid = PointGrid.rectangle(40.0, 40.0, 88.0, 88.0, spacing_px=8.0)
     seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
     # other patches and the other interpolation compile when first asked for; compiled kernels are kept on disk
-    options = MeasureOptions(subset_px=21, patch="stretch")
+    options = MeasureOptions(subset_px=21, patch="affine")
     with CompileAside(options.patch) as aside, report_compiling(aside.start):
         reference = ReferencePair(pair, left, right)
         shape = reference.shape(grid, options, seeds=seeds)

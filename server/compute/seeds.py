@@ -87,7 +87,7 @@ def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
 def epipolar_line(pair: StereoPair, xy_px: Place, size2_px: tuple[int, int]) -> list[list[float]]:
     """Return where camera 2 may see a point of camera 1, about 32 places along the line; empty if nowhere."""
     place = np.asarray(xy_px, dtype=np.float64)
-    depths = visible_depths(pair, place, (size2_px[1], size2_px[0]), step_px=max(*size2_px) / 32.0)
+    depths = visible_depths(pair, place, (size2_px[1], size2_px[0]), spacing_px=max(*size2_px) / 32.0)
     if not len(depths):
         return []
     line = pair.image2_at_depth(np.broadcast_to(place, (len(depths), 2)), 1.0 / depths)

@@ -45,7 +45,7 @@ def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_windo
     )
     if gauge_px is None or strain_window is None:
         return text
-    plain = (strain_window - 1) * smoothing.step_px + smoothing.subset_px
+    plain = (strain_window - 1) * smoothing.spacing_px + smoothing.subset_px
     return f"{text}; the strain gauge grows from {plain:g} to {gauge_px:g} px"
 
 

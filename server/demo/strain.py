@@ -106,5 +106,5 @@ def whole_gauges(strain: StrainField) -> Bool:
 def chi_limit(strain: StrainField) -> float:
     """Return how far above 1 chance may bring chi: as many independent readings as gauges lie side by side."""
     rows, cols = strain.status.shape
-    gauges = rows * cols * (strain.step_px / strain.gauge_px) ** 2
+    gauges = rows * cols * (strain.spacing_px / strain.gauge_px) ** 2
     return 1.0 + SAFE / float(np.sqrt(2.0 * max(gauges, 1.0)))

@@ -221,6 +221,6 @@ def check_fps(fps: float) -> None:
     if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         raise InputError(
             f"{fps:g} frames a second is not between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}.",
-            code="look_invalid",
+            code="figure_style_invalid",
             remedy="Give another rate.",
         )

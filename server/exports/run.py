@@ -32,7 +32,7 @@ def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        ``look_invalid``, ``steps_mixed``, ``export_too_large``, ``mask_unusable``.
+        ``figure_style_invalid``, ``steps_mixed``, ``export_too_large``, ``mask_unusable``.
     NotFoundError
         ``no_results``, ``step_missing``, ``field_missing``, ``image_missing``.
     FileFormatError

@@ -34,7 +34,7 @@ class Look:
     Raises
     ------
     InputError
-        ``look_invalid``.
+        ``figure_style_invalid``.
     """
 
     limits: tuple[float, float] | None = None
@@ -61,6 +61,6 @@ class Look:
         if wrong is not None:
             raise InputError(
                 f"A picture cannot be drawn so: {wrong}.",
-                code="look_invalid",
+                code="figure_style_invalid",
                 remedy=f"Correct it; colours are {', '.join(COLOURS)}.",
             )

@@ -81,7 +81,7 @@ def _png(figure: Figure) -> bytes:
 
 def region(
     image: NDArray[Any],
-    places_px: Float,
+    positions_px: Float,
     valid: NDArray[np.bool_],
     title: str,
     cuts: Cuts | None = None,
@@ -91,7 +91,7 @@ def region(
 
     Parameters
     ----------
-    places_px
+    positions_px
         (n, 2) where the camera sees the points; NaN where it does not.
     valid
         (n,) whether they were measured.
@@ -110,9 +110,9 @@ def region(
     figure = Figure(figsize=(width, width * min(max(rows / cols, 0.2), 1.6) + 0.35), layout="constrained")
     axis = figure.add_subplot()
     axis.imshow(small, cmap="gray", vmin=low, vmax=max(high, low + 1.0), extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))
-    size = float(np.clip(80.0 / np.sqrt(max(len(places_px), 1)), 0.5, 3.5))
+    size = float(np.clip(80.0 / np.sqrt(max(len(positions_px), 1)), 0.5, 3.5))
     for chosen, colour in ((valid, _SEEN), (~valid, _LOST)):
-        axis.plot(*places_px[chosen].T, ".", color=colour, markersize=size, markeredgewidth=0.0)
+        axis.plot(*positions_px[chosen].T, ".", color=colour, markersize=size, markeredgewidth=0.0)
     if outline_px is not None:
         closed = np.concatenate([outline_px, outline_px[:1]])
         axis.plot(closed[:, 0], closed[:, 1], "-", color="#ffb000", linewidth=1.2)

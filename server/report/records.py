@@ -124,7 +124,7 @@ class SettingsRecord(Record):
 
     reference: int = 0
     subset_px: float | None = None
-    step_px: float | None = None
+    spacing_px: float | None = None
     prefilter_px: float | None = None
     interpolation: str | None = None
     reference_update: str | None = None

@@ -11,8 +11,8 @@ from server.report.steps import Measured
 
 _SHAPES = {
     "rigid": "plane patch, rigid motion (9 unknowns), seen through both calibrated cameras",
-    "stretch": "plane patch, rigid motion and in-plane stretch (12 unknowns), seen through both calibrated cameras",
-    "curved": "patch of second order in shape and motion, seen through both calibrated cameras",
+    "affine": "plane patch, rigid motion and in-plane stretch (12 unknowns), seen through both calibrated cameras",
+    "quadratic": "patch of second order in shape and motion, seen through both calibrated cameras",
 }
 _TENSORS = {
     "green_lagrange": "Green-Lagrange, E = (C - I) / 2",
@@ -49,7 +49,7 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
         one("software", "Software", Value(version, None, "written in the results")),
         one("prefilter", "Image filtering", _prefilter(settings), needs),
         one("subset", "Subset size", length(settings.subset_px), needs, "width of the square subset"),
-        one("step", "Step size", length(settings.step_px), needs, "distance of the points"),
+        one("step", "Step size", length(settings.spacing_px), needs, "distance of the points"),
         one("shape_function", "Subset shape function", _shape_function(measured, settings), needs),
         one("criterion", "Matching criterion", Value(_CRITERION, None, "of this program")),
         one(

@@ -74,7 +74,7 @@ def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
     Raises
     ------
     FileFormatError
-        ``facts_invalid``, one line that names the first wrong field.
+        ``metadata_invalid``, one line that names the first wrong field.
     """
     try:
         return TestFacts.model_validate(dict(document))
@@ -83,7 +83,7 @@ def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
         where = ".".join(str(part) for part in first["loc"]) or "file"
         raise FileFormatError(
             f"{name}: {where}: {first['msg']}.",
-            code="facts_invalid",
+            code="metadata_invalid",
             field=where,
             remedy="Correct it; docs/how_to/report.md lists what can be told.",
         ) from error
@@ -95,7 +95,7 @@ def load_facts(path: Path) -> TestFacts:
     Raises
     ------
     FileFormatError
-        ``file_missing``, ``file_unreadable``, ``facts_invalid``.
+        ``file_missing``, ``file_unreadable``, ``metadata_invalid``.
     """
     try:
         return parse_facts(tomllib.loads(path.read_text(encoding="utf-8")), name=str(path))

@@ -60,7 +60,7 @@ def notes_of(step: StepResult, source: Source) -> list[str]:
         f"{name} {settings[key]}{unit}"
         for name, key, unit in (
             ("subset", "subset_px", " px"),
-            ("step", "step_px", " px"),
+            ("step", "spacing_px", " px"),
             ("patch", "patch", ""),
             ("interpolation", "interpolation", ""),
             ("prefilter", "prefilter_px", " px"),

@@ -19,6 +19,10 @@ from server.store.folder import DataFolder, is_id, now_utc
 REJECTED = "rejected.json"
 
 
+#: a review's file, and its earlier name
+_REVIEWS = ("review.json", "judgement.json")
+
+
 class CalibrationStore:
     """The calibrations of one data folder."""
 
@@ -78,9 +82,9 @@ class CalibrationStore:
         """Record why there is no calibration."""
         write_json(self.path(calibration_id) / "failure.json", problem)
 
-    def put_judgement(self, calibration_id: str, document: Mapping[str, object] | None) -> None:
+    def put_review(self, calibration_id: str, document: Mapping[str, object] | None) -> None:
         """Keep what was decided on a calibration beside it; None takes it back."""
-        path = self.path(calibration_id) / "judgement.json"
+        path = self.path(calibration_id) / _REVIEWS[0]
         write_json(path, {"decision": None} if document is None else document)
 
     def read(self, calibration_id: str) -> CalibrationRecord:
@@ -105,8 +109,9 @@ class CalibrationStore:
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
             if (path / REJECTED).exists():  # what its verdict refused is there to be looked at
                 document = {**read_json(path / REJECTED), **document}
-        judgement = read_json(path / "judgement.json") if (path / "judgement.json").exists() else {}
-        document["judgement"] = judgement if judgement.get("decision") is not None else None
+        kept = next((path / name for name in _REVIEWS if (path / name).exists()), None)
+        review = {} if kept is None else read_json(kept)
+        document["review"] = review if review.get("decision") is not None else None
         return record_of(CalibrationRecord, document, path / "plan.json")
 
     def view_file(self, calibration_id: str, index: int, cam: str) -> Path:

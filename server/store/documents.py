@@ -218,7 +218,7 @@ class MadeRecord(Document):
 
 
 class Decided(Document):
-    """``judgement.json``: what somebody decided on a calibration."""
+    """``review.json``: what somebody decided on a calibration."""
 
     decision: str | None = None
     note: str | None = None
@@ -238,7 +238,7 @@ class CalibrationRecord(MadeRecord):
     """A calibration."""
 
     taken: list[ViewRecord] | None = None
-    judgement: Decided | None = None
+    review: Decided | None = None
     verdict: object = None
 
 

@@ -29,7 +29,7 @@ def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str,
         "label": made.plan.label,
         "created_utc": made.plan.created_utc,
         "verdict": made.verdict if isinstance(made.verdict, dict) else None,  # an imported file may hold anything
-        "decision": None if made.judgement is None else made.judgement.decision,
+        "decision": None if made.review is None else made.review.decision,
     }
 
 

@@ -21,6 +21,7 @@ from core.names import CAMERAS
 from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
+from server.formats.results.settings import current_step, current_summary
 from server.store.documents import AnalysisJob, AnalysisRecord, StepFound, StepRecord, SummaryRecord, TestRecord
 from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
@@ -135,7 +136,7 @@ class TestStore:
         found = self.read(test_id).facts
         return found if isinstance(found, dict) else {}
 
-    def put_facts(
+    def put_metadata(
         self, test_id: str, facts: Mapping[str, object], expected: Mapping[str, object] | None = None
     ) -> None:
         """Replace what was told about a test; durable when this returns.
@@ -148,14 +149,14 @@ class TestStore:
         Raises
         ------
         StateError
-            ``facts_changed`` if they are not what was expected.
+            ``metadata_changed`` if they are not what was expected.
         """
         with self._lock:
             document = read_json(self.path(test_id) / "test.json")
             if expected is not None and document.get("facts", {}) != expected:
                 raise StateError(
                     f"The facts of test {test_id} were changed meanwhile.",
-                    code="facts_changed",
+                    code="metadata_changed",
                     remedy="Read them again, then send the change.",
                 )
             write_json(self.path(test_id) / "test.json", document | {"facts": facts})
@@ -371,7 +372,9 @@ class TestStore:
         """What was found, by step; only of steps whose result is there."""
         path = self.analysis_path(test_id, analysis_id)
         files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
-        return {n: read_record(StepFound, file) for n, file in files.items() if file.is_file()}
+        return {
+            n: record_of(StepFound, current_step(read_json(file)), file) for n, file in files.items() if file.is_file()
+        }
 
     def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:
         """Numbers of the steps whose result file is there."""
@@ -423,4 +426,4 @@ class TestStore:
     def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
         """Return ``summary.json``, or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
-        return read_record(SummaryRecord, path) if path.exists() else None
+        return record_of(SummaryRecord, current_summary(read_json(path)), path) if path.exists() else None

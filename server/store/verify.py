@@ -27,8 +27,8 @@ _OURS = frozenset(
 )
 # What the service writes into a folder of each kind
 _KNOWN = {
-    "calibration": r"(plan|target|view|judgement|failure|rejected)\.json|(calibration\.json|residuals\.nc)(\.sha256)?"
-    r"|views",
+    "calibration": r"(plan|target|view|review|judgement|failure|rejected)\.json|"
+    r"(calibration\.json|residuals\.nc)(\.sha256)?|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
     "test": r"(test|calibration|watch)\.json|steps|analyses|exports",
     "step": r"step\.json|cam[12]\.tif",
@@ -145,7 +145,7 @@ class _Walk:
     def calibration(self, path: Path) -> None:
         self.there.add(("calibration", "", path.name))
         self.strangers(path, "calibration")
-        self.documents(path, "target.json", "failure.json", "rejected.json", "judgement.json")
+        self.documents(path, "target.json", "failure.json", "rejected.json", "review.json", "judgement.json")
         if self.document(path / "plan.json") is None:
             return
         taken = self.document(path / "view.json") if (path / "view.json").is_file() else None

@@ -85,7 +85,7 @@ def decide(service: Service, calibration_id: str, decision: Decision | None, not
             state=state,
         )
     document = None if decision is None else {"decision": decision, "note": note, "by": by, "decided_utc": now_utc()}
-    service.calibrations.put_judgement(calibration_id, document)
+    service.calibrations.put_review(calibration_id, document)
     entry = calibration_entry(service.calibrations, calibration_id)
     service.catalog.put_entry("calibration", "", calibration_id, entry)
     service.hub.publish("calibration", {"calibration_id": calibration_id, "state": entry["state"]})
@@ -104,7 +104,7 @@ def newest_accepted(service: Service) -> str:
         raise StateError(
             "No calibration has been accepted.",
             code="no_calibration_accepted",
-            remedy="Accept one (PUT /calibrations/{id}/judgement), or name one by its id.",
+            remedy="Accept one (PUT /calibrations/{id}/review), or name one by its id.",
         )
     return max(accepted)
 
@@ -117,9 +117,9 @@ def check_not_discarded(service: Service, calibration_id: str) -> None:
     StateError
         ``calibration_discarded``.
     """
-    judgement = service.calibrations.read(calibration_id).judgement
-    if judgement is not None and judgement.decision == "discarded":
-        why = f": {judgement.note}" if judgement.note else "."
+    review = service.calibrations.read(calibration_id).review
+    if review is not None and review.decision == "discarded":
+        why = f": {review.note}" if review.note else "."
         raise StateError(
             f"Calibration {calibration_id} was discarded{why}",
             code="calibration_discarded",

@@ -45,7 +45,7 @@ def pictures():
 @pytest.mark.parametrize("name", CASES)
 def test_no_wrong_point_is_valid(pictures, name):
     case = CASES[name](pictures)
-    grid = bench.grid(step_px=6.0)
+    grid = bench.grid(spacing_px=6.0)
     true = bench.truth(grid, bench.scene("block", 0.0, MOTION), bench.scene("block", 1.0, MOTION))
     try:
         field = ReferencePair(bench.pair(), *case.pictures[:2]).motion(*case.pictures[2:], grid, OPTIONS)
@@ -77,7 +77,7 @@ def shoot(scene):
 @pytest.mark.fault(36)
 def test_a_texture_that_repeats_gives_no_start():
     reference = ReferencePair(bench.pair(), *shoot(lattice("block", 0.0)))
-    grid = bench.grid(step_px=12.0)
+    grid = bench.grid(spacing_px=12.0)
     with pytest.raises(SeedError):
         reference.shape(grid, OPTIONS)
     # a user who says which dot is which gets the shape, but no guess at how many dots it moved

@@ -40,7 +40,7 @@ def test_worker_measures_the_scene(scene: BenchScene, tmp_path: Path) -> None:
         "files1": [str(p) for p in scene.cam1],
         "files2": [str(p) for p in scene.cam2],
         "calibration": str(scene.calibration),
-        "step_px": 10,
+        "spacing_px": 10,
     }
     run = {"steps": 1, "subset_px": 33, "region_px": TINY.region(33), "options": {"interpolation": "cubic"}}
     out = tmp_path / "out"

@@ -91,7 +91,7 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
 @pytest.mark.fault(41)
 def test_points_outside_are_flagged_and_less_certain() -> None:
     first, now = take("block"), take("block", 1.0)
-    grid = PointGrid.rectangle(30, 30, SIZE[0] - 31, SIZE[1] - 31, step_px=16)
+    grid = PointGrid.rectangle(30, 30, SIZE[0] - 31, SIZE[1] - 31, spacing_px=16)
     field = measure_motion(pair(), *first, *now, grid, MeasureOptions(subset_px=25))
     # a target that covered the middle only
     small = GridTarget(pitch_mm=0.25, lines=(7, 7), line_width_mm=0.02)

@@ -45,7 +45,7 @@ def reference() -> ReferencePair:
 def test_it_is_found_again(in_plane: np.ndarray | None, motion: RigidTransform | None) -> None:
     still = plane_scene(rig().texture(3))
     moved = plane_scene(rig().texture(3), in_plane=in_plane, motion=motion)
-    grid = PointGrid.rectangle(*REGION, step_px=15)
+    grid = PointGrid.rectangle(*REGION, spacing_px=15)
     field = reference().motion(*rig().shoot(moved, seed=2, noise=2.0), grid, MeasureOptions(subset_px=33))
     _, truth = true_points(still, moved, rig().pair.cam1, grid.xy_px)
     assert field.valid.mean() > 0.99

@@ -47,7 +47,7 @@ def take(pair: StereoPair, scene: Scene, rig: SimRig, seed: int) -> list[NDArray
 def test_points_over_an_open_crack_are_refused_and_both_lips_stand(rig: SimRig) -> None:
     pair = StereoPair(cut(rig.cam1.camera), cut(rig.cam2.camera))
     before, after = make_scene(rig, "panel", load=0.0), make_scene(rig, "panel", load=35.6)
-    grid = PointGrid.rectangle(20, 20, SIZE[0] - 21, SIZE[1] - 21, step_px=5)
+    grid = PointGrid.rectangle(20, 20, SIZE[0] - 21, SIZE[1] - 21, spacing_px=5)
     reference = ReferencePair(pair, *take(pair, before, rig, 1))
     shape = reference.shape(grid, MeasureOptions(subset_px=33))
     field = reference.motion(*take(pair, after, rig, 2), grid, MeasureOptions(subset_px=33), shape=shape)

@@ -26,7 +26,7 @@ from tests.support import field_bench as bench
 from tests.support.cut_scenes import STILL, below, parted, reference, true_uvw
 from tests.support.requirements import ROOT
 
-OPTIONS = MeasureOptions(subset_px=21, patch="stretch")
+OPTIONS = MeasureOptions(subset_px=21, patch="affine")
 X = np.linspace(0.0, 263.0, 41)
 LINES = {
     "straight": np.array([(0.0, 107.3), (263.0, 118.1)]),
@@ -45,7 +45,7 @@ def distance_px(points: NDArray[np.float64], cuts: Cuts) -> NDArray[np.float64]:
 def test_both_lips_stand_up_to_the_line(kind: str) -> None:
     line = LINES[kind]
     side = below(line)
-    plain = bench.grid(step_px=5.0, margin_px=36.0)
+    plain = bench.grid(spacing_px=5.0, margin_px=36.0)
     grid = plain.with_cracks([line])
     pair = ReferencePair(bench.pair(), *reference())
     now = parted(side)
@@ -84,7 +84,7 @@ def test_a_crack_that_ends_inside_the_field() -> None:
     along = np.linspace(-model.half_crack_mm, model.half_crack_mm, 21) * np.sqrt(0.5)
     line = pair.cam1.project(np.stack([along, -along, np.full_like(along, -model.bow_mm)], axis=-1)).xy
     columns, rows = panel.SIZE
-    plain = PointGrid.rectangle(20, 20, columns - 21, rows - 21, step_px=5)
+    plain = PointGrid.rectangle(20, 20, columns - 21, rows - 21, spacing_px=5)
     images, now = panel.take(pair, before, rig, 1), panel.take(pair, after, rig, 2)
     field = ReferencePair(pair, *images).motion(*now, plain.with_cracks([line]), OPTIONS)
     without = ReferencePair(pair, *images).motion(*now, plain, OPTIONS)
@@ -121,7 +121,7 @@ def test_what_shows_through_a_hole_counts_for_nothing() -> None:
             # well inside: the rim of the body moves by a pixel or two
             (x0, y0), (x1, y1) = np.sort(corners, axis=0)[1:3].round().astype(int) + np.array([[4, 4], [-4, -4]])
             image[y0 : y1 + 1, x0 : x1 + 1] = other[y0 : y1 + 1, x0 : x1 + 1]
-    plain = bench.grid(step_px=5.0)
+    plain = bench.grid(spacing_px=5.0)
     grid = plain.without_holes([hole])
     reference_pair = ReferencePair(bench.pair(), *images[0])
     field = reference_pair.motion(*images[1], grid, OPTIONS)
@@ -154,7 +154,7 @@ def test_threads_change_no_digit() -> None:
     try:
         for n in (1, 2):
             set_threads(n)
-            grid = bench.grid(step_px=8.0, margin_px=36.0).with_cracks([LINES["kinked"]])
+            grid = bench.grid(spacing_px=8.0, margin_px=36.0).with_cracks([LINES["kinked"]])
             fields.append(ReferencePair(bench.pair(), *reference()).motion(*now, grid, OPTIONS))
     finally:
         set_threads(before)
@@ -163,7 +163,7 @@ def test_threads_change_no_digit() -> None:
 
 def test_points_away_from_the_line_are_the_same_to_the_digit() -> None:
     """From the same starts: what the kernels do for a point whose subset is whole does not know of the others."""
-    grid = bench.grid(step_px=8.0, margin_px=36.0).with_cracks([LINES["straight"]])
+    grid = bench.grid(spacing_px=8.0, margin_px=36.0).with_cracks([LINES["straight"]])
     visibility = with_visibility(grid, 21).visibility
     assert visibility is not None
     xy = grid.xy_px.reshape(-1, 2)

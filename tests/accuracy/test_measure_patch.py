@@ -55,7 +55,7 @@ def test_a_sphere_comes_out_where_it_is_and_as_curved_as_it_is() -> None:
     points = grid()
     images = take("sphere", noise=2.0)
     fields = {
-        p: measure_shape(pair(), *images, points, MeasureOptions(subset_px=21, patch=p)) for p in ("curved", "auto")
+        p: measure_shape(pair(), *images, points, MeasureOptions(subset_px=21, patch=p)) for p in ("quadratic", "auto")
     }
     for field in fields.values():
         assert field.valid.mean() > 0.99
@@ -66,5 +66,5 @@ def test_a_sphere_comes_out_where_it_is_and_as_curved_as_it_is() -> None:
         mean = field.curvature_per_mm[field.valid].mean(axis=1)
         assert abs(30.0 * mean.mean() - 1.0) < 0.03
         assert field.patch is not None
-        assert field.patch.patch == "curved"
-    assert fields["auto"].patch != fields["curved"].patch  # the one with a reason, the other asked for
+        assert field.patch.patch == "quadratic"
+    assert fields["auto"].patch != fields["quadratic"].patch  # the one with a reason, the other asked for

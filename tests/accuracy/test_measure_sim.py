@@ -234,8 +234,8 @@ def test_unrelated_images_give_no_field() -> None:
 def test_images_that_are_noisier_than_the_reference_are_told(noise: float) -> None:
     first, second = take("block")
     now = take("block", 1.0, seed=3, noise=noise)
-    dense = grid(step_px=6.0)
-    field = measure_motion(pair(), first, second, *now, dense, replace(OPTIONS, patch="stretch"))
+    dense = grid(spacing_px=6.0)
+    field = measure_motion(pair(), first, second, *now, dense, replace(OPTIONS, patch="affine"))
     error = (field.uvw_mm - truth(dense, scene("block"), scene("block", 1.0)).uvw_mm)[field.valid]
     told = np.sqrt((field.sigma_mm[field.valid][:, 3:] ** 2).mean(axis=0))
     assert field.valid.mean() > 0.97
@@ -283,7 +283,7 @@ def test_a_cancel_is_heard_and_progress_is_told(reference: ReferencePair) -> Non
 
 def test_fields_of_another_grid_are_refused(reference: ReferencePair, shape: Field) -> None:
     with pytest.raises(InputError) as error:
-        reference.motion(*take("block", 0.5), grid(step_px=9.0), OPTIONS, shape=shape)
+        reference.motion(*take("block", 0.5), grid(spacing_px=9.0), OPTIONS, shape=shape)
     assert error.value.code == "grid_mismatch"
 
 

@@ -33,7 +33,7 @@ def reference(specimen_dir: Path, pair: StereoPair) -> ReferencePair:
 
 @pytest.fixture(scope="module")
 def grid() -> PointGrid:
-    return PointGrid.rectangle(*RECTANGLE, step_px=10)
+    return PointGrid.rectangle(*RECTANGLE, spacing_px=10)
 
 
 @pytest.fixture(scope="module")

@@ -119,8 +119,8 @@ def test_images_blurred_unalike_are_refused():
 
 def test_a_field_with_a_prefilter():
     """Truth by the renderer; points whose blur would lack pixels are left out, and what is reported is the scatter."""
-    grid = PointGrid.rectangle(16, 16, field_bench.SIZE[0] - 17, field_bench.SIZE[1] - 17, step_px=8.0)
-    options = MeasureOptions(subset_px=31, patch="stretch", prefilter_px=1.0)
+    grid = PointGrid.rectangle(16, 16, field_bench.SIZE[0] - 17, field_bench.SIZE[1] - 17, spacing_px=8.0)
+    options = MeasureOptions(subset_px=31, patch="affine", prefilter_px=1.0)
     reference = ReferencePair(field_bench.pair(), *field_bench.take("strip"))
     shape = reference.shape(grid, options)
     moved = reference.motion(*field_bench.take("strip", 1.0, seed=5), grid, options, shape=shape)
@@ -146,7 +146,7 @@ def test_noise_is_not_taken_for_texture():
     for image in (one, two):
         image[:, 130:] = np.clip(np.rint(128.0 + 3.0 * rng.normal(size=image[:, 130:].shape)), 0, 255)
     grid = field_bench.grid()
-    options = MeasureOptions(subset_px=21, patch="stretch", prefilter_px=2.0)
+    options = MeasureOptions(subset_px=21, patch="affine", prefilter_px=2.0)
     field = measure_shape(field_bench.pair(), one, two, grid, options)
     assert field.valid[grid.x_px < 115].mean() > 0.9
     assert not field.valid[grid.x_px > 145].any()
@@ -154,9 +154,7 @@ def test_noise_is_not_taken_for_texture():
 
 def test_a_region_at_the_border_alone_is_refused():
     one, two = field_bench.take("strip")
-    grid = PointGrid.rectangle(10, 1, 60, 9, step_px=1.0)
+    grid = PointGrid.rectangle(10, 1, 60, 9, spacing_px=1.0)
     with pytest.raises(RegionError) as caught:
-        measure_shape(
-            field_bench.pair(), one, two, grid, MeasureOptions(subset_px=9, prefilter_px=2.0, patch="stretch")
-        )
+        measure_shape(field_bench.pair(), one, two, grid, MeasureOptions(subset_px=9, prefilter_px=2.0, patch="affine"))
     assert caught.value.code == "region_too_small"

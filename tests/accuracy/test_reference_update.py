@@ -68,7 +68,7 @@ def test_motions_of_planes_compose_exactly() -> None:
 
 def test_a_field_tells_its_unknowns_to_the_last_digits() -> None:
     pair = bench.rig().pair
-    grid = PointGrid.rectangle(100, 100, 200, 180, step_px=20)
+    grid = PointGrid.rectangle(100, 100, 200, 180, spacing_px=20)
     n = grid.x_px.size
     rng = np.random.default_rng(2)
     xy = grid.xy_px.reshape(n, 2)
@@ -173,7 +173,7 @@ def test_told_errors_after_updates_are_the_empirical_ones() -> None:
     """Monte Carlo over the noise: five updates, each leaving the same scatter about the truth as told."""
     scenes = [bench.plate(0.4 * n, np.array([0.021, -0.013, 0.02]) * n) for n in range(7)]
     clean = [bench.rig().shoot(s, noise=0.0) for s in scenes]
-    grid = PointGrid.rectangle(90, 90, 430, 390, step_px=28)
+    grid = PointGrid.rectangle(90, 90, 430, 390, spacing_px=28)
     errors, sigmas = [], []
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -262,7 +262,7 @@ def test_a_jump_in_mid_sequence_is_found_by_new_seeds(mode: str) -> None:
         bench.plate(43.0, (4.0, -2.5, 1.0), np.diag([1.2, 1.1])),
     ]
     images = [bench.shoot(s, seed=k) for k, s in enumerate(scenes)]
-    grid = PointGrid.rectangle(190, 200, 290, 290, step_px=14)
+    grid = PointGrid.rectangle(190, 200, 290, 290, spacing_px=14)
     fields = bench.measure(images, mode, grid=grid)  # type: ignore[arg-type]
     for n in (3, 4):
         seen = bench.rig().pair.cam1.project(fields[n].xyz_mm + fields[n].uvw_mm).xy
@@ -298,7 +298,7 @@ def test_a_reference_that_nothing_is_left_of_is_refused() -> None:
 
 def test_curved_patches_are_followed_too() -> None:
     images, truth = moving()
-    fields = bench.measure(images[:3], "always", options=MeasureOptions(subset_px=33, patch="curved"))
+    fields = bench.measure(images[:3], "always", options=MeasureOptions(subset_px=33, patch="quadratic"))
     for n, field in fields.items():
         assert field.valid.mean() > 0.95
         error = 1e3 * (field.uvw_mm - truth[n])  # type: ignore[operator]
@@ -319,8 +319,8 @@ def test_a_leg_that_begins_with_an_open_crack_reaches_over_neither_lip() -> None
     x = np.linspace(0.0, 263.0, 41)
     line = np.stack([x, 112.0 + 18.0 * np.sin(x / 42.0)], axis=-1)
     side = below(line)
-    grid = field_bench.grid(step_px=5.0, margin_px=36.0).with_cracks([line])
-    options = MeasureOptions(subset_px=21, patch="stretch")
+    grid = field_bench.grid(spacing_px=5.0, margin_px=36.0).with_cracks([line])
+    options = MeasureOptions(subset_px=21, patch="affine")
     pairs = [crack_reference(), parted(side, seed=2), parted(side, seed=12)]
     images = [(MeasureImage(one), MeasureImage(two)) for one, two in pairs]
     reference = ReferencePair(field_bench.pair(), *images[0])

@@ -42,7 +42,7 @@ def _noisy(images: list[np.ndarray], seed: int) -> list[np.ndarray]:
 
 
 def _strain(before: list[np.ndarray], after: list[np.ndarray], window: int = 7) -> StrainField:
-    options = MeasureOptions(subset_px=SUBSET, patch="stretch")
+    options = MeasureOptions(subset_px=SUBSET, patch="affine")
     reference = ReferencePair(pair(), *before)
     field = reference.motion(*after, grid(), options, shape=reference.shape(grid(), options))
     # 5 mm out of plane carry some points out of these small pictures; no other may be lost
@@ -101,10 +101,10 @@ def test_uncertainty_of_repeated_pictures() -> None:
 def test_lips_of_an_open_crack_have_no_false_strain() -> None:
     """Two halves part by 120 um along a drawn line: on both lips the strain is zero within what is told."""
     line = np.array([(0.0, 107.3), (263.0, 118.1)])
-    marked = bench.grid(step_px=5.0, margin_px=36.0).with_cracks([line])
+    marked = bench.grid(spacing_px=5.0, margin_px=36.0).with_cracks([line])
     reference = ReferencePair(bench.pair(), *cut_scenes.reference())
     now = cut_scenes.parted(cut_scenes.below(line))
-    field = reference.motion(*now, marked, MeasureOptions(subset_px=SUBSET, patch="stretch"))
+    field = reference.motion(*now, marked, MeasureOptions(subset_px=SUBSET, patch="affine"))
     found = surface_strain(field, StrainOptions(window=7), subset_px=SUBSET)
     beside = np.abs(field.y_px - np.interp(field.x_px, line[:, 0], line[:, 1])) < 15.0
     assert found.valid[beside].mean() > 0.9

@@ -38,7 +38,7 @@ def _subset_means(rng, components):
 def test_reported_over_empirical(motion, tensor, order):
     """In the middle, at an edge, and beside a hole: white noise averaged over overlapping subsets."""
     rng = np.random.default_rng(5)
-    clean = make_field(plane, lambda p: p @ MOTIONS[motion].T, shape=SHAPE, step_px=STEP)
+    clean = make_field(plane, lambda p: p @ MOTIONS[motion].T, shape=SHAPE, spacing_px=STEP)
     mix = np.linalg.qr(rng.standard_normal((6, 6)))[0]
     root = np.diag(SIGMA) @ mix  # a covariance that is not diagonal after the rotation below
     root = np.linalg.qr(rng.standard_normal((6, 6)))[0] @ root
@@ -73,7 +73,7 @@ def test_reported_over_empirical(motion, tensor, order):
 def test_principal_scatter():
     """Where strain is large against its noise the principal values' uncertainty is theirs."""
     rng = np.random.default_rng(6)
-    clean = make_field(plane, lambda p: p @ MOTIONS["large"].T, shape=SHAPE, step_px=STEP)
+    clean = make_field(plane, lambda p: p @ MOTIONS["large"].T, shape=SHAPE, spacing_px=STEP)
     covariance = np.broadcast_to(np.diag(SIGMA**2), (*SHAPE, 6, 6))
     found, told = [], None
     for _ in range(200):
@@ -106,7 +106,7 @@ def test_correlation_of_curved_patches():
 
 def test_curved_patches_scatter_less_over_a_gauge():
     """Their neighbours go together less, so a gauge gains more by averaging them."""
-    plain = make_field(plane, lambda p: p, shape=SHAPE, step_px=STEP)
-    bent = replace(plain, patch=asked_for("curved", "curved"))
+    plain = make_field(plane, lambda p: p, shape=SHAPE, spacing_px=STEP)
+    bent = replace(plain, patch=asked_for("quadratic", "quadratic"))
     one, two = (surface_strain(f, StrainOptions(window=7), subset_px=SUBSET) for f in (plain, bent))
     assert np.nanmedian(two.sigma) < 0.9 * np.nanmedian(one.sigma)

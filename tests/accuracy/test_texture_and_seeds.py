@@ -104,7 +104,7 @@ def problem(answer: httpx.Response) -> tuple[int, str]:
 def test_texture_over_http(client: httpx.Client, test_id: str) -> None:
     where = f"{API}/tests/{test_id}/steps/0/texture"
     region = {"rectangle": [60, 60, 180, 170], "holes": [[[100, 100], [140, 100], [140, 140], [100, 140]]]}
-    told = client.post(where, json={"region": region, "subset_px": 33, "step_px": 10})
+    told = client.post(where, json={"region": region, "subset_px": 33, "spacing_px": 10})
     assert told.status_code == 200, told.text
     assert told.json()["subsets"] < 13 * 12  # none in the hole
     assert told.json()["level"] == "good"

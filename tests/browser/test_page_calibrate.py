@@ -180,7 +180,7 @@ def test_what_a_verdict_refused_is_shown_with_its_reasons(
         client.post(f"{API}/tests", json={"name": "hasty", "calibration_id": refused}),
     ):
         assert (answer.status_code, answer.json()["code"]) == (409, "calibration_not_complete"), answer.text
-    answer = client.put(f"{API}/calibrations/{refused}/judgement", json={"decision": "accepted"})
+    answer = client.put(f"{API}/calibrations/{refused}/review", json={"decision": "accepted"})
     assert answer.status_code == 409
     page.sound()
 
@@ -226,7 +226,7 @@ def test_import_compare_accept_discard(page: Watched, client: httpx.Client, tmp_
 
     shown.get_by_role("button", name="Accept", exact=True).click()
     expect(shown.get_by_role("region", name="Verdict")).to_contain_text("accepted")
-    assert client.get(f"{API}/calibrations/{other}").json()["judgement"]["decision"] == "accepted"
+    assert client.get(f"{API}/calibrations/{other}").json()["review"]["decision"] == "accepted"
     # a new test measures with it unless another one is chosen
     shown.get_by_role("link", name="Test", exact=True).click()
     expect(shown.get_by_label("Calibration", exact=True)).to_have_value(other)

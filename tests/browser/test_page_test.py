@@ -216,7 +216,7 @@ def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client:
     texture = shown.locator('[data-role="texture"]')
     expect(texture).to_contain_text("texture")
     shown.get_by_label("Subset", exact=True).fill("41")
-    body = {"region": {"rectangle": [90, 80, 170, 160]}, "subset_px": 41, "step_px": 10}
+    body = {"region": {"rectangle": [90, 80, 170, 160]}, "subset_px": 41, "spacing_px": 10}
     told = client.post(f"{API}/tests/{plate}/steps/0/texture", json=body).json()
     expect(texture).to_contain_text(f"of {told['subsets']} subsets")
     square = shown.locator('[data-role="subset"]')

@@ -97,7 +97,7 @@ try:
         # room for a few results, not for all
         free = service.folder.free_mib() * 2**20
         (data / "ballast").write_bytes(bytes(max(0, int(free) - 700_000)))
-        body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "step_px": 4, "strain": None}
+        body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "spacing_px": 4, "strain": None}
         made = client.post(f"{api}/tests/t000007-abcdef/analyses", json=body).json()
         job = wait_for_job(client, made["job"])
         out["job"] = [job["state"], (job["problem"] or {}).get("code")]

@@ -59,7 +59,7 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
     try:
         test = "/tests/t000007-abcdef"
         assert len(client.get(test).json()["steps"]) == 40
-        body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "step_px": 2}
+        body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "spacing_px": 2}
         accepted = client.post(f"{test}/analyses", json=body).json()
         url = f"{test}/analyses/{accepted['analysis_id']}"
         deadline = time.monotonic() + 240
@@ -95,7 +95,7 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
                 assert hashlib.sha256(content).hexdigest() == step["sha256"][cam]
         assert [s["n"] for s in shown["summary"]["steps"]] == shown["steps_finished"]
         # a new analysis can start at once, and comes to its end
-        fresh = client.post(f"{test}/analyses", json={**body, "step_px": 20, "steps": [0, 1]})
+        fresh = client.post(f"{test}/analyses", json={**body, "spacing_px": 20, "steps": [0, 1]})
         assert fresh.status_code == 202, fresh.text
         deadline = time.monotonic() + 240
         while (new_job := client.get(f"/jobs/{fresh.json()['job']['id']}").json())["state"] in ("queued", "running"):

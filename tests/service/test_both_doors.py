@@ -99,7 +99,7 @@ def same_as_its_file(result: dic.Result, path: Path) -> None:
 def test_a_folder_measured_through_both_doors_is_the_same_to_the_last_bit(
     data: Path, tmp_path: Path, update: str
 ) -> None:
-    settings = {"subset_px": 25, "step_px": 12, "patch": "stretch", "reference_update": update, "smoothing_window": 3}
+    settings = {"subset_px": 25, "spacing_px": 12, "patch": "affine", "reference_update": update, "smoothing_window": 3}
     region = {"rectangle": ROI, "cracks": [[[60, 60], [100, 60]]]}
     one = by_the_service(data, {**settings, "region": region, "strain": {"window": 5}})
     command = [
@@ -113,7 +113,7 @@ def test_a_folder_measured_through_both_doors_is_the_same_to_the_last_bit(
         "3",
     ]
     command += ["--roi", ",".join(map(str, ROI)), "--crack", "60,60,100,60", "--subset", "25", "--step", "12"]
-    assert main([*command, "--patch", "stretch", "--reference-update", update]) == 0
+    assert main([*command, "--patch", "affine", "--reference-update", update]) == 0
     for n, result in enumerate(by_the_library(data, {**settings, "region": region, "strain": {"window": 5}})):
         same_as_its_file(result, tmp_path / f"step_{n:04d}.nc")
     outside, later = 0, set()

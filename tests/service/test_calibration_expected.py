@@ -141,10 +141,10 @@ def calibration(client: httpx.Client) -> str:
 def test_decisions_are_kept_and_heeded(client: httpx.Client, calibration: str) -> None:
     nobody = client.post("/api/v1/tests", json={"name": "t", "calibration_id": "accepted"})
     assert (nobody.status_code, nobody.json()["code"]) == (409, "no_calibration_accepted")
-    where = f"/api/v1/calibrations/{calibration}/judgement"
+    where = f"/api/v1/calibrations/{calibration}/review"
     accepted = client.put(where, json={"decision": "accepted", "note": "fresh"}).json()
-    assert accepted["judgement"]["decision"] == "accepted"
-    assert accepted["judgement"]["by"] == "local"
+    assert accepted["review"]["decision"] == "accepted"
+    assert accepted["review"]["by"] == "local"
     listed = {e["id"]: e for e in client.get("/api/v1/calibrations").json()["calibrations"]}
     assert listed[calibration]["decision"] == "accepted"
     test = client.post("/api/v1/tests", json={"name": "t", "calibration_id": "accepted"})
@@ -155,13 +155,13 @@ def test_decisions_are_kept_and_heeded(client: httpx.Client, calibration: str) -
     assert (refused.status_code, refused.json()["code"]) == (409, "calibration_discarded")
     assert "the lamp was off" in refused.json()["detail"]
     client.put(where, json={"decision": None}).raise_for_status()
-    assert client.get(f"/api/v1/calibrations/{calibration}").json()["judgement"] is None
+    assert client.get(f"/api/v1/calibrations/{calibration}").json()["review"] is None
     assert client.post("/api/v1/tests", json={"name": "t", "calibration_id": calibration}).status_code == 201
-    assert client.put("/api/v1/calibrations/c000099-aaaaaa/judgement", json={"decision": None}).status_code == 404
+    assert client.put("/api/v1/calibrations/c000099-aaaaaa/review", json={"decision": None}).status_code == 404
 
 
 def test_the_decision_survives_a_rebuilt_index(client: httpx.Client, service: Service, calibration: str) -> None:
-    client.put(f"/api/v1/calibrations/{calibration}/judgement", json={"decision": "accepted"}).raise_for_status()
+    client.put(f"/api/v1/calibrations/{calibration}/review", json={"decision": "accepted"}).raise_for_status()
     service.catalog.put_entry("calibration", "", calibration, {"id": calibration, "state": "unfinished"})
     rebuild(service.catalog, service.folder, service.calibrations, service.tests)
     entry = next(e for e in service.catalog.entries("calibration") if e["id"] == calibration)

@@ -56,7 +56,7 @@ def test_after_the_wait_nothing_is_started(tmp_path, monkeypatch):
 def test_leaving_early_ends_the_process(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     before = time.monotonic()
-    with CompileAside("curved") as aside:
+    with CompileAside("quadratic") as aside:
         aside.start()
         process = aside._process
     assert process is not None

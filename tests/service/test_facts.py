@@ -51,7 +51,7 @@ def test_a_change_of_another_state_is_refused(client: httpx.Client) -> None:
     assert client.put(url, json={"operator": "a"}, headers={"If-Match": first}).status_code == 200
     refused = client.put(url, json={"operator": "b"}, headers={"If-Match": first})
     assert refused.status_code == 412, refused.text
-    assert refused.json()["code"] == "facts_changed"
+    assert refused.json()["code"] == "metadata_changed"
     assert client.get(url).json() == {"operator": "a"}
     assert client.put(url, json={"operator": "c"}, headers={"If-Match": refused.json()["etag"]}).status_code == 200
     assert client.put(url, json={}, headers={"If-Match": "*"}).json() == {}
@@ -93,7 +93,7 @@ def test_a_file_of_facts(tmp_path: Path) -> None:
     facts = load_facts(path)
     assert facts.cam2 == CameraFacts(lens=LensFacts(f_number=5.6))
     assert facts.document() == {"operator": "A", "static_steps": [1], "cam2": {"lens": {"f_number": 5.6}}}
-    for text, code in (("operator = ", "file_unreadable"), ("operater = 'A'", "facts_invalid")):
+    for text, code in (("operator = ", "file_unreadable"), ("operater = 'A'", "metadata_invalid")):
         path.write_text(text)
         with pytest.raises(FileFormatError) as caught:
             load_facts(path)

@@ -16,7 +16,7 @@ from tests.support.service_rig import served, tiny_config, wait_for_job, wait_fo
 API = "/api/v1"
 TEST = "t000007-abcdef"
 WAITING = 2  # compute_queue of the tiny rig
-BODY: dict[str, Any] = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "step_px": 2, "strain": None}
+BODY: dict[str, Any] = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "spacing_px": 2, "strain": None}
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""A change that was meant for another state is refused: of an axis, a camera, a calibration's judgement, a watch."""
+"""A change that was meant for another state is refused: of an axis, a camera, a calibration's review, a watch."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def camera(client: httpx.Client) -> tuple[str, str, str, list[dict[str, Any]]]:
     return f"{API}/cameras/cam2", "PATCH", f"{API}/cameras/cam2", [{"exposure_ms": 8.0}, {"exposure_ms": 9.0}]
 
 
-def judgement(client: httpx.Client) -> tuple[str, str, str, list[dict[str, Any]]]:
+def review(client: httpx.Client) -> tuple[str, str, str, list[dict[str, Any]]]:
     file = json.dumps(true_cameras(TINY)).encode()
     made = client.post(f"{API}/calibrations:import", files={"file": ("calibration.json", file)}).json()["id"]
     bodies = [{"decision": "accepted", "note": "mine"}, {"decision": "discarded", "note": "yours"}]
-    return f"{API}/calibrations/{made}", "PUT", f"{API}/calibrations/{made}/judgement", bodies
+    return f"{API}/calibrations/{made}", "PUT", f"{API}/calibrations/{made}/review", bodies
 
 
 def watch(client: httpx.Client) -> tuple[str, str, str, list[dict[str, Any]]]:
@@ -40,7 +40,7 @@ def watch(client: httpx.Client) -> tuple[str, str, str, list[dict[str, Any]]]:
     return url, "PUT", url, [{"channel": "load_n", "threshold": 2.0}, {"channel": "load_n", "threshold": 3.0}]
 
 
-@pytest.mark.parametrize("thing", [axis, camera, judgement, watch])
+@pytest.mark.parametrize("thing", [axis, camera, review, watch])
 def test_the_second_of_two_changes_is_refused(
     client: httpx.Client, thing: Callable[[httpx.Client], tuple[str, str, str, list[dict[str, Any]]]]
 ) -> None:

@@ -170,8 +170,8 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Measurement]:
             body = {
                 "region": {"rectangle": [60, 60, 180, 170]},
                 "subset_px": 25,
-                "step_px": 10,
-                "patch": "stretch",
+                "spacing_px": 10,
+                "patch": "affine",
                 "strain": {"window": 5},
             }
             accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
@@ -298,7 +298,7 @@ def test_settings_are_told_in_px_and_mm(page: Page) -> None:
         assert mm is not None
         assert float(mm[1]) == pytest.approx(px * scale, rel=5e-3)
     for key, text in (
-        ("shape_function", "stretch"),
+        ("shape_function", "affine"),
         ("criterion", "zero-mean"),
         ("interpolant", "quintic"),
         ("prefilter", "none"),
@@ -547,7 +547,7 @@ def test_results_of_files_without_a_rig(plate: Measurement, tmp_path: Path) -> N
                 "--subset",
                 "25",
                 "--patch",
-                "stretch",
+                "affine",
                 "--prefilter",
                 "0.7",
                 "--smooth",

@@ -59,7 +59,7 @@ def plate_test(client: httpx.Client, calibration_id: str) -> str:
 
 @pytest.fixture(scope="module")
 def analysis(client: httpx.Client, plate_test: str) -> tuple[str, dict[str, Any]]:
-    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10}
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10}
     accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body)
     assert accepted.status_code == 202, accepted.text
     done = wait_for_job(client, accepted.json()["job"], 240.0)
@@ -90,8 +90,8 @@ def test_prefilter_and_smoothing_are_recorded_and_told(client: httpx.Client, pla
     body = {
         "region": {"rectangle": RECTANGLE},
         "subset_px": 25,
-        "step_px": 10,
-        "patch": "stretch",
+        "spacing_px": 10,
+        "patch": "affine",
         "prefilter_px": 0.8,
         "smoothing_window": 5,
         "strain": {"window": 5},
@@ -126,7 +126,7 @@ def test_prefilter_and_smoothing_are_recorded_and_told(client: httpx.Client, pla
     ],
 )
 def test_prefilters_and_windows_that_cannot_be(client: httpx.Client, plate_test: str, change: dict[str, Any]) -> None:
-    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, **change}
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, **change}
     code = "values_disagree" if change.get("prefilter_px") == 6.3 else "invalid_request"  # 6.3 px suit larger subsets
     refused(client.post(f"{API}/tests/{plate_test}/analyses", json=body), 422, code)
 
@@ -278,7 +278,7 @@ def test_a_crack_and_a_hole_are_kept_to_and_told(client: httpx.Client, plate_tes
     body = {
         "kind": "profile",
         "subset_px": 25,
-        "step_px": 5,
+        "spacing_px": 5,
         "steps": [0],
         "region": {"rectangle": [70, 70, 140, 140], "cracks": [crack], "holes": [hole]},
     }
@@ -309,7 +309,7 @@ def test_mask_and_profile_measure_where_the_mask_is_white(client: httpx.Client, 
     body = {
         "kind": "profile",
         "subset_px": 25,
-        "step_px": 10,
+        "spacing_px": 10,
         "steps": [0],
         "region": {"rectangle": RECTANGLE, "mask_png_base64": base64.b64encode(buffer.getvalue()).decode()},
     }
@@ -330,17 +330,17 @@ def test_auto_patches_say_why_step_by_step(client: httpx.Client, calibration_id:
     for load in (0.0, 0.2):
         client.put(f"{API}/sim/scene", json={"scene": "sphere", "load": load})
         assert client.post(f"{API}/tests/{test_id}/steps", json={"label": str(load)}).status_code == 201
-    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, "patch": "auto"}
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, "patch": "auto"}
     accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
     done = wait_for_job(client, accepted["job"], 240.0)
     assert done["state"] == "succeeded", done["problem"]
     reply = client.get(f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}").json()
     shape, moved = (step["patch"] for step in reply["summary"]["steps"])
     assert reply["settings"]["patch"] == "auto"
-    assert shape["patch"] == "curved"
+    assert shape["patch"] == "quadratic"
     assert shape["reason"].startswith("curved: plane patches have a bias of")
-    assert shape["plane_error_mm"] > shape["curved_noise_mm"] > shape["plane_noise_mm"] > 0.0
-    assert moved["patch"] == "stretch"  # a sphere that moves as a block does not bend
+    assert shape["plane_error_mm"] > shape["quadratic_noise_mm"] > shape["plane_noise_mm"] > 0.0
+    assert moved["patch"] == "affine"  # a sphere that moves as a block does not bend
     url = f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}/steps/0/fields/curvature_1"
     assert client.get(url).json()["units"] == "mm-1"
 
@@ -362,7 +362,7 @@ def test_blank_step_fails_alone(client: httpx.Client, calibration_id: str, plate
         answer = client.post(f"{API}/tests/{test_id}/steps:import", files={"cam1": ("a", one), "cam2": ("b", two)})
         codes.append(answer.json()["quality"]["code"])
     assert codes == ["ok", "blank", "ok"]
-    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 20}
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 20}
     done = wait_for_job(client, client.post(f"{API}/tests/{test_id}/analyses", json=body).json()["job"])
     assert done["state"] == "failed"
     assert done["result"]["steps_finished"] == [0, 2]
@@ -372,7 +372,7 @@ def test_blank_step_fails_alone(client: httpx.Client, calibration_id: str, plate
 
 @pytest.mark.fault(43)
 def test_cancelled_analysis_keeps_its_finished_steps(client: httpx.Client, plate_test: str) -> None:
-    body = {"region": {"rectangle": [20, 20, 230, 215]}, "subset_px": 25, "step_px": 2}
+    body = {"region": {"rectangle": [20, 20, 230, 215]}, "subset_px": 25, "spacing_px": 2}
     accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body).json()
     url = f"{API}/tests/{plate_test}/analyses/{accepted['analysis_id']}"
     deadline = time.monotonic() + 120
@@ -391,7 +391,7 @@ def test_cancelled_analysis_keeps_its_finished_steps(client: httpx.Client, plate
 
 
 def test_each_step_can_be_matched_against_the_one_before(client: httpx.Client, plate_test: str) -> None:
-    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 20, "reference_update": "always"}
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 20, "reference_update": "always"}
     accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body).json()
     done = wait_for_job(client, accepted["job"], 240.0)
     assert done["state"] == "succeeded", done["problem"]
@@ -457,7 +457,7 @@ def test_noise_is_measured_on_the_rig_and_used(client: httpx.Client, plate_test:
     assert content["settings"]["cam1"]["exposure_ms"] == pytest.approx(10.0)
     load_noise(tmp_path / "noise.json")
 
-    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 30, "steps": [1], "noise_id": noise_id}
+    body = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 30, "steps": [1], "noise_id": noise_id}
     accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body)
     assert accepted.status_code == 202, accepted.text
     done = wait_for_job(client, accepted.json()["job"], 240.0)

@@ -76,7 +76,7 @@ def test_specimen_is_measured_with_an_imported_calibration(
         files = {cam: (cam, (specimen_dir / f"000{n}_{k}.tif").read_bytes()) for k, cam in enumerate(("cam1", "cam2"))}
         step = client.post(f"{API}/tests/{test_id}/steps:import", files=files)
         assert step.status_code == 201, step.text
-    body = {"kind": "displacement", "region": {"rectangle": [800, 500, 1000, 620]}, "step_px": 20}
+    body = {"kind": "displacement", "region": {"rectangle": [800, 500, 1000, 620]}, "spacing_px": 20}
     accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
     done = wait_for_job(client, accepted["job"])
     assert done["state"] == "succeeded", done["problem"]

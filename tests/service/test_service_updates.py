@@ -39,7 +39,7 @@ def tasks(inputs: Path, out: Path, **settings: Any) -> list[StepTask]:
     """The tasks of an analysis, as the service makes them."""
     out.mkdir()
     body = AnalysisRequest.model_validate(
-        {"region": {"rectangle": [190, 180, 330, 300]}, "step_px": 14, "patch": "stretch", "strain": None, **settings}
+        {"region": {"rectangle": [190, 180, 330, 300]}, "spacing_px": 14, "patch": "affine", "strain": None, **settings}
     )
     steps = {}
     for n in STEPS:
@@ -77,7 +77,7 @@ def test_a_fresh_worker_goes_on_from_the_files(inputs: Path, tmp_path: Path) -> 
             xr.open_dataset(tmp_path / "fresh" / f"step_{STEPS[k]:04d}.nc") as b,
         ):
             assert a.attrs["reference_step"] == b.attrs["reference_step"] == STEPS[k - 1]
-            for name in ("u_mm", "v_mm", "w_mm", "stretch_11", "sigma_u_mm", "handed_on_noise_xx_px2", "status"):
+            for name in ("u_mm", "v_mm", "w_mm", "stretch_11", "sigma_u_mm", "propagated_noise_xx_px2", "status"):
                 np.testing.assert_allclose(a[name], b[name], rtol=1e-5, atol=1e-9, err_msg=name)
             assert json.loads(a.attrs["settings"])["reference_update"] == "always"
             # a file written anew by somebody else is no reference any more

@@ -45,7 +45,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
             client.put(f"{API}/sim/scene", json={"scene": "plate"}).raise_for_status()
             for _ in range(3):
                 client.post(f"{API}/tests/{test_id}/steps", json={}).raise_for_status()
-            body = {"region": {"rectangle": [80, 80, 160, 150]}, "subset_px": 21, "step_px": 10, "strain": None}
+            body = {"region": {"rectangle": [80, 80, 160, 150]}, "subset_px": 21, "spacing_px": 10, "strain": None}
             accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
             done = wait_for_job(client, accepted["job"], 240.0)
             assert done["state"] == "succeeded", done["problem"]
@@ -280,7 +280,7 @@ def everything_else(client: httpx.Client) -> None:
     body: dict[str, Any] = {"region": {"rectangle": [80, 80, 160, 150]}, "subset_px": 21, "strain": None}
     calibration = client.get(f"{API}/calibrations").json()["calibrations"][0]["id"]
     decision = {"decision": "accepted", "note": "good"}
-    client.put(f"{API}/calibrations/{calibration}/judgement", json=decision).raise_for_status()
+    client.put(f"{API}/calibrations/{calibration}/review", json=decision).raise_for_status()
     client.put(f"{test}/facts", json={"operator": "A. Smith"}).raise_for_status()
     client.put(f"{test}/watch", json={"channel": "load_n", "threshold": 1.0}).raise_for_status()
     analysis = client.get(test).json()["analyses"][0]["id"]
@@ -317,7 +317,7 @@ def test_a_folder_that_holds_everything_has_no_false_finding_and_hides_no_true_o
     assert verify(data).findings == ()
     for pattern in ("calibrations/*", "tests/*", "tests/*/steps/0000", "tests/*/analyses/*", "noise/*"):
         (sorted(data.glob(pattern))[0] / "holiday.jpg").write_bytes(b"x")
-    (only(data, "calibrations/*") / "judgement.json").write_text("{")
+    (only(data, "calibrations/*") / "review.json").write_text("{")
     for pattern in ("trash/*/content/cam2.tif", "trash/*/content/steps/0000/cam1.tif", "trash/*/content/noise.json"):
         flip(only(data, pattern))
     levels = [level for level, _ in found_in(data)]

@@ -213,7 +213,7 @@ def fill(client: httpx.Client) -> Known:
     for load in (0.0, 1.0):
         client.put(f"{api}/sim/scene", json={"scene": "plate", "load": load}).raise_for_status()
         client.post(f"{api}/tests/{test}/steps", json={"load_n": load}).raise_for_status()
-    body = {"region": {"rectangle": [55, 55, 105, 90]}, "subset_px": 21, "step_px": 10}
+    body = {"region": {"rectangle": [55, 55, 105, 90]}, "subset_px": 21, "spacing_px": 10}
     analysis = client.post(f"{api}/tests/{test}/analyses", json=body).json()
     job = wait_for_job(client, analysis["job"], 600.0)  # where kernels are compiled first, on a busy machine
     assert job["state"] == "succeeded", job

@@ -219,7 +219,7 @@ def _calibration(session: Session) -> str:
         call("export_calibration", calibration, query={"format": form})
     call("report_conversion", calibration, query={"format": "opencv"})
     decision = {"decision": "accepted", "note": "held-out residuals are small"}
-    call("put_judgement", calibration, summary="Measure with it from now on", body=decision)
+    call("put_review", calibration, summary="Measure with it from now on", body=decision)
     call(
         "import_calibration",
         summary="Both cameras as calibration.json",
@@ -265,8 +265,8 @@ def _test(session: Session, calibration: str) -> str:
         "cam1": {"maker": "Basler", "pixel_um": 3.45, "lens": {"maker": "Schneider", "focal_length_mm": 50.0}},
         "static_steps": [1],
     }
-    call("put_facts", test, summary="What the guide's tables ask for and no device can say", body=facts)
-    call("get_facts", test)
+    call("put_metadata", test, summary="What the guide's tables ask for and no device can say", body=facts)
+    call("get_metadata", test)
     watch = {"channel": "load_n", "threshold": 500.0, "frames": 1}
     call("put_watch", test, summary="A step at each further 500 N", body=watch)
     call("get_watch", test)
@@ -282,7 +282,7 @@ def _test(session: Session, calibration: str) -> str:
 
 def _analysis(session: Session, test: str) -> str:
     call, client = session.call, session.client
-    wanted = {"region": REGION, "subset_px": 21, "step_px": 10, "strain": {"window": 3}}
+    wanted = {"region": REGION, "subset_px": 21, "spacing_px": 10, "strain": {"window": 3}}
     made = call(
         "create_analysis", test, summary="Shape, displacement and strain of two steps", body={**wanted, "steps": [0, 1]}
     ).json()
@@ -316,7 +316,7 @@ def _results(call: Callable[..., httpx.Response], test: str, analysis: str) -> N
     part = {"rows": "0:2", "cols": "0:3"}
     for form in ("json", "npy", "csv", "nc", "f32", "png"):
         call("get_field", test, analysis, 1, "w_mm", query={**part, "format": form})
-    call("get_places", test, analysis, 1, "cam1")
+    call("get_positions", test, analysis, 1, "cam1")
     call("get_probe", test, analysis, query={"x_px": 128, "y_px": 120, "step": 1})
     gauges = {
         "extensometers": [{"name": "axial", "a_px": [100.0, 120.0], "b_px": [160.0, 120.0]}],

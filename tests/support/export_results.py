@@ -21,7 +21,7 @@ HOLE = [(85.0, 108.0), (111.0, 108.0), (111.0, 137.0), (85.0, 137.0), (85.0, 108
 PIN_HOLE = [(202.0, 83.0), (203.0, 83.0), (203.0, 84.0), (202.0, 83.0)]  # inside one triangle
 FAILED = [(3, 25), (3, 26), (17, 4), (23, 30), (12, 22), (13, 21)]
 CALIBRATION = "c0" * 32
-SETTINGS = {"subset_px": SUBSET, "step_px": 7, "patch": "stretch", "interpolation": "quintic", "note": "a -- b # c"}
+SETTINGS = {"subset_px": SUBSET, "spacing_px": 7, "patch": "affine", "interpolation": "quintic", "note": "a -- b # c"}
 
 
 def cylinder(x_px: Float, y_px: Float) -> Float:

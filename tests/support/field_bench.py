@@ -68,8 +68,10 @@ def take(
     return first, second
 
 
-def grid(*, step_px: float = 8.0, margin_px: float = 36.0) -> PointGrid:
-    return PointGrid.rectangle(margin_px, margin_px, SIZE[0] - 1 - margin_px, SIZE[1] - 1 - margin_px, step_px=step_px)
+def grid(*, spacing_px: float = 8.0, margin_px: float = 36.0) -> PointGrid:
+    return PointGrid.rectangle(
+        margin_px, margin_px, SIZE[0] - 1 - margin_px, SIZE[1] - 1 - margin_px, spacing_px=spacing_px
+    )
 
 
 def truth(points: PointGrid, reference: Scene, now: Scene | None = None) -> Truth:

@@ -58,7 +58,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
                 client.put(f"{API}/sim/scene", json={"scene": "plate", "load": pressure})
                 step = {"label": f"{pressure} kPa", "load_n": 2 * pressure, "channels": {"stroke_mm": pressure / 100}}
                 assert client.post(f"{API}/tests/{test_id}/steps", json=step).status_code == 201
-            asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "step_px": 10, "strain": {"window": 5}}
+            asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, "strain": {"window": 5}}
             made = client.post(f"{API}/tests/{test_id}/analyses", json=asked).json()
             assert wait_for_job(client, made["job"])["state"] == "succeeded"
             yield Bench(
@@ -82,7 +82,7 @@ def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
         object.__setattr__(field, "cuts", Cuts([[(155.0, 50.0), (155.0, 120.0)]]))
         if field.uvw_mm is not None:
             field.uvw_mm[..., 2] += 1e-3
-        provenance = Provenance({"subset_px": 25, "step_px": 10}, {"a": "b"}, "0.1.0", step=n)
+        provenance = Provenance({"subset_px": 25, "spacing_px": 10}, {"a": "b"}, "0.1.0", step=n)
         write_field(folder / f"step_{n:04d}.nc", field, provenance)
     return document.id
 

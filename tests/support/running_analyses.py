@@ -18,7 +18,7 @@ from tests.support.service_rig import served
 API = "/api/v1"
 
 
-BODY: dict[str, Any] = {"region": {"rectangle": [30, 30, 120, 110]}, "subset_px": 21, "step_px": 8}
+BODY: dict[str, Any] = {"region": {"rectangle": [30, 30, 120, 110]}, "subset_px": 21, "spacing_px": 8}
 
 
 def begin(client: httpx.Client, url: str, **changes: Any) -> tuple[str, dict[str, Any]]:

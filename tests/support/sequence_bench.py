@@ -22,8 +22,8 @@ from tests.bench.accuracy.paper_rig import Rig, plane_scene, true_points, turn
 from tests.bench.speed.scene import rig_of_size
 
 SIZE = (520, 480)
-GRID = PointGrid.rectangle(190, 180, 330, 300, step_px=14)
-OPTIONS = MeasureOptions(subset_px=33, patch="stretch")
+GRID = PointGrid.rectangle(190, 180, 330, 300, spacing_px=14)
+OPTIONS = MeasureOptions(subset_px=33, patch="affine")
 Images = list[np.ndarray]
 
 

@@ -19,7 +19,7 @@ def make_field(
     motion: Callable[[Array], Array],
     *,
     shape: tuple[int, int] = (31, 35),
-    step_px: float = 10.0,
+    spacing_px: float = 10.0,
     sigma_mm: tuple[float, float] = (2e-4, 3e-4),
     cuts: Cuts | None = None,
     stretch: Array | None = None,
@@ -27,7 +27,7 @@ def make_field(
 ) -> Field:
     """Points of ``surface(a, b)`` over the pixels in mm about the grid's middle, moved to ``motion(points)``."""
     rows, cols = shape
-    x, y = np.meshgrid(100.0 + step_px * np.arange(cols), 80.0 + step_px * np.arange(rows))
+    x, y = np.meshgrid(100.0 + spacing_px * np.arange(cols), 80.0 + spacing_px * np.arange(rows))
     a, b = (x - x.mean()) * MM_PER_PX, (y - y.mean()) * MM_PER_PX
     xyz = surface(a, b)
     da, db = np.array([1e-6, 0.0]), np.array([0.0, 1e-6])

@@ -39,7 +39,7 @@ def advise(choice: PatchChoice, estimate: PlaneError | None) -> PatchChoice:
     estimate
         Bias and noise of the field's plane patches; None where they could not be estimated.
     """
-    if estimate is None or choice.patch == "curved":
+    if estimate is None or choice.patch == "quadratic":
         return choice
     choice = replace(choice, plane_error_mm=estimate.error_mm, plane_noise_mm=estimate.noise_mm)
     if np.hypot(estimate.error_mm, estimate.noise_mm) <= _CLEARLY * _CURVED_NOISE * estimate.noise_mm:
@@ -48,7 +48,7 @@ def advise(choice: PatchChoice, estimate: PlaneError | None) -> PatchChoice:
         f"plane patches have a bias of {format_length(estimate.error_mm)} (rms) in {_quantity(choice.patch)} here, "
         f"besides {format_length(estimate.noise_mm)} of noise; curved ones would have the smaller total error"
     )
-    return replace(choice, curved_advised=True, reason=f"{choice.reason}; {text}")
+    return replace(choice, quadratic_advised=True, reason=f"{choice.reason}; {text}")
 
 
 def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: PlaneError | None) -> PatchChoice:
@@ -70,7 +70,7 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
     PatchChoice
         ``curved`` if that leaves clearly (1.1 times) less error in all, rms over a sample of the field.
     """
-    plane: UsedPatch = "plane" if fitter.comparisons == 1 else "stretch"
+    plane: UsedPatch = "plane" if fitter.comparisons == 1 else "affine"
     if estimate is not None and estimate.below_mm < _SURELY * estimate.noise_mm:
         text = (
             f"plane patches have a bias of {_format_bias(estimate)} (rms) in {_quantity(plane)} here and "
@@ -140,13 +140,13 @@ def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: 
         f"noise besides; curved ones have {format_length(curved_noise)} of noise"
     )
     return PatchChoice(
-        patch="curved" if curved else plane,
+        patch="quadratic" if curved else plane,
         asked="auto",
-        reason=f"{'curved' if curved else plane}: {numbers}",
+        reason=f"{'quadratic' if curved else plane}: {numbers}",
         sample=len(used),
         plane_error_mm=float(error),
         plane_noise_mm=float(plane_noise),
-        curved_noise_mm=float(curved_noise),
+        quadratic_noise_mm=float(curved_noise),
     )
 
 

@@ -39,7 +39,7 @@ class PlaneError(NamedTuple):
 
 
 def plane_error(
-    points: PointFits, *, shape: tuple[int, int], rays: Float, step_px: float, subset_px: int
+    points: PointFits, *, shape: tuple[int, int], rays: Float, spacing_px: float, subset_px: int
 ) -> PlaneError | None:
     """Estimate the plane patches' bias.
 
@@ -51,7 +51,7 @@ def plane_error(
         Rows and columns.
     rays
         (n, 3) normalised.
-    step_px, subset_px
+    spacing_px, subset_px
         Distance of the points and width of the subset, px.
 
     Returns
@@ -59,9 +59,9 @@ def plane_error(
     PlaneError or None
         None where too few points have neighbours, or the neighbours lie too far away.
     """
-    separation = max(1, int(np.ceil(subset_px / step_px)))
+    separation = max(1, int(np.ceil(subset_px / spacing_px)))
     rows, cols = shape
-    if separation * step_px > _FAR_SUBSETS * subset_px or min(rows, cols) < 2 * separation + 1:
+    if separation * spacing_px > _FAR_SUBSETS * subset_px or min(rows, cols) < 2 * separation + 1:
         return None
     w, G = points.w[:, 0], points.G[:, :, 0]
     moved = points.zncc.shape[1] == 3
@@ -74,7 +74,7 @@ def plane_error(
     else:
         by_w = -rays / w[:, None] ** 2
         variance = (by_w**2).sum(1) * points.covariance[:, 0, 0]
-    factor = (subset_px**2 - 1) / 24.0 / (separation * step_px) ** 2
+    factor = (subset_px**2 - 1) / 24.0 / (separation * spacing_px) ** 2
     bend_w, noise = _laplacian(w.reshape(shape), separation), _gathered(variance.reshape(shape), separation) * factor**2
     inner = (slice(separation, rows - separation), slice(separation, cols - separation))
     off = factor * bend_w[..., None] * by_w.reshape(rows, cols, 3)[inner]

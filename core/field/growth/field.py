@@ -56,7 +56,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shap
     """
     if not state.points.ok.any() and (shape is None or shape.valid.any()):
         raise _no_seed(state.fitter.ref1.noise_variance)
-    if state.patch.patch == "curved" and state.fitter.terms == 3:
+    if state.patch.patch == "quadratic" and state.fitter.terms == 3:
         state = refit_curved(inputs, state)
     state = choose_patch(inputs, fill(inputs, state))
     if not state.checked:  # measured anew

@@ -17,7 +17,7 @@ from core.field.points.result import Field
 def keep_patch(inputs: FieldInputs, state: GrowthState, previous: Field | None) -> GrowthState:
     """Keep curved patches where an earlier step of the sequence chose them."""
     choice = None if previous is None or not previous.has_motion else previous.patch
-    if inputs.options.patch == "auto" and choice is not None and choice.patch == "curved":
+    if inputs.options.patch == "auto" and choice is not None and choice.patch == "quadratic":
         return replace(state, patch=choice.for_next_step())
     return state
 
@@ -41,7 +41,7 @@ def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
             state.points,
             shape=inputs.grid.shape,
             rays=inputs.rays,
-            step_px=inputs.grid.step_px,
+            spacing_px=inputs.grid.spacing_px,
             subset_px=inputs.options.subset_px,
         )
     if inputs.options.patch != "auto":
@@ -49,4 +49,4 @@ def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     if state.patch.kept:
         return state
     state = replace(state, patch=choose(state.fitter, state.points, inputs.xy_px, estimate))
-    return refit_curved(inputs, state) if state.patch.patch == "curved" else state
+    return refit_curved(inputs, state) if state.patch.patch == "quadratic" else state

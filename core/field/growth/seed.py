@@ -92,7 +92,7 @@ def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
     """Seed from feature matches of reduced images, reduced less until seeds are found; return their number."""
     if not (inputs.usable & ~inputs.repeating).any():
         return 0
-    reach = inputs.options.subset_px + inputs.grid.step_px
+    reach = inputs.options.subset_px + inputs.grid.spacing_px
     shape1, shape2 = inputs.ref1.shape, inputs.ref2.shape
     box1 = box_around(inputs.xy_px[inputs.usable], reach, shape1)
     box2 = seen_by_camera2(inputs.pair, box1, shape2)
@@ -136,7 +136,7 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
 
 def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> GrowthState:
     """Start all points from the previous step's values; a fitted sample of them is valid already."""
-    if state.patch.patch == "curved":
+    if state.patch.patch == "quadratic":
         state = refit_curved(inputs, state)
     points = state.points
     sample = np.flatnonzero(points.ok)
@@ -201,7 +201,7 @@ def _rather_whole(inputs: FieldInputs, usable: Bool) -> Bool:
 
 
 def _nearest(inputs: FieldInputs, seeds: tuple[Seed, ...], usable: Bool) -> NDArray[np.intp]:
-    reach = max(_REACH_STEPS * inputs.grid.step_px, float(inputs.options.subset_px))
+    reach = max(_REACH_STEPS * inputs.grid.spacing_px, float(inputs.options.subset_px))
     return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, visibility=inputs.visibility)
 
 

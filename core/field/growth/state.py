@@ -215,7 +215,7 @@ def begin(inputs: FieldInputs) -> GrowthState:
     plane: UsedPatch = "plane" if matcher.comparisons == 1 else matcher.options.patch
     return GrowthState(
         fitter=matcher,
-        patch=asked_for("curved" if asked == "curved" else plane, asked),
+        patch=asked_for("quadratic" if asked == "quadratic" else plane, asked),
         points=matcher.empty(len(inputs.xy_px)),
         attempts=fresh_attempts(inputs),
         checked=False,

@@ -121,7 +121,7 @@ class Fitter:
     @property
     def terms(self) -> int:
         """Numbers in a point's ``w`` and in each row of its ``G``: 3 for a plane patch, 6 for a curved one."""
-        return 6 if self.options.patch == "curved" else 3
+        return 6 if self.options.patch == "quadratic" else 3
 
     def empty(self, n: int) -> PointFits:
         """Return n points not yet reached."""
@@ -133,7 +133,7 @@ class Fitter:
 
     def curved(self) -> Fitter:
         """Return the same matcher with curved patches."""
-        return replace(self, options=replace(self.options, patch="curved"))
+        return replace(self, options=replace(self.options, patch="quadratic"))
 
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and reject those that fail the checks of a single point."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from core.settings import PatchSetting
 
-UsedPatch = Literal["plane", "rigid", "stretch", "curved"]
+UsedPatch = Literal["plane", "rigid", "affine", "quadratic"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +30,9 @@ class PatchChoice:
     plane_error_mm
         Bias of plane patches because of curvature, rms, less noise; of the position for a shape, of the displacement
         for a motion. None where it is not known, as the next two.
-    plane_noise_mm, curved_noise_mm
+    plane_noise_mm, quadratic_noise_mm
         Standard deviation of the same from image noise, rms, with plane and with curved patches.
-    curved_advised
+    quadratic_advised
         True if plane patches were asked for and curved ones would have the smaller total error.
     kept
         True if the choice was made in an earlier step of the sequence and kept.
@@ -44,8 +44,8 @@ class PatchChoice:
     sample: int = 0
     plane_error_mm: float | None = None
     plane_noise_mm: float | None = None
-    curved_noise_mm: float | None = None
-    curved_advised: bool = False
+    quadratic_noise_mm: float | None = None
+    quadratic_advised: bool = False
     kept: bool = False
 
     def document(self) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class SharedPixels:
     @staticmethod
     def of(field: Field, subset_px: float) -> SharedPixels:
         """Return the correlation that fits a field's patches; plane where the field has no record of them."""
-        return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "curved", field.smoothing)
+        return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "quadratic", field.smoothing)
 
     @property
     def positions(self) -> SharedPixels:
@@ -62,7 +62,7 @@ class SharedPixels:
     @property
     def reach_px(self) -> float:
         """Largest distance of two points whose errors are correlated."""
-        more = 0.0 if self.smoothing is None else (self.smoothing.window - 1) * self.smoothing.step_px
+        more = 0.0 if self.smoothing is None else (self.smoothing.window - 1) * self.smoothing.spacing_px
         return self.subset_px + more
 
     def correlation(self, dx_px: ArrayLike, dy_px: ArrayLike) -> Float:
@@ -99,7 +99,7 @@ class SharedPixels:
         # even both ways, and the same distances again and again
         distance = np.round(np.abs(dx), 6) + 1j * np.round(np.abs(dy), 6)
         each, back = np.unique(distance, return_inverse=True)
-        lag = (np.arange(len(weights)) - len(weights) // 2) * self.smoothing.step_px
+        lag = (np.arange(len(weights)) - len(weights) // 2) * self.smoothing.spacing_px
         out = np.empty(len(each))
         for first in range(0, len(each), _AT_ONCE):
             some = each[first : first + _AT_ONCE, None, None]

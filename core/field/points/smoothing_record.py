@@ -31,7 +31,7 @@ class Smoothing:
         Points across the square window, odd.
     order
         Of the polynomial: 1 plane, 2 quadratic.
-    step_px, subset_px
+    spacing_px, subset_px
         Of the field.
     resolution_px
         Width of the area that one value averages, (window - 1) spacing + subset.
@@ -44,7 +44,7 @@ class Smoothing:
 
     window: int
     order: Order = 2
-    step_px: float
+    spacing_px: float
     subset_px: float
     resolution_px: float
     resolution_mm: float | None

@@ -119,4 +119,6 @@ def _find(grid: PointGrid, subset: int) -> Visibility:
     run_ranges(
         lambda first, last: separated_neighbours(first, last, x, y, REACH, pieces, white, separated), grid.shape[0], 4
     )
-    return Visibility(xy, grid.shape, grid.step_px, pieces, white, VisiblePixels(patches, of_point), share, separated)
+    return Visibility(
+        xy, grid.shape, grid.spacing_px, pieces, white, VisiblePixels(patches, of_point), share, separated
+    )

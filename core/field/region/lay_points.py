@@ -35,7 +35,7 @@ def make_grid(settings: AnalysisSettings, mask: NDArray[np.bool_] | None, image_
             code="mask_size",
             remedy="Draw the mask over camera 1's reference image.",
         )
-    grid = lay_points(settings.region, settings.step_px, mask)
+    grid = lay_points(settings.region, settings.spacing_px, mask)
     check_region(grid, image_shape=image_shape, subset_px=settings.subset_px)
     rows, cols = image_shape
     for x, y in settings.seeds or []:
@@ -48,7 +48,7 @@ def make_grid(settings: AnalysisSettings, mask: NDArray[np.bool_] | None, image_
     return grid
 
 
-def lay_points(region: Region, step_px: int, mask: NDArray[np.bool_] | None) -> PointGrid:
+def lay_points(region: Region, spacing_px: int, mask: NDArray[np.bool_] | None) -> PointGrid:
     """Lay the points of a region; those on a mask's black, in holes, are not allowed.
 
     Raises
@@ -57,11 +57,11 @@ def lay_points(region: Region, step_px: int, mask: NDArray[np.bool_] | None) -> 
         ``region_empty``, ``cut_invalid``.
     """
     if region.rectangle is not None:
-        grid = PointGrid.rectangle(*region.rectangle, step_px=step_px)
+        grid = PointGrid.rectangle(*region.rectangle, spacing_px=spacing_px)
     elif region.polygon is not None:
-        grid = PointGrid.polygon(np.asarray(region.polygon, dtype=np.float64), step_px=step_px)
+        grid = PointGrid.polygon(np.asarray(region.polygon, dtype=np.float64), spacing_px=spacing_px)
     elif mask is not None:
-        grid = PointGrid.mask(mask, step_px=step_px)
+        grid = PointGrid.mask(mask, spacing_px=spacing_px)
     else:
         raise RegionError("The region names no rectangle, no polygon and no mask.", code="region_empty")
     if mask is not None:

@@ -30,7 +30,7 @@ class PointGrid:
         (r, c) columns and rows of the points.
     allowed
         (r, c) True where a point's centre lies in the region and on the mask's white; the others get the status MASKED.
-    step_px
+    spacing_px
         Distance of neighbouring points.
     extent_px
         (x0, y0, x1, y1) of the region given, px.
@@ -46,7 +46,7 @@ class PointGrid:
     x_px: Float
     y_px: Float
     allowed: Bool
-    step_px: float
+    spacing_px: float
     extent_px: tuple[float, float, float, float]
     cuts: Cuts | None = None
     white: Bool | None = None
@@ -63,7 +63,7 @@ class PointGrid:
         return np.stack([self.x_px, self.y_px], axis=-1)
 
     @staticmethod
-    def rectangle(x0_px: float, y0_px: float, x1_px: float, y1_px: float, *, step_px: float) -> PointGrid:
+    def rectangle(x0_px: float, y0_px: float, x1_px: float, y1_px: float, *, spacing_px: float) -> PointGrid:
         """Lay points at X0 + i step up to X1 inclusive, and likewise in Y.
 
         Raises
@@ -72,26 +72,26 @@ class PointGrid:
             ``region_unusable`` for numbers that are not finite, ``region_empty`` for corners out of order.
         """
         _finite("rectangle", [x0_px, y0_px, x1_px, y1_px])
-        _step(step_px)
+        _step(spacing_px)
         if x1_px < x0_px or y1_px < y0_px:
             raise RegionError(
                 f"the rectangle from ({x0_px:g}, {y0_px:g}) to ({x1_px:g}, {y1_px:g}) holds nothing.",
                 code="region_empty",
                 remedy="Give the upper left corner first, then the lower right one.",
             )
-        n_x = int(np.floor((x1_px - x0_px) / step_px + 1e-9)) + 1
-        n_y = int(np.floor((y1_px - y0_px) / step_px + 1e-9)) + 1
+        n_x = int(np.floor((x1_px - x0_px) / spacing_px + 1e-9)) + 1
+        n_y = int(np.floor((y1_px - y0_px) / spacing_px + 1e-9)) + 1
         if n_x * n_y > _MAX_POINTS:
             raise RegionError(
                 f"the region holds {n_x} x {n_y} points, more than {_MAX_POINTS:,}.",
                 code="region_too_large",
                 remedy="Give a larger step or a smaller region.",
             )
-        x, y = np.meshgrid(x0_px + step_px * np.arange(n_x), y0_px + step_px * np.arange(n_y))
-        return PointGrid(x, y, np.ones(x.shape, bool), float(step_px), (x0_px, y0_px, x1_px, y1_px))
+        x, y = np.meshgrid(x0_px + spacing_px * np.arange(n_x), y0_px + spacing_px * np.arange(n_y))
+        return PointGrid(x, y, np.ones(x.shape, bool), float(spacing_px), (x0_px, y0_px, x1_px, y1_px))
 
     @staticmethod
-    def polygon(vertices_px: ArrayLike, *, step_px: float) -> PointGrid:
+    def polygon(vertices_px: ArrayLike, *, spacing_px: float) -> PointGrid:
         """Lay points inside a polygon (n, 2); the grid starts at its bounding box's upper left corner.
 
         Raises
@@ -101,10 +101,10 @@ class PointGrid:
         """
         v = _vertices(vertices_px)
         (x0, y0), (x1, y1) = v.min(axis=0), v.max(axis=0)
-        return PointGrid.rectangle(x0, y0, x1, y1, step_px=step_px).within_polygon(v)
+        return PointGrid.rectangle(x0, y0, x1, y1, spacing_px=spacing_px).within_polygon(v)
 
     @staticmethod
-    def mask(mask: ArrayLike, *, step_px: float) -> PointGrid:
+    def mask(mask: ArrayLike, *, spacing_px: float) -> PointGrid:
         """Lay points on the white of a mask (rows, cols); the grid starts at the white's upper left corner."""
         m = np.asarray(mask).astype(bool)
         if m.ndim != 2 or not m.any():
@@ -115,7 +115,7 @@ class PointGrid:
             )
         rows, cols = np.flatnonzero(m.any(axis=1)), np.flatnonzero(m.any(axis=0))
         box = (float(cols[0]), float(rows[0]), float(cols[-1]), float(rows[-1]))
-        return PointGrid.rectangle(*box, step_px=step_px).within_mask(m)
+        return PointGrid.rectangle(*box, spacing_px=spacing_px).within_mask(m)
 
     def within_polygon(self, vertices_px: ArrayLike) -> PointGrid:
         """Keep only the points inside a polygon (n, 2), by crossing number; the border's own points count as inside."""
@@ -237,7 +237,7 @@ def check_region(
         )
     if not grid.allowed.any():
         raise RegionError(
-            f"no point of the region {box} at a step of {grid.step_px:g} px lies inside it and on the mask's white.",
+            f"no point of the region {box} at a step of {grid.spacing_px:g} px lies inside it and on the mask's white.",
             code="region_empty",
             remedy="Paint white where points may lie, or give a smaller step.",
         )
@@ -268,10 +268,10 @@ def _finite(what: str, values: ArrayLike) -> None:
         raise RegionError(f"the {what} holds a number that is not finite: {np.asarray(values).tolist()}.")
 
 
-def _step(step_px: float) -> None:
-    if not (np.isfinite(step_px) and step_px >= 1.0):
+def _step(spacing_px: float) -> None:
+    if not (np.isfinite(spacing_px) and spacing_px >= 1.0):
         raise RegionError(
-            f"the step is {step_px} px; it must be 1 px or more.",
+            f"the step is {spacing_px} px; it must be 1 px or more.",
             code="step_invalid",
             remedy="Give a step between 1 px and the subset's width.",
         )

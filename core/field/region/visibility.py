@@ -32,7 +32,7 @@ class Visibility:
 
     Attributes
     ----------
-    xy_px, shape, step_px
+    xy_px, shape, spacing_px
         (n, 2) the points, rows and columns, and their distance.
     pieces_px, white
         (m, 4) the cuts' straight pieces, and the mask, empty where there is none.
@@ -46,7 +46,7 @@ class Visibility:
 
     xy_px: Float
     shape: tuple[int, int]
-    step_px: float
+    spacing_px: float
     pieces_px: Float
     white: NDArray[np.uint8]
     visible: VisiblePixels
@@ -77,7 +77,7 @@ class Visibility:
             If a position is not one of the grid's points.
         """
         rows, cols = self.shape
-        col, row = np.rint((xy_px - self.xy_px[0]) / self.step_px).astype(np.int64).T
+        col, row = np.rint((xy_px - self.xy_px[0]) / self.spacing_px).astype(np.int64).T
         inside = (row >= 0) & (col >= 0) & (row < rows) & (col < cols)
         index = np.where(inside, row * cols + col, 0)
         if not inside.all() or np.abs(self.xy_px[index] - xy_px).max(initial=0.0) > 1e-6:

@@ -22,8 +22,8 @@ DEPTH_SPAN = 8.0
 _BLOCK = 512
 
 
-def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int], *, step_px: float = 1.0) -> Float:
-    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,), every ``step_px`` inside camera 2's image."""
+def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int], *, spacing_px: float = 1.0) -> Float:
+    """Return inverse depths (m,) on camera 1's ray of ``xy_px`` (2,), every ``spacing_px`` inside camera 2's image."""
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     if not np.isfinite(ray).all():
         return np.zeros(0)
@@ -36,7 +36,7 @@ def visible_depths(pair: StereoPair, xy_px: Float, image2_shape: tuple[int, int]
     if seen.sum() < 2:
         return np.zeros(0)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy2[seen], axis=0), axis=1))])
-    count = max(int(length[-1] / step_px), 2)
+    count = max(int(length[-1] / spacing_px), 2)
     return np.interp(np.linspace(0.0, length[-1], count), length, w[seen])
 
 

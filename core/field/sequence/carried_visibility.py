@@ -120,7 +120,7 @@ def carry_visibility(
     return SegmentVisibility(
         xy_px=pixel,
         shape=segment_grid.shape,
-        step_px=segment_grid.step_px,
+        spacing_px=segment_grid.spacing_px,
         pieces_px=first.pieces_px,
         white=first.white,
         visible=VisiblePixels(patches, of_point),

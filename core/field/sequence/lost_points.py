@@ -148,7 +148,7 @@ class SegmentFitter:
     def __init__(self, segment: Segment, fitter: Fitter, grid: PointGrid) -> None:
         self._segment, self._fitter, self._subset_px = segment, fitter, fitter.options.subset_px
         self.own = fitter.empty(grid.x_px.size)
-        self._corner, self._step_px, self._cols = grid.xy_px[0, 0], grid.step_px, grid.shape[1]
+        self._corner, self._step_px, self._cols = grid.xy_px[0, 0], grid.spacing_px, grid.shape[1]
         self.comparisons, self.terms = 3, 3
 
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:

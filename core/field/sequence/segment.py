@@ -201,7 +201,7 @@ def begin_segment(
         x_px=pixel[:, 0].reshape(grid.shape),
         y_px=pixel[:, 1].reshape(grid.shape),
         allowed=has.reshape(grid.shape),
-        step_px=max(grid.step_px * spread, 1.0),
+        spacing_px=max(grid.spacing_px * spread, 1.0),
         extent_px=(0.0, 0.0, cols - 1.0, rows - 1.0),
     )
     if grid.visibility is not None:

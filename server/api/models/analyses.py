@@ -47,7 +47,7 @@ class Region(settings.Region):
 
 
 class StrainRequest(settings.StrainSettings):
-    """Strain over a virtual gauge, (window - 1) step_px + subset_px wide."""
+    """Strain over a virtual gauge, (window - 1) spacing_px + subset_px wide."""
 
 
 class AnalysisRequest(settings.AnalysisSettings):

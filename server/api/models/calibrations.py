@@ -92,7 +92,7 @@ class ExpectReply(Reply):
     reasons: list[str] = Field(description="Why.")
 
 
-class JudgementRequest(Request):
+class ReviewRequest(Request):
     """A decision on a calibration."""
 
     decision: Literal["accepted", "discarded"] | None = Field(
@@ -101,7 +101,7 @@ class JudgementRequest(Request):
     note: Label = Field("", description="Why.")
 
 
-class Judgement(Reply):
+class Review(Reply):
     """What somebody decided on a calibration."""
 
     decision: Literal["accepted", "discarded"] = Field(description="The decision.")
@@ -185,7 +185,7 @@ class CalibrationReply(Reply):
     plan: PlanReply = Field(description="Positions, frames and localiser asked for.")
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Why there is no calibration.")
-    judgement: Judgement | None = Field(None, description="What somebody decided on it; null: nothing yet.")
+    review: Review | None = Field(None, description="What somebody decided on it; null: nothing yet.")
 
 
 class CalibrationFile(Reply):

@@ -53,7 +53,7 @@ _BY_CODE = {
     "wrong_camera": 409,
     "precondition_failed": 412,
     "precondition_required": 428,
-    "facts_changed": 412,
+    "metadata_changed": 412,
 }
 
 #: the first that fits counts

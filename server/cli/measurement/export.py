@@ -87,6 +87,6 @@ def _pair(option: str, text: str) -> tuple[float, float]:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high)):
         raise InputError(
-            f"{option} {text!r} is not two numbers.", code="look_invalid", remedy=f"Give {option} LOW,HIGH."
+            f"{option} {text!r} is not two numbers.", code="figure_style_invalid", remedy=f"Give {option} LOW,HIGH."
         )
     return low, high

@@ -176,7 +176,7 @@ def _align(args: argparse.Namespace) -> dict[str, object]:
             code="gauge_unusable",
             remedy="Give --align plane, or 3-2-1: and the six places' twelve numbers.",
         )
-    return {"kind": "3-2-1", "places_px": _pairs(_numbers("--align 3-2-1", places, (12,)))}
+    return {"kind": "3-2-1", "positions_px": _pairs(_numbers("--align 3-2-1", places, (12,)))}
 
 
 def _named(

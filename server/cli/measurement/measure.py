@@ -18,11 +18,12 @@ from core.settings import (
     PATCH_SETTINGS,
     REFERENCE_UPDATES,
     SMOOTHING_WINDOW,
-    STEP_PX,
+    SPACING_PX,
     STRAIN_TENSORS,
     STRAIN_WINDOW,
     SUBSET_PX,
     StoredSettings,
+    patch_name,
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
@@ -61,13 +62,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a polygon inside which nothing is measured",
     )
     add("--subset", default=str(SUBSET_PX.default), metavar="PX", help=f"subset width, odd ({SUBSET_PX.default})")
-    add("--step", default=str(STEP_PX.default), metavar="PX", help=f"distance of the points ({STEP_PX.default})")
+    add(
+        "--step",
+        "--spacing",
+        default=str(SPACING_PX.default),
+        metavar="PX",
+        help=f"distance of the points ({SPACING_PX.default})",
+    )
     add(
         "--patch",
+        type=patch_name,
         choices=PATCH_SETTINGS,
         default=DEFAULT_PATCH,
-        help="stretch, rigid: plane patches; curved: second-order shape and motion, about twice the noise; auto: "
-        f"stretch or curved, whichever errs less on the field in all, and says why ({DEFAULT_PATCH})",
+        help="affine, rigid: plane patches; quadratic: second-order shape and motion, about twice the noise; auto: "
+        f"affine or quadratic, whichever has the smaller total error, with the reason ({DEFAULT_PATCH})",
     )
     add(
         "--interpolation",
@@ -182,7 +190,7 @@ def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
 def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     """Check everything that can be checked before anything is computed or written."""
     subset = check_whole("--subset", args.subset, SUBSET_PX)
-    step = check_whole("--step", args.step, STEP_PX)
+    step = check_whole("--step", args.step, SPACING_PX)
     rectangle = None if args.roi is None else parse_rectangle(args.roi)
     strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
@@ -205,7 +213,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         rectangle,
         image_shape=shapes[0],
         subset_px=subset,
-        step_px=step,
+        spacing_px=step,
         mask_path=mask_file,
         seeds=args.seed,
         cracks=args.crack,
@@ -217,7 +225,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         {
             "region": region,
             "subset_px": subset,
-            "step_px": step,
+            "spacing_px": step,
             "patch": args.patch,
             "interpolation": args.interpolation,
             "prefilter_px": prefilter_px,

@@ -103,7 +103,7 @@ def check_region(
     *,
     image_shape: tuple[int, int],
     subset_px: int,
-    step_px: int,
+    spacing_px: int,
     mask_path: Path | None,
     seeds: Sequence[str],
     cracks: Sequence[str] = (),
@@ -129,7 +129,7 @@ def check_region(
         }
     )
     mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
-    points = lay_points(region, step_px, mask)
+    points = lay_points(region, spacing_px, mask)
     check_points(points, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
     return region, _seeds(seeds, rectangle, mask)
 

@@ -214,7 +214,7 @@ class _Runner:
         choice = result.patch
         if choice is None:
             return
-        new = (choice.patch, choice.curved_advised)
+        new = (choice.patch, choice.quadratic_advised)
         if (choice.asked == "auto" and n <= 1) or (new != self._chosen and (choice.asked == "auto" or new[1])):
             self._progress.note(f"{'shape' if n == 0 else f'step {n}'}: {choice.reason}")
         if n > 0:

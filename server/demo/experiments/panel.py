@@ -16,7 +16,7 @@ from server.demo.strain import fetched_strain
 from server.formats.calibrations.recognise import load_calibration
 from sim.panel import PAPER_LOADS_KN, CrackedPanel
 
-SUBSET_PX, STEP_PX = 21, 10
+SUBSET_PX, SPACING_PX = 21, 10
 MARGIN_PX = 30
 LIMIT_MM = 0.05  # the dimensional accuracy that the paper states for this set-up
 
@@ -44,7 +44,7 @@ def run(session: Session, calibration_id: str) -> Outcome:
     crack = _crack_px(session, panel)
     # drawn as a line: both lips are measured up to it
     region = {"rectangle": list(roi), "cracks": [crack.tolist()]}
-    analysis = client.analyse(test, "displacement", region, subset_px=SUBSET_PX, step_px=STEP_PX)
+    analysis = client.analyse(test, "displacement", region, subset_px=SUBSET_PX, spacing_px=SPACING_PX)
     shape, *fields = session.fetch(analysis, range(len(loads) + 1))
     comparisons = [compare_motion(f, session.rig, "panel", load) for f, load in zip(fields, loads, strict=True)]
     outcome = _judge(shape, fields, comparisons, loads, session)

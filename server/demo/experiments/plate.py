@@ -19,7 +19,7 @@ from server.demo.strain import fetched_strain
 from sim.plate import PAPER_PRESSURES_KPA, CircularPlate
 
 ROI_PX = (86.0, 70.0, 426.0, 410.0)  # 341 x 341 px, as in the paper
-SUBSET_PX, STEP_PX = 21, 10
+SUBSET_PX, SPACING_PX = 21, 10
 CENTRE_LIMIT_UM = 0.5
 RADIUS_LIMIT_PERCENT = 0.5
 _CENTRE_REACH_MM = 5.0  # an even polynomial of degree four is Eq. (18) itself
@@ -90,7 +90,9 @@ def run(session: Session, calibration_id: str) -> Outcome:
         client.set_scene("plate", load=pressure)
         client.capture(test, f"{pressure:g} kPa")
     session.say(f"captured {len(pressures) + 1} steps")
-    analysis = client.analyse(test, "displacement", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, step_px=STEP_PX)
+    analysis = client.analyse(
+        test, "displacement", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, spacing_px=SPACING_PX
+    )
     shape, *fields = session.fetch(analysis, range(len(pressures) + 1))
     comparisons = [compare_motion(f, session.rig, "plate", q) for f, q in zip(fields, pressures, strict=True)]
     fit = fit_plate(fields, pressures, plate)

@@ -81,7 +81,7 @@ def plate_strain(
 def gauge_effect(strain: StrainField, pressure_kpa: float, plate: CircularPlate) -> float:
     """Return by how much the gauge's width lowers the plate's bending strain."""
     half = strain.options.window // 2
-    place = np.arange(-half, half + 1) * strain.gauge_mm * strain.step_px / strain.gauge_px
+    place = np.arange(-half, half + 1) * strain.gauge_mm * strain.spacing_px / strain.gauge_px
     m2, m4 = np.mean(place**2), np.mean(place**4)
     at_centre = float(plate.bending_strain(0.0, pressure_kpa)[0])
     return float(at_centre * (m4 / m2 + m2) / plate.radius_mm**2)

@@ -13,7 +13,7 @@ from sim.catalog import make_scene
 from sim.truth import subset_planes
 
 ROI_PX = (56.0, 85.0, 456.0, 395.0)  # 400 x 310 px, as in the paper
-SUBSET_PX, STEP_PX = 21, 15  # 27 x 21 = 567 points; the paper has 566
+SUBSET_PX, SPACING_PX = 21, 15  # 27 x 21 = 567 points; the paper has 566
 MOTION_STEP_PX = 10
 CAPTURES = 5  # one is the measurement, all of them tell its noise
 LIMIT_PERCENT = 3.0
@@ -34,8 +34,8 @@ def run(session: Session, calibration_id: str) -> Outcome:
         "profile",
         {"rectangle": list(ROI_PX)},
         subset_px=SUBSET_PX,
-        step_px=STEP_PX,
-        patch="stretch",
+        spacing_px=SPACING_PX,
+        patch="affine",
         steps=list(range(CAPTURES)),
     )
     fields = session.fetch(analysis, range(CAPTURES))
@@ -92,7 +92,7 @@ def run(session: Session, calibration_id: str) -> Outcome:
         {"rectangle": list(ROI_PX)},
         "results_moved",
         subset_px=SUBSET_PX,
-        step_px=MOTION_STEP_PX,
+        spacing_px=MOTION_STEP_PX,
     )
     steel_motion.judge(outcome, moved, strains)
     outcome.pictures |= gauges.moved(session.out, moved_fields, strains, moved)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from core.field.points.result import Field
 
 FORMAT_VERSION = 2
-COMPARISONS = ("cam1_t0__cam2_t0", "cam1_t0__cam1_t", "cam1_t0__cam2_t")
+COMPARISONS = ("cam1_ref__cam2_ref", "cam1_ref__cam1_cur", "cam1_ref__cam2_cur")
 COVARIANCE_NAMES = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
 #: What steps that are matched against this one inherit: name in variables and in `References` -> its cause
 HANDED_ON = {"noise": "the cameras' noise", "pattern": "changes of the surface's pattern"}

@@ -21,7 +21,7 @@ from core.names import CameraName
 from core.status import PointStatus
 from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, HANDED_ON, MOTION, SHAPE
 from server.formats.results.netcdf import opened
-from server.formats.results.settings import current_inputs, current_settings
+from server.formats.results.settings import current_entries, current_inputs, current_settings, variable_name
 
 
 @contextlib.contextmanager
@@ -70,8 +70,8 @@ def read_field(path: str | Path) -> Field:
             iterations=np.asarray(variables["iterations"][...], dtype=np.int32),
             zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
             covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
-            smoothing=None if smoothing is None else Smoothing.from_document(json.loads(smoothing)),
-            patch=None if choice is None else PatchChoice.from_document(json.loads(choice)),
+            smoothing=None if smoothing is None else Smoothing.from_document(current_entries(json.loads(smoothing))),
+            patch=None if choice is None else PatchChoice.from_document(current_entries(json.loads(choice))),
             cuts=_cuts_of(variables),
             references=_references_of(dataset),
         )
@@ -180,7 +180,9 @@ def _references_of(dataset: Any) -> References | None:
     for what in HANDED_ON:
         values[what] = np.full((*steps.shape, 2, 2), np.nan)
         for name, (i, j) in ENTRIES.items():
-            read = np.asarray(variables[f"handed_on_{what}_{name}_px2"][...], dtype=np.float64)
+            read = np.asarray(
+                variables[variable_name(f"propagated_{what}_{name}_px2", variables)][...], dtype=np.float64
+            )
             values[what][..., i, j] = values[what][..., j, i] = read
     return References(int(dataset.reference_step), steps, values["noise"], values["pattern"])
 

@@ -12,6 +12,7 @@ import numpy as np
 from core.errors import FileFormatError
 from core.strain import STRAIN_STATUS_MEANINGS, StrainField, StrainOptions, StrainStatus
 from server.formats.results.netcdf import opened
+from server.formats.results.settings import current_entries
 
 _TENSOR = {
     "green_lagrange": "Green-Lagrange strain",
@@ -87,7 +88,7 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
     status[...] = strain.status
     document = {
         **asdict(strain.options),
-        "step_px": strain.step_px,
+        "spacing_px": strain.spacing_px,
         "subset_px": strain.subset_px,
         "gauge_px": strain.gauge_px,
         "gauge_mm": None if np.isnan(strain.gauge_mm) else strain.gauge_mm,
@@ -122,7 +123,7 @@ def read_strain(path: str | Path) -> StrainField | None:
 def _strain_of(dataset: Any) -> StrainField | None:
     if "strain" not in dataset.ncattrs():
         return None
-    document = json.loads(dataset.strain)
+    document = current_entries(json.loads(dataset.strain))
     variables = dataset.variables
 
     def stacked(suffix: str = "", prefix: str = "") -> Any:
@@ -142,7 +143,7 @@ def _strain_of(dataset: Any) -> StrainField | None:
     known = StrainOptions.__dataclass_fields__
     return StrainField(
         options=StrainOptions(**{k: v for k, v in document.items() if k in known}),
-        step_px=document["step_px"],
+        spacing_px=document["spacing_px"],
         subset_px=document["subset_px"],
         gauge_px=document["gauge_px"],
         gauge_mm=np.nan if document["gauge_mm"] is None else document["gauge_mm"],

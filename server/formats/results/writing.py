@@ -227,7 +227,7 @@ def _put_references(dataset: Any, references: References) -> None:
         for name, (i, j) in ENTRIES.items():
             _put(
                 dataset,
-                f"handed_on_{what}_{name}_px2",
+                f"propagated_{what}_{name}_px2",
                 values[..., i, j],
                 ("row", "col"),
                 units="pixel2",

@@ -209,7 +209,7 @@ def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
         inside = points_within(step.field, asked.corners())
         return align_plane(step.field, shared=step.shared, chosen=inside, x_direction=asked.x_direction)
     assert asked is not None
-    return align_3_2_1(step.field, asked.places_px, shared=step.shared)
+    return align_3_2_1(step.field, asked.positions_px, shared=step.shared)
 
 
 def _placed(field: Field, request: GaugeRequest) -> _Placed:

@@ -134,7 +134,7 @@ class ThreeTwoOneAlignment(Request):
     """Three places on the plane Z = 0, two on the X axis, one at X = 0."""
 
     kind: Literal["3-2-1"] = Field(description="3-2-1.")
-    places_px: Annotated[list[Place], Field(min_length=6, max_length=6)] = Field(
+    positions_px: Annotated[list[Place], Field(min_length=6, max_length=6)] = Field(
         description="Six places: plane, plane, plane, from, to, origin."
     )
 

@@ -84,7 +84,7 @@ export async function open(root, { path }) {
     }
     try {
       const document_ = await api.get(`/calibrations/${id}`);
-      const state = JSON.stringify([id, document_.state, document_.judgement, Boolean(document_.taken)]);
+      const state = JSON.stringify([id, document_.state, document_.review, Boolean(document_.taken)]);
       if (!again && state === drawn) return;
       drawn = state;
       closeShown?.();
@@ -105,7 +105,7 @@ export async function open(root, { path }) {
   async function one(document_) {
     const { id, plan } = document_;
     const heading = h("div.spread", h("h2", plan.label || "Calibration", " ", h("code", id)),
-      h("span.row", badge(document_.state, STATE_KIND[document_.state]), document_.judgement ? badge(document_.judgement.decision, DECISION[document_.judgement.decision]) : null));
+      h("span.row", badge(document_.state, STATE_KIND[document_.state]), document_.review ? badge(document_.review.decision, DECISION[document_.review.decision]) : null));
     const decide = h("div.row", decisions(document_, async () => { await refresh(); await show(true); }, async () => {
       chosen = undefined;
       await refresh();
@@ -282,7 +282,7 @@ function verdict(document_) {
     document_.problem ? h("p", document_.problem.remedy, " ", h("code.quiet", document_.problem.code)) : null,
     u ? facts([["shape", `${um(u.shape_rms_mm)} rms, expected from this calibration alone`], ["Z at the middle, at the corners", `${um(u.centre_z_mm)}, ${um(u.corner_z_mm)}`], ["common scale", quantity(100 * u.scale, "%", 2)]]) : null,
     checks?.made ? h("details", h("summary", "What was checked, and what was not"), h("ul", checks.made.map((check) => h("li", badge(check.made ? "checked" : "not checked", check.made ? "good" : "warn"), " ", check.text)))) : null,
-    document_.judgement?.note ? h("p.quiet", `${document_.judgement.decision} by ${document_.judgement.by}: ${document_.judgement.note}`) : null,
+    document_.review?.note ? h("p.quiet", `${document_.review.decision} by ${document_.review.by}: ${document_.review.note}`) : null,
   ];
 }
 
@@ -293,8 +293,8 @@ function verdict(document_) {
  */
 function decisions(document_, changed, gone) {
   const { id, state } = document_;
-  const now = document_.judgement?.decision;
-  const put = (/** @type {"accepted" | "discarded" | null} */ decision, note = "") => api.put(`/calibrations/${id}/judgement`, { decision, note }).then(changed);
+  const now = document_.review?.decision;
+  const put = (/** @type {"accepted" | "discarded" | null} */ decision, note = "") => api.put(`/calibrations/${id}/review`, { decision, note }).then(changed);
   return [
     state === "complete" && now !== "accepted" ? action("Accept", () => put("accepted"), { kind: "primary", title: "New tests measure with the newest accepted calibration" }) : null,
     now !== "discarded" ? action("Discard", async () => {

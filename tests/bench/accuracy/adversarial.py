@@ -61,7 +61,7 @@ class _Setting:
     rig: str
     size_px: tuple[int, int]
     region: tuple[float, float, float, float]
-    step_px: float
+    spacing_px: float
     subset_px: int
     px_um: float
 
@@ -106,7 +106,7 @@ def _scene(setting: _Setting) -> _Scene:
     moved = plane_scene(rig.texture(1), in_plane=np.diag([1.004, 0.9985]), motion=tilt)
     other = plane_scene(rig.texture(7), motion=turn(np.array([0.0, 0.0, 1.0]), np.deg2rad(0.3)))
     clean = (*rig.shoot(still, seed=1), *rig.shoot(moved, seed=2))
-    grid = PointGrid.rectangle(*setting.region, step_px=setting.step_px)
+    grid = PointGrid.rectangle(*setting.region, spacing_px=setting.spacing_px)
     here, motion = true_points(still, moved, rig.pair.cam1, grid.xy_px)
     pictures = Pictures(clean, tuple(rig.shoot(other, seed=3)))  # type: ignore[arg-type]
     return _Scene(setting, rig, still, moved, grid, pictures, here, motion)
@@ -214,7 +214,7 @@ def _calibrations(scene: _Scene) -> list[Row]:
     pair = scene.rig.pair
     lens = pair.cam2.lens
     assert isinstance(lens, SeidelLens)
-    grid = PointGrid.rectangle(*scene.setting.region, step_px=4 * scene.setting.step_px)
+    grid = PointGrid.rectangle(*scene.setting.region, spacing_px=4 * scene.setting.spacing_px)
     here, motion = true_points(scene.still, scene.moved, pair.cam1, grid.xy_px)
     wrong = {
         "across the epipolar lines": replace(pair.cam2, lens=replace(lens, cy_px=lens.cy_px + 1.0)),

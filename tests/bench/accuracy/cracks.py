@@ -27,7 +27,7 @@ from tests.bench.accuracy.table import Row, Section
 
 SIZE_PX, CORNER_PX = (288, 160), (112.0, 160.0)  # the whole crack and what lies above and below it
 LOAD_KN = 35.6
-SUBSET_PX, STEP_PX = 21, 4
+SUBSET_PX, SPACING_PX = 21, 4
 REPEATS = 16
 BANDS = ((0.0, 2.0), (2.0, 5.0), (5.0, 10.5), (14.0, 40.0))
 MIDDLE_MM = 30.0  # from the crack's middle: nearer to the tips, 51 mm away, its field bends within a subset
@@ -59,8 +59,8 @@ def cracks(figures: Path) -> Section:
     along = np.linspace(-half, half, 41)
     place = before.surface.place(np.stack([along, np.zeros(41)], axis=-1), 1.0)
     line = np.asarray(pair.cam1.project(before.sys_from_body.apply(place)).xy)
-    plain = PointGrid.rectangle(20, 20, SIZE_PX[0] - 21, SIZE_PX[1] - 21, step_px=STEP_PX)
-    grid, options = plain.with_cracks([line]), MeasureOptions(subset_px=SUBSET_PX, patch="stretch")
+    plain = PointGrid.rectangle(20, 20, SIZE_PX[0] - 21, SIZE_PX[1] - 21, spacing_px=SPACING_PX)
+    grid, options = plain.with_cracks([line]), MeasureOptions(subset_px=SUBSET_PX, patch="affine")
     clean = [_render(rig, pair, scene) for scene in (before, after)]
     truth = truth_at(before, pair.cam1, grid.xy_px, now=after)
     away, middle = _distance(grid.xy_px, line), np.abs(truth.st_mm[..., 0]) < MIDDLE_MM

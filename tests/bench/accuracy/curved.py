@@ -24,8 +24,8 @@ from tests.bench.accuracy.table import Row, Section
 
 REGION = (90, 90, 420, 390)
 RADIUS_MM = 30.0
-PATCHES: tuple[PatchSetting, ...] = ("stretch", "curved", "auto")
-NAMES = {"stretch": "plane", "curved": "curved", "auto": "auto"}
+PATCHES: tuple[PatchSetting, ...] = ("affine", "quadratic", "auto")
+NAMES = {"affine": "plane", "quadratic": "quadratic", "auto": "auto"}
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def _rms(e: Float) -> float:
 
 
 def _grid(step: int = 10, region: tuple[float, float, float, float] = REGION) -> PointGrid:
-    return PointGrid.rectangle(*region, step_px=step)
+    return PointGrid.rectangle(*region, spacing_px=step)
 
 
 def _measure(
@@ -107,25 +107,25 @@ def sphere_shape(figures: Path) -> Section:
             found = _measure(rig, scene, None, subset=subset, noise=noise, seed=3)
             label = f"{subset} px, noise {noise:g}"
             for patch, e in found.items():
-                limit = 0.05 if patch != "stretch" and subset == 21 else None
+                limit = 0.05 if patch != "affine" and subset == 21 else None
                 rows.append(Row(f"sphere, {label}, {NAMES[patch]}: mean Z error", abs(float(e.z.mean())), "um", limit))
                 rows.append(Row(f"sphere, {label}, {NAMES[patch]}: rms Z error", _rms(e.z), "um"))
             auto = found["auto"]
             rows.append(
                 Row(
                     f"sphere, {label}: rms Z of auto over the better of both",
-                    _rms(auto.z) / min(_rms(found["stretch"].z), _rms(found["curved"].z)),
+                    _rms(auto.z) / min(_rms(found["affine"].z), _rms(found["quadratic"].z)),
                     "",
                     1.1,
                 )
             )
-            lost = int((~found["curved"].field.valid & found["stretch"].field.valid).sum())
+            lost = int((~found["quadratic"].field.valid & found["affine"].field.valid).sum())
             rows.append(Row(f"sphere, {label}: points that only plane patches keep", lost, "", 0 if noise else None))
             if subset == 21 and noise:
                 maps = found
-                curvature = found["curved"].field.curvature_per_mm
+                curvature = found["quadratic"].field.curvature_per_mm
                 assert curvature is not None
-                k = curvature[found["curved"].field.valid]
+                k = curvature[found["quadratic"].field.valid]
                 mean = k.mean(axis=1)
                 rows += [
                     Row(
@@ -149,7 +149,7 @@ def sphere_shape(figures: Path) -> Section:
 
 def _maps(path: Path, found: dict[PatchSetting, Errors]) -> None:
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained", gridspec_kw={"width_ratios": (1, 1, 0.9)})
-    for ax, patch in zip(axes, ("stretch", "curved"), strict=False):
+    for ax, patch in zip(axes, ("affine", "quadratic"), strict=False):
         e = found[patch]
         mesh = ax.pcolormesh(
             e.field.x_px,
@@ -164,7 +164,7 @@ def _maps(path: Path, found: dict[PatchSetting, Errors]) -> None:
         ax.set_aspect("equal")
         ax.set(title=f"{NAMES[patch]} patches", xlabel="x / px", ylabel="y / px")
     fig.colorbar(mesh, ax=axes[:2], label="error of Z / um")
-    for patch in ("stretch", "curved"):
+    for patch in ("affine", "quadratic"):
         axes[2].hist(found[patch].z, bins=40, histtype="step", density=True, label=NAMES[patch])
     axes[2].axvline(0.0, color="k", lw=0.5)
     axes[2].set(xlabel="error of Z / um", ylabel="density")
@@ -179,35 +179,41 @@ def noise_cost(figures: Path) -> Section:
     rows: list[Row] = []
     bars: dict[int, dict[str, tuple[float, float]]] = {}
     for subset in (21, 33):
-        sums: dict[str, list[Float]] = {"stretch": [], "curved": []}
-        sigmas: dict[str, list[Float]] = {"stretch": [], "curved": []}
+        sums: dict[str, list[Float]] = {"affine": [], "quadratic": []}
+        sigmas: dict[str, list[Float]] = {"affine": [], "quadratic": []}
         means = []
         for seed in (1, 2, 3):
             before = plane_scene(rig.texture(seed))
             after = plane_scene(rig.texture(seed), motion=RigidTransform(np.eye(3), np.array([0.026, -0.014, 0.042])))
-            found = _measure(rig, before, after, subset=subset, noise=2.0, seed=7 * seed, patches=("stretch", "curved"))
+            found = _measure(
+                rig, before, after, subset=subset, noise=2.0, seed=7 * seed, patches=("affine", "quadratic")
+            )
             for patch, e in found.items():
                 sums[patch].append(np.var(np.column_stack([e.uvw, e.z]), axis=0))
                 variance = np.diagonal(e.field.covariance, axis1=-2, axis2=-1)[e.field.valid] * 1e6
                 sigmas[patch].append(variance[:, [3, 4, 5, 2]].mean(0))
-            means.append(np.abs(found["curved"].uvw.mean(0)))
+            means.append(np.abs(found["quadratic"].uvw.mean(0)))
         sd = {patch: np.sqrt(np.mean(v, axis=0)) for patch, v in sums.items()}
         reported = {patch: np.sqrt(np.mean(v, axis=0)) for patch, v in sigmas.items()}
         bars[subset] = {}
         for i, name in enumerate(("u", "v", "w", "Z")):
-            one, two = float(sd["stretch"][i]), float(sd["curved"][i])
+            one, two = float(sd["affine"][i]), float(sd["quadratic"][i])
             bars[subset][name] = one, two
             rows += [
                 Row(f"{name} random, {subset} px, plane patches", one, "um"),
                 Row(f"{name} random, {subset} px, curved patches", two, "um"),
                 Row(f"{name} random, {subset} px: curved over plane", two / one, ""),
-                Row(f"{name}, {subset} px, curved: reported over empirical sd", float(reported["curved"][i]) / two, ""),
+                Row(
+                    f"{name}, {subset} px, curved: reported over empirical sd",
+                    float(reported["quadratic"][i]) / two,
+                    "",
+                ),
             ]
         rows.append(Row(f"mean u, v, w, {subset} px, curved, worst of the fields", float(np.max(means)), "um", 0.06))
     fig, ax = plt.subplots(figsize=(6, 3.2), layout="constrained")
     for k, values in enumerate(bars.values()):
         x = np.arange(4) + 5 * k
-        for j, label in enumerate(("plane", "curved")):
+        for j, label in enumerate(("plane", "quadratic")):
             ax.bar(x + 0.4 * j - 0.2, [v[j] for v in values.values()], 0.4, color=f"C{j}", label=None if k else label)
         for xi, (one, two) in zip(x, values.values(), strict=True):
             ax.text(xi + 0.2, two, f"{two / one:.2f}x", ha="center", va="bottom", fontsize=8)
@@ -244,9 +250,9 @@ def bending(figures: Path) -> Section:
         for patch, e in found.items():
             curves[patch].append(_rms(e.uvw))
         chosen.append(found["auto"].chosen)
-        worst = max(worst, curves["auto"][-1] / min(curves["stretch"][-1], curves["curved"][-1]))
+        worst = max(worst, curves["auto"][-1] / min(curves["affine"][-1], curves["quadratic"][-1]))
         if radius in (300.0, 30.0):
-            for patch in ("stretch", "curved"):
+            for patch in ("affine", "quadratic"):
                 e = found[patch]
                 rows.append(
                     Row(f"bent to R = {radius:g} mm, {NAMES[patch]}: mean w error", abs(e.uvw.mean(0)[2]), "um")
@@ -255,7 +261,7 @@ def bending(figures: Path) -> Section:
         if radius == radii[-1]:
             reason = found["auto"].reason
         if radius in (300.0, 30.0):
-            choice, bias = found["stretch"].field.patch, found["stretch"].uvw.mean(0)
+            choice, bias = found["affine"].field.patch, found["affine"].uvw.mean(0)
             assert choice is not None
             assert choice.plane_error_mm is not None
             ratio = 1e3 * choice.plane_error_mm / float(np.linalg.norm(bias))
@@ -273,18 +279,18 @@ def bending(figures: Path) -> Section:
         subset=21,
         noise=0.0,
         seed=0,
-        patches=("stretch", "curved"),
+        patches=("affine", "quadratic"),
     )
     for patch, e in clean.items():
-        limit = 0.05 if patch == "curved" else None
+        limit = 0.05 if patch == "quadratic" else None
         rows.append(
             Row(f"bent to R = 30 mm, noise-free, {NAMES[patch]}: mean w error", abs(e.uvw.mean(0)[2]), "um", limit)
         )
     rows.append(Row("rms of auto over the better of both, worst of the radii", worst, "", 1.15))
     fig, ax = plt.subplots(figsize=(6, 3.6), layout="constrained")
     k = 1.0 / np.array(radii)
-    ax.loglog(k, curves["stretch"], "o-", label="plane (stretch)")
-    ax.loglog(k, curves["curved"], "s-", label="curved")
+    ax.loglog(k, curves["affine"], "o-", label="plane (stretch)")
+    ax.loglog(k, curves["quadratic"], "s-", label="quadratic")
     ax.loglog(k, curves["auto"], "k.", ms=14, mfc="none", label="auto")
     for x, y, name in zip(k, curves["auto"], chosen, strict=True):
         ax.annotate(name, (x, y), xytext=(0, 8), textcoords="offset points", ha="center", fontsize=7)
@@ -349,10 +355,10 @@ def choices(figures: Path) -> Section:
         found = _measure(rig, before, after, subset=33, noise=2.0, seed=5, grid=grid)
         error = {patch: _rms(e.z if after is None else e.uvw) for patch, e in found.items()}
         bars.append((label, error, found["auto"].chosen))
-        better = min(error["stretch"], error["curved"])
+        better = min(error["affine"], error["quadratic"])
         rows += [
-            Row(f"{label}: plane, rms", error["stretch"], "um"),
-            Row(f"{label}: curved, rms", error["curved"], "um"),
+            Row(f"{label}: plane, rms", error["affine"], "um"),
+            Row(f"{label}: curved, rms", error["quadratic"], "um"),
             Row(f"{label}: auto, rms over the better of both", error["auto"] / better, "", 1.15),
         ]
         notes.append(f'{label}: "{found["auto"].reason}".')

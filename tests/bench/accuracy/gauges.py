@@ -23,7 +23,7 @@ from tests.bench.accuracy.paper_rig import load_rig, plane_scene, turn
 from tests.bench.accuracy.table import Row, Section
 
 SUBSET, STEP, NOISE = 33, 8, 2.0
-GRID = PointGrid.rectangle(220, 200, 220 + 8 * STEP, 200 + 6 * STEP, step_px=STEP)
+GRID = PointGrid.rectangle(220, 200, 220 + 8 * STEP, 200 + 6 * STEP, spacing_px=STEP)
 COPIES = 200
 SHARED = SharedPixels(SUBSET)
 LAGS = tuple((dx, dy) for dy in range(6) for dx in range(6))
@@ -35,7 +35,7 @@ def _copies() -> list[Field]:
     after = plane_scene(rig.texture(1), motion=RigidTransform(motion.rotation, np.array([0.05, -0.03, 0.1])))
     clean = [np.asarray(v) for s in (plane_scene(rig.texture(1)), after) for v in rig.shoot(s, noise=0.0)]
     rng = np.random.default_rng(17)
-    options = MeasureOptions(subset_px=SUBSET, patch="stretch")
+    options = MeasureOptions(subset_px=SUBSET, patch="affine")
     seeds = GRID.xy_px[3:4, 4]
     out = []
     for _ in range(COPIES):

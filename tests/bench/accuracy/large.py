@@ -18,7 +18,7 @@ from tests.bench.speed.scene import rig_of_size
 
 SIZE_PX = (1200, 1100)
 REGION = (400, 380, 800, 720)
-STEP_PX = 10
+SPACING_PX = 10
 PX_MM = 0.039
 WRONG_UM = 20.0  # half a pixel
 Z = np.array([0.0, 0.0, 1.0])
@@ -49,7 +49,7 @@ def large_motion(figures: Path) -> Section:
     texture = rig.texture(1)
     still = plane_scene(texture)
     reference = ReferencePair(rig.pair, *rig.shoot(still, seed=1, noise=2.0))
-    grid = PointGrid.rectangle(*REGION, step_px=STEP_PX)
+    grid = PointGrid.rectangle(*REGION, spacing_px=SPACING_PX)
     options = MeasureOptions(subset_px=33)
     shape = reference.shape(grid, options)
     rows, pictures = [], []

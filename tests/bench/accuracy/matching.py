@@ -24,7 +24,7 @@ TEXTURES = (1, 2, 3)
 
 
 def _grid(step: int = 10) -> PointGrid:
-    return PointGrid.rectangle(*REGION, step_px=step)
+    return PointGrid.rectangle(*REGION, spacing_px=step)
 
 
 def _xy(field: Field) -> Float:
@@ -48,7 +48,7 @@ def _motion(
     noise: float,
     seed: int,
     subset: int,
-    patch: str = "stretch",
+    patch: str = "affine",
     interpolation: str = "quintic",
     pair: StereoPair | None = None,
 ) -> Field:
@@ -144,7 +144,7 @@ def strain(figures: Path) -> Section:
     rig = load_rig()
     rows, curves = [], {}
     strains = (0.01, 0.02, 0.05)
-    for patch in ("stretch", "rigid"):
+    for patch in ("affine", "rigid"):
         curve = []
         for eps in strains:
             before = plane_scene(rig.texture(1))
@@ -158,7 +158,7 @@ def strain(figures: Path) -> Section:
                         f"{patch} patch, 5 % strain, noise-free, rms of the worst component",
                         float(curve[-1].max()),
                         "um",
-                        0.04 if patch == "stretch" else None,
+                        0.04 if patch == "affine" else None,
                     )
                 )
                 rows.append(Row(f"{patch} patch, 5 % strain, points valid", 100 * float(field.valid.mean()), "%"))
@@ -170,7 +170,7 @@ def strain(figures: Path) -> Section:
                 )
         curves[patch] = np.array(curve)
     fig, ax = plt.subplots(figsize=(6, 3.2), layout="constrained")
-    for patch, style in (("stretch", "o-"), ("rigid", "s--")):
+    for patch, style in (("affine", "o-"), ("rigid", "s--")):
         for i, name in enumerate("uvw"):
             ax.semilogy(100 * np.array(strains), curves[patch][:, i], style, color=f"C{i}", label=f"{patch}, {name}")
     ax.set(xlabel="strain / %", ylabel="rms error / um", title="Strained plane, 21 px, noise-free")

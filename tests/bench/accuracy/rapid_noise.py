@@ -27,7 +27,7 @@ def window_slope(window: int, axis: int) -> Float:
 
 
 def seen_over_told(
-    values: Float, sigma: Float, weights: Float, shared: SharedPixels, step_px: float, lag: int
+    values: Float, sigma: Float, weights: Float, shared: SharedPixels, spacing_px: float, lag: int
 ) -> float:
     """Return the noise that is seen over that which is told.
 
@@ -39,7 +39,7 @@ def seen_over_told(
         (m, n) of that sum; ``[[1]]`` for the points themselves.
     shared
         The correlation of neighbouring points.
-    step_px
+    spacing_px
         Distance of neighbouring points.
     lag
         Steps between the places that are differenced.
@@ -48,12 +48,12 @@ def seen_over_told(
     signs[0, ::lag] = [(-1) ** k * comb(ORDER, k) for k in range(ORDER + 1)]
     count = values.shape[1] - ORDER * lag
     seen = sum(s * values[:, k * lag : k * lag + count] for k, s in enumerate(signs[0, ::lag]))
-    share = _variance(fftconvolve(weights, signs), shared, step_px) / _variance(weights, shared, step_px)
+    share = _variance(fftconvolve(weights, signs), shared, spacing_px) / _variance(weights, shared, spacing_px)
     return float(np.sqrt(np.nanmean(np.square(seen)) / (share * np.nanmean(sigma**2))))
 
 
-def _variance(weights: Float, shared: SharedPixels, step_px: float) -> float:
+def _variance(weights: Float, shared: SharedPixels, spacing_px: float) -> float:
     """Variance of a weighted sum of points of variance 1."""
-    reach = step_px * (np.arange(-(max(weights.shape) - 1), max(weights.shape)))
+    reach = spacing_px * (np.arange(-(max(weights.shape) - 1), max(weights.shape)))
     rho = shared.correlation(*np.meshgrid(reach, reach))
     return float((weights * fftconvolve(weights, rho, mode="same")).sum())

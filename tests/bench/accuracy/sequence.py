@@ -22,8 +22,8 @@ from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import rig_of_size
 
 SIZE_PX = (620, 580)
-GRID = PointGrid.rectangle(206, 186, 414, 394, step_px=26)
-OPTIONS = MeasureOptions(subset_px=33, patch="stretch")
+GRID = PointGrid.rectangle(206, 186, 414, 394, spacing_px=26)
+OPTIONS = MeasureOptions(subset_px=33, patch="affine")
 PX_UM = 39.0
 NOISE = 2.0
 STEPS = 24

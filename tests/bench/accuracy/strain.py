@@ -62,7 +62,7 @@ RIGID = (
 def _fields(
     rig: Rig, before: Scene, after: Scene, *, noise: float, seeds: tuple[int, ...], step: int = 10
 ) -> list[Field]:
-    grid = PointGrid.rectangle(*REGION, step_px=step)
+    grid = PointGrid.rectangle(*REGION, spacing_px=step)
     options = MeasureOptions(subset_px=SUBSET)
     out = []
     for seed in seeds:
@@ -163,8 +163,8 @@ def moved_fields(rig: Rig, repeats: int) -> list[Field]:
     before = plane_scene(rig.texture(3))
     after = plane_scene(rig.texture(3), motion=_moved((0.026, -0.014, 0.042)))
     clean = rig.shoot(before, noise=0.0), rig.shoot(after, noise=0.0)
-    grid = PointGrid.rectangle(*REGION, step_px=10)
-    options = MeasureOptions(subset_px=SUBSET, patch="stretch")
+    grid = PointGrid.rectangle(*REGION, spacing_px=10)
+    options = MeasureOptions(subset_px=SUBSET, patch="affine")
     fields = []
     for seed in range(repeats):
         rng = np.random.default_rng(seed)

@@ -100,7 +100,7 @@ def _everything() -> tuple[Field, Field]:
     references = References(1, np.ones(field.shape, np.int32), some, some)
     smoothing = Smoothing(
         window=5,
-        step_px=7.0,
+        spacing_px=7.0,
         subset_px=float(SUBSET),
         resolution_px=49.0,
         resolution_mm=None,

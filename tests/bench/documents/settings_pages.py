@@ -12,7 +12,7 @@ from tests.bench.documents.prose import cell
 OPTIONS = {
     "region": "`--roi`, `--mask`, `--crack`, `--hole`",
     "subset_px": "`--subset`",
-    "step_px": "`--step`",
+    "spacing_px": "`--step`",
     "patch": "`--patch`",
     "interpolation": "`--interpolation`",
     "prefilter_px": "`--prefilter`",

@@ -38,8 +38,8 @@ LIVE_S = 10.0
 BODY = {
     "region": {"rectangle": [80, 64, 430, 414]},
     "subset_px": 21,
-    "step_px": 1,
-    "patch": "stretch",
+    "spacing_px": 1,
+    "patch": "affine",
     "strain": None,
     "label": "fine",
 }

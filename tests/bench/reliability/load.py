@@ -214,7 +214,7 @@ def analysing(base: str, data: Path) -> Iterator[None]:
     ended = threading.Event()
 
     def again() -> None:
-        body = {"region": REGION, "subset_px": 21, "step_px": 4}
+        body = {"region": REGION, "subset_px": 21, "spacing_px": 4}
         with httpx.Client(base_url=base, timeout=60.0, trust_env=False) as client:
             while not ended.wait(1.0):
                 with contextlib.suppress(httpx.HTTPError):

@@ -182,7 +182,7 @@ def make_load(base: str) -> None:
         time.sleep(0.02)
 
     def analyse() -> None:
-        body = {"region": REGION, "subset_px": 21, "step_px": 2}
+        body = {"region": REGION, "subset_px": 21, "spacing_px": 2}
         client.post(f"{API}/tests/{TEST_ID}/analyses", json=body)  # beyond the queue's length: 503
         time.sleep(0.5)
 

@@ -236,8 +236,8 @@ class Lab:
             "region": REGION,
             "steps": [1, 2, 3, 4, 5],
             "subset_px": 21,
-            "step_px": 12,
-            "patch": "stretch",
+            "spacing_px": 12,
+            "patch": "affine",
             "strain": None,
         }
         while not self.over.is_set():

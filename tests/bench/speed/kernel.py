@@ -105,7 +105,7 @@ class Costs:
         return self.point_us + self.iteration_us * iterations
 
 
-def make_kernel_scene(step_px: int = 4) -> KernelScene:
+def make_kernel_scene(spacing_px: int = 4) -> KernelScene:
     """Render the paper's rig: 512 x 480 px, 60 degrees, noise 2 of 255."""
     rig = load_rig()
     moved = RigidTransform(np.eye(3), np.array([0.013, -0.007, 0.021]))
@@ -114,7 +114,7 @@ def make_kernel_scene(step_px: int = 4) -> KernelScene:
         *rig.shoot(plane_scene(rig.texture(1), motion=moved), seed=2),
     ]
     images = {kind: [prepare(picture, kind) for picture in pictures] for kind in KINDS}
-    xy = PointGrid.rectangle(60, 60, 450, 420, step_px=step_px).xy_px.reshape(-1, 2)
+    xy = PointGrid.rectangle(60, 60, 450, 420, spacing_px=spacing_px).xy_px.reshape(-1, 2)
     depth = rig.pair.cam1.cam_from_sys.apply(rig.pair.cam1.back_project_to_plane(xy).xyz_mm)[:, 2]
     return KernelScene(rig.pair, images, xy, 1.0 / depth)
 

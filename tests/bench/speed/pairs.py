@@ -36,20 +36,20 @@ class Request:
     config: str
     size_px: tuple[int, int]
     region_px: tuple[int, int, int, int]
-    step_px: int
+    spacing_px: int
     steps: int
 
     def region(self, subset_px: int) -> tuple[int, int, int, int]:
         """Region (x0, y0, x1, y1) of the points' centres, ends included."""
         x0, y0, x1, y1 = self.region_px
-        off = (subset_px // 2 - x0) % self.step_px
-        assert (subset_px // 2 - y0) % self.step_px == off
+        off = (subset_px // 2 - x0) % self.spacing_px
+        assert (subset_px // 2 - y0) % self.spacing_px == off
         return (x0 + off, y0 + off, x1 + off, y1 + off)
 
     def points(self, subset_px: int) -> Float:
         """Points (N, 2) row by row."""
         x0, y0, x1, y1 = self.region(subset_px)
-        x, y = np.meshgrid(np.arange(x0, x1 + 1, self.step_px), np.arange(y0, y1 + 1, self.step_px))
+        x, y = np.meshgrid(np.arange(x0, x1 + 1, self.spacing_px), np.arange(y0, y1 + 1, self.spacing_px))
         return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
 
 

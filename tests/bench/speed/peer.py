@@ -136,7 +136,7 @@ def _job(scene: BenchScene, runs: list[Run], threads: int, folder: Path) -> dict
         "files1": [str(p) for p in scene.cam1],
         "files2": [str(p) for p in scene.cam2],
         "size_px": scene.request.size_px,
-        "step_px": scene.request.step_px,
+        "spacing_px": scene.request.spacing_px,
         "runs": [
             {
                 "name": r.name,

@@ -65,7 +65,7 @@ def correlate(run, out):
         calibration=pair,
         seed=[(x0 + x1) // 2, (y0 + y1) // 2],
         subset_size=run["subset_px"],
-        subset_step=JOB["step_px"],
+        subset_step=JOB["spacing_px"],
         num_threads=JOB["threads"],
         output_basepath=out,
         output_binary=True,

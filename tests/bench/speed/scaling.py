@@ -43,8 +43,8 @@ TEST = "t000001-abcdef"
 BODY = {
     "region": {"rectangle": [60, 60, 450, 420]},
     "subset_px": 33,
-    "step_px": 5,
-    "patch": "stretch",
+    "spacing_px": 5,
+    "patch": "affine",
     "start_from": "reference",
 }
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"

@@ -247,7 +247,7 @@ def _images(files: SequenceFiles, step: int) -> tuple[MeasureImage, MeasureImage
 def measure_seeds(folder: Path, *, threads: int, runs: int = 3) -> list[SeedFigures]:
     """Feature seeds on 2448 x 2048 px with 45,000 points: of a shape, and of a motion from nothing known."""
     files = sequence_files(folder, steps=1, size_px=SEED_SIZE)
-    grid = PointGrid.rectangle(60.0, 60.0, SEED_SIZE[0] - 61.0, SEED_SIZE[1] - 61.0, step_px=10.0)
+    grid = PointGrid.rectangle(60.0, 60.0, SEED_SIZE[0] - 61.0, SEED_SIZE[1] - 61.0, spacing_px=10.0)
     options = MeasureOptions(interpolation="cubic")
     set_threads(threads)
     out = []
@@ -287,7 +287,9 @@ def measure_points(folder: Path, counts: tuple[int, ...], *, threads: int, runs:
     out = []
     try:
         for count in counts:
-            grid = PointGrid.rectangle(60.0, 60.0, 60.0 + width, 60.0 + height, step_px=(width * height / count) ** 0.5)
+            grid = PointGrid.rectangle(
+                60.0, 60.0, 60.0 + width, 60.0 + height, spacing_px=(width * height / count) ** 0.5
+            )
             best = (np.inf, np.inf, np.inf)
             for _ in range(runs if count < 100_000 else 1):
                 reference = _images(files, 0)  # anew, so that its features are found anew

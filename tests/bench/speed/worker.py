@@ -36,7 +36,7 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
         "--subset",
         str(run["subset_px"]),
         "--step",
-        str(job["step_px"]),
+        str(job["spacing_px"]),
         "--out",
         str(out),
         "--strain",

@@ -226,7 +226,7 @@ def test_simulated_pictures_behind_the_same_drivers_end_in_a_calibration(network
                 world.stdin.flush()
                 assert json.loads(world.stdout.readline())["done"]
                 client.post(f"{API}/tests/{test_id}/steps", json={"label": f"{load} kPa"}).raise_for_status()
-            body = {"region": {"rectangle": [70, 70, 170, 160]}, "subset_px": 25, "step_px": 10}
+            body = {"region": {"rectangle": [70, 70, 170, 160]}, "subset_px": 25, "spacing_px": 10}
             analysis = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
             done = wait_for_job(client, analysis["job"], 240.0)
             assert done["state"] == "succeeded", done["problem"]

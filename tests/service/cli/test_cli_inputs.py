@@ -12,7 +12,7 @@ from PIL import Image
 
 from core.errors import FileFormatError, ImageError, InputError, RegionError
 from core.field.seeding.seeds import Seed
-from core.settings import STEP_PX, SUBSET_PX
+from core.settings import SPACING_PX, SUBSET_PX
 from server.cli import main
 from server.cli.measurement.image_lists import expand, pair_up, pairs_of_test_folder
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
@@ -106,7 +106,7 @@ def test_rois_that_say_nothing(text: str) -> None:
 )
 def test_regions_that_leave_nothing(rectangle: tuple[float, float, float, float], word: str) -> None:
     with pytest.raises(RegionError, match=word):
-        check_region(rectangle, image_shape=SHAPE, subset_px=33, step_px=10, mask_path=None, seeds=[])
+        check_region(rectangle, image_shape=SHAPE, subset_px=33, spacing_px=10, mask_path=None, seeds=[])
 
 
 def test_a_mask_must_fit_and_leave_points(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_mask_must_fit_and_leave_points(tmp_path: Path) -> None:
             (100.0, 100.0, 300.0, 300.0),
             image_shape=SHAPE,
             subset_px=33,
-            step_px=10,
+            spacing_px=10,
             mask_path=tmp_path / "mask.png",
             seeds=[],
         )
@@ -157,7 +157,7 @@ def test_seeds_must_lie_in_the_region_and_on_white(tmp_path: Path, seed: str, co
             (100.0, 100.0, 300.0, 300.0),
             image_shape=SHAPE,
             subset_px=33,
-            step_px=10,
+            spacing_px=10,
             mask_path=tmp_path / "mask.png",
             seeds=["150,150", seed],
         )
@@ -169,7 +169,7 @@ def test_seeds_come_as_points() -> None:
         (100.0, 100.0, 300.0, 300.0),
         image_shape=SHAPE,
         subset_px=33,
-        step_px=10,
+        spacing_px=10,
         mask_path=None,
         seeds=["150,160.5", "200,210"],
     )
@@ -181,7 +181,7 @@ def test_a_seed_may_say_where_camera_2_sees_it() -> None:
         (100.0, 100.0, 300.0, 250.0),
         image_shape=SHAPE,
         subset_px=33,
-        step_px=10,
+        spacing_px=10,
         mask_path=None,
         seeds=["150,160.5,151.25,158", "200,210"],
     )
@@ -191,7 +191,7 @@ def test_a_seed_may_say_where_camera_2_sees_it() -> None:
             (100.0, 100.0, 300.0, 250.0),
             image_shape=SHAPE,
             subset_px=33,
-            step_px=10,
+            spacing_px=10,
             mask_path=None,
             seeds=["150,160,151"],
         )
@@ -204,7 +204,7 @@ def test_subsets_are_odd_and_sensible(text: str) -> None:
         check_whole("--subset", text, SUBSET_PX)
     assert caught.value.code == "option_out_of_range"
     assert check_whole("--subset", "33", SUBSET_PX) == 33
-    assert check_whole("--step", "10", STEP_PX) == 10
+    assert check_whole("--step", "10", SPACING_PX) == 10
 
 
 @pytest.mark.parametrize("arguments", [[], ["frobnicate"], ["--version"]])

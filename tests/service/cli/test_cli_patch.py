@@ -75,7 +75,7 @@ def test_auto_decides_shape_and_motion_apart_keeps_to_it_and_says_why(
     assert "step 1: stretch: plane patches have a bias of less than" in said
     assert "step 2: curved: plane patches have a bias of" in said
     steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
-    assert [step["patch"]["patch"] for step in steps] == ["curved", "stretch", "curved", "curved"]
+    assert [step["patch"]["patch"] for step in steps] == ["quadratic", "affine", "quadratic", "quadratic"]
     assert [step["patch"]["kept"] for step in steps] == [False, False, False, True]
     assert all(step["patch"]["asked"] == "auto" for step in steps)
     # 1.8 um along Z, a tenth and more of it along the ray besides
@@ -91,7 +91,7 @@ def test_auto_decides_shape_and_motion_apart_keeps_to_it_and_says_why(
             if n:
                 assert np.abs(uvw.mean(0)).max() < 0.15
                 assert np.sqrt((uvw**2).mean()) < (0.35 if state == "moved" and n == 1 else 0.6)
-            assert ("curvature_1" in data) == (data.attrs["patch"] == "curved")
+            assert ("curvature_1" in data) == (data.attrs["patch"] == "quadratic")
             if "curvature_1" in data:
                 mean = 0.5 * (data["curvature_1"] + data["curvature_2"])
                 assert abs(30.0 * float(mean.mean()) - 1.0) < 0.05
@@ -103,7 +103,7 @@ def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
     rig: SimRig, folder: Path, tmp_path: Path, capfd: Any
 ) -> None:
     two = {cam: [str(folder / f"{cam}_{n}.tif") for n in (0, 2)] for cam in ("cam1", "cam2")}
-    assert main(command(folder, tmp_path / "out", patch="stretch", **two)) == 0
+    assert main(command(folder, tmp_path / "out", patch="affine", **two)) == 0
     said = capfd.readouterr().err
     assert "shape: plane: asked for; plane patches have a bias of" in said
     assert "step 1: stretch: asked for; plane patches have a bias of" in said
@@ -111,14 +111,14 @@ def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
     with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
         z, _ = errors_um(rig, data, "still")
         choice = json.loads(data.attrs["patch_choice"])
-        assert choice["curved_advised"]
+        assert choice["quadratic_advised"]
         # what it says of itself, against the truth: the error is along camera 1's ray, 30 degrees from Z
         assert abs(choice["plane_error_mm"] * 1e3 * np.cos(np.radians(30.0)) / abs(z.mean()) - 1.0) < 0.1
         assert "curvature_1" not in data
 
 
 def test_curved_patches_asked_for_are_taken_for_both(rig: SimRig, folder: Path, tmp_path: Path) -> None:
-    assert main(command(folder, tmp_path / "out", patch="curved")) == 0
+    assert main(command(folder, tmp_path / "out", patch="quadratic")) == 0
     for n, state in enumerate(STATES):
         with xr.open_dataset(tmp_path / "out" / f"step_{n:04d}.nc") as data:
             assert data.attrs["patch_reason"] == "curved: asked for"
@@ -131,5 +131,5 @@ def test_an_unknown_patch_is_refused(folder: Path, tmp_path: Path, capfd: Any) -
     with pytest.raises(SystemExit) as stopped:
         main(command(folder, tmp_path / "out", patch="bent"))
     assert stopped.value.code == 2
-    assert "curved" in capfd.readouterr().err
+    assert "quadratic" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -57,7 +57,7 @@ def assert_covariance(stated: Float, drawn: Float, tolerance: float) -> None:
 # correlation ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("curved", [False, True], ids=["plane", "curved"])
+@pytest.mark.parametrize("curved", [False, True], ids=["plane", "quadratic"])
 def test_correlation_is_that_of_least_squares_fits_to_white_pixels(curved: bool) -> None:
     half = 30
     u = np.arange(-half, half + 1) / half

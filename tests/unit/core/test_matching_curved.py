@@ -75,7 +75,7 @@ def test_the_solution_is_the_twins(kind, interpolation, order, noise):
         images = noisy(images)
     # Jacobians need not be the same to the last digit: they weigh the noise, which moves corners by 0.05 px here
     limit = 1e-3 if noise else 1e-4
-    options = MatchOptions(subset_px=25, patch="curved", interpolation=interpolation, tolerance_px=3e-6)
+    options = MatchOptions(subset_px=25, patch="quadratic", interpolation=interpolation, tolerance_px=3e-6)
     shape = fit_shape(pair, *images[:2], XY, w, options)
     motion = fit_motion(pair, *images, XY, w, G, options)
     assert (shape.status == 0).all()
@@ -103,7 +103,7 @@ def test_bent_surfaces_come_out_without_the_plane_patchs_error(kind):
     rays = pair.cam1.rays_cam(xy).xyz_mm
     truth = (G[:, :, 0] - rays) / w[:, :1]
     depth, moved = {}, {}
-    for patch in ("stretch", "curved"):
+    for patch in ("affine", "quadratic"):
         # from the plane start in both cases: the curvature must be found
         options = MatchOptions(subset_px=25, patch=patch)
         fit = fit_motion(pair, *images, xy, w[:, :3], G[:, :, :3], options)
@@ -112,7 +112,7 @@ def test_bent_surfaces_come_out_without_the_plane_patchs_error(kind):
         assert (shape.status == 0).all()
         depth[patch] = max(abs(((1.0 / f.w[:, 0] - 1.0 / w[:, 0]) * 1e3).mean()) for f in (fit, shape))
         moved[patch] = np.abs((((fit.G[:, :, 0] - rays) / fit.w[:, :1] - truth) * 1e3).mean(0)).max()
-    assert depth["curved"] < (0.05 if kind == "seidel" else 0.2)
-    assert moved["curved"] < (0.03 if kind == "seidel" else 0.15)
-    assert depth["stretch"] > 2.0
-    assert moved["stretch"] > 2.0 * moved["curved"]
+    assert depth["quadratic"] < (0.05 if kind == "seidel" else 0.2)
+    assert moved["quadratic"] < (0.03 if kind == "seidel" else 0.15)
+    assert depth["affine"] > 2.0
+    assert moved["affine"] > 2.0 * moved["quadratic"]

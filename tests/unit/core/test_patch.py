@@ -26,13 +26,13 @@ def sample(bias_um: float, *, n: int = 250, wrong: int = 0, seed: int = 3) -> Pa
     difference = rng.normal(0.0, extra, (n, 3)) + bias_um * np.array([0.6, 0.0, 0.8])
     difference[:wrong] += 40.0
     variance = [np.full(n, (1e-3 * um) ** 2) for um in (PLANE_UM, CURVED_UM)]
-    return decide(1e-3 * difference, *variance, plane="stretch")
+    return decide(1e-3 * difference, *variance, plane="affine")
 
 
 @pytest.mark.parametrize("bias_um", [0.8, 1.8, 6.0])
 def test_a_bias_above_the_cost_in_noise_makes_it_curved(bias_um: float) -> None:
     choice = sample(bias_um)
-    assert choice.patch == "curved"
+    assert choice.patch == "quadratic"
     assert choice.plane_error_mm is not None
     assert abs(1e3 * choice.plane_error_mm / bias_um - 1.0) < 0.1
     assert choice.reason.startswith("curved: plane patches have a bias of ")
@@ -44,15 +44,15 @@ def test_a_bias_above_the_cost_in_noise_makes_it_curved(bias_um: float) -> None:
 def test_a_bias_below_it_leaves_it_plane(bias_um: float) -> None:
     for seed in range(20):
         choice = sample(bias_um, seed=seed)
-        assert choice.patch == "stretch"
+        assert choice.patch == "affine"
         assert choice.reason.startswith("stretch: plane patches have a bias of ")
     if bias_um == 0.0:
         assert "less than 0." in choice.reason
 
 
 def test_a_few_wrong_fits_do_not_decide() -> None:
-    assert sample(0.0, wrong=4).patch == "stretch"
-    assert sample(0.0, wrong=40).patch == "curved"  # 16 % are no exceptions any more
+    assert sample(0.0, wrong=4).patch == "affine"
+    assert sample(0.0, wrong=40).patch == "quadratic"  # 16 % are no exceptions any more
 
 
 def test_a_choice_survives_its_file_and_is_kept_by_the_steps_after() -> None:

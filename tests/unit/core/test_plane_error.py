@@ -55,7 +55,7 @@ def field(before: Bent, after: Bent | None, *, noise_mm: float) -> tuple[PointFi
 
 
 def told(points: PointFits, *, step: float = STEP) -> PlaneError | None:
-    return plane_error(points, shape=X.shape, rays=RAYS, step_px=step, subset_px=SUBSET)
+    return plane_error(points, shape=X.shape, rays=RAYS, spacing_px=step, subset_px=SUBSET)
 
 
 TILTED = np.linalg.qr(np.array([[1.0, 0.2], [0.1, 1.0], [0.35, -0.2]]))[0]
@@ -112,15 +112,15 @@ def test_points_too_far_apart_or_too_few_say_nothing() -> None:
 
 
 def test_plane_patches_asked_for_get_advice_where_curved_ones_would_err_less() -> None:
-    asked = asked_for("stretch", "stretch")
+    asked = asked_for("affine", "affine")
     assert advise(asked, None) == asked
     fine = advise(asked, PlaneError(1e-4, 1.1e-4, 2e-4))
-    assert (fine.curved_advised, fine.plane_error_mm, fine.plane_noise_mm) == (False, 1e-4, 2e-4)
+    assert (fine.quadratic_advised, fine.plane_error_mm, fine.plane_noise_mm) == (False, 1e-4, 2e-4)
     bad = advise(asked, PlaneError(1.8e-3, 1.9e-3, 2e-4))
-    assert bad.curved_advised
-    assert bad.patch == "stretch"
+    assert bad.quadratic_advised
+    assert bad.patch == "affine"
     assert "1.8 um (rms) in displacement" in bad.reason
-    curved = asked_for("curved", "curved")
+    curved = asked_for("quadratic", "quadratic")
     assert advise(curved, PlaneError(1.8e-3, 1.9e-3, 2e-4)) == curved
 
 
@@ -130,7 +130,7 @@ def test_auto_fits_nothing_twice_where_curvature_cannot_pay() -> None:
 
     points, _ = field(Bent(basis=TILTED), Bent(), noise_mm=3e-4)
     choice = choose_patch(NoFits(), points, XY, told(points))  # type: ignore[arg-type]
-    assert choice.patch == "stretch"
+    assert choice.patch == "affine"
     assert choice.sample == 0
     assert choice.asked == "auto"
     assert "less than" in choice.reason

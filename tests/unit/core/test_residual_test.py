@@ -126,7 +126,7 @@ def test_points_outside_have_none_and_unknowns_must_fit(images):
 # fields
 
 MOTION = (0.02, -0.013, 0.03, 0.0006, -0.0004, 0.001)
-OPTIONS = MeasureOptions(subset_px=21, patch="stretch")
+OPTIONS = MeasureOptions(subset_px=21, patch="affine")
 
 
 def pictures(*, noise=2.0, seed=0):
@@ -140,7 +140,7 @@ def through(image, share, where=None):
 
 
 def measured(reference, now, options=OPTIONS):
-    grid = bench.grid(step_px=6.0)
+    grid = bench.grid(spacing_px=6.0)
     field = ReferencePair(bench.pair(), *reference).motion(*now, grid, options)
     true = bench.truth(grid, bench.scene("block", 0.0, MOTION), bench.scene("block", 1.0, MOTION))
     return field, field.uvw_mm - true.uvw_mm
@@ -198,7 +198,7 @@ def test_images_much_noisier_than_the_reference_are_told_as_they_are(noise):
 def test_noise_at_t_alone_does_not_touch_the_shape():
     reference, now = pictures(noise=15.0)
     field, error = measured(reference, now)
-    shape = ReferencePair(bench.pair(), *reference).shape(bench.grid(step_px=6.0), OPTIONS)
+    shape = ReferencePair(bench.pair(), *reference).shape(bench.grid(spacing_px=6.0), OPTIONS)
     v = field.valid
     assert v.mean() > 0.99
     np.testing.assert_allclose(field.sigma_mm[v][:, :3], shape.sigma_mm[v], rtol=0.5)
@@ -228,7 +228,7 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
 def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(depth_said, offset_said, kept):
     """Residuals show this many times the variances that the fit tells; of noise there is too much for any point."""
     reference, _ = pictures()
-    inputs = prepare(bench.pair(), reference, None, bench.grid(step_px=6.0), OPTIONS)
+    inputs = prepare(bench.pair(), reference, None, bench.grid(spacing_px=6.0), OPTIONS)
     state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)
     points, count = state.points, int(state.points.ok.sum())
     sd = np.sqrt(np.diagonal(points.covariance[points.ok], axis1=1, axis2=2)).mean(0)
@@ -243,7 +243,7 @@ def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(d
 
 def test_matches_without_any_residual_stay_as_they_are():
     reference, _ = pictures()
-    inputs = prepare(bench.pair(), reference, None, bench.grid(step_px=12.0), OPTIONS)
+    inputs = prepare(bench.pair(), reference, None, bench.grid(spacing_px=12.0), OPTIONS)
     state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)
     points = state.points
     points.covariance[:2] = 0.0

@@ -30,7 +30,7 @@ def distance(p: tuple[float, float], a: tuple[float, float], b: tuple[float, flo
 
 
 def test_a_point_sees_what_the_definition_says() -> None:
-    grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, step_px=7.0).with_cracks([KINKED])
+    grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, spacing_px=7.0).with_cracks([KINKED])
     visibility = with_visibility(grid, SUBSET).visibility
     assert visibility is not None
     half = SUBSET // 2
@@ -53,7 +53,7 @@ def test_a_point_sees_what_the_definition_says() -> None:
 
 
 def test_neighbours_that_a_crack_parts_are_none() -> None:
-    grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, step_px=7.0).with_cracks([KINKED])
+    grid = PointGrid.rectangle(20.0, 20.0, 100.0, 100.0, spacing_px=7.0).with_cracks([KINKED])
     visibility = with_visibility(grid, SUBSET).visibility
     assert visibility is not None
     rows, cols = grid.shape
@@ -82,7 +82,7 @@ def test_a_mask_is_seen_along_its_white_alone() -> None:
     mask = np.zeros((120, 120), bool)
     mask[10:110, 10:110] = True
     mask[10:90, 55:63] = False
-    grid = PointGrid.rectangle(20.0, 20.0, 100.0, 104.0, step_px=6.0).within_mask(mask)
+    grid = PointGrid.rectangle(20.0, 20.0, 100.0, 104.0, spacing_px=6.0).within_mask(mask)
     visibility = with_visibility(grid, SUBSET).visibility
     assert visibility is not None
     col = int(np.flatnonzero(grid.x_px[0] == 50.0)[0])
@@ -96,7 +96,7 @@ def test_a_mask_is_seen_along_its_white_alone() -> None:
 
 def test_a_hole_takes_its_points_and_what_lies_behind_it() -> None:
     hole = [(40.0, 40.0), (60.0, 40.0), (60.0, 60.0), (40.0, 60.0)]
-    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0).without_holes([hole])
+    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, spacing_px=5.0).without_holes([hole])
     inside = (np.abs(grid.x_px - 50.0) <= 10.0) & (np.abs(grid.y_px - 50.0) <= 10.0)
     np.testing.assert_array_equal(grid.allowed, ~inside)
     assert grid.cuts is not None
@@ -109,7 +109,7 @@ def test_a_hole_takes_its_points_and_what_lies_behind_it() -> None:
 
 
 def test_a_point_on_the_line_sees_nothing() -> None:
-    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0).with_cracks([[(20.0, 50.0), (80.0, 50.0)]])
+    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, spacing_px=5.0).with_cracks([[(20.0, 50.0), (80.0, 50.0)]])
     visibility = with_visibility(grid, SUBSET).visibility
     assert visibility is not None
     np.testing.assert_array_equal(visibility.enough, grid.y_px != 50.0)
@@ -137,7 +137,7 @@ def test_local_fits_hear_only_what_they_see() -> None:
 
 def test_a_click_starts_on_its_own_side() -> None:
     """The nearest point lies just over the line."""
-    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=10.0).with_cracks([[(15.0, 49.0), (85.0, 49.0)]])
+    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, spacing_px=10.0).with_cracks([[(15.0, 49.0), (85.0, 49.0)]])
     visibility = with_visibility(grid, SUBSET).visibility
     xy, usable = grid.xy_px.reshape(-1, 2), np.ones(49, bool)
     seeds = as_seeds([(50.0, 48.0), (50.0, 51.0)])
@@ -149,11 +149,11 @@ def test_a_click_starts_on_its_own_side() -> None:
 
 
 def test_a_crack_outside_the_image_is_refused() -> None:
-    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0).with_cracks([[(20.0, 50.0), (120.0, 50.0)]])
+    grid = PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, spacing_px=5.0).with_cracks([[(20.0, 50.0), (120.0, 50.0)]])
     with pytest.raises(RegionError) as caught:
         check_region(grid, image_shape=(100, 100), subset_px=SUBSET)
     assert caught.value.code == "cut_outside_image"
 
 
 def test_without_anything_in_the_way_there_is_nothing_to_see() -> None:
-    assert with_visibility(PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, step_px=5.0), SUBSET).visibility is None
+    assert with_visibility(PointGrid.rectangle(20.0, 20.0, 80.0, 80.0, spacing_px=5.0), SUBSET).visibility is None

@@ -309,7 +309,7 @@ def test_limits_percentiles_and_states(source: Source, tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError) as caught:
             Look(**bad)  # type: ignore[arg-type]
-        assert caught.value.code == "look_invalid"
+        assert caught.value.code == "figure_style_invalid"
 
 
 def test_a_map_lies_over_the_image_where_its_points_are(source: Source, tmp_path: Path) -> None:
@@ -440,8 +440,8 @@ def test_the_command_line(results: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert "written: 2 files" in capsys.readouterr().out
     for arguments, code in (
         (["--step", "x"], "step_invalid"),
-        (["--limits", "2"], "look_invalid"),
-        (["--limits=2,1"], "look_invalid"),
+        (["--limits", "2"], "figure_style_invalid"),
+        (["--limits=2,1"], "figure_style_invalid"),
         (["--analysis", "a1"], "option_conflict"),
         (["--step", "9"], "step_missing"),
     ):

@@ -66,14 +66,14 @@ def a_field(*, motion: bool, curved: bool = False) -> Field:
         rotation_rad=numbers(3) if motion else None,
         stretch=numbers(3) if motion else None,
         curvature_per_mm=numbers(2) if curved else None,
-        patch=PatchChoice(patch="curved", asked="auto", reason="curved: Gründe", sample=200, plane_error_mm=1.8e-3)
+        patch=PatchChoice(patch="quadratic", asked="auto", reason="curved: Gründe", sample=200, plane_error_mm=1.8e-3)
         if curved
         else None,
         cuts=Cuts([[(1.5, 2.0), (30.25, 40.0), (1e-3, 7.0)], [(50.0, 60.0), (50.0, 61.0)]]) if motion else None,
     )
 
 
-@pytest.mark.parametrize("curved", [False, True], ids=["plane", "curved"])
+@pytest.mark.parametrize("curved", [False, True], ids=["plane", "quadratic"])
 @pytest.mark.parametrize("motion", [False, True], ids=["shape", "displacement"])
 def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool) -> None:
     field = a_field(motion=motion, curved=curved)

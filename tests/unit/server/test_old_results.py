@@ -28,7 +28,7 @@ def test_settings_are_told_by_todays_names(folder: Path) -> None:
     assert "roi" not in settings
     assert settings["region"]["rectangle"] == [110.0, 105.0, 150.0, 145.0]
     stored = stored_settings(settings)
-    assert (stored.subset_px, stored.step_px, stored.reference_update, stored.strain) == (21, 20, "auto", None)
+    assert (stored.subset_px, stored.spacing_px, stored.reference_update, stored.strain) == (21, 20, "auto", None)
     assert stored.region.cracks == [[(100.0, 60.0), (110.0, 60.0)]]
     assert stored.region.mask is None
 

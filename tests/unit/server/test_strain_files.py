@@ -33,7 +33,7 @@ def test_written_and_read_back(strain_and_file):
     strain, path = strain_and_file
     back = read_strain(path)
     assert back.options == strain.options
-    assert (back.gauge_px, back.step_px, back.subset_px) == (81.0, 10.0, 21)
+    assert (back.gauge_px, back.spacing_px, back.subset_px) == (81.0, 10.0, 21)
     assert back.gauge_mm == pytest.approx(strain.gauge_mm)
     np.testing.assert_array_equal(back.status, strain.status)
     np.testing.assert_allclose(back.strain, strain.strain, rtol=1e-6)

@@ -12,7 +12,7 @@ from pydantic import Field, StringConstraints
 from core.errors import InputError
 from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import Seed
-from core.settings import STEP_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, StepPx, SubsetPx, Whole
+from core.settings import SPACING_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, SpacingPx, SubsetPx, Whole
 from server.api.models import Region, Reply, Request
 from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
@@ -32,7 +32,7 @@ class TextureRequest(Request):
 
     region: Region = Field(description="Where points may lie.")
     subset_px: SubsetPx = SUBSET_PX.default
-    step_px: StepPx = STEP_PX.default
+    spacing_px: SpacingPx = SPACING_PX.default
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None, description="Noise measurement that tells camera 1's noise; 1 % of full scale is assumed without it."
     )
@@ -108,7 +108,7 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
     pixels, full_scale = step_image(service, test_id, n, "cam1")
     mask = mask_of(body.region)
     settings = AnalysisSettings.model_validate(
-        {"region": body.region, "step_px": body.step_px, "subset_px": body.subset_px}
+        {"region": body.region, "spacing_px": body.spacing_px, "subset_px": body.subset_px}
     )
     grid = make_grid(settings, None if mask is None else decode_mask(mask), (pixels.shape[0], pixels.shape[1]))
     noise = body.noise_grey

@@ -113,7 +113,7 @@ def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n
     response_model=FieldReply,
     responses=errors(404, 409, 422) | {200: {"content": {"application/x-npy": {}}}},
 )
-def get_places(
+def get_positions(
     service: ServiceDep,
     test_id: TestId,
     analysis_id: AnalysisId,

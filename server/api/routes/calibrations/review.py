@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from server.api.models import CalibrationReply
-from server.api.models.calibrations import ExpectReply, ExpectRequest, JudgementRequest
+from server.api.models.calibrations import ExpectReply, ExpectRequest, ReviewRequest
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import CalibrationId, ServiceDep, person_name
 from server.api.protocol.problems import errors
@@ -32,14 +32,15 @@ def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -
     return ExpectReply.model_validate(calibration_review.expectation(service, plan, body.noise_px, body.roll_deg))
 
 
+@router.put("/{calibration_id}/judgement", include_in_schema=False)  # its earlier address
 @router.put(
-    "/{calibration_id}/judgement", summary="Accept or discard a calibration", responses=errors(404, 409, 412, 422, 507)
+    "/{calibration_id}/review", summary="Accept or discard a calibration", responses=errors(404, 409, 412, 422, 507)
 )
-def put_judgement(
+def put_review(
     service: ServiceDep,
     request: Request,
     calibration_id: CalibrationId,
-    body: JudgementRequest,
+    body: ReviewRequest,
     response: Response,
     if_match: IfMatch = None,
 ) -> CalibrationReply:

@@ -16,7 +16,7 @@ router = APIRouter(prefix="/tests/{test_id}/facts", tags=["tests"])
 
 
 @router.get("", summary="What was told about a test", response_model_exclude_none=True, responses=errors(404))
-def get_facts(service: ServiceDep, test_id: TestId, response: Response) -> TestFacts:
+def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> TestFacts:
     """Return the facts, empty where nothing was told; the header ETag names this state of them."""
     return TestFacts.model_validate(tagged(response, service.tests.facts(test_id)))
 
@@ -27,7 +27,7 @@ def get_facts(service: ServiceDep, test_id: TestId, response: Response) -> TestF
     response_model_exclude_none=True,
     responses=errors(404, 412, 422, 507),
 )
-def put_facts(
+def put_metadata(
     service: ServiceDep,
     test_id: TestId,
     body: TestFacts,
@@ -43,10 +43,10 @@ def put_facts(
         if etag_of(expected) not in [tag.strip() for tag in if_match.split(",")]:
             raise StateError(
                 f"The facts of test {test_id} are not those that If-Match names.",
-                code="facts_changed",
+                code="metadata_changed",
                 remedy="Read them again, then send the change.",
                 etag=etag_of(expected),
             )
     document = body.document()
-    service.tests.put_facts(test_id, document, expected)
+    service.tests.put_metadata(test_id, document, expected)
     return TestFacts.model_validate(tagged(response, document))

@@ -93,7 +93,7 @@ export async function measurePanel(id, test, ends, done) {
         return;
       }
       try {
-        const told = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), step_px: Number(step.value), noise_id: noiseChoice.value || null });
+        const told = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), spacing_px: Number(step.value), noise_id: noiseChoice.value || null });
         if (mine !== asked) return;
         replace(texture,
           h("p", badge(`${told.level} texture`, LEVEL[told.level] ?? ""), ` ${num(100 * told.good_share, 3)} % of ${count(told.subsets)} subsets below ${told.good_px} px, ${num(100 * told.usable_share, 3)} % below ${told.usable_px} px; median ${quantity(told.median_error_px, "px", 2)} at a noise of ${num(told.noise_grey, 3)} grey levels.`),
@@ -156,7 +156,7 @@ export async function measurePanel(id, test, ends, done) {
 
     // settings
     const kind = select([["displacement", "shape and displacement"], ["profile", "shape only"]], "displacement");
-    const patch = select([["auto", "auto: plane or curved"], ["stretch", "stretch (plane)"], ["rigid", "rigid (the paper's)"], ["curved", "curved"]], "auto");
+    const patch = select([["auto", "auto: affine or quadratic"], ["affine", "affine (plane)"], ["rigid", "rigid (the paper's)"], ["quadratic", "quadratic (curved)"]], "auto");
     const interpolation = select([["quintic", "quintic B-spline"], ["cubic", "cubic B-spline"]], "quintic");
     const prefilter = number(0, { min: 0, max: 64 });
     const smoothing = number(null, { min: 3, step: 2, placeholder: "none" });
@@ -184,7 +184,7 @@ export async function measurePanel(id, test, ends, done) {
       if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
       /** @type {Request} */
       const body_ = {
-        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), step_px: Number(step.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
+        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(step.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
         reference: Number(reference.value), reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
         smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: Number(order.value), tensor: tensor.value }) : null,
       };
