@@ -23,6 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from core.field.growth.seed import match_seeds
+from core.field.growth.state import begin, prepare
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureImage, MeasureOptions, ReferencePair
@@ -265,12 +267,10 @@ def measure_seeds(folder: Path, *, threads: int, runs: int = 3) -> list[SeedFigu
 
 
 def _seeds_once(files: SequenceFiles, grid: PointGrid, options: MeasureOptions, what: str, threads: int) -> SeedFigures:
-    from core.field.growth.run import Run
-
-    now = _images(files, 1) if what == "motion" else (None, None)
-    run = Run(files.pair, *_images(files, 0), *now, grid, options, None, None)
+    inputs = prepare(files.pair, _images(files, 0), _images(files, 1) if what == "motion" else None, grid, options)
+    state = begin(inputs)
     start = time.perf_counter(), time.process_time()
-    seeds = run._match_seeds()
+    seeds = match_seeds(inputs, state)
     return SeedFigures(what, threads, time.perf_counter() - start[0], time.process_time() - start[1], seeds)
 
 
