@@ -11,7 +11,7 @@ remedy. The service sends the same code as problem+json; the command line prints
     |   +-- TargetError            the calibration grid was not found or not indexed without doubt
     |   +-- CalibrationInputError  views that cannot determine the camera
     |   +-- RegionError            region, mask, subset or seed that leaves nothing to measure
-    |   +-- FileFormatError        a file that cannot be read as what it claims to be
+    |   +-- FileFormatError        a file that is not of the format that it is given as
     +-- MeasurementError           the computation could not be done
     |   +-- CalibrationError       no usable minimum
     |   +-- SeedError              no start values found
@@ -40,7 +40,7 @@ class StereorigError(Exception):
     remedy
         Remedy for the caller; the class's own when left out.
     **context
-        Values a program may want (``view="cam1_+0.000mm.tif"``, ``found=10, expected=11``).
+        Values for programs (``view="cam1_+0.000mm.tif"``, ``found=10, expected=11``).
     """
 
     code = "error"
@@ -104,7 +104,7 @@ class RegionError(InputError):
 
 
 class FileFormatError(InputError):
-    """A file cannot be read as what it claims to be."""
+    """A file is not of the format that it is given as."""
 
     code = "file_unreadable"
     remedy = "Check the file named above."
@@ -138,7 +138,7 @@ class Cancelled(MeasurementError):
 
 
 class DeviceError(StereorigError):
-    """A camera or stage did not do what it was asked."""
+    """A camera or stage failed or refused a request."""
 
     code = "device_fault"
     remedy = "Check cables and power, then reconnect."

@@ -181,7 +181,7 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
         )
     c, sd, misfit = _fit(levels, bins.variances, bins.sds)
     low, high = float(levels[0]), float(levels[-1])
-    if c[2] == 0.0:  # a line holds beyond what was seen, as far as it stays clear of zero
+    if c[2] == 0.0:  # a line is valid beyond the levels seen, as far as it stays clear of zero
         low = 0.0 if low > 0.0 and c[0] > _CLEAR * (c[0] + c[1] * low) else low
         high = full_scale if high < full_scale < np.inf and c[1] >= 0.0 else high
     return NoiseModel(

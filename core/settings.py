@@ -214,7 +214,7 @@ class AnalysisSettings(Settings):
 
 
 class NoiseRecord(BaseModel):
-    """The noise models that weighed the pixels: the numbers that were used, and where they come from."""
+    """The noise models that weighed the pixels: the numbers used, and their source."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 

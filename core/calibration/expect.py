@@ -44,7 +44,7 @@ class Expectation:
     points_mm, sigma_mm
         (9, 3) the middle of the volume, then its corners, and the standard deviation of X, Y, Z there.
     seen
-        Of each camera, the share of the inner intersections that the nominal camera sees at the worst position.
+        Of each camera, the share of the inner intersections in the nominal camera's image at the worst position.
     reasons
         Reasons for which :func:`core.calibration.calibrate` would refuse such views; empty if it would not.
     """

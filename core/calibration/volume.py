@@ -1,6 +1,6 @@
 """The calibrated volume, and the calibration's covariance of points inside and outside it.
 
-Each camera saw the target's intersections up to some distance from its optical axis and over some range of depths.
+The target's intersections reach up to some distance from each camera's optical axis and over some range of depths.
 Beyond these, distortion and pose are extrapolated by the model. The parameters' covariance gives the uncertainty there,
 as far as the model holds.
 """

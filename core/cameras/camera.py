@@ -91,7 +91,7 @@ def rotation_from_angles(alpha_rad: float, beta_rad: float, gamma_rad: float) ->
 
 
 def rotation_derivatives(alpha_rad: float, beta_rad: float, gamma_rad: float) -> Float:
-    """Return dR/d(alpha, beta, gamma), (3, 3, 3), first axis = which angle."""
+    """Return dR/d(alpha, beta, gamma), (3, 3, 3), first axis the angle."""
     (rx, drx), (ry, dry), (rz, drz) = _axis_rotations(alpha_rad, beta_rad, gamma_rad)
     return np.stack([rx @ ry @ drz, drx @ ry @ rz, rx @ dry @ rz])
 

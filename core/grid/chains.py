@@ -148,7 +148,7 @@ class Chain:
 
 
 def order(lines: list[CoarseLine], transversal_point: Float, transversal_direction: Float) -> Chain:
-    """Number the lines by where they cross a transversal, growing along its direction."""
+    """Number the lines by their crossings with a transversal, growing along its direction."""
     if not lines:
         return Chain((), np.zeros(0, dtype=np.intp), ())
     u = np.array([_crossing(line, transversal_point, transversal_direction) for line in lines])

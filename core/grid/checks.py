@@ -129,7 +129,7 @@ def blame_glare(error: TargetError, grey: Float32, saturation: float) -> TargetE
     """Return the same error, named after the glare where saturated pixels can have hidden the lines."""
     expected, found = error.context.get("expected"), error.context.get("found")
     too_many = expected is not None and found is not None and sum(found) > sum(expected)
-    # what a 5 x 5 px square fits into is no clipped noise
+    # a spot that holds a 5 x 5 px square is no clipped noise
     share = float(cv2.erode((grey >= saturation).astype(np.uint8), np.ones((5, 5), np.uint8)).mean())
     if share < _GLARING_SHARE or too_many or error.code == "target_rotated":
         return error

@@ -128,7 +128,7 @@ def _coarse(grey: Float32, target: GridTarget) -> tuple[Lattice, float]:
     failure: TargetError | None = None
     for factor in coarse_factors((grey.shape[1], grey.shape[0]), target):
         picture = line_picture(grey, target, factor)
-        # what closing fills by chance lies well below the noise's own standard deviation
+        # the depth filled by chance is well below the noise's own standard deviation
         if picture.threshold < picture.noise / max(factor, 1.0):
             failure = failure or not_found(
                 f"no lines: the deepest structures stand out by {picture.threshold:.3g} grey levels from a noise of"

@@ -23,7 +23,7 @@ CUT = 1e-8
 
 _BAND_ROWS = 512
 _PERIOD = 512
-_READS = (np.uint8, np.uint16, np.float32)  # what OpenCV filters into float32 without a copy
+_READS = (np.uint8, np.uint16, np.float32)  # types that OpenCV filters into float32 without a copy
 
 
 @cache

@@ -73,7 +73,7 @@ class MeasureImage:
     def prepared(
         self, interpolation: Interpolation, noise: NoiseModel | None = None, blur: Blur | None = None
     ) -> ImageData:
-        """Return the image, blurred where asked for, with its spline coefficients and the camera's noise; made once."""
+        """Return the image, blurred if requested, with its spline coefficients and the camera's noise; cached."""
         noise = self.noise if noise is None else noise
         key = interpolation, noise, blur
         if key not in self._prepared:

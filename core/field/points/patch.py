@@ -54,7 +54,7 @@ class PatchChoice:
 
     @staticmethod
     def from_document(document: dict[str, Any]) -> PatchChoice:
-        """Return what :meth:`document` wrote; names of later versions are left out."""
+        """Return the choice from :meth:`document`; names of later versions are left out."""
         known = PatchChoice.__dataclass_fields__
         return PatchChoice(**{name: value for name, value in document.items() if name in known})
 

@@ -58,7 +58,7 @@ class Smoothing:
 
     @staticmethod
     def from_document(document: Mapping[str, Any]) -> Smoothing:
-        """Return what :meth:`document` made; unknown entries are left out."""
+        """Return the record from :meth:`document`; unknown entries are left out."""
         known = {f.name for f in fields(Smoothing)}
         return Smoothing(**{name: value for name, value in document.items() if name in known})
 

@@ -58,7 +58,7 @@ def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, 
             with cgutils.for_range(builder, whole) as part:
                 offset = builder.mul(part.index, LONG(LANES))
                 store(load(builder, at(builder, source, offset)), at(builder, target, offset))
-            # the rest, overlapping what is there
+            # the rest, overlapping the pixels already copied
             store(load(builder, at(builder, source, last)), at(builder, target, last))
         return context.get_dummy_value()
 
