@@ -15,9 +15,10 @@ from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
+from core.field.sequence.reference_steps import PreviousStep
 from core.field.settings import MeasureOptions
 from core.field.smoothed import smoothed_displacement
-from core.measure import Earlier, ReferencePair
+from core.measure import ReferencePair
 from core.settings import AnalysisSettings
 from core.strain import StrainOptions, surface_strain
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
@@ -108,7 +109,7 @@ class Measurement:
         shape = self._shape
         n = len(self._images)
         images = self._prepared(image1, image2, f"step {n}")
-        previous = Earlier(n - 1, self._fields[n - 1]) if n > 1 else None
+        previous = PreviousStep(n - 1, self._fields[n - 1]) if n > 1 else None
         field = self._steps.measure(images, previous, seeds=seeds_of(self.settings))
         self._images.append((image1, image2) if self.settings.reference_update != "never" else (shape.x_px,) * 2)
         self._fields.append(field)
