@@ -112,7 +112,7 @@ class Metrics:
             times = self._jobs.get(data["id"])
             if times is None:
                 if state in _FINAL:
-                    return  # told before
+                    return  # reported before
                 if len(self._jobs) >= _MOST_JOBS:
                     self._jobs.clear()
                 times = self._jobs[data["id"]] = {"accepted": now}

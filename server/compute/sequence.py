@@ -246,7 +246,7 @@ class SequenceMeasurement:
     def _field(self, n: int) -> Field:
         """Field of an earlier step as it was measured: before smoothing, and without the calibration's own error.
 
-        What later steps inherit of it is the images' noise; the calibration's error is told once, of the total.
+        What later steps propagate of it is the images' noise; the calibration's error is added once, to the total.
         """
         if n not in self._fields:
             path = self.file_of(n)

@@ -40,7 +40,7 @@ def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_windo
     """Say what a smoothed displacement, and strain from it, can still tell apart."""
     mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
     text = (
-        f"displacements are smoothed over {smoothing.window} points: what is told apart is "
+        f"displacements are smoothed over {smoothing.window} points: what is distinguished is "
         f"{smoothing.resolution_px:g} px{mm} wide, {smoothing.subset_px:g} px without smoothing"
     )
     if gauge_px is None or strain_window is None:
@@ -67,7 +67,7 @@ class PatchStrain:
 
 @dataclass(frozen=True)
 class StrainSummary:
-    """One step's strain in a few numbers; what cannot be told is None.
+    """One step's strain in a few numbers; what is not known is None.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """What only people know about a camera and its lens: from the rig file, kept with every step.
 
-A fact that nobody told is None, never a guess.
+A fact that the operator did not state is None, never a guess.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class CameraFacts(ClosedFacts):
 
 def merged(over: CameraFacts | None, under: Mapping[str, object] | None) -> CameraFacts:
     """Facts of a camera, one by one: those of ``over`` go before those of ``under``, as a step's record has them."""
-    told = CameraFacts.model_validate({k: v for k, v in (under or {}).items() if k in CameraFacts.model_fields})
+    stated = CameraFacts.model_validate({k: v for k, v in (under or {}).items() if k in CameraFacts.model_fields})
     if over is None:
-        return told
+        return stated
     document, lens = over.model_dump(exclude_none=True), over.lens
-    both = {**told.model_dump(exclude_none=True), **document}
-    if lens is not None and told.lens is not None:
-        both["lens"] = {**told.lens.model_dump(exclude_none=True), **lens.model_dump(exclude_none=True)}
+    both = {**stated.model_dump(exclude_none=True), **document}
+    if lens is not None and stated.lens is not None:
+        both["lens"] = {**stated.lens.model_dump(exclude_none=True), **lens.model_dump(exclude_none=True)}
     return CameraFacts.model_validate(both)

@@ -1,4 +1,4 @@
-"""What the calibration found, told and drawn."""
+"""The calibration's result, printed and drawn."""
 
 from __future__ import annotations
 

@@ -140,9 +140,9 @@ class ServiceClient:
         accepted = self.call("POST", "/calibrations", json=plan).json()
         self.wait(accepted["job"]["id"])
         calibration_id = str(accepted["calibration_id"])
-        told = self.get(f"/calibrations/{calibration_id}")
-        record = CalibrationRecord.model_validate(told)
-        return Calibrated(calibration_id, record, told.get("checks"), told.get("verdict"))
+        document = self.get(f"/calibrations/{calibration_id}")
+        record = CalibrationRecord.model_validate(document)
+        return Calibrated(calibration_id, record, document.get("checks"), document.get("verdict"))
 
     def create_test(self, name: str, calibration_id: str, specimen: str = "") -> str:
         """Make a test; return its id."""

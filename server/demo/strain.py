@@ -28,7 +28,7 @@ class Difference:
     ----------
     mean, rms
         Of measured minus the other.
-    told
+    reported
         Root mean square of the standard deviations that the results tell.
     chi
         Root mean square of the difference in units of its own sigma: 1 where noise explains all of it.
@@ -36,7 +36,7 @@ class Difference:
 
     mean: float
     rms: float
-    told: float
+    reported: float
     chi: float
 
 
@@ -90,7 +90,7 @@ def difference(found: Float, other: Float, sigma: Float, use: Bool) -> Differenc
     return Difference(
         mean=MICRO * float(off.mean()),
         rms=MICRO * float(np.sqrt(np.mean(off**2))),
-        told=MICRO * float(np.sqrt(np.mean(sd**2))),
+        reported=MICRO * float(np.sqrt(np.mean(sd**2))),
         chi=float(np.sqrt(np.mean((off / sd) ** 2))),
     )
 

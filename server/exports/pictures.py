@@ -187,7 +187,7 @@ def write_mp4(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float) -> Non
     first = next(drawn)
     height, width = first.shape[:2]
     with written_aside(path) as aside:
-        named = aside.with_suffix(".mp4")  # the container is told by the name
+        named = aside.with_suffix(".mp4")  # the name determines the container
         writer = cv2.VideoWriter()
         try:
             for codec in CODECS:

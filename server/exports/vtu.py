@@ -41,7 +41,7 @@ def write_vtu(
     mask
         Camera 1's image, False where no triangle may lie.
     at_rest
-        The step is what displacements are told from: its own is zero, which a time series needs to warp all its steps.
+        Displacements are relative to this step: its own is zero, which a time series needs to warp all its steps.
 
     Notes
     -----

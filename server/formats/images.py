@@ -1,7 +1,7 @@
 """Image files: gray, 8 or 16 bit, in and out, with every number as the camera gave it.
 
 Read: TIFF, PNG, BMP, JPEG. A colour file is taken only if its channels are equal everywhere (a gray image saved as
-colour); true colour is refused, since how it was made gray is part of the measurement. Size and type are judged from
+colour); true colour is refused, since how it was made gray is part of the measurement. Size and type are checked in
 the header, before anything is decoded.
 """
 
@@ -156,7 +156,7 @@ def decode_image(data: bytes, *, name: str = "the image") -> GrayImage:
     ------
     ImageError
         ``image_unreadable`` (damaged, truncated, no image), ``image_unsupported`` (true colour, other pixel types,
-        several images), ``image_too_large`` (judged from the header).
+        several images), ``image_too_large`` (checked in the header).
     """
     if data[:4] in _TIFF_MAGIC:
         return _decode_tiff(name, data)

@@ -34,7 +34,7 @@ class ConnectionLimits:
     body_bytes_per_s
         Pace below which a body is too slow, over ``body_s``.
     body_s
-        Time over which the pace is judged.
+        Time over which the pace is measured.
     unread_s
         How long a client may take nothing of an answer that waits for it.
     """

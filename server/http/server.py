@@ -119,7 +119,7 @@ class OrderlyServer(uvicorn.Server):
         if not probe.cancelled() and probe.exception() is None and probe.result():
             self._notifier.alive()
         else:
-            _log.error("a part of the service has ended; the watchdog is not told that it lives")
+            _log.error("a part of the service has ended; the watchdog is not notified")
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End: the stage, then streams, then requests, then the rest (the app's lifespan closes the service)."""

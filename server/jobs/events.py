@@ -1,7 +1,7 @@
 """What happens in the service, as a numbered stream that readers can resume.
 
-Events live in a bounded ring. A slow reader loses the oldest ones and is told so by an event ``gap``; it never holds up
-a writer. Numbers grow over restarts too, so that a reader which comes back after one is told what it missed.
+Events live in a bounded ring. A slow reader loses the oldest ones and gets an event ``gap``; it never holds up
+a writer. Numbers grow over restarts too, so that a reader which comes back after one learns what it missed.
 """
 
 from __future__ import annotations

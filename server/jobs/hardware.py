@@ -1,6 +1,6 @@
 """Who holds the hardware, and the one thread that talks to it.
 
-Hardware is never queued: a second caller is told who has it. Stopping needs neither the hold nor the thread.
+Hardware is never queued: a second caller learns who has it. Stopping needs neither the hold nor the thread.
 """
 
 from __future__ import annotations

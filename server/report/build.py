@@ -140,11 +140,11 @@ def _boxes(source: Source, measured: Measured) -> list[Box]:
     if floor is not None and floor.spatial_sd is not None:
         noise, small = f"{1e3 * floor.spatial_sd:.2g} {UM}", f"sd of W over the points, {floor.steps} static steps"
     else:
-        sigma = measured.told.get("W", measured.told.get("Z"))
+        sigma = measured.reported.get("W", measured.reported.get("Z"))
         noise, small = ("-" if sigma is None else f"{1e3 * sigma:.2g} {UM}"), "predicted, no static steps"
     return [
         Box("Calibration", verdict or "no record", held_text, _LEVELS.get(verdict or "", "")),
-        Box("Cameras since then", level or "not told", off, _LEVELS.get(level or "", "")),
+        Box("Cameras since then", level or "not known", off, _LEVELS.get(level or "", "")),
         Box(
             "Valid points, least of the steps",
             f"{100.0 * share:.1f} %",
@@ -159,8 +159,8 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
     facts = source.facts
     times = [s.captured_utc for s in measured.steps if s.captured_utc]
 
-    def told(name: str, label: str, value: str | None) -> Item:
-        known = Value(value, None, "as told") if value else None
+    def stated(name: str, label: str, value: str | None) -> Item:
+        known = Value(value, None, "as stated") if value else None
         return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/facts or facts.toml")
 
     taken = None
@@ -169,13 +169,13 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
         origin = "import of the files, not their exposure" if imported else "recorded with the images"
         taken = Value(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}", None, origin)
     return [
-        told("purpose", "Purpose", facts.purpose),
-        told("specimen", "Specimen", facts.specimen or source.test_record.specimen),
-        told("material", "Material", facts.material),
-        told("loading", "Loading", facts.loading),
-        told("environment", "Environment", facts.environment),
-        told("laboratory", "Laboratory", facts.laboratory),
-        told("operator", "Operator", facts.operator),
+        stated("purpose", "Purpose", facts.purpose),
+        stated("specimen", "Specimen", facts.specimen or source.test_record.specimen),
+        stated("material", "Material", facts.material),
+        stated("loading", "Loading", facts.loading),
+        stated("environment", "Environment", facts.environment),
+        stated("laboratory", "Laboratory", facts.laboratory),
+        stated("operator", "Operator", facts.operator),
         Item("test.images_taken", "Images taken", (taken,), "is recorded when the service captures or imports"),
     ]
 
@@ -282,9 +282,9 @@ def _origin(source: Source) -> Origin:
         written = source.heads[n].created
         name = f"{path.name}, written {written}" if written else path.name
         rows.append((name, sorted((k, v) for k, v in inputs[n].items() if k not in common)))
-    told = source.facts.document()
+    stated = source.facts.document()
     return Origin(
         settings=json.dumps(first.settings, sort_keys=True, ensure_ascii=False),
-        facts=json.dumps(told, ensure_ascii=False) if told else "",
+        facts=json.dumps(stated, ensure_ascii=False) if stated else "",
         inputs=rows,
     )

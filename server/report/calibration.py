@@ -55,12 +55,12 @@ class CalibrationPart:
         """The measures at fitted and at held-out positions."""
         rows = []
         for name, label, unit in _CHECKS:
-            for which, told in (("fitted", "positions that were fitted"), ("held_out", "held-out positions")):
+            for which, positions in (("fitted", "positions that were fitted"), ("held_out", "held-out positions")):
                 found = getattr(self._record.checks, which)
                 each = {} if found is None else found.per_camera
                 measures = (found, *(each.get(cam) for cam in CAMERAS))
                 values = tuple(getattr(m, name) if isinstance(m, Measures) else None for m in measures)
-                rows.append(Check(f"calibration.{which}.{name}", f"{label}, {told}", unit, values))
+                rows.append(Check(f"calibration.{which}.{name}", f"{label}, {positions}", unit, values))
         return rows
 
     @property
@@ -84,7 +84,7 @@ class CalibrationPart:
         cameras = {"cam1": self._record.cam1, "cam2": self._record.cam2}
         rows = []
         for name in ELEVEN_PARAMETER_NAMES:
-            unit = next((told for end, told in _UNITS.items() if name.endswith(f"_{end}")), "")
+            unit = next((of for end, of in _UNITS.items() if name.endswith(f"_{end}")), "")
             label = name.split("_")[0] if name.endswith("px2") or not unit else name.rsplit("_", 1)[0]
             values = tuple(
                 Value(_with_sd(found[name], self._record.sigma.get(f"{cam}.{name}")), found[name])
@@ -96,13 +96,13 @@ class CalibrationPart:
     @property
     def target(self) -> str:
         """The target, and how the calibration was made."""
-        target, told, tilt = self._record.target, self._record.provenance, self._record.settings.axis_tilt_sigma_rad
+        target, origin, tilt = self._record.target, self._record.provenance, self._record.settings.axis_tilt_sigma_rad
         assert target is not None
         more = [
-            f"localiser {told.localiser}" if told.localiser else "",
-            f"{told.frames} frames averaged at each position" if told.frames else "",
-            f"rig {told.rig!r}" if told.rig else "",
-            f"stereorig {told.software_version}" if told.software_version else "",
+            f"localiser {origin.localiser}" if origin.localiser else "",
+            f"{origin.frames} frames averaged at each position" if origin.frames else "",
+            f"rig {origin.rig!r}" if origin.rig else "",
+            f"stereorig {origin.software_version}" if origin.software_version else "",
             f"axis tilt prior {tilt:g} rad" if tilt else "",
         ]
         made = "; ".join(filter(None, more))
@@ -119,10 +119,10 @@ class CalibrationPart:
         rows = []
         for name, camera in (("camera 1", self._loaded.pair.cam1), ("camera 2", self._loaded.pair.cam2)):
             lens = camera.lens
-            told: list[tuple[str, object]] = (
+            figures: list[tuple[str, object]] = (
                 [(f.name, getattr(lens, f.name)) for f in fields(lens)] if is_dataclass(lens) else []
             )
-            values = ", ".join(f"{n} = {v:.8g}" for n, v in told if isinstance(v, int | float))
+            values = ", ".join(f"{n} = {v:.8g}" for n, v in figures if isinstance(v, int | float))
             rows.append((name, type(lens).__name__, values))
         return rows
 

@@ -21,27 +21,27 @@ _STATIC = re.compile(r"\s*static\b", re.IGNORECASE)
 _MOST_BYTES = 96 << 20
 
 
-def static_steps(told: Sequence[int] | None, labels: Mapping[int, str], reference: int) -> tuple[list[int], str]:
+def static_steps(stated: Sequence[int] | None, labels: Mapping[int, str], reference: int) -> tuple[list[int], str]:
     """Return the static steps and how they are known.
 
     Parameters
     ----------
-    told
+    stated
         What the facts say; None: nothing.
     labels
         By measured step.
     reference
         Not one of them: everything is measured against it.
     """
-    if told is not None:
-        return sorted(n for n in set(told) if n in labels and n != reference), "as told for this test (static_steps)"
+    if stated is not None:
+        return sorted(n for n in set(stated) if n in labels and n != reference), "as stated (static_steps)"
     found = sorted(n for n, label in labels.items() if _STATIC.match(label) and n != reference)
     return found, "by their labels, which begin with the word static" if found else ""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """One quantity over the static steps; lengths in mm, strains as pure numbers. What cannot be told is None.
+    """One quantity over the static steps; lengths in mm, strains as pure numbers. What is not known is None.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Quantity:
 
     name: str
     floor: Floor | None
-    told: float | None
+    reported: float | None
 
     @property
     def is_place(self) -> bool:
@@ -154,14 +154,14 @@ def _floor(stack: Float, *, place: bool) -> Floor:
     return Floor(bias, ends, temporal, spatial, points, steps)
 
 
-def told_sigma(field: Field, strain: StrainField | None) -> dict[str, float | None]:
+def reported_sigma(field: Field, strain: StrainField | None) -> dict[str, float | None]:
     """Median of the standard deviations that a step's points carry, by quantity."""
     sigma = field.sigma_mm
     names = ("X", "Y", "Z", "U", "V", "W")[: sigma.shape[-1]]
-    told: dict[str, float | None] = {name: _median(sigma[..., k][field.valid]) for k, name in enumerate(names)}
+    reported: dict[str, float | None] = {name: _median(sigma[..., k][field.valid]) for k, name in enumerate(names)}
     if strain is not None:
-        told |= {name: _median(strain.sigma[..., k][strain.valid]) for k, name in enumerate(STRAINS)}
-    return told
+        reported |= {name: _median(strain.sigma[..., k][strain.valid]) for k, name in enumerate(STRAINS)}
+    return reported
 
 
 def _median(values: NDArray[Any]) -> float | None:

@@ -1,6 +1,6 @@
 """What follows from the calibration and the measured surface: stereo angle, stand-off, scale, field of view.
 
-All of it is told at the middle of what was measured, on the plane that fits the surface best.
+All of it holds at the middle of what was measured, on the plane that fits the surface best.
 """
 
 from __future__ import annotations

@@ -12,14 +12,14 @@ from core.pattern import PatternSize, pattern_size
 from server.config.camera_facts import CameraFacts, LensFacts, merged
 from server.formats.calibrations.record import CameraIdentity
 from server.report.geometry import Geometry, View
-from server.report.items import CALIBRATION, MEASURED, RECORD, TOLD, Item, Value, each, of_number, of_text, one
+from server.report.items import CALIBRATION, MEASURED, RECORD, STATED, Item, Value, each, of_number, of_text, one
 from server.report.records import CameraRecord
 from server.report.source import Source
 from server.report.steps import Measured
 
 _FACTS = "PUT /tests/{id}/facts or facts.toml"
 _RIG_FILE = f"the rig file or {_FACTS}"
-_IN_FILE = "as told (test or rig file)"
+_IN_FILE = "as stated (test or rig file)"
 _BY_SERVICE = "is recorded when the service captures"
 _NEEDS_CALIBRATION = "needs the calibration that the results were measured with (--calibration)"
 
@@ -118,7 +118,7 @@ def _lens_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> list[
     ]
     if any(lens.note for lens in lenses.values()):  # most have nothing on them: that is no item that is missing
         note = "Lens, accessories"
-        items.append(each("lens.note", note, lambda cam: of_text(lenses[cam].note, _IN_FILE) or Value("none told")))
+        items.append(each("lens.note", note, lambda cam: of_text(lenses[cam].note, _IN_FILE) or Value("none stated")))
     how = "of the fitted camera; longer than the focal length, since the lens is focused near"
     return [*items, each("lens.pinhole", "Pinhole distance", pinhole, _NEEDS_CALIBRATION, how)]
 
@@ -164,8 +164,8 @@ def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
         ),
     ]
     if source.facts.standoff_mm is not None:
-        ruler = of_number(source.facts.standoff_mm, "g", "mm", TOLD)
-        items.append(one("stand_off.told", "Stand-off distance, by ruler", ruler))
+        ruler = of_number(source.facts.standoff_mm, "g", "mm", STATED)
+        items.append(one("stand_off.stated", "Stand-off distance, by ruler", ruler))
     baseline, angle, between, remedy = None, None, "", _NEEDS_CALIBRATION
     if found is not None:
         degrees, sight = float(np.degrees(found.stereo_angle_rad)), float(np.degrees(found.sight_angle_rad))
@@ -180,7 +180,7 @@ def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
 def _recording_items(source: Source, measured: Measured) -> list[Item]:
     facts, rig, read_back = source.facts, source.rig, "read back from the camera"
     set_to = {cam: rig.cameras.get(cam, CameraRecord()) for cam in CAMERAS}
-    lighting = of_text(facts.lighting, TOLD) or of_text(rig.lighting, "as told (rig file)")
+    lighting = of_text(facts.lighting, STATED) or of_text(rig.lighting, "as stated (rig file)")
     return [
         one("rate", "Image acquisition rate", _rate(source, measured), f"frame_rate_hz of {_FACTS}"),
         each(
@@ -188,7 +188,7 @@ def _recording_items(source: Source, measured: Measured) -> list[Item]:
             "Exposure",
             lambda cam: (
                 of_number(set_to[cam].exposure_ms, "g", "ms", read_back)
-                or of_number(facts.exposure_ms, "g", "ms", TOLD)
+                or of_number(facts.exposure_ms, "g", "ms", STATED)
             ),
             f"exposure_ms of {_FACTS}",
         ),
@@ -204,7 +204,7 @@ def _recording_items(source: Source, measured: Measured) -> list[Item]:
         one(
             "pattern.technique",
             "Patterning technique",
-            of_text(facts.pattern_technique, TOLD),
+            of_text(facts.pattern_technique, STATED),
             f"pattern_technique of {_FACTS}",
         ),
     ]
@@ -237,7 +237,7 @@ def image_sizes(source: Source) -> tuple[tuple[int, int] | None, tuple[int, int]
 
 def _rate(source: Source, measured: Measured) -> Value | None:
     if source.facts.frame_rate_hz is not None:
-        return of_number(source.facts.frame_rate_hz, "g", "Hz", TOLD)
+        return of_number(source.facts.frame_rate_hz, "g", "Hz", STATED)
     rate, trigger = source.rig.frame_rate_hz, source.rig.trigger
     if rate is not None and trigger in ("free", "hardware"):
         return Value(f"{rate:g} Hz (trigger: {trigger})", rate, RECORD)
@@ -274,9 +274,9 @@ def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list
         contrast = Value(f"{size.contrast_grey:.1f} grey levels", size.contrast_grey, MEASURED)
     items = [one("pattern.size", "Pattern feature size", feature, needs, how)]
     if facts.pattern_feature_mm is not None:
-        told = of_number(facts.pattern_feature_mm, "g", "mm", TOLD)
-        method = facts.pattern_feature_method or "how it is known was not told"
-        items.append(one("pattern.told", "Pattern feature size, as told", told, "", method))
+        feature = of_number(facts.pattern_feature_mm, "g", "mm", STATED)
+        method = facts.pattern_feature_method or "how it is known was not stated"
+        items.append(one("pattern.stated", "Pattern feature size, as stated", feature, "", method))
     of = "standard deviation of the pattern's grey levels in the same region"
     return [*items, one("pattern.contrast", "Pattern contrast", contrast, needs, of)]
 
@@ -315,5 +315,5 @@ def _noise(source: Source, measured: Measured) -> tuple[Value | None, ...]:
         else:
             values.append(None)
     if values[1] is None and values[0] is not None and "residuals" in values[0].origin:
-        return (values[0],)  # the residuals of both images, told as camera 1's
+        return (values[0],)  # the residuals of both images, reported as camera 1's
     return tuple(values)

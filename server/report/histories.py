@@ -18,7 +18,7 @@ from server.report.steps import Measured, StepFigures
 from server.results.gauges.readings import read_gauges
 
 #: a gauge's values in every step, and why there are none
-_Told = Sequence[tuple[Mapping[str, Number], str]]
+_Readings = Sequence[tuple[Mapping[str, Number], str]]
 _EXTENSOMETER = ("elongation_mm", "strain")
 
 
@@ -113,35 +113,35 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
     curves: list[Picture] = []
     tables = []
     for k, extensometer in enumerate(steps[0].extensometers):
-        told: _Told = [(s.extensometers[k].values, s.extensometers[k].missing) for s in steps]
+        read: _Readings = [(s.extensometers[k].values, s.extensometers[k].missing) for s in steps]
         title = f"Extensometer {extensometer.name}"
-        tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, told))
-        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in told], axis)
-    others: list[tuple[str | None, str, _Told]] = []
+        tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, read))
+        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis)
+    others: list[tuple[str | None, str, _Readings]] = []
     for k, point in enumerate(steps[0].points):
         others.append((point.name, "Point", [(s.points[k].values, s.points[k].missing) for s in steps]))
     for k, area in enumerate(steps[0].areas):
         means = [({n: v.mean_number for n, v in s.areas[k].values.items()}, s.areas[k].missing) for s in steps]
         others.append((area.name, "Area", means))
-    for name, kind, told in others:
-        last = told[-1][0]
-        tables.append(_table(name, f"{kind} {name}", list(last), steps, told))
+    for name, kind, read in others:
+        last = read[-1][0]
+        tables.append(_table(name, f"{kind} {name}", list(last), steps, read))
         moved = [n for n in last if n in ("u_mm", "v_mm", "w_mm")]
-        curves += _curves(f"{kind} {name}", moved, [values for values, _ in told], axis)
+        curves += _curves(f"{kind} {name}", moved, [values for values, _ in read], axis)
     for line in steps[-1].lines:
         curves += _line(line, steps[-1].n)
     return Gauges(curves, problems, tables)
 
 
 def _table(
-    name: str | None, title: str, wanted: Sequence[str], steps: Sequence[StepReadings], told: _Told
+    name: str | None, title: str, wanted: Sequence[str], steps: Sequence[StepReadings], read: _Readings
 ) -> GaugeTable:
-    wanted = [n for n in wanted if n in told[-1][0]]
-    units = {n: next((values[n].units for values, _ in told if n in values), "") for n in wanted}
+    wanted = [n for n in wanted if n in read[-1][0]]
+    units = {n: next((values[n].units for values, _ in read if n in values), "") for n in wanted}
     columns = [f"{n.removesuffix('_mm')}{'' if units[n] in ('', '1') else ', ' + units[n]}" for n in wanted]
     rows = [
         (step.n, [_value(values.get(n), missing) for n in wanted])
-        for step, (values, missing) in zip(steps, told, strict=True)
+        for step, (values, missing) in zip(steps, read, strict=True)
     ]
     return GaugeTable(str(name), title, ["step", *columns], rows)
 
@@ -153,13 +153,13 @@ def _value(number: Number | None, missing: str) -> Value:
     return Value(f"{number.value:.6g}{sd}", number.value)
 
 
-def _curves(title: str, wanted: Sequence[str], told: Sequence[Mapping[str, Number]], axis: _Axis) -> list[Picture]:
+def _curves(title: str, wanted: Sequence[str], read: Sequence[Mapping[str, Number]], axis: _Axis) -> list[Picture]:
     if not wanted:
         return []
     factor, unit = (1e3, UM) if wanted[0].endswith("_mm") else (1e6, "microstrain")
     lines: Lines = {}
     for n in wanted:
-        numbers = [values.get(n) for values in told]
+        numbers = [values.get(n) for values in read]
         value = [None if v is None or v.value is None else factor * v.value for v in numbers]
         sigma = [None if v is None or v.sigma is None else factor * v.sigma for v in numbers]
         lines[n.removesuffix("_mm")] = (value, sigma)
@@ -169,12 +169,12 @@ def _curves(title: str, wanted: Sequence[str], told: Sequence[Mapping[str, Numbe
 
 def _line(line: LineReading, n: int) -> list[Picture]:
     drawn = []
-    for name, told in list(line.values.items())[:6]:
+    for name, read in list(line.values.items())[:6]:
         data = course(
             line.distance_px,
-            {name: (told.value, None)},
+            {name: (read.value, None)},
             x_label="distance along the line, px",
-            y_label=f"{name}, {told.units}",
+            y_label=f"{name}, {read.units}",
             title=f"Line {line.name}, step {n}",
         )
         drawn.append(Picture(data, SVG, f"{name} along line {line.name}", f"Line {line.name}: {name} in step {n}"))

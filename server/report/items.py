@@ -9,10 +9,10 @@ import numpy as np
 
 from core.names import CAMERAS, CameraName
 
-CALIBRATION, MEASURED, TOLD, RECORD, SETTINGS = (
+CALIBRATION, MEASURED, STATED, RECORD, SETTINGS = (
     "from the calibration",
     "measured here",
-    "as told",
+    "as stated",
     "recorded with the images",
     "settings of the analysis",
 )

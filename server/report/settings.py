@@ -21,8 +21,8 @@ _TENSORS = {
 }
 _REFERENCES = {
     "never": "the first for all steps (total)",
-    "always": "the step before (incremental), told as totals",
-    "auto": "the first, or a later one where that fails, told as totals",
+    "always": "the step before (incremental), reported as totals",
+    "auto": "the first, or a later one where that fails, reported as totals",
 }
 _CRITERION = (
     "zero-mean normalised sum of squared differences (ZNSSD), "
@@ -86,7 +86,7 @@ def _smoothing(measured: Measured) -> Value:
         return Value("none", None, SETTINGS)
     mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
     text = f"polynomial of order {smoothing.order} over {smoothing.window} x {smoothing.window} points; "
-    text += f"{smoothing.resolution_px:g} px{mm} are told apart"
+    text += f"{smoothing.resolution_px:g} px{mm} are distinguished"
     return Value(text, float(smoothing.resolution_px), SETTINGS)
 
 

@@ -42,7 +42,7 @@ class Source:
     calibration, calibration_file
         None where it was not found or is not the one that was measured with.
     facts
-        What people told.
+        Metadata stated by the operator.
     stale
         What is gone or was replaced since the results were written.
     doubts
@@ -126,7 +126,7 @@ def find_source(
     calibration
         Its file, where it is not beside the results.
     facts
-        What people told; left out: what is kept with the test.
+        Metadata stated by the operator; left out: what is kept with the test.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def _calibration(
                 code="calibration_changed",
                 remedy="Give the other one.",
             )
-        doubts.append(f"{path.name} is not the calibration that was measured with; nothing is told from it.")
+        doubts.append(f"{path.name} is not the calibration that was measured with; nothing is reported from it.")
     if given is not None:
         load_calibration(given)  # says what is wrong with it
     return None, None

@@ -15,7 +15,7 @@ from server.formats.calibrations.volume import rbe_of
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
 from server.formats.results.summary import StepSummary, summarise
-from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, static_steps, told_sigma
+from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, reported_sigma, static_steps
 from server.report.records import QualityRecord
 from server.report.source import Source
 
@@ -88,14 +88,14 @@ class Measured:
     steps
         Ascending.
     reference
-        The shape that everything is told from.
+        The shape that everything is relative to.
     shown
         Steps that are drawn: the peak and the last; of shapes, the last.
     floor
         By quantity; empty without static steps.
     static, static_how, static_left_out
         Which steps the floor is from, how they are known, and which did not fit into memory.
-    told
+    reported
         Median of the predicted standard deviations by quantity, of the first displacement or else of the shape.
     noise_grey
         Median noise of the reference image from the residuals of the matching.
@@ -108,16 +108,16 @@ class Measured:
     static: list[int]
     static_how: str
     static_left_out: list[int]
-    told: dict[str, float | None]
+    reported: dict[str, float | None]
     noise_grey: float | None
 
     @property
     def quantities(self) -> list[Quantity]:
         """What is known of the noise of each quantity."""
         return [
-            Quantity(name, self.floor.get(name), self.told.get(name))
+            Quantity(name, self.floor.get(name), self.reported.get(name))
             for name in (*LENGTHS, *STRAINS)
-            if name in self.floor or name in self.told
+            if name in self.floor or name in self.reported
         ]
 
     @property
@@ -153,7 +153,7 @@ def read_steps(source: Source) -> Measured:
     peak: Shown | None = None
     last: Shown | None = None
     height = -np.inf
-    told: dict[str, float | None] = {}
+    reported: dict[str, float | None] = {}
     loads = {n: _load(source, n) for n in source.files}
     by_load = all(load is not None for load in loads.values()) and len(set(loads.values())) > 1
     for n, path in source.files.items():
@@ -164,8 +164,8 @@ def read_steps(source: Source) -> Measured:
         figures.append(step)
         if reference is None:
             reference = field
-        if not told or ("U" not in told and field.has_motion):
-            told = told_sigma(field, strain)
+        if not reported or ("U" not in reported and field.has_motion):
+            reported = reported_sigma(field, strain)
         if n == source.reference and field.has_motion is False:
             reference = field
         if n == source.reference and len(source.files) > 1:
@@ -189,7 +189,7 @@ def read_steps(source: Source) -> Measured:
         static=keeper.steps,
         static_how=how,
         static_left_out=keeper.left_out,
-        told=told,
+        reported=reported,
         noise_grey=float(np.median(grey)) if grey.size else None,
     )
 

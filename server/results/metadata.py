@@ -1,7 +1,7 @@
-"""What only people know about a test: lenses, light, pattern, specimen, purpose.
+"""Metadata of a test that no device knows: lenses, light, pattern, specimen, purpose.
 
-Nothing here is measured or guessed. A fact that nobody told is None, and a report lists it as not stated. Facts about
-cameras and lenses stand in the rig file, and are kept with every step that is captured; those of a test go before them.
+Nothing here is measured or guessed. A fact that was not stated is None, and a report lists it as not stated. Those of
+cameras and lenses come from the rig file and are kept with every captured step; those of a test go before them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from server.results.gauges.request import GaugeRequest
 
 
 class TestFacts(ClosedFacts):
-    """What is told of one test."""
+    """Metadata of one test."""
 
     __test__ = False
 
@@ -64,7 +64,7 @@ class TestFacts(ClosedFacts):
         return self.cam1 if cam == "cam1" else self.cam2
 
     def document(self) -> dict[str, object]:
-        """Return what was told, nothing else."""
+        """Return what was stated, nothing else."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
@@ -85,7 +85,7 @@ def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
             f"{name}: {where}: {first['msg']}.",
             code="metadata_invalid",
             field=where,
-            remedy="Correct it; docs/how_to/report.md lists what can be told.",
+            remedy="Correct it; docs/how_to/report.md lists what can be stated.",
         ) from error
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from server.results.quality import gradients
 
-#: noise for which errors are told where it is not known, as a share of full scale: 2.55 grey levels of 255
+#: noise for which errors are reported where it is not known, as a share of full scale: 2.55 grey levels of 255
 NOISE_SHARE = 0.01
 #: expected errors in px up to which texture is called good, and usable
 GOOD_PX, USABLE_PX = 0.01, 0.05
@@ -124,10 +124,10 @@ def texture_verdict(
         Standard deviation of the noise; `NOISE_SHARE` of full scale where not known.
     """
     noise = NOISE_SHARE * full_scale if noise_grey is None else noise_grey
-    told = errors_at(pixels, xy_px, noise, tuple(sorted({*SIZES, subset_px})))
+    errors = errors_at(pixels, xy_px, noise, tuple(sorted({*SIZES, subset_px})))
     shares = {
         size: SubsetShare(size, float(np.mean(error <= GOOD_PX)), float(np.mean(error <= USABLE_PX)))
-        for size, error in told.items()
+        for size, error in errors.items()
     }
     proposed = next((s for s in SIZES if shares[s].good_share >= ENOUGH), None)
     if proposed is None:
@@ -136,7 +136,7 @@ def texture_verdict(
     level: Literal["good", "usable", "poor"] = "good"
     if own.good_share < ENOUGH:
         level = "usable" if own.usable_share >= ENOUGH else "poor"
-    median = float(np.median(told[subset_px]))
+    median = float(np.median(errors[subset_px]))
     return TextureVerdict(
         subset_px=subset_px,
         subsets=len(xy_px),

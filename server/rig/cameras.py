@@ -42,7 +42,7 @@ class PairShot:
         Largest difference of the two exposures' beginnings.
     image_speed_px_s
         How fast camera 1's image moved from the first to the last frame; None for a single frame, or where it cannot
-        be told.
+        be known.
     settings
         Exposure (ms) and gain (dB) of each camera, as read back.
     frame_counts

@@ -165,7 +165,7 @@ def identity_of(description: CameraDescription) -> dict[str, str]:
 
 
 def kept_camera(settings: CameraSettings, facts: CameraFacts) -> CameraKept:
-    """Return what a step's record keeps of a camera; a fact that nobody told is not there."""
+    """Return what a step's record keeps of a camera; a fact that was not stated is not there."""
     has = asdict(settings)
-    told = facts.model_dump(mode="json", exclude_none=True)
-    return CameraKept.model_validate({**{name: has[name] for name in _KEPT_SETTINGS}, **told})
+    stated = facts.model_dump(mode="json", exclude_none=True)
+    return CameraKept.model_validate({**{name: has[name] for name in _KEPT_SETTINGS}, **stated})

@@ -51,12 +51,12 @@ def analysis_entry(analysis: AnalysisRecord, job_id: str | None = None) -> dict[
 
 
 def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: list[str]) -> list[Entry]:
-    """Everything that the index holds of a test; what cannot be read is left out and told.
+    """Everything that the index holds of a test; what cannot be read is left out and reported.
 
     Parameters
     ----------
     lost
-        Told of every document.
+        Called with every document.
     trouble
         Gets a line for each document that cannot be read.
     """

@@ -1,4 +1,4 @@
-"""What the folders know of jobs and requests, for a catalogue that was lost, or was not yet told when a kill came.
+"""What the folders know of jobs and requests, for a catalogue that was lost, or did not have them yet when a kill came.
 
 Whatever a job makes bears the job's id and the Idempotency-Key that asked for it. From there both are known again:
 a client that sends its request once more gets what it made, with its job as it ended.
@@ -88,9 +88,9 @@ class LostJobs:
     ) -> None:
         if not is_id(job_id, "j"):  # a folder from elsewhere may say anything
             return
-        told = None if problem is None else JobProblem.model_validate(problem.plain())
-        if state != "succeeded" and told is None:
-            told = problem_of(RESTART)
+        known_problem = None if problem is None else JobProblem.model_validate(problem.plain())
+        if state != "succeeded" and known_problem is None:
+            known_problem = problem_of(RESTART)
         self._jobs[job_id] = JobRecord(
             id=job_id,
             kind=kind,
@@ -101,7 +101,7 @@ class LostJobs:
             started_utc=None,
             finished_utc=None,
             result=None if result is None else dict(result),
-            problem=told,
+            problem=known_problem,
         )
 
     def _end_bursts(self) -> None:

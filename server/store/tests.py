@@ -132,14 +132,14 @@ class TestStore:
             yield
 
     def facts(self, test_id: str) -> dict[str, object]:
-        """Return what was told about a test besides its images; empty where nothing was."""
+        """Return a test's metadata; empty where nothing was stated."""
         found = self.read(test_id).facts
         return found if isinstance(found, dict) else {}
 
     def put_metadata(
         self, test_id: str, facts: Mapping[str, object], expected: Mapping[str, object] | None = None
     ) -> None:
-        """Replace what was told about a test; durable when this returns.
+        """Replace a test's metadata; durable when this returns.
 
         Parameters
         ----------

@@ -110,7 +110,7 @@ class _Walk:
                 self.document(folder / name)
 
     def strangers(self, folder: Path, kind: str) -> None:
-        """Tell what lies in a folder that the service does not write there; half-written files are told elsewhere."""
+        """Report strange files in a folder; half-written ones are reported elsewhere."""
         for path in sorted(folder.iterdir()):
             if re.fullmatch(_KNOWN[kind], path.name) is None and not path.name.endswith(".part"):
                 self.say("foreign", path, "this name is not one that the service makes")
@@ -131,7 +131,7 @@ class _Walk:
         self.compare(path, recorded_sha256(path))
 
     def entries(self, folder: Path, letter: str, mark: str) -> Iterator[Path]:
-        """Folders of a kind that hold their mark; the others are told."""
+        """Folders of a kind that hold their mark; the others are reported."""
         if not folder.is_dir():
             return
         for path in sorted(folder.iterdir()):
@@ -276,7 +276,7 @@ def verify(root: Path) -> Verification:
     Parameters
     ----------
     root
-        A data folder; a service may run on it: then only what is found twice, a moment apart, is told.
+        A data folder; a service may run on it: then only what is found twice, a moment apart, is reported.
 
     Raises
     ------

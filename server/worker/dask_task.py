@@ -65,7 +65,7 @@ def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args
     name
         Of the task, for :func:`stop` and for its progress.
     topic
-        Where its progress is told.
+        Where its progress is reported.
     threads
         Kernel threads of this worker.
     """

@@ -65,7 +65,7 @@ def _oom_kills(path: Path) -> int | None:
 
 
 def resident_mib(pid: int) -> float | None:
-    """Memory that a process holds; None where it cannot be told, as when it has ended."""
+    """Memory that a process holds; None where it is not known, as when it has ended."""
     try:
         return float(psutil.Process(pid).memory_info().rss) / 2**20 or None
     except psutil.Error:

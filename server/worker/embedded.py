@@ -248,10 +248,10 @@ class ComputeWorker(TaskExecutor):
 
     def _wait_ready(self, task: _Task, connection: Connection, process: multiprocessing.process.BaseProcess) -> bool:
         # a task that is cancelled while the kernels warm up must not cost a restart
-        told = False
+        announced = False
         while not self.ready.is_set():
-            if self.compiling.is_set() and not told and task.future.on_progress is not None:
-                told = True
+            if self.compiling.is_set() and not announced and task.future.on_progress is not None:
+                announced = True
                 task.future.on_progress(COMPILING, 0, 1)
             if task.future.stop_requested.is_set() or self._closing.is_set():
                 raise Cancelled("The computation was cancelled.")

@@ -120,14 +120,14 @@ class AnalysisRun:
     def _tell(self, job: Job) -> dict[str, object]:
         """Put what is finished into the job's result, and return it."""
         finished = [self._summaries[n] for n in self._document.steps if n in self._summaries]
-        told: dict[str, object] = {
+        found: dict[str, object] = {
             "analysis_id": self._document.id,
             "test_id": self._test_id,
             "steps_finished": [found.n for found in finished],
             "steps": [found.plain() for found in finished],
         }
-        job.result = told
-        return told
+        job.result = found
+        return found
 
     def _measure(self, job: Job) -> None:
         steps = self._document.steps
@@ -212,12 +212,12 @@ class AnalysisRun:
         self._failed[n] = error
 
     def _note(self, job: Job, n: int, summary: Mapping[str, object], started: float) -> None:
-        """A step is finished: durable first, then told."""
+        """A step is finished: durable first, then announced."""
         service, analysis_id = self._service, self._document.id
         seconds = round(time.monotonic() - started, 3)
-        told = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
-        service.tests.put_step_summary(self._test_id, analysis_id, n, told)
-        self._summaries[n] = StepFound.model_validate(told)
+        found = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
+        service.tests.put_step_summary(self._test_id, analysis_id, n, found)
+        self._summaries[n] = StepFound.model_validate(found)
         self._done[n] = service.tests.step(self._test_id, n)
         self._tell(job)
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
@@ -298,7 +298,7 @@ def task_of(
 
 
 def images_of(n: int, step: StepFiles) -> StepImages:
-    """Return a stored step's images as the worker is told of them."""
+    """Return a stored step's images as the worker gets them."""
     sha256 = step.document.sha256
     return StepImages(
         n=n,

@@ -1,4 +1,4 @@
-"""A burst: steps at an interval, as one job that holds the cameras; each step is durable before it is told."""
+"""A burst: steps at an interval, as one job that holds the cameras; each step is durable before it is announced."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def _run(
             failures.append({"index": index, "problem": problem.plain()})
             continue
         first_ns = step.host_monotonic_ns if first_ns is None else first_ns
-        told = {"index": index, "n": step.n, "since_first_ms": step.burst and step.burst.since_first_ms}
-        steps.append({**told, "quality": step.quality_code, "sha256": step.sha256})
+        taken = {"index": index, "n": step.n, "since_first_ms": step.burst and step.burst.since_first_ms}
+        steps.append({**taken, "quality": step.quality_code, "sha256": step.sha256})
     job.progress("steps", count, count)
     if problems:
         first, why = problems[0]

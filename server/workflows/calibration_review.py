@@ -39,7 +39,7 @@ def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None,
         model = "local" if target.node_tolerance_mm > 0.0 else "straight"
     noise = EXPECTED_NOISE_PX if noise_px is None else noise_px
     options = CalibrationOptions(axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"])
-    told = expect(
+    expected = expect(
         plan.positions_mm, target, nominals_of(rig), options, noise_px=noise, roll_deg=roll_deg, line_model=model
     )
     names = ("middle", *(f"{z} {y} {x}" for z in ("back", "front") for y in ("-Y", "+Y") for x in ("-X", "+X")))
@@ -51,18 +51,18 @@ def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None,
             "text": f"Each intersection is found to {noise:g} px a coordinate ({model} lines); the cameras are the rig "
             f"file's, look at the target's centre and see it turned by {roll_deg:g} degrees.",
         },
-        "parameters": {n: {"value": v, "sigma": told.sigma[n]} for n, v in told.parameters.items()},
+        "parameters": {n: {"value": v, "sigma": expected.sigma[n]} for n, v in expected.parameters.items()},
         "points": [
             {"name": name, "xyz_mm": xyz, "sigma_mm": sigma}
-            for name, xyz, sigma in zip(names, told.points_mm.tolist(), told.sigma_mm.tolist(), strict=True)
+            for name, xyz, sigma in zip(names, expected.points_mm.tolist(), expected.sigma_mm.tolist(), strict=True)
         ],
-        "shape_rms_mm": told.volume.shape_rms_mm,
-        "scale": told.volume.scale,
-        "centre_px": told.volume.centre_px,
-        "standoff_relative": told.volume.standoff_relative,
-        "seen_share": {"cam1": told.seen[0], "cam2": told.seen[1]},
-        "refused": bool(told.reasons),
-        "reasons": list(told.reasons),
+        "shape_rms_mm": expected.volume.shape_rms_mm,
+        "scale": expected.volume.scale,
+        "centre_px": expected.volume.centre_px,
+        "standoff_relative": expected.volume.standoff_relative,
+        "seen_share": {"cam1": expected.seen[0], "cam2": expected.seen[1]},
+        "refused": bool(expected.reasons),
+        "reasons": list(expected.reasons),
     }
 
 

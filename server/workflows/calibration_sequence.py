@@ -61,7 +61,7 @@ def check_plan(plan: CalibrationPlan) -> None:
     if fitted.size < 2 or np.ptp(fitted) < SAME_POSITION_MM:
         raise CalibrationInputError(
             f"The plan fits {fitted.size} position ({', '.join(f'{p:g} mm' for p in fitted)}); with one, a camera's "
-            "pinhole distance cannot be told from its distance to the target.",
+            "pinhole distance cannot be distinguished from its distance to the target.",
             remedy="Give two or more positions that lie millimetres apart.",
         )
     both = set(plan.positions_mm) & set(plan.held_out_mm)

@@ -100,7 +100,7 @@ class FlashConsent(Request):
 
 
 class StopReply(Reply):
-    """The stage was told to stop."""
+    """The stage was commanded to stop."""
 
     stopped: bool = Field(description="True once the stop command is on the wire.")
     elapsed_ms: float = Field(

@@ -86,7 +86,7 @@ async def _counted(app: ASGIApp, limit: int, scope: Scope, receive: Receive, sen
             raise TooLargeError(f"The body is larger than {limit} bytes.")
         return message
 
-    async def told(message: Message) -> None:
+    async def noted(message: Message) -> None:
         nonlocal answered, cut_off
         if cut_off:
             return
@@ -100,4 +100,4 @@ async def _counted(app: ASGIApp, limit: int, scope: Scope, receive: Receive, sen
         answered = True
         await send(message)
 
-    await app(scope, counted, told)
+    await app(scope, counted, noted)

@@ -105,12 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"({STRAIN_WINDOW.default})",
     )
     add("--strain-order", choices=("1", "2"), default="1", help="fit planes (1) or quadratics (2) over the gauge (1)")
-    add(
-        "--strain-tensor",
-        choices=STRAIN_TENSORS,
-        default="green_lagrange",
-        help="which strain is told (green_lagrange)",
-    )
+    add("--strain-tensor", choices=STRAIN_TENSORS, default="green_lagrange", help="strain tensor (green_lagrange)")
     add(
         "--smooth",
         default="off",

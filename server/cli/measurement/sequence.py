@@ -202,7 +202,7 @@ class _Runner:
         return summary
 
     def _say_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
-        """Say once what smoothing leaves to be told apart."""
+        """Print once what smoothing leaves distinguishable."""
         if result.smoothing is None or self._told_smoothing:
             return
         self._told_smoothing = True

@@ -88,7 +88,7 @@ def buckle(out: Path, up: Slice, across: Slice, loads_kn: Sequence[float]) -> di
                 off, sd = 1e3 * (line.found[i] - line.true[i])[order], 1e3 * line.sigma[i][order]
                 axes[1, k].plot(at, off, ".-", color=colour, markersize=3, linewidth=0.6)
                 if i == len(loads_kn) - 1:
-                    axes[1, k].fill_between(at, -sd, sd, color="0.85", linewidth=0.0, zorder=0, label="+- sigma told")
+                    axes[1, k].fill_between(at, -sd, sd, color="0.85", linewidth=0.0, zorder=0, label="reported sigma")
             axes[0, k].set_title(f"{title} (lines: true)")
             axes[1, k].set_xlabel("along the load, mm" if k == 0 else "along the crack, mm")
         axes[0, 0].set_ylabel("w towards the cameras, mm")
@@ -117,7 +117,7 @@ def strain(
             axes[1, 0],
             field,
             values - read,
-            f"difference: rms {found.all_read.rms:.0f}, told {found.all_read.told:.0f}",
+            f"difference: rms {found.all_read.rms:.0f}, reported {found.all_read.reported:.0f}",
             "microstrain",
         )
         axis = axes[1, 1]
@@ -168,7 +168,8 @@ def moved(out: Path, fields: Sequence[Field], strains: Sequence[StrainField], fo
             w = field.uvw_mm[..., 2]  # type: ignore[index]
             draw_map(axes[0, k], field, w, f"{one.name}: w", "mm", cmap=HEIGHT)
             for j, name in enumerate(("exx", "eyy")):
-                title = f"false {name}: mean {one.false_mean[j]:+.1f}, sd {one.false_sd[j]:.0f}, told {one.told[j]:.0f}"
+                sd = f"sd {one.false_sd[j]:.0f}, reported {one.reported[j]:.0f}"
+                title = f"false {name}: mean {one.false_mean[j]:+.1f}, {sd}"
                 draw_difference(axes[1 + j, k], field, MICRO * strain.strain[..., j], title, "microstrain", limit)
         save(figure, out / "steel_motion.png")
     return {"steel_motion.png": "three rigid motions, and the strain that is not there"}

@@ -59,7 +59,7 @@ def plate(
                 f"measured, gauge of {strains[-1].gauge_mm:.1f} mm",
                 "its window cut by the region's edge",
                 "plate theory at the point",
-                "+- sigma told",
+                "+- sigma reported",
                 "its bending alone",
             ],
             frameon=False,
@@ -91,8 +91,8 @@ def plate(
 def _theory(axis: Any, k: int, theory: CircularPlate, pressure: float, one: PlateStrain, strain: StrainField) -> None:
     radius = np.linspace(0.0, float(np.nanmax(one.r_mm[strain.valid])), 200)
     value = MICRO * theory.face_strain(radius, pressure)[k]
-    told = MICRO * float(np.median(one.sigma[k][one.whole]))
-    axis.fill_between(radius, value - told, value + told, color="0.8", linewidth=0.0, zorder=0)
+    reported = MICRO * float(np.median(one.sigma[k][one.whole]))
+    axis.fill_between(radius, value - reported, value + reported, color="0.8", linewidth=0.0, zorder=0)
     axis.plot(radius, value, "-", color="black", linewidth=0.8)
     axis.plot(radius, MICRO * theory.bending_strain(radius, pressure)[k], "--", color="black", linewidth=0.6)
     axis.annotate(

@@ -117,7 +117,7 @@ def read_opening(
 def read_slice(
     session: Session, analysis: AnalysisHandle, ends_px: Float, loads_kn: Sequence[float], axis: int
 ) -> Slice:
-    """Read w along a line over HTTP; ``axis`` 0: told along the crack, 1: along the load."""
+    """Read w along a line over HTTP; ``axis`` 0: given along the crack, 1: along the load."""
     line = {"vertices_px": np.asarray(ends_px).tolist()}
     steps = session.client.gauges(analysis, lines=[line], variables=["w_mm"])[1:]
     first = steps[0].lines[0]

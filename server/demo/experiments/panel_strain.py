@@ -79,7 +79,7 @@ def judge(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainField, l
             f"{load:g}",
             f"{one.at_points.rms:.0f}",
             f"{one.all_read.rms:.0f}",
-            f"{one.all_read.told:.0f}",
+            f"{one.all_read.reported:.0f}",
             f"{one.all_read.chi:.2f}",
             f"{one.beside_points.rms:.0f}",
             f"{one.beside_read.rms:.0f}",
@@ -113,7 +113,17 @@ def judge(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainField, l
         f"strain along the load, microstrain, gauge of {strain.gauge_mm:.1f} mm; off the truth at the points, and "
         "off what the gauge reads of it:",
         *table(
-            ["kN", "rms off", "as read", "told", "chi", "beside the crack", "as read", "chi", "over it it would be"],
+            [
+                "kN",
+                "rms off",
+                "as read",
+                "reported",
+                "chi",
+                "beside the crack",
+                "as read",
+                "chi",
+                "over it it would be",
+            ],
             rows,
         ),
     ]
@@ -121,7 +131,7 @@ def judge(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainField, l
         "gauge_mm": strain.gauge_mm,
         "rms_microstrain": [one.at_points.rms for one in found],
         "rms_as_read_microstrain": [one.all_read.rms for one in found],
-        "told_microstrain": [one.all_read.told for one in found],
+        "reported_microstrain": [one.all_read.reported for one in found],
         "chi": [one.all_read.chi for one in found],
         "beside_crack_rms_microstrain": [one.beside_points.rms for one in found],
         "beside_crack_chi": [one.beside_read.chi for one in found],

@@ -119,7 +119,7 @@ def judge(
                 f"{radial.rms:.0f}",
                 f"{hoop.rms:.0f}",
                 f"{MICRO * gauge_effect(strain, q, plate):.0f}",
-                f"{radial.told:.0f}",
+                f"{radial.reported:.0f}",
                 f"{radial_read.chi:.2f}",
                 f"{hoop_read.chi:.2f}",
             ]
@@ -128,7 +128,7 @@ def judge(
     effect, chance = MICRO * gauge_effect(strain, q, plate), chi_limit(strain)
     for k, name in enumerate(("radial", "hoop")):
         off, read = found[-1].off_theory[k], found[-1].off_read[k]
-        limit = float(np.hypot(chance * off.told, effect))
+        limit = float(np.hypot(chance * off.reported, effect))
         outcome.checks += [
             Check(f"{name} strain at {q:g} kPa, rms off plate theory", "microstrain", off.rms, None, off.rms, limit),
             Check(
@@ -161,7 +161,7 @@ def judge(
                 "rms off: radial",
                 "hoop",
                 "gauge's width",
-                "noise told",
+                "noise reported",
                 "chi radial",
                 "hoop",
             ],
@@ -178,6 +178,6 @@ def judge(
         "centre_sigma_microstrain": [MICRO * s for _, s in at_centre],
         "rms_microstrain": [[d.rms for d in one.off_theory] for one in found],
         "rms_all_points_microstrain": [[d.rms for d in one.all_off_theory] for one in found],
-        "told_microstrain": [[d.told for d in one.off_theory] for one in found],
+        "reported_microstrain": [[d.reported for d in one.off_theory] for one in found],
         "chi": [[d.chi for d in one.off_read] for one in found],
     }

@@ -50,8 +50,8 @@ class Moved:
     false_mean, false_mean_sigma, false_mean_calibration
         (3,) microstrain of exx, eyy, exy: mean of strain that is not there, as the service's area reads it, its sigma,
         and what the calibration's covariance adds.
-    false_sd, told
-        (3,) its scatter over the field, and the scatter that is told.
+    false_sd, reported
+        (3,) its standard deviation over the field, and the reported one.
     chi
         Root mean square of that strain in units of its own sigma.
     left
@@ -70,7 +70,7 @@ class Moved:
     false_mean_sigma: Float
     false_mean_calibration: Float
     false_sd: Float
-    told: Float
+    reported: Float
     chi: float
     left: Mapping[str, AreaStatistics]
 
@@ -176,7 +176,7 @@ def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField
         false_mean_sigma=mean_sigma,
         false_mean_calibration=MICRO * np.sqrt(np.diag(calibration))[6:],
         false_sd=MICRO * e.std(axis=0),
-        told=MICRO * np.sqrt(np.mean(sigma**2, axis=0)),
+        reported=MICRO * np.sqrt(np.mean(sigma**2, axis=0)),
         chi=float(np.sqrt(np.mean((e / sigma) ** 2))),
         left=area,
     )
@@ -217,7 +217,7 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
                 f"{1e3 * float(np.max(one.elongation_sigma_mm)):.2f}",
                 false,
                 f"{one.false_sd[0]:.0f}",
-                f"{one.told[0]:.0f}",
+                f"{one.reported[0]:.0f}",
                 f"{one.chi:.2f}",
             ]
         )
@@ -236,7 +236,7 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
                 "sigma",
                 "false strain, mean",
                 "sd exx",
-                "told",
+                "reported",
                 "chi",
             ],
             false_rows,
@@ -261,7 +261,7 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
                 "mean_sigma": one.false_mean_sigma.tolist(),
                 "mean_sigma_calibration": one.false_mean_calibration.tolist(),
                 "sd": one.false_sd.tolist(),
-                "told": one.told.tolist(),
+                "reported": one.reported.tolist(),
                 "chi": one.chi,
             },
         }

@@ -165,7 +165,7 @@ def opencv_text(
 ) -> str:
     """Return a stereo calibration as ``cv2.FileStorage`` reads it; the skew, which OpenCV does not know, must be 0.
 
-    The image size is told where both cameras share one.
+    The image size is given where both cameras share one.
     """
     pose = pair.cam2_from_cam1
     lines = ["%YAML:1.0", "---", f"# {comment}"]

@@ -37,7 +37,7 @@ class ChecksRecord(Record):
 
 
 class VerdictRecord(Record):
-    """What the calibration was judged to be worth."""
+    """The verdict on a calibration."""
 
     level: str | None = None
     reasons: list[str] = Field(default=[])

@@ -28,9 +28,9 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
     # those that the fit used
     fitted = [view for view in record.views if not view.held_out]
     positions = [[view.dz_mm for view in fitted if view.camera == cam] for cam in CAMERAS]
-    told = record.target
+    target = record.target
     try:
-        grid = GridTarget(pitch_mm=told.pitch_mm, lines=told.lines, line_width_mm=told.line_width_mm)
+        grid = GridTarget(pitch_mm=target.pitch_mm, lines=target.lines, line_width_mm=target.line_width_mm)
     except TargetError:
         return None
     return calibrated_volume(
@@ -44,7 +44,7 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
 
 
 def rbe_of(calibration: LoadedCalibration) -> float | None:
-    """Return the calibration's reprojection error, of held-out positions where there are any; None if not told."""
+    """Return the calibration's reprojection error, of held-out positions where there are any; None if not known."""
     checks = calibration.record.checks or ChecksRecord()
     for measures in (checks.held_out, checks.fitted):
         value = None if measures is None else measures.rbe_px

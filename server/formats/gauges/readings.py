@@ -156,7 +156,7 @@ class GaugeReadings:
     stale, stale_reasons
         Whether inputs or results are gone or were replaced since, and which.
     frame
-        What places and displacements are told in.
+        The frame of positions and displacements.
     smoothing_window
         Of the displacements; None: as measured.
     alignment

@@ -75,10 +75,10 @@ def _of_step(step: StepReadings) -> Iterator[Row]:
             parts[f"{quantity}:count"] = Number(v.count, None, "1")
             yield from _rows(replace(head, gauge=area.name, kind="area"), parts, area.missing)
     for line in step.lines:
-        for quantity, told in line.values.items():
+        for quantity, numbers in line.values.items():
             for k, (x, y, at) in enumerate(zip(line.x_px, line.y_px, line.distance_px, strict=True)):
                 place = replace(head, gauge=line.name, kind="line", x_px=x, y_px=y, distance_px=at)
-                number = Number(told.value[k], told.sigma[k], told.units)
+                number = Number(numbers.value[k], numbers.sigma[k], numbers.units)
                 yield from _rows(place, {quantity: number}, line.missing[k])
 
 

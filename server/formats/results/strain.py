@@ -28,14 +28,14 @@ _COMPONENTS = (("exx", "along axis 1"), ("eyy", "along axis 2"), ("exy", "shear 
 
 def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> None:
     """Add the strain's variables (``row``, ``col``) to an open result file; strain as a pure number."""
-    told = _TENSOR[strain.options.tensor]
+    tensor = _TENSOR[strain.options.tensor]
     principal, sigma, sigma_principal = strain.principal, strain.sigma, strain.sigma_principal
     found: list[tuple[str, Any, str, str]] = []
     for k, (name, what) in enumerate(_COMPONENTS):
-        found.append((name, strain.strain[..., k], "1", f"{told}, {what}"))
+        found.append((name, strain.strain[..., k], "1", f"{tensor}, {what}"))
         found.append((f"sigma_{name}", sigma[..., k], "1", f"standard deviation of {name}"))
     for k, which in enumerate(("larger", "smaller")):
-        found.append((f"e{k + 1}", principal[..., k], "1", f"{told}, {which} principal value"))
+        found.append((f"e{k + 1}", principal[..., k], "1", f"{tensor}, {which} principal value"))
         found.append((f"sigma_e{k + 1}", sigma_principal[..., k], "1", f"standard deviation of e{k + 1}, linearised"))
     found += [
         ("strain_angle_rad", strain.angle_rad, "rad", "direction of e1 from axis 1 towards axis 2"),
@@ -53,7 +53,7 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
                 f"{name}_patch",
                 strain.patch[..., k],
                 "1",
-                f"{told} of the patch itself, {what}",
+                f"{tensor} of the patch itself, {what}",
                 sparse=sparse,
             ).setncatts({"gauge_px": float(strain.subset_px)})
     _variable(

@@ -41,7 +41,7 @@ class Span:
 
 @dataclass(frozen=True)
 class StepSummary:
-    """One field in a few numbers; what cannot be told is None.
+    """One field in a few numbers; what is not known is None.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class StepSummary:
     zncc_median, sigma_median_mm
         By comparison, and by coordinate (``x_mm`` ...).
     smoothing
-        How the displacement was smoothed and what can still be told apart.
+        How the displacement was smoothed and what is still distinguished.
     patch
         What the field was measured with, why, and the numbers of the choice.
     reference_step, points_by_reference, displacement_mm

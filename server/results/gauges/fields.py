@@ -79,14 +79,14 @@ class FieldWriter:
             },
             sort_keys=True,
         )
-        told = head.frame
+        described = head.frame
         if self._request.align is not None:
-            told = f"aligned by {self._request.align.kind}; before: {told}"
+            described = f"aligned by {self._request.align.kind}; before: {described}"
         provenance = Provenance(
             settings=head.settings,
             inputs=head.inputs_sha256,
             software_version=software_version(),
-            frame=told,
+            frame=described,
             step=head.step,
             extra=extra,
         )

@@ -213,7 +213,7 @@ def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
 
 
 def _placed(field: Field, request: GaugeRequest) -> _Placed:
-    """Return the pixels of each named point and extensometer; those told in mm are found on the first step's shape."""
+    """Return the pixels of each named point and extensometer; those given in mm are found on the first step's shape."""
     placed: _Placed = {}
     gauges: list[PointGauge | ExtensometerGauge] = [*request.points, *request.extensometers]
     for gauge in gauges:
@@ -277,7 +277,7 @@ def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> d
 def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> PointReading:
     places = sample(variables.field, [xy])
     found = _at_places(variables, names, places)
-    values = {n: Number(told.value[0], told.sigma[0], told.units) for n, told in found.items()}
+    values = {n: Number(reading.value[0], reading.sigma[0], reading.units) for n, reading in found.items()}
     return PointReading(name, xy, places.missing[0], values)
 
 
@@ -350,7 +350,7 @@ def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
     turns = {f"rotation_{axis}_rad": (motion.rotation_vector_rad[k], sigma[k], "rad") for k, axis in enumerate("xyz")}
     shifts = {f"translation_{axis}_mm": (motion.translation_mm[k], sigma[3 + k], "mm") for k, axis in enumerate("xyz")}
     return RigidMotionReading(
-        values={name: _number(*told) for name, told in (turns | shifts).items()},
+        values={name: _number(*reading) for name, reading in (turns | shifts).items()},
         centre_mm=motion.centre_mm.tolist(),
         covariance=motion.covariance.tolist(),
         points=motion.points,

@@ -38,7 +38,7 @@ class PointGauge(_Named):
         return self
 
     def places(self) -> tuple[list[PlaceMm], bool]:
-        """Return the place, and True if it is told in mm."""
+        """Return the place, and True if it is given in mm."""
         return [p for p in (self.xy_px, self.xy_mm) if p is not None], self.xy_px is None
 
 
@@ -68,7 +68,7 @@ class ExtensometerGauge(_Named):
         return self
 
     def places(self) -> tuple[list[PlaceMm], bool]:
-        """Return both ends, and True if they are told in mm."""
+        """Return both ends, and True if they are given in mm."""
         if self.a_px is not None and self.b_px is not None:
             return [self.a_px, self.b_px], False
         return list(self.ends_mm or ()), True

@@ -87,7 +87,7 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
         except NotFoundError:
             job_id = None  # the catalogue was lost with its jobs; the files tell the rest
     stale = analysis_start.stale_reasons(service, test_id, document)
-    told = {
+    reply = {
         **document.shown(),
         "state": state,
         "job_id": job_id,
@@ -97,7 +97,7 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
         "stale": bool(stale),
         "stale_reasons": stale,
     }
-    return AnalysisReply.model_validate(told)
+    return AnalysisReply.model_validate(reply)
 
 
 @router.get("", summary="A test's analyses, oldest first", responses=errors(404, 422))

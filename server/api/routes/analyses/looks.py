@@ -22,7 +22,7 @@ Kind = Annotated[MapKind, Path(description="What the map shows.")]
 Index = Annotated[int, Path(ge=0, le=9999, description="Number of the position.")]
 Subset = Annotated[
     int,
-    Query(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Width of the subset that the texture is judged for, px."),
+    Query(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Width of the subset that the texture is rated for, px."),
 ]
 Width = Annotated[int | None, Query(ge=16, le=8192, description="Width in px; the image's own if left out.")]
 _KEPT = "private, max-age=86400"  # what a step or a view shows never changes
@@ -173,9 +173,9 @@ def _within(pixels: GrayImage, x_px: int, y_px: int) -> None:
         )
 
 
-def _full_scale(pixels: GrayImage, told: float | None) -> float:
+def _full_scale(pixels: GrayImage, stated: float | None) -> float:
     """Return the largest grey level; of images from elsewhere the one that their type can hold."""
-    return float(told) if told else (255.0 if pixels.dtype.itemsize == 1 else 65535.0)
+    return float(stated) if stated else (255.0 if pixels.dtype.itemsize == 1 else 65535.0)
 
 
 def step_image(service: Service, test_id: str, n: int, cam: str) -> tuple[GrayImage, float]:
@@ -183,8 +183,8 @@ def step_image(service: Service, test_id: str, n: int, cam: str) -> tuple[GrayIm
     step = service.tests.verified_step(test_id, n)
     pixels = read_image(step.cam1 if cam == "cam1" else step.cam2)
     depth = (step.document.bit_depth or {}).get(cam)
-    told = None if depth is None else (2**depth - 1) * (step.document.grey_scale or 1)
-    return pixels, _full_scale(pixels, told)
+    full_scale = None if depth is None else (2**depth - 1) * (step.document.grey_scale or 1)
+    return pixels, _full_scale(pixels, full_scale)
 
 
 def _jpeg(data: bytes) -> Response:

@@ -62,7 +62,7 @@ async def job_events(
     after = hub.last_number if last_event_id is None else last_event_id
 
     def shown() -> ServerSentEvent:
-        # the number first: what happens meanwhile is told twice, and never not at all
+        # the number first: what happens meanwhile is sent twice rather than not at all
         number = hub.last_number
         return ServerSentEvent(data=service.jobs.document(job_id).plain(), event="job", id=str(number))
 

@@ -99,7 +99,7 @@ async def events(service: ServiceDep, last_event_id: LastEventId = None) -> Asyn
     """Follow jobs, steps, results, scene and stage; resumes after `Last-Event-ID`, also over a restart.
 
     Where events are lost to the reader, because it was away for long, too slow, or the service was started again, an
-    event `gap` comes first: `next` is the first number that can be told. What the reader shows must be asked anew.
+    event `gap` comes first: `next` is the first number that is available. What the reader shows must be asked anew.
     """
     after = service.hub.last_number if last_event_id is None else last_event_id
     with service.streams.counted("events"):

@@ -15,9 +15,9 @@ from server.results.metadata import TestFacts
 router = APIRouter(prefix="/tests/{test_id}/facts", tags=["tests"])
 
 
-@router.get("", summary="What was told about a test", response_model_exclude_none=True, responses=errors(404))
+@router.get("", summary="Metadata of a test", response_model_exclude_none=True, responses=errors(404))
 def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> TestFacts:
-    """Return the facts, empty where nothing was told; the header ETag names this state of them."""
+    """Return the facts, empty where nothing was stated; the header ETag names this state of them."""
     return TestFacts.model_validate(tagged(response, service.tests.facts(test_id)))
 
 

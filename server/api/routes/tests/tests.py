@@ -213,8 +213,8 @@ def import_images(
     request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], said)
 
     def make() -> Ids:
-        told = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
-        facts = StepFacts.model_validate({**told, **request.document()})
+        sent = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
+        facts = StepFacts.model_validate({**sent, **request.document()})
         return {"n": import_step(service, test_id, data, facts).n}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)

@@ -89,15 +89,15 @@ def post_channels(
 
     def make() -> Ids:
         outcome = watches.reading(test_id, step_facts(body, sent))
-        told = {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
-        return {name: value for name, value in told.items() if value is not None}
+        values = {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
+        return {name: value for name, value in values.items() if value is not None}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
     step = None if made.get("n") is None else service.tests.step(test_id, int(made["n"])).document
-    told: dict[str, object] = {name: made.get(name) for name in ("reason", "value", "last_value")}
-    if step is not None and "reason" not in made:  # told by the step, the catalogue was lost
+    values: dict[str, object] = {name: made.get(name) for name in ("reason", "value", "last_value")}
+    if step is not None and "reason" not in made:  # the step has it, the catalogue was lost
         value, last = (None, None) if step.watch is None else (step.watch.value, step.watch.last_value)
-        told = {"reason": "first" if last is None else "changed", "value": value, "last_value": last}
+        values = {"reason": "first" if last is None else "changed", "value": value, "last_value": last}
     shown = None if step is None else step.shown()
-    reply = ReadingReply.model_validate({"taken": step is not None, "step": shown, **told})
+    reply = ReadingReply.model_validate({"taken": step is not None, "step": shown, **values})
     return JSONResponse(reply.model_dump(mode="json"), status_code=200 if step is None else 201)
