@@ -32,7 +32,7 @@ def about(**ids: str) -> Iterator[None]:
         _about.reset(token)
 
 
-def ids_now() -> dict[str, str]:
+def current_ids() -> dict[str, str]:
     """Return the ids that a log line would name here."""
     return dict(_about.get() or {})
 
@@ -43,7 +43,7 @@ class AboutFilter(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         """Add; refuse nothing."""
         if not hasattr(record, "about"):
-            record.about = ids_now()
+            record.about = current_ids()
         return True
 
 

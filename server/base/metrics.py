@@ -25,7 +25,7 @@ _CAPTURE_S = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 60.0)
 _STOP_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.5, 2.0)
 _JOB_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0, 7200.0, 36000.0)
 _FINAL = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
-_MOST_JOBS = 10_000
+_MAX_JOBS = 10_000
 
 disable_created_metrics()  # type: ignore[no-untyped-call]  # a second series for each counter, which nobody asks for
 
@@ -113,7 +113,7 @@ class Metrics:
             if times is None:
                 if state in _FINAL:
                     return  # reported before
-                if len(self._jobs) >= _MOST_JOBS:
+                if len(self._jobs) >= _MAX_JOBS:
                     self._jobs.clear()
                 times = self._jobs[data["id"]] = {"accepted": now}
             began = state == "running" and "started" not in times

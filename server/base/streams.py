@@ -41,8 +41,8 @@ class Streams:
             ``too_many_streams``.
         """
         with self._lock:
-            limit, now = self._limits[kind], self._open[kind]
-        if now >= limit:
+            limit, open_now = self._limits[kind], self._open[kind]
+        if open_now >= limit:
             raise QueueFullError(
                 f"{limit} {_WORDS[kind]} are open already.",
                 code="too_many_streams",

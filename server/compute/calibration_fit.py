@@ -29,7 +29,7 @@ from server.worker.tasks import FitTask
 #: mean shift of the grid between the first and the last view at zero: above the first a warning, above the second no
 #: calibration. The detector repeats to 0.002 px; 0.1 px of epipolar error shows as micrometres of false motion.
 DRIFT_WARNING_PX = 0.05
-DRIFT_REFUSED_PX = 0.1
+MAX_DRIFT_PX = 0.1
 
 
 def fit_calibration(task: FitTask) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
         "cameras": {view["camera"]: view["device"] for view in task.views if "device" in view},
     }
     content = calibration_content(found.result, target, provenance=provenance)
-    _judge_drift(content, drift)
+    _check_drift(content, drift)
     _write_residuals(folder / "residuals.nc", found.result, {Path(f).name: grid for f, grid in known.items()})
     if content["verdict"]["level"] == "failed":
         write_json(folder / REJECTED, content)
@@ -127,7 +127,7 @@ def _drift(
     return drift
 
 
-def _judge_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
+def _check_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
     """Add the drift to the content's checks and verdict.
 
     Raises
@@ -137,7 +137,7 @@ def _judge_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
     """
     worst = max(drift, key=lambda cam: drift[cam])
     text = f"back at zero, the grid lies {drift[worst]:.4f} px from where {worst} first saw it"
-    if drift[worst] > DRIFT_REFUSED_PX:
+    if drift[worst] > MAX_DRIFT_PX:
         raise CalibrationError(
             f"The grid or a camera moved while the views were taken: {text}.",
             code="grid_moved",

@@ -22,7 +22,7 @@ from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
 from core.threads import set_threads
-from server.compute.compile_aside import CompileAside
+from server.compute.background_compilation import BackgroundCompilation
 from server.compute.sequence import Pair, SequenceMeasurement
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import read_mask
@@ -41,7 +41,7 @@ class _Kept:
     sequence: SequenceMeasurement
     ahead: tuple[StepImages, Future[Pair]] | None = None
 
-    def images_now(self, step: StepImages) -> Pair | None:
+    def current_images(self, step: StepImages) -> Pair | None:
         """Return the step's images if they were read while the step before was fitted."""
         ahead, self.ahead = self.ahead, None
         return ahead[1].result() if ahead is not None and ahead[0] == step else None
@@ -68,7 +68,7 @@ def measure_step(task: StepTask) -> dict[str, object]:
     kept = _kept_of(task)
     sequence = kept.sequence
     sequence.steps |= task.earlier
-    images = None if task.step.n == task.reference.n else kept.images_now(task.step) or sequence.read(task.step)
+    images = None if task.step.n == task.reference.n else kept.current_images(task.step) or sequence.read(task.step)
     if task.following is not None:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
     result = sequence.measure(task.step, images, previous=task.previous, progress=channel.progress, cancel=channel)
@@ -128,8 +128,8 @@ def warm_up(threads: int) -> None:
     seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
     # other patches and the other interpolation compile when first asked for; compiled kernels are kept on disk
     options = MeasureOptions(subset_px=21, patch="affine")
-    with CompileAside(options.patch) as aside, report_compiling(aside.start):
+    with BackgroundCompilation(options.patch) as compilation, report_compiling(compilation.start):
         reference = ReferencePair(pair, left, right)
         shape = reference.shape(grid, options, seeds=seeds)
-        aside.wait()
+        compilation.wait()
         reference.motion(left.copy(), right.copy(), grid, options, shape=shape)

@@ -17,7 +17,7 @@ from server.formats.calibrations.recognise import load_calibration
 #: a click is good to some pixels; further from the epipolar line it is another point
 FARTHEST_PX = 8.0
 
-Place = Sequence[float]
+Position = Sequence[float]
 
 
 def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[int, int]) -> None:
@@ -39,10 +39,10 @@ def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[i
     """
     seeds = [s for s in seeds_of(settings) or [] if s.xy2_px is not None]
     if seeds:
-        check_places(load_calibration(calibration).pair, seeds, size2_px)
+        check_positions(load_calibration(calibration).pair, seeds, size2_px)
 
 
-def check_places(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int, int]) -> None:
+def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int, int]) -> None:
     """Refuse seeds whose places in camera 2 lie outside its image, or cannot be the points of camera 1.
 
     Raises
@@ -84,11 +84,11 @@ def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
     return out
 
 
-def epipolar_line(pair: StereoPair, xy_px: Place, size2_px: tuple[int, int]) -> list[list[float]]:
+def epipolar_line(pair: StereoPair, xy_px: Position, size2_px: tuple[int, int]) -> list[list[float]]:
     """Return where camera 2 may see a point of camera 1, about 32 places along the line; empty if nowhere."""
-    place = np.asarray(xy_px, dtype=np.float64)
-    depths = visible_depths(pair, place, (size2_px[1], size2_px[0]), spacing_px=max(*size2_px) / 32.0)
+    position = np.asarray(xy_px, dtype=np.float64)
+    depths = visible_depths(pair, position, (size2_px[1], size2_px[0]), spacing_px=max(*size2_px) / 32.0)
     if not len(depths):
         return []
-    line = pair.image2_at_depth(np.broadcast_to(place, (len(depths), 2)), 1.0 / depths)
+    line = pair.image2_at_depth(np.broadcast_to(position, (len(depths), 2)), 1.0 / depths)
     return [[round(float(x), 3), round(float(y), 3)] for x, y in line if np.isfinite(x) and np.isfinite(y)]

@@ -158,11 +158,11 @@ class SequenceMeasurement:
             result = self.pair.shape(self.grid, self.options, **more)
         else:
             shape = self._field(self.reference.n)
-            earlier = None
+            previous_step = None
             if previous is not None and previous != self.reference.n:
-                earlier = PreviousStep(previous, self._field(previous))
+                previous_step = PreviousStep(previous, self._field(previous))
             images = images or self.read(step)
-            result = self._updating(shape).measure(images, earlier, **more)
+            result = self._updating(shape).measure(images, previous_step, **more)
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
         self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
         return result
@@ -224,12 +224,12 @@ class SequenceMeasurement:
                 self.options,
                 reference_update=self.settings.reference_update,
                 first=self.reference.n,
-                images_of=lambda n: own._earlier_images(n),
+                images_of=lambda n: own._previous_images(n),
                 field_of=lambda n: own._field(n),
             )
         return self._sequence
 
-    def _earlier_images(self, n: int) -> Pair:
+    def _previous_images(self, n: int) -> Pair:
         """Images of an earlier step: those of the last one are still here, others are read and checked again."""
         if self._last_images is not None and self._last_images[0] == n:
             return self._last_images[1]

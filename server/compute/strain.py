@@ -107,11 +107,11 @@ def summarise_strain(strain: StrainField) -> StrainSummary:
     valid, patch = strain.valid, None
     if strain.patch is not None:
         both = valid & np.isfinite(strain.patch).all(axis=-1)
-        apart = strain.patch[both] - strain.strain[both]
+        difference = strain.patch[both] - strain.strain[both]
         patch = PatchStrain(
             mean_microstrain=_figures(strain.patch[both], np.mean),
-            difference_mean_microstrain=_figures(apart, np.mean),
-            difference_sd_microstrain=_figures(apart, np.std),
+            difference_mean_microstrain=_figures(difference, np.mean),
+            difference_sd_microstrain=_figures(difference, np.std),
         )
     return StrainSummary(
         window=strain.options.window,

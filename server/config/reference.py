@@ -129,8 +129,10 @@ def _array(core: JsonSchemaValue, known: Definitions) -> str:
     if "prefixItems" in core:
         inner = [kind_of_value(item, known) for item in core["prefixItems"]]
         return f"[{inner[0]}] x {len(inner)}" if len(set(inner)) == 1 else f"[{', '.join(inner)}]"
-    least, most = core.get("minItems", 0), core.get("maxItems")
-    return f"list of {kind_of_value(core.get('items', {}), known)}" + ("" if most is None else f", {least} to {most}")
+    minimum, maximum = core.get("minItems", 0), core.get("maxItems")
+    return f"list of {kind_of_value(core.get('items', {}), known)}" + (
+        "" if maximum is None else f", {minimum} to {maximum}"
+    )
 
 
 def _range(core: JsonSchemaValue) -> str:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from core.errors import FileFormatError
 from core.names import CameraName
-from server.config.camera_facts import Above, CameraFacts, LensFacts, Text
+from server.config.camera_metadata import Above, CameraMetadata, LensMetadata, Text
 
 _log = logging.getLogger("stereorig.config")
 
@@ -128,7 +128,7 @@ class CameraSection(_Closed):
     maker: Text | None = Field(None, description="Maker of the camera; kept with every step, for reports.")
     sensor: Text | None = Field(None, description="The sensor; for reports.")
     pixel_um: Above | None = Field(None, description="Width of a pixel on the sensor; for reports.")
-    lens: LensFacts | None = Field(None, description="The lens, as printed on it; for reports.")
+    lens: LensMetadata | None = Field(None, description="The lens, as printed on it; for reports.")
 
     @model_validator(mode="after")
     def _device_named(self) -> Self:
@@ -138,9 +138,9 @@ class CameraSection(_Closed):
             raise ValueError(f"region_px is {self.region_px[2:]} px large, image_size_px is {self.image_size_px}")
         return self
 
-    def facts(self) -> CameraFacts:
+    def metadata(self) -> CameraMetadata:
         """What the file tells of camera and lens for reports."""
-        return CameraFacts(maker=self.maker, model=None, sensor=self.sensor, pixel_um=self.pixel_um, lens=self.lens)
+        return CameraMetadata(maker=self.maker, model=None, sensor=self.sensor, pixel_um=self.pixel_um, lens=self.lens)
 
 
 class StageAxisSection(_Closed):

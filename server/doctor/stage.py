@@ -12,7 +12,7 @@ from server.doctor.report import Notebook, State, percentile
 _QUERIES = 50
 _STOPS = 20
 #: on a slow line fewer do
-_LONGEST_S = 2.0
+_MAX_WAIT_S = 2.0
 #: an answer later than this and the end of a motion is noticed late; stops share the line with it
 _SLOW_ANSWER_MS = 100.0
 #: what the service promises, from the request to the wire
@@ -127,7 +127,7 @@ def _outside(config: RigConfig, axis: int, low_mm: float, high_mm: float) -> str
 def _check_answers(book: Notebook, stage: Stage) -> None:
     with book.guard("stage", "answers"):
         times = []
-        end = time.perf_counter() + _LONGEST_S
+        end = time.perf_counter() + _MAX_WAIT_S
         for index in range(_QUERIES):
             start = time.perf_counter()
             if start > end:
@@ -160,7 +160,7 @@ def _check_stop(book: Notebook, stage: Stage) -> None:
             )
             return
         written, answered = [], []
-        end = time.perf_counter() + _LONGEST_S
+        end = time.perf_counter() + _MAX_WAIT_S
         for _ in range(_STOPS):
             start = time.perf_counter()
             if start > end:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.io
 
 from core.errors import InputError
-from server.formats.files import written_aside
+from server.formats.files import written_temporary
 from server.results.provenance import provenance
 from server.results.steps import Source, StepResult
 
@@ -41,7 +41,7 @@ _KEYWORDS = frozenset(
         "while",
     }
 )
-_MOST_BYTES = (1 << 31) - (1 << 20)  # of one variable in this version of the format
+_MAX_BYTES = (1 << 31) - (1 << 20)  # of one variable in this version of the format
 
 
 def matlab_name(name: str) -> str:
@@ -64,10 +64,10 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
     InputError
         ``export_too_large`` for a step beyond the 2 GB that this version of the format holds in one variable.
     """
-    with written_aside(path) as aside, aside.open("wb") as out:
+    with written_temporary(path) as temporary, temporary.open("wb") as out:
         for step in steps:
             size = sum(8 * v.values.size for v in step.variables.values())
-            if size > _MOST_BYTES:
+            if size > _MAX_BYTES:
                 raise InputError(
                     f"Step {step.n} comes to {size >> 20} MiB; a MATLAB file of version 5 holds 2 GB.",
                     code="export_too_large",

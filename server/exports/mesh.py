@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from core.arrays import Float
 from core.field.region.cuts import Cuts, crosses
 
-Places = NDArray[np.intp]
+Indices = NDArray[np.intp]
 
 
 def triangles_of(
     x_px: Float, y_px: Float, valid: NDArray[np.bool_], cuts: Cuts | None, mask: NDArray[np.bool_] | None = None
-) -> Places:
+) -> Indices:
     """Return (m, 3) triangles between neighbouring valid points; indices into the flattened (r, c) grid.
 
     Parameters
@@ -32,8 +32,8 @@ def triangles_of(
     image.
     """
     rows, cols = valid.shape
-    place = np.arange(rows * cols).reshape(rows, cols)
-    a, b, c, d = (place[i : rows - 1 + i, j : cols - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
+    index = np.arange(rows * cols).reshape(rows, cols)
+    a, b, c, d = (index[i : rows - 1 + i, j : cols - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
     ok = valid.ravel()
     # the other diagonal where one end of the usual one failed
     other = (~ok[b] | ~ok[c]) & ok[a] & ok[d]
@@ -48,8 +48,8 @@ def triangles_of(
         three = three[~_over_black(xy[three], mask)]
     if cuts and len(three):
         corners = xy[three]
-        parted = crosses(corners, np.roll(corners, -1, axis=1), cuts).any(axis=1)
-        three = three[~(parted | _holds_a_cut(corners, cuts))]
+        separated = crosses(corners, np.roll(corners, -1, axis=1), cuts).any(axis=1)
+        three = three[~(separated | _holds_a_cut(corners, cuts))]
     return np.asarray(three, dtype=np.intp)
 
 
@@ -81,7 +81,7 @@ def _holds_a_cut(corners: Float, cuts: Cuts) -> NDArray[np.bool_]:
     return held
 
 
-def turned_as(triangles: Places, xyz_mm: Float, normals: Float) -> Places:
+def turned_as(triangles: Indices, xyz_mm: Float, normals: Float) -> Indices:
     """Turn triangles so that their right-handed normals point as the points' ``normals`` (n, 3) do."""
     p = xyz_mm[triangles]
     normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])

@@ -15,8 +15,8 @@ from core.errors import InputError, StorageError
 from core.field.region.cuts import Cuts
 from server.base.errors import NotFoundError
 from server.formats.figure import Picture, PictureForm, draw, draw_pixels, scale_of
-from server.formats.figure_options import Look
-from server.formats.files import write_bytes, written_aside
+from server.formats.figure_options import FigureStyle
+from server.formats.files import write_bytes, written_temporary
 from server.formats.images import read_image
 from server.results.provenance import notes_of, provenance
 from server.results.steps import Source, StepResult, columns_of, each
@@ -24,7 +24,7 @@ from server.results.steps import Source, StepResult, columns_of, each
 FPS_RANGE = (0.1, 60.0)
 # VP9, which browsers play; MPEG-4 part 2, which they do not, only where OpenCV was built without libvpx
 CODECS = ("vp09", "mp4v")
-_MOST_SAMPLES = 20_000  # of a step, for the percentiles of a film
+_MAX_SAMPLES = 20_000  # of a step, for the percentiles of a film
 _PALETTE = 255
 
 
@@ -95,23 +95,23 @@ def image_of(source: Source, over_image: bool) -> NDArray[np.generic] | None:
     return read_image(source.image)
 
 
-def write_figure(path: Path, picture: Picture, look: Look, form: PictureForm) -> None:
+def write_figure(path: Path, picture: Picture, style: FigureStyle, form: PictureForm) -> None:
     """Write one figure."""
-    write_bytes(path, draw(picture, look, form))
+    write_bytes(path, draw(picture, style, form))
 
 
-def common_look(source: Source, steps: Sequence[int] | None, name: str, look: Look) -> Look:
+def common_style(source: Source, steps: Sequence[int] | None, name: str, style: FigureStyle) -> FigureStyle:
     """Return the look with one colour scale for all steps; percentiles are those of all steps' values together."""
-    if look.limits is not None:
-        return look
+    if style.limits is not None:
+        return style
     samples = []
     for step in each(source, steps, _read_for(name)):
         variable = columns_of(step).get(name)
         if variable is not None and variable.flags is None:
             finite = variable.values[np.isfinite(variable.values)]
-            samples.append(finite[:: max(1, finite.size // _MOST_SAMPLES)])
-    limits = scale_of(np.concatenate(samples), look) if samples else None
-    return Look(limits, look.percentiles, look.colours, look.width_px, look.opacity)
+            samples.append(finite[:: max(1, finite.size // _MAX_SAMPLES)])
+    limits = scale_of(np.concatenate(samples), style) if samples else None
+    return FigureStyle(limits, style.percentiles, style.colours, style.width_px, style.opacity)
 
 
 def _read_for(name: str) -> list[str]:
@@ -120,7 +120,7 @@ def _read_for(name: str) -> list[str]:
 
 
 def frames(
-    source: Source, steps: Sequence[int] | None, name: str, look: Look, image: NDArray[np.generic] | None
+    source: Source, steps: Sequence[int] | None, name: str, style: FigureStyle, image: NDArray[np.generic] | None
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw the steps that have the variable, one after the other, on one colour scale.
 
@@ -129,7 +129,7 @@ def frames(
     NotFoundError
         ``field_missing`` if none has it.
     """
-    common = common_look(source, steps, name, look)
+    common = common_style(source, steps, name, style)
     size: tuple[int, int] | None = None
     last: StepResult | None = None
     for step in each(source, steps, _read_for(name)):
@@ -156,11 +156,11 @@ def write_gif(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float, commen
 
     def rest() -> Iterator[Image.Image]:
         for pixels in drawn:
-            yield _few_colours(pixels)
+            yield _reduced_colours(pixels)
 
-    with written_aside(path) as aside:
-        _few_colours(first).save(
-            aside,
+    with written_temporary(path) as temporary:
+        _reduced_colours(first).save(
+            temporary,
             format="GIF",
             save_all=True,
             append_images=rest(),
@@ -171,7 +171,7 @@ def write_gif(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float, commen
         )
 
 
-def _few_colours(pixels: NDArray[np.uint8]) -> Image.Image:
+def _reduced_colours(pixels: NDArray[np.uint8]) -> Image.Image:
     return Image.fromarray(pixels).quantize(_PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
 
 
@@ -186,8 +186,8 @@ def write_mp4(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float) -> Non
     check_fps(fps)
     first = next(drawn)
     height, width = first.shape[:2]
-    with written_aside(path) as aside:
-        named = aside.with_suffix(".mp4")  # the name determines the container
+    with written_temporary(path) as temporary:
+        named = temporary.with_suffix(".mp4")  # the name determines the container
         writer = cv2.VideoWriter()
         try:
             for codec in CODECS:
@@ -203,7 +203,7 @@ def write_mp4(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float) -> Non
             for pixels in drawn:
                 write(pixels)
             writer.release()
-            named.rename(aside)
+            named.rename(temporary)
         finally:
             writer.release()
             named.unlink(missing_ok=True)

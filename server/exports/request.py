@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from core.errors import InputError
-from server.formats.figure_options import Look
+from server.formats.figure_options import FigureStyle
 
 ExportFormat = Literal["nc", "csv", "vtu", "mat", "h5", "png", "svg", "gif", "mp4"]
 FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
@@ -37,7 +37,7 @@ class ExportRequest:
         Numbers; None: all that are finished.
     variables
         Names in the result files; None: all, of pictures and films the displacement ``w_mm`` or the shape ``z_mm``.
-    look
+    style
         Of pictures and films.
     over_image
         Draw over camera 1's reference image.
@@ -48,7 +48,7 @@ class ExportRequest:
     format: ExportFormat
     steps: Sequence[int] | None = None
     variables: Sequence[str] | None = None
-    look: Look = field(default_factory=Look)
+    style: FigureStyle = field(default_factory=FigureStyle)
     over_image: bool = False
     fps: float = 2.0
 

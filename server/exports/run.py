@@ -17,7 +17,7 @@ from server.exports.request import ExportRequest
 from server.exports.stacked import write_stacked
 from server.exports.table import write_table
 from server.exports.vtu import NEEDS, write_pvd, write_vtu
-from server.formats.files import written_aside
+from server.formats.files import written_temporary
 from server.formats.images import read_mask
 from server.formats.results.folder import number_of
 from server.results.provenance import provenance
@@ -93,8 +93,8 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
         )
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
-        with written_aside(copy) as aside:
-            shutil.copyfile(path, aside)
+        with written_temporary(copy) as temporary:
+            shutil.copyfile(path, temporary)
         yield copy
 
 
@@ -129,7 +129,7 @@ def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: P
         require_known(files, [of_file])
         if request.format in ("gif", "mp4"):
             path = out / f"{source.name}_{name}.{request.format}"
-            drawn = frames(source, request.steps, name, request.look, image)
+            drawn = frames(source, request.steps, name, request.style, image)
             if request.format == "gif":
                 first = read_step(files[0], [])
                 write_gif(path, drawn, request.fps, json.dumps(provenance(first, source), sort_keys=True))
@@ -141,5 +141,5 @@ def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: P
             if name in columns_of(step) or step.n == number_of(files[-1]):
                 path = out / f"{source.name}_step_{step.n:04d}_{name}.{request.format}"
                 form: Literal["png", "svg"] = "svg" if request.format == "svg" else "png"
-                write_figure(path, picture_of(step, name, source, image), request.look, form)
+                write_figure(path, picture_of(step, name, source, image), request.style, form)
                 yield path

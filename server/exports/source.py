@@ -59,11 +59,13 @@ def source_of(folder: Path, files: list[Path]) -> Source:
             about["analysis_id"] = folder.name
             name = f"{test.name}_{folder.name}"
         return Source(files, name, title, image, about, mask, stale)
-    said = heads[0].image_file("cam1")
+    image_file = heads[0].image_file("cam1")
     calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
-    return Source(files, folder.name or "results", folder.name, Path(said) if said else None, about, mask, stale)
+    return Source(
+        files, folder.name or "results", folder.name, Path(image_file) if image_file else None, about, mask, stale
+    )
 
 
 def _mask(folder: Path, settings: object) -> Path | None:

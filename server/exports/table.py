@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.files import written_aside
+from server.formats.files import written_temporary
 from server.results.provenance import provenance
 from server.results.steps import Source, StepResult, columns_of
 
@@ -25,7 +25,7 @@ def write_table(path: Path, step: StepResult, source: Source) -> None:
     a variable of states is written as its number, with the name in the next column.
     """
     columns = columns_of(step)
-    with written_aside(path) as aside, aside.open("w", encoding="utf-8", newline="") as out:
+    with written_temporary(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as out:
         for name, value in provenance(step, source).items():
             out.write(f"# {name}: {_one_line(value)}\n")
         out.write("# column row, unit 1: row of the grid of points\n# column col, unit 1: column of the grid\n")

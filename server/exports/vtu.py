@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.exports.mesh import triangles_of, turned_as
-from server.formats.files import write_bytes, written_aside
+from server.formats.files import write_bytes, written_temporary
 from server.results.provenance import provenance
 from server.results.reader import Variable
 from server.results.steps import Source, StepResult, columns_of
@@ -63,7 +63,7 @@ def write_vtu(
     cells = np.concatenate([index[triangles].ravel(), alone])
     offsets = np.concatenate([3 * np.arange(1, len(triangles) + 1), 3 * len(triangles) + np.arange(1, alone.size + 1)])
     kinds = np.concatenate([np.full(len(triangles), _TRIANGLE), np.full(alone.size, _VERTEX)]).astype(np.uint8)
-    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as out:
+    with written_temporary(path) as temporary, temporary.open("w", encoding="utf-8") as out:
         about = _about(step, source, columns)
         out.write(
             f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {about} -->\n<VTKFile type="UnstructuredGrid" '

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.field.region.cuts import Cuts
-from server.formats.figure_options import Look
+from server.formats.figure_options import FigureStyle
 
 PictureForm = Literal["png", "svg"]
 
@@ -77,14 +77,14 @@ class Picture:
     flags: Mapping[int, str] | None = None
 
 
-def scale_of(values: NDArray[Any], look: Look) -> tuple[float, float] | None:
+def scale_of(values: NDArray[Any], style: FigureStyle) -> tuple[float, float] | None:
     """Return the ends of the colour scale; None where there are no values and no limits."""
-    if look.limits is not None:
-        return look.limits
+    if style.limits is not None:
+        return style.limits
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return None
-    low, high = (float(v) for v in np.percentile(finite, look.percentiles))
+    low, high = (float(v) for v in np.percentile(finite, style.percentiles))
     if low == high:  # one value: a scale about it
         half = 0.5 * max(abs(low), 1e-12)
         return low - half, high + half
@@ -109,19 +109,19 @@ def _pitch(along: Float, other: Float) -> float:
     return 1.0
 
 
-def draw(picture: Picture, look: Look, form: PictureForm) -> bytes:
+def draw(picture: Picture, style: FigureStyle, form: PictureForm) -> bytes:
     """Draw a picture; return the file's bytes."""
     with _drawing, mpl.rc_context({"svg.fonttype": "none"}):
-        figure = _figure(picture, look)
+        figure = _figure(picture, style)
         out = io.BytesIO()
         figure.savefig(out, format=form, metadata=_metadata(picture, form))
     return out.getvalue()
 
 
-def draw_pixels(picture: Picture, look: Look) -> NDArray[np.uint8]:
+def draw_pixels(picture: Picture, style: FigureStyle) -> NDArray[np.uint8]:
     """Draw a picture; return its pixels (h, w, 3), red green blue, of even height and width."""
     with _drawing:
-        canvas: Any = FigureCanvasAgg(_figure(picture, look))
+        canvas: Any = FigureCanvasAgg(_figure(picture, style))
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3]
         height, width = (n - n % 2 for n in pixels.shape[:2])
@@ -137,8 +137,8 @@ def _metadata(picture: Picture, form: PictureForm) -> dict[str, str]:
     return {**known, "Description": json.dumps(texts, ensure_ascii=False, sort_keys=True)}
 
 
-def _figure(picture: Picture, look: Look) -> Figure:
-    width = look.width_px / look.dots_per_inch
+def _figure(picture: Picture, style: FigureStyle) -> Figure:
+    width = style.width_px / style.dots_per_inch
     shape: tuple[float, float]
     if picture.image is not None:
         shape = picture.image.shape[0], picture.image.shape[1]
@@ -146,12 +146,12 @@ def _figure(picture: Picture, look: Look) -> Figure:
         left, right, bottom, top = extent_of(picture.x_px, picture.y_px)
         shape = bottom - top, right - left
     height = width * min(max(_MAP_SHARE * shape[0] / shape[1], 0.15), _TALLEST) + _TEXT_IN
-    size, dpi = (width, round(height, 2)), look.dots_per_inch
+    size, dpi = (width, round(height, 2)), style.dots_per_inch
     figure = Figure(figsize=size, dpi=dpi, layout="constrained", facecolor="white")
     axis = figure.add_subplot()
     if picture.image is not None:
-        _draw_image(axis, picture.image, look)
-    drawn, ticks = _draw_map(axis, picture, look)
+        _draw_image(axis, picture.image, style)
+    drawn, ticks = _draw_map(axis, picture, style)
     for line in picture.cuts.lines_px if picture.cuts else ():
         axis.plot(line[:, 0], line[:, 1], "-", color="black", linewidth=1.0)
     axis.set_xlabel("x, px of camera 1", fontsize=_SMALL)
@@ -177,9 +177,9 @@ def _wrapped(text: str, width: int) -> str:
     return "\n".join(textwrap.wrap(printable, width)[:4])
 
 
-def _draw_image(axis: Any, image: NDArray[Any], look: Look) -> None:
+def _draw_image(axis: Any, image: NDArray[Any], style: FigureStyle) -> None:
     rows, cols = image.shape[:2]
-    shrink = cols / (2.0 * look.width_px)
+    shrink = cols / (2.0 * style.width_px)
     if shrink > 1.0:  # what the picture cannot show is not carried into it
         size = (round(cols / shrink), max(1, round(rows / shrink)))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -187,8 +187,8 @@ def _draw_image(axis: Any, image: NDArray[Any], look: Look) -> None:
     axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1.0), extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))
 
 
-def _draw_map(axis: Any, picture: Picture, look: Look) -> tuple[Any, list[str] | None]:
-    opacity = look.opacity if picture.image is not None else 1.0
+def _draw_map(axis: Any, picture: Picture, style: FigureStyle) -> tuple[Any, list[str] | None]:
+    opacity = style.opacity if picture.image is not None else 1.0
     extent = extent_of(picture.x_px, picture.y_px)
     show = functools.partial(axis.imshow, extent=extent, interpolation="nearest", alpha=opacity)
     ticks = None
@@ -202,9 +202,9 @@ def _draw_map(axis: Any, picture: Picture, look: Look) -> tuple[Any, list[str] |
         norm = BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present))
         drawn = show(values, cmap=ListedColormap(palette), norm=norm)
     else:
-        scale = scale_of(picture.values, look)
+        scale = scale_of(picture.values, style)
         low, high = scale if scale is not None else (0.0, 1.0)
-        drawn = show(picture.values, cmap=look.colours, vmin=low, vmax=high)
+        drawn = show(picture.values, cmap=style.colours, vmin=low, vmax=high)
         if not np.isfinite(picture.values).any():
             axis.text(0.5, 0.5, "no values", transform=axis.transAxes, ha="center", va="center", color="0.4")
     axis.set_aspect("equal")

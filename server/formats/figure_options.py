@@ -13,7 +13,7 @@ WIDTHS_PX = (200, 4000)
 
 
 @dataclass(frozen=True)
-class Look:
+class FigureStyle:
     """How a field is drawn.
 
     Attributes

@@ -43,7 +43,7 @@ def fsync_path(path: Path) -> None:
 
 
 _hashes: dict[tuple[str, int, int, int], str] = {}
-_MOST_HASHES = 100_000
+_MAX_HASHES = 100_000
 
 
 def known_sha256(path: Path) -> str:
@@ -52,7 +52,7 @@ def known_sha256(path: Path) -> str:
     # the time of the inode's change, which nobody can set
     key = str(path), stat.st_ino, stat.st_ctime_ns, stat.st_size
     if key not in _hashes:
-        if len(_hashes) >= _MOST_HASHES:
+        if len(_hashes) >= _MAX_HASHES:
             _hashes.clear()
         _hashes[key] = sha256_of(path)
     return _hashes[key]
@@ -96,7 +96,7 @@ def require_recorded(path: Path, of: str, folder: str) -> None:
 
 
 @contextlib.contextmanager
-def written_aside(path: Path, *, checksum: bool = False) -> Iterator[Path]:
+def written_temporary(path: Path, *, checksum: bool = False) -> Iterator[Path]:
     """Give a temporary path in the same folder; on leaving, sync it, rename it to ``path``, sync the folder.
 
     With ``checksum``, its SHA-256 is put beside it first, so that a file under its real name never lacks it. If the
@@ -107,24 +107,24 @@ def written_aside(path: Path, *, checksum: bool = False) -> Iterator[Path]:
     StorageError
         ``storage_full`` or ``storage_failed``, for any :class:`OSError` in the body or in the renaming.
     """
-    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        yield aside
-        fsync_path(aside)
+        yield temporary
+        fsync_path(temporary)
         if checksum:
-            write_bytes(checksum_file(path), f"{sha256_of(aside)}  {path.name}\n".encode())
-        _disk.disk.replace(aside, path)
+            write_bytes(checksum_file(path), f"{sha256_of(temporary)}  {path.name}\n".encode())
+        _disk.disk.replace(temporary, path)
         fsync_path(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, data: bytes, *, checksum: bool = False) -> None:
-    """Write a whole file, see :func:`written_aside`."""
-    with written_aside(path, checksum=checksum) as aside:
-        _disk.disk.write(aside, data)
+    """Write a whole file, see :func:`written_temporary`."""
+    with written_temporary(path, checksum=checksum) as temporary:
+        _disk.disk.write(temporary, data)
 
 
 def make_folder(path: Path) -> None:

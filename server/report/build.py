@@ -59,10 +59,10 @@ class Box:
 
 @dataclass(frozen=True)
 class Origin:
-    """Settings and facts as they are on file, and by result file the checksums of what it was made from."""
+    """Settings and metadata as they are on file, and by result file the checksums of what it was made from."""
 
     settings: str
-    facts: str
+    metadata: str
     inputs: list[tuple[str, list[tuple[str, str]]]]
 
 
@@ -88,8 +88,8 @@ def make_report(source: Source) -> Report:
     missing += [*_floor_gaps(source, measured), *calibration_gaps(source, measured), *unseen]
     if not measured.loaded:
         missing.append(Missing("Load of the steps", "give load_n with each step"))
-    if source.facts.gauges is None and len(measured.steps) > 1:
-        remedy = "name extensometers, points, areas or lines in `gauges` of the facts"
+    if source.metadata.gauges is None and len(measured.steps) > 1:
+        remedy = "name extensometers, points, areas or lines in `gauges` of the metadata"
         missing.append(Missing("Gauges", remedy))
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     page, policy = render(
@@ -103,7 +103,7 @@ def make_report(source: Source) -> Report:
         settings=settings,
         calibration=None if source.calibration is None else CalibrationPart(source.calibration),
         worst=measured.worst_epipolar,
-        most_outside=max(s.summary.status.get("extrapolated", 0) for s in measured.steps),
+        max_extrapolated=max(s.summary.status.get("extrapolated", 0) for s in measured.steps),
         seen=seen,
         unseen=unseen,
         fields=_fields(measured),
@@ -117,7 +117,7 @@ def make_report(source: Source) -> Report:
 
 def _under(source: Source, measured: Measured, made_utc: str) -> list[str]:
     """What stands under the title."""
-    kind = "displacement" if any(s.largest_mm is not None for s in measured.steps) else "shape"
+    kind = "displacement" if any(s.max_displacement_mm is not None for s in measured.steps) else "shape"
     under = [f"Report of a {kind} measurement with two cameras", f"{len(measured.steps)} steps"]
     under += [f"test {source.test_record.id}"] if source.test_record.id else []
     under += [f"analysis {source.analysis.id}"] if source.analysis.id else []
@@ -156,7 +156,7 @@ def _boxes(source: Source, measured: Measured) -> list[Box]:
 
 def the_test(source: Source, measured: Measured) -> list[Item]:
     """Return the items of the test."""
-    facts = source.facts
+    metadata = source.metadata
     times = [s.captured_utc for s in measured.steps if s.captured_utc]
 
     def stated(name: str, label: str, value: str | None) -> Item:
@@ -169,13 +169,13 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
         origin = "import of the files, not their exposure" if imported else "recorded with the images"
         taken = Value(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}", None, origin)
     return [
-        stated("purpose", "Purpose", facts.purpose),
-        stated("specimen", "Specimen", facts.specimen or source.test_record.specimen),
-        stated("material", "Material", facts.material),
-        stated("loading", "Loading", facts.loading),
-        stated("environment", "Environment", facts.environment),
-        stated("laboratory", "Laboratory", facts.laboratory),
-        stated("operator", "Operator", facts.operator),
+        stated("purpose", "Purpose", metadata.purpose),
+        stated("specimen", "Specimen", metadata.specimen or source.test_record.specimen),
+        stated("material", "Material", metadata.material),
+        stated("loading", "Loading", metadata.loading),
+        stated("environment", "Environment", metadata.environment),
+        stated("laboratory", "Laboratory", metadata.laboratory),
+        stated("operator", "Operator", metadata.operator),
         Item("test.images_taken", "Images taken", (taken,), "is recorded when the service captures or imports"),
     ]
 
@@ -189,7 +189,7 @@ def _floor_gaps(source: Source, measured: Measured) -> list[Missing]:
     gaps = []
     if len(measured.static) == 1:
         gaps.append(Missing("Noise floor from step to step (temporal)", "take at least two static steps"))
-    lost = [n for n in source.facts.static_steps or [] if n not in source.files]
+    lost = [n for n in source.metadata.static_steps or [] if n not in source.files]
     if lost:
         gaps.append(Missing(f"Results of the static steps {', '.join(map(str, lost))}", "measure them too"))
     if not any(n in measured.floor for n in "UVW"):
@@ -210,15 +210,15 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[
             missing.append(Missing(f"Reference image of {name}", remedy))
             continue
         if cam == "cam1":
-            places = np.stack([field.x_px.ravel(), field.y_px.ravel()], axis=-1)
+            positions = np.stack([field.x_px.ravel(), field.y_px.ravel()], axis=-1)
         elif source.calibration is not None:
             found = source.calibration.pair.cam2.project(field.xyz_mm.reshape(-1, 3))
-            places = np.where(found.valid[:, None], found.xy, np.nan)
+            positions = np.where(found.valid[:, None], found.xy, np.nan)
         else:
-            places = np.empty((0, 2))
-        chosen = valid if len(places) == len(valid) else np.empty(0, dtype=bool)
+            positions = np.empty((0, 2))
+        chosen = valid if len(positions) == len(valid) else np.empty(0, dtype=bool)
         cuts, outline = (field.cuts, _outline(source)) if cam == "cam1" else (None, None)
-        data = pictures.region(image, places, chosen, f"{name}, step {source.reference}", cuts, outline)
+        data = pictures.region(image, positions, chosen, f"{name}, step {source.reference}", cuts, outline)
         caption = f"{name.capitalize()}, reference: green where a point was measured, red where not"
         caption += ", yellow the region that was asked for" if outline is not None else ""
         text = f"reference image of {name} with the measured points"
@@ -282,9 +282,9 @@ def _origin(source: Source) -> Origin:
         written = source.heads[n].created
         name = f"{path.name}, written {written}" if written else path.name
         rows.append((name, sorted((k, v) for k, v in inputs[n].items() if k not in common)))
-    stated = source.facts.document()
+    stated = source.metadata.document()
     return Origin(
         settings=json.dumps(first.settings, sort_keys=True, ensure_ascii=False),
-        facts=json.dumps(stated, ensure_ascii=False) if stated else "",
+        metadata=json.dumps(stated, ensure_ascii=False) if stated else "",
         inputs=rows,
     )

@@ -133,10 +133,10 @@ def _with_sd(value: float, sd: float | None) -> str:
     exponent = int(np.floor(np.log10(sd)))
     if exponent < -7:
         power = int(np.floor(np.log10(max(abs(value), sd))))
-        places = max(power - exponent + 1, 0)
-        return f"({value / 10.0**power:.{places}f} \u00b1 {sd / 10.0**power:.{places}f}) \u00b7 10^{power}"
-    places = max(1 - exponent, 0)
-    return f"{value:.{places}f} \u00b1 {sd:.{places}f}"
+        digits = max(power - exponent + 1, 0)
+        return f"({value / 10.0**power:.{digits}f} \u00b1 {sd / 10.0**power:.{digits}f}) \u00b7 10^{power}"
+    digits = max(1 - exponent, 0)
+    return f"{value:.{digits}f} \u00b1 {sd:.{digits}f}"
 
 
 def calibration_gaps(source: Source, measured: Measured) -> list[Missing]:

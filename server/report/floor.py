@@ -18,7 +18,7 @@ UM = "\u00b5m"
 LENGTHS = ("U", "V", "W", "X", "Y", "Z")
 STRAINS = ("exx", "eyy", "exy")
 _STATIC = re.compile(r"\s*static\b", re.IGNORECASE)
-_MOST_BYTES = 96 << 20
+_MAX_BYTES = 96 << 20
 
 
 def static_steps(stated: Sequence[int] | None, labels: Mapping[int, str], reference: int) -> tuple[list[int], str]:
@@ -27,7 +27,7 @@ def static_steps(stated: Sequence[int] | None, labels: Mapping[int, str], refere
     Parameters
     ----------
     stated
-        What the facts say; None: nothing.
+        What the metadata say; None: nothing.
     labels
         By measured step.
     reference
@@ -75,7 +75,7 @@ class Quantity:
     reported: float | None
 
     @property
-    def is_place(self) -> bool:
+    def is_position(self) -> bool:
         """Whether it is a position, of which nobody knows the truth."""
         return self.name in "XYZ"
 
@@ -102,7 +102,7 @@ class FloorKeeper:
 
     def add(self, n: int, field: Field, strain: StrainField | None) -> None:
         """Take a step."""
-        if self._bytes > _MOST_BYTES:
+        if self._bytes > _MAX_BYTES:
             self.left_out.append(n)
             return
         self.steps.append(n)
@@ -134,21 +134,21 @@ class FloorKeeper:
                 continue  # no strain in some of them, or other points
             stack = np.stack(layers).astype(np.float64).reshape(len(layers), -1)
             stack = stack[:, np.isfinite(stack).all(axis=0)]
-            found[name] = _floor(stack, place=name in "XYZ")
+            found[name] = _floor(stack, position=name in "XYZ")
         return found
 
 
-def _floor(stack: Float, *, place: bool) -> Floor:
+def _floor(stack: Float, *, position: bool) -> Floor:
     steps, points = stack.shape
     temporal = spatial = bias = None
     ends: tuple[float, float] | None = None
     if points and steps >= 2:
         temporal = float(np.sqrt(np.mean(np.var(stack, axis=0, ddof=1))))
-    if points >= 2 and (not place or steps >= 2):
+    if points >= 2 and (not position or steps >= 2):
         # the mean of the steps has a share of each step's noise
-        apart = (stack - stack.mean(axis=0)) * np.sqrt(steps / (steps - 1)) if place else stack
-        spatial = float(np.sqrt(np.mean(np.var(apart, axis=1, ddof=1))))
-    if points and not place:
+        deviations = (stack - stack.mean(axis=0)) * np.sqrt(steps / (steps - 1)) if position else stack
+        spatial = float(np.sqrt(np.mean(np.var(deviations, axis=1, ddof=1))))
+    if points and not position:
         means = stack.mean(axis=1)
         bias, ends = float(means.mean()), (float(means.min()), float(means.max()))
     return Floor(bias, ends, temporal, spatial, points, steps)

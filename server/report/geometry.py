@@ -48,7 +48,7 @@ class Geometry:
     ----------
     stereo_angle_rad
         Between the optical axes.
-    sight_angle_rad
+    viewing_angle_rad
         Between both lines of sight to the middle of what was measured.
     baseline_mm
         Between the pinholes.
@@ -57,7 +57,7 @@ class Geometry:
     """
 
     stereo_angle_rad: float
-    sight_angle_rad: float
+    viewing_angle_rad: float
     baseline_mm: float
     views: dict[str, View]
 
@@ -83,8 +83,8 @@ def geometry(
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][2]
     middle = middle - ((middle - points.mean(axis=0)) @ normal) * normal  # onto the plane
-    sights = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
-    directions = [s / np.linalg.norm(s) for s in sights]
+    directions_mm = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
+    directions = [s / np.linalg.norm(s) for s in directions_mm]
     views: dict[str, View] = {}
     for name, camera, size in zip(CAMERAS, (pair.cam1, pair.cam2), sizes, strict=True):
         view = _view(camera, middle, normal, size)
@@ -93,7 +93,7 @@ def geometry(
         views[name] = view
     return Geometry(
         stereo_angle_rad=pair.stereo_angle_rad,
-        sight_angle_rad=float(np.arccos(np.clip(directions[0] @ directions[1], -1.0, 1.0))),
+        viewing_angle_rad=float(np.arccos(np.clip(directions[0] @ directions[1], -1.0, 1.0))),
         baseline_mm=pair.baseline_mm,
         views=views,
     )
@@ -108,8 +108,8 @@ def _view(camera: Camera, middle: Float, normal: Float, size: tuple[int, int] | 
         return None
     xy = here.xy
 
-    def on_plane(places: Float) -> Float:
-        return camera.back_project_to_plane(places, point_sys_mm=middle, normal_sys=normal).xyz_mm
+    def on_plane(positions: Float) -> Float:
+        return camera.back_project_to_plane(positions, point_sys_mm=middle, normal_sys=normal).xyz_mm
 
     ends = on_plane(xy + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
     scale = (float(np.linalg.norm(ends[1] - ends[0])), float(np.linalg.norm(ends[3] - ends[2])))

@@ -9,7 +9,7 @@ import numpy as np
 
 from core.names import CAMERAS, CameraName
 from core.pattern import PatternSize, pattern_size
-from server.config.camera_facts import CameraFacts, LensFacts, merged
+from server.config.camera_metadata import CameraMetadata, LensMetadata, merged
 from server.formats.calibrations.record import CameraIdentity
 from server.report.geometry import Geometry, View
 from server.report.items import CALIBRATION, MEASURED, RECORD, STATED, Item, Value, each, of_number, of_text, one
@@ -17,8 +17,8 @@ from server.report.records import CameraRecord
 from server.report.source import Source
 from server.report.steps import Measured
 
-_FACTS = "PUT /tests/{id}/facts or facts.toml"
-_RIG_FILE = f"the rig file or {_FACTS}"
+_METADATA_SOURCE = "PUT /tests/{id}/facts or facts.toml"
+_RIG_FILE = f"the rig file or {_METADATA_SOURCE}"
 _IN_FILE = "as stated (test or rig file)"
 _BY_SERVICE = "is recorded when the service captures"
 _NEEDS_CALIBRATION = "needs the calibration that the results were measured with (--calibration)"
@@ -29,7 +29,7 @@ def hardware(source: Source, measured: Measured, found: Geometry | None) -> list
     cameras = {}
     for cam in CAMERAS:
         recorded = source.rig.cameras.get(cam, CameraRecord())
-        cameras[cam] = merged(source.facts.camera(cam), recorded.model_dump(exclude_none=True))
+        cameras[cam] = merged(source.metadata.camera(cam), recorded.model_dump(exclude_none=True))
     return [
         *_camera_items(source, cameras),
         *_lens_items(source, cameras),
@@ -46,7 +46,7 @@ def hardware(source: Source, measured: Measured, found: Geometry | None) -> list
     ]
 
 
-def _camera_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> list[Item]:
+def _camera_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> list[Item]:
     step, sizes = source.reference_step, _sizes(source)
     identity = step.cameras
     if not identity and source.calibration is not None:
@@ -55,7 +55,7 @@ def _camera_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> lis
     def device(cam: CameraName, name: Literal["model", "serial"]) -> Value | None:
         return of_text(getattr(identity.get(cam, CameraIdentity()), name), "from the camera itself")
 
-    def fact(name: Literal["maker", "model", "sensor"], cam: CameraName) -> Value | None:
+    def recorded_text(name: Literal["maker", "model", "sensor"], cam: CameraName) -> Value | None:
         return of_text(getattr(cameras[cam], name), _IN_FILE)
 
     def size(cam: CameraName) -> Value | None:
@@ -63,12 +63,12 @@ def _camera_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> lis
         return None if found is None else Value(f"{found[0][0]} x {found[0][1]} px", None, found[1])
 
     return [
-        each("camera.maker", "Camera, maker", lambda cam: fact("maker", cam), f"camN.maker of {_RIG_FILE}"),
+        each("camera.maker", "Camera, maker", lambda cam: recorded_text("maker", cam), f"camN.maker of {_RIG_FILE}"),
         each(
             "camera.model",
             "Camera, model",
-            lambda cam: device(cam, "model") or fact("model", cam),
-            f"camN.model of {_FACTS}",
+            lambda cam: device(cam, "model") or recorded_text("model", cam),
+            f"camN.model of {_METADATA_SOURCE}",
         ),
         each("camera.serial", "Camera, serial number", lambda cam: device(cam, "serial"), _BY_SERVICE),
         each("camera.resolution", "Image size", size, "needs the images or the calibration"),
@@ -78,7 +78,7 @@ def _camera_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> lis
             lambda cam: of_number(step.bit_depth.get(cam), "d", "bit", RECORD),
             f"{_BY_SERVICE} or imports",
         ),
-        each("camera.sensor", "Sensor", lambda cam: fact("sensor", cam), f"camN.sensor of {_RIG_FILE}"),
+        each("camera.sensor", "Sensor", lambda cam: recorded_text("sensor", cam), f"camN.sensor of {_RIG_FILE}"),
         each(
             "camera.pixel",
             "Pixel size",
@@ -88,8 +88,8 @@ def _camera_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> lis
     ]
 
 
-def _lens_items(source: Source, cameras: dict[CameraName, CameraFacts]) -> list[Item]:
-    nothing = LensFacts.model_validate({})
+def _lens_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> list[Item]:
+    nothing = LensMetadata.model_validate({})
     lenses = {cam: camera.lens or nothing for cam, camera in cameras.items()}
     where = f"in [camN.lens] of {_RIG_FILE}"
 
@@ -163,34 +163,34 @@ def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
             "from the pinhole along the optical axis to the surface's plane",
         ),
     ]
-    if source.facts.standoff_mm is not None:
-        ruler = of_number(source.facts.standoff_mm, "g", "mm", STATED)
+    if source.metadata.standoff_mm is not None:
+        ruler = of_number(source.metadata.standoff_mm, "g", "mm", STATED)
         items.append(one("stand_off.stated", "Stand-off distance, by ruler", ruler))
     baseline, angle, between, remedy = None, None, "", _NEEDS_CALIBRATION
     if found is not None:
-        degrees, sight = float(np.degrees(found.stereo_angle_rad)), float(np.degrees(found.sight_angle_rad))
+        degrees, viewing = float(np.degrees(found.stereo_angle_rad)), float(np.degrees(found.viewing_angle_rad))
         angle, remedy = Value(f"{degrees:.3f} degrees", degrees, CALIBRATION), ""
         between = "between the optical axes; between both lines of sight to the middle of the surface "
-        between += f"{sight:.3f} degrees"
+        between += f"{viewing:.3f} degrees"
         baseline = of_number(found.baseline_mm, ".3f", "mm", CALIBRATION)
     items.append(one("stereo_angle", "Stereo angle", angle, remedy, between))
     return [*items, one("baseline", "Distance of the pinholes", baseline, _NEEDS_CALIBRATION)]
 
 
 def _recording_items(source: Source, measured: Measured) -> list[Item]:
-    facts, rig, read_back = source.facts, source.rig, "read back from the camera"
+    metadata, rig, read_back = source.metadata, source.rig, "read back from the camera"
     set_to = {cam: rig.cameras.get(cam, CameraRecord()) for cam in CAMERAS}
-    lighting = of_text(facts.lighting, STATED) or of_text(rig.lighting, "as stated (rig file)")
+    lighting = of_text(metadata.lighting, STATED) or of_text(rig.lighting, "as stated (rig file)")
     return [
-        one("rate", "Image acquisition rate", _rate(source, measured), f"frame_rate_hz of {_FACTS}"),
+        one("rate", "Image acquisition rate", _rate(source, measured), f"frame_rate_hz of {_METADATA_SOURCE}"),
         each(
             "exposure",
             "Exposure",
             lambda cam: (
                 of_number(set_to[cam].exposure_ms, "g", "ms", read_back)
-                or of_number(facts.exposure_ms, "g", "ms", STATED)
+                or of_number(metadata.exposure_ms, "g", "ms", STATED)
             ),
-            f"exposure_ms of {_FACTS}",
+            f"exposure_ms of {_METADATA_SOURCE}",
         ),
         each("gain", "Gain", lambda cam: of_number(set_to[cam].gain_db, "g", "dB", read_back), _BY_SERVICE),
         one(
@@ -204,8 +204,8 @@ def _recording_items(source: Source, measured: Measured) -> list[Item]:
         one(
             "pattern.technique",
             "Patterning technique",
-            of_text(facts.pattern_technique, STATED),
-            f"pattern_technique of {_FACTS}",
+            of_text(metadata.pattern_technique, STATED),
+            f"pattern_technique of {_METADATA_SOURCE}",
         ),
     ]
 
@@ -236,8 +236,8 @@ def image_sizes(source: Source) -> tuple[tuple[int, int] | None, tuple[int, int]
 
 
 def _rate(source: Source, measured: Measured) -> Value | None:
-    if source.facts.frame_rate_hz is not None:
-        return of_number(source.facts.frame_rate_hz, "g", "Hz", STATED)
+    if source.metadata.frame_rate_hz is not None:
+        return of_number(source.metadata.frame_rate_hz, "g", "Hz", STATED)
     rate, trigger = source.rig.frame_rate_hz, source.rig.trigger
     if rate is not None and trigger in ("free", "hardware"):
         return Value(f"{rate:g} Hz (trigger: {trigger})", rate, RECORD)
@@ -261,7 +261,7 @@ def _synchronisation(source: Source, measured: Measured) -> Value | None:
 
 
 def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
-    size, facts = _pattern_size(source, measured), source.facts
+    size, metadata = _pattern_size(source, measured), source.metadata
     feature, contrast, needs = None, None, "needs the reference image of camera 1"
     how = (
         "full width of the autocorrelation's peak at half of its height, over the measured region of camera 1's "
@@ -273,9 +273,9 @@ def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list
         how += f" ({size.width_x_px:.2f} px along rows, {size.width_y_px:.2f} px down columns)"
         contrast = Value(f"{size.contrast_grey:.1f} grey levels", size.contrast_grey, MEASURED)
     items = [one("pattern.size", "Pattern feature size", feature, needs, how)]
-    if facts.pattern_feature_mm is not None:
-        feature = of_number(facts.pattern_feature_mm, "g", "mm", STATED)
-        method = facts.pattern_feature_method or "how it is known was not stated"
+    if metadata.pattern_feature_mm is not None:
+        feature = of_number(metadata.pattern_feature_mm, "g", "mm", STATED)
+        method = metadata.pattern_feature_method or "how it is known was not stated"
         items.append(one("pattern.stated", "Pattern feature size, as stated", feature, "", method))
     of = "standard deviation of the pattern's grey levels in the same region"
     return [*items, one("pattern.contrast", "Pattern contrast", contrast, needs, of)]

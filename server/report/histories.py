@@ -45,7 +45,7 @@ class Gauges:
 class _Axis:
     """What courses are drawn over: time since the reference, or the step's number."""
 
-    places: list[float]
+    positions: list[float]
     label: str
 
     @staticmethod
@@ -57,7 +57,7 @@ class _Axis:
         return _Axis([float(s.n) for s in steps], "step")
 
     def draw(self, lines: Lines, y_label: str, title: str, *, text: str, caption: str) -> Picture:
-        data = course(self.places, lines, x_label=self.label, y_label=y_label, title=title)
+        data = course(self.positions, lines, x_label=self.label, y_label=y_label, title=title)
         return Picture(data, SVG, f"{text} over the steps", caption)
 
 
@@ -77,7 +77,7 @@ def courses(measured: Measured) -> list[Picture] | None:
 
     def over(chosen: Sequence[StepFigures]) -> _Axis:
         numbers = {s.n for s in chosen}
-        return _Axis([x for x, s in zip(axis.places, steps, strict=True) if s.n in numbers], axis.label)
+        return _Axis([x for x, s in zip(axis.positions, steps, strict=True) if s.n in numbers], axis.label)
 
     if measured.moved:
         lines = {}
@@ -97,11 +97,11 @@ def courses(measured: Measured) -> list[Picture] | None:
 
 
 def gauges(source: Source, measured: Measured) -> Gauges | None:
-    """Read the gauges of the facts in every step, and draw their courses; None where none were asked for."""
-    if source.facts.gauges is None:
+    """Read the gauges of the metadata in every step, and draw their courses; None where none were asked for."""
+    if source.metadata.gauges is None:
         return None
     try:
-        readings = read_gauges(list(source.files.values()), source.facts.gauges)
+        readings = read_gauges(list(source.files.values()), source.metadata.gauges)
     except StereorigError as error:
         return Gauges(None, [f"The gauges could not be read: {error.cause}"], [])
     problems = [f"Step {s.n}: {s.problem.cause}" for s in readings.steps if s.problem is not None]

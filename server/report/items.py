@@ -98,5 +98,5 @@ def plain(value: float, digits: int = 4) -> str:
     """A number with so many digits, without an exponent where that reads better."""
     if value == 0.0 or not np.isfinite(value):
         return "0" if value == 0.0 else "-"
-    places = int(max(0, digits - 1 - np.floor(np.log10(abs(value)))))
-    return f"{value:.{min(places, 12)}f}" if abs(value) >= 1e-6 else f"{value:.{digits - 1}e}"
+    decimals = int(max(0, digits - 1 - np.floor(np.log10(abs(value)))))
+    return f"{value:.{min(decimals, 12)}f}" if abs(value) >= 1e-6 else f"{value:.{digits - 1}e}"

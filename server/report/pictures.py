@@ -19,14 +19,14 @@ from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField
 from server.formats.figure import Picture, draw
-from server.formats.figure_options import Look
+from server.formats.figure_options import FigureStyle
 
 #: by name, values and their standard deviations
 Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
-_HALF = Look(width_px=960, dots_per_inch=210)
-_MOST_PX = 900
+_HALF = FigureStyle(width_px=960, dots_per_inch=210)
+_MAX_PX = 900
 _COLOURS = ("#1b4f72", "#b9770e", "#7d3c98", "#1e8449", "#a93226", "#5d6d7e", "#2e86c1", "#6e2c00")
-_SEEN, _LOST = "#00d9a0", "#ff4060"
+_VALID, _INVALID = "#00d9a0", "#ff4060"
 
 
 def _cropped(data: bytes) -> bytes:
@@ -46,10 +46,10 @@ def _cropped(data: bytes) -> bytes:
 def unit_for(values: Float, *, strain: bool = False) -> tuple[float, str]:
     """Factor and unit in which a length (mm) or a strain reads well."""
     finite = np.abs(values[np.isfinite(values)])
-    most = float(np.percentile(finite, 99)) if finite.size else 0.0
+    largest = float(np.percentile(finite, 99)) if finite.size else 0.0
     if strain:
-        return (1e6, "microstrain") if most < 0.02 else (100.0, "%")
-    return (1e3, "\u00b5m") if most < 0.5 else (1.0, "mm")
+        return (1e6, "microstrain") if largest < 0.02 else (100.0, "%")
+    return (1e3, "\u00b5m") if largest < 0.5 else (1.0, "mm")
 
 
 def field_map(
@@ -99,7 +99,7 @@ def region(
         (m, 2) corners of the region that was asked for.
     """
     rows, cols = image.shape[:2]
-    shrink = max(1.0, cols / _MOST_PX)
+    shrink = max(1.0, cols / _MAX_PX)
     small = (
         image
         if shrink == 1.0
@@ -111,7 +111,7 @@ def region(
     axis = figure.add_subplot()
     axis.imshow(small, cmap="gray", vmin=low, vmax=max(high, low + 1.0), extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))
     size = float(np.clip(80.0 / np.sqrt(max(len(positions_px), 1)), 0.5, 3.5))
-    for chosen, colour in ((valid, _SEEN), (~valid, _LOST)):
+    for chosen, colour in ((valid, _VALID), (~valid, _INVALID)):
         axis.plot(*positions_px[chosen].T, ".", color=colour, markersize=size, markeredgewidth=0.0)
     if outline_px is not None:
         closed = np.concatenate([outline_px, outline_px[:1]])

@@ -6,19 +6,22 @@ from pathlib import Path
 
 from pydantic import Field
 
-from server.config.camera_facts import LensFacts
+from server.config.camera_metadata import LensMetadata
 from server.formats.calibrations.record import CameraIdentity
 from server.formats.records import Record
 
 
 class CameraRecord(Record):
-    """A camera as the rig file describes it and as it was set; see :class:`server.config.camera_facts.CameraFacts`."""
+    """A camera as the rig file describes it and as it was set.
+
+    See :class:`server.config.camera_metadata.CameraMetadata`.
+    """
 
     maker: str | None = None
     model: str | None = None
     sensor: str | None = None
     pixel_um: float | None = None
-    lens: LensFacts | None = None
+    lens: LensMetadata | None = None
     exposure_ms: float | None = None
     gain_db: float | None = None
 

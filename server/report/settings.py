@@ -105,10 +105,10 @@ def _matched(measured: Measured) -> str:
 
 
 def _points(measured: Measured) -> str:
-    first, least = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary.valid)
+    first, fewest = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary.valid)
     return (
         f"{first.points} in the region; valid in the reference {first.valid}, "
-        f"fewest {least.summary.valid} in step {least.n}"
+        f"fewest {fewest.summary.valid} in step {fewest.n}"
     )
 
 

@@ -1,4 +1,4 @@
-"""The sources of a report: result files, the records that lie about them, the calibration, the facts."""
+"""The sources of a report: result files, the records that lie about them, the calibration, the metadata."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from server.formats.images import read_image
 from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import ResultHead, read_head
 from server.report.records import AnalysisRecord, RigRecord, SettingsRecord, StepRecord, TestRecord
-from server.results.metadata import TestFacts, parse_facts
+from server.results.metadata import TestMetadata, parse_metadata
 from server.results.staleness import stale_results
 from server.store.durable import known_json
 
@@ -41,7 +41,7 @@ class Source:
         ``step.json`` of every file's step; empty where there is none.
     calibration, calibration_file
         None where it was not found or is not the one that was measured with.
-    facts
+    metadata
         Metadata stated by the operator.
     stale
         What is gone or was replaced since the results were written.
@@ -57,7 +57,7 @@ class Source:
     steps: dict[int, StepRecord]
     calibration: LoadedCalibration | None
     calibration_file: Path | None
-    facts: TestFacts
+    metadata: TestMetadata
     stale: list[str]
     doubts: list[str] = field(default_factory=list)
 
@@ -93,11 +93,11 @@ class Source:
         head = self.heads.get(n, self.heads[max(self.heads)])
         inputs = head.inputs_sha256
         sha256 = inputs.get(f"reference_{cam}") or inputs.get(cam)
-        places = [] if self.test is None else [self.test / "steps" / f"{n:04d}" / f"{cam}.tif"]
+        candidates = [] if self.test is None else [self.test / "steps" / f"{n:04d}" / f"{cam}.tif"]
         if n in self.heads and self.heads[n].image_file(cam):
             named = Path(self.heads[n].image_file(cam))
-            places += [named, self.files[n].parent / named.name]
-        for path in places:
+            candidates += [named, self.files[n].parent / named.name]
+        for path in candidates:
             try:
                 if path.is_file() and (sha256 is None or known_sha256(path) == sha256):
                     return read_image(path)
@@ -112,7 +112,7 @@ def find_source(
     test: str | None = None,
     analysis: str | None = None,
     calibration: Path | None = None,
-    facts: TestFacts | None = None,
+    metadata: TestMetadata | None = None,
 ) -> Source:
     """Find everything about one measurement.
 
@@ -125,7 +125,7 @@ def find_source(
         results.
     calibration
         Its file, where it is not beside the results.
-    facts
+    metadata
         Metadata stated by the operator; left out: what is kept with the test.
 
     Raises
@@ -135,7 +135,7 @@ def find_source(
     NotFoundError
         No such test or analysis.
     FileFormatError
-        A result file that cannot be read, facts that cannot be.
+        A result file that cannot be read, metadata that cannot be.
     """
     folder = _results_folder(place, test, analysis)
     files = {number_of(path): path for path in results_in(folder)}
@@ -164,7 +164,7 @@ def find_source(
         steps=steps,
         calibration=loaded,
         calibration_file=file,
-        facts=parse_facts(test_record.facts, name="the facts of the test") if facts is None else facts,
+        metadata=parse_metadata(test_record.facts, name="the metadata of the test") if metadata is None else metadata,
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
     )
@@ -225,11 +225,11 @@ def _calibration(
     """Find the calibration that the results were measured with, by its checksum."""
     inputs = heads[max(heads)].inputs_sha256
     sha256 = inputs.get("calibration")
-    places = [] if given is None else [given]
+    candidates = [] if given is None else [given]
     if given is None:
-        places += [] if test is None else [test / "calibration.json"]
-        places += [] if made.calibration is None else [made.calibration.file]
-    for path in places:
+        candidates += [] if test is None else [test / "calibration.json"]
+        candidates += [] if made.calibration is None else [made.calibration.file]
+    for path in candidates:
         if not path.is_file():
             continue
         loaded = load_calibration(path)

@@ -61,7 +61,7 @@ class StepFigures:
     static: bool
 
     @property
-    def least_zncc(self) -> float | None:
+    def min_zncc(self) -> float | None:
         """Smallest of the comparisons' medians."""
         return min((v for v in self.summary.zncc_median.values() if v is not None), default=None)
 
@@ -72,7 +72,7 @@ class StepFigures:
         return [None if mm is None else 1e3 * mm for mm in medians]
 
     @property
-    def largest_mm(self) -> float | None:
+    def max_displacement_mm(self) -> float | None:
         """Largest component of any point's displacement; None for a shape."""
         moved = self.summary.displacement_mm or {}
         ends = [abs(v) for component in moved.values() if component for v in (component.min, component.max)]
@@ -145,7 +145,7 @@ class Measured:
 def read_steps(source: Source) -> Measured:
     """Read every result file once; at most three fields are held at a time, and the static steps' values."""
     labels = {n: _label(source, n) for n in source.files}
-    static, how = static_steps(source.facts.static_steps, labels, source.reference)
+    static, how = static_steps(source.metadata.static_steps, labels, source.reference)
     rbe = None if source.calibration is None else rbe_of(source.calibration)
     keeper = FloorKeeper()
     figures: list[StepFigures] = []
@@ -171,7 +171,7 @@ def read_steps(source: Source) -> Measured:
         if n == source.reference and len(source.files) > 1:
             continue
         last = Shown(n, "the last step", field, strain)
-        size = abs(loads[n] or 0.0) if by_load else step.largest_mm
+        size = abs(loads[n] or 0.0) if by_load else step.max_displacement_mm
         if size is not None and size > height:
             why = "the step of the highest load" if by_load else "the step of the largest displacement"
             height, peak = size, Shown(n, why, field, strain)

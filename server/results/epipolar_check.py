@@ -60,7 +60,7 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
     variables = step.variables
     xy1 = np.stack([variables[n].values[ok] for n in ("x_px", "y_px")], axis=1)
     xyz = np.stack([variables[n].values[ok] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
-    xy2 = _seen_by_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
+    xy2 = _visible_in_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
     return EpipolarComparison(
         results=files[0].name,
         measured_with=Residual.of(own.pair.epipolar_residual_px(xy1, xy2)),
@@ -68,7 +68,7 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
     )
 
 
-def _seen_by_camera2(pair: StereoPair, xy1: Float, xyz_mm: Float, offset_px: Float) -> Float:
+def _visible_in_camera2(pair: StereoPair, xy1: Float, xyz_mm: Float, offset_px: Float) -> Float:
     """Where camera 2 saw the points: beside the epipolar line by the offset that was measured."""
     on_line = pair.cam2.project(xyz_mm).xy
     h = 0.01

@@ -26,7 +26,7 @@ MEDIA_TYPES: dict[FieldForm, str] = {
     "png": "image/png",
 }
 RANGE_PATTERN = r"^[0-9]{0,6}:[0-9]{0,6}$"
-_LARGEST_PX = 1200
+_MAX_PX = 1200
 _BAR_PX, _TEXT_PX, _MARGIN_PX, _TITLE_PX = 22, 130, 12, 34
 _BLANK = (255, 255, 255)
 
@@ -83,8 +83,8 @@ class FieldPart:
     values
         (r, c) or (r, c, ...); NaN where there is nothing.
     rows, cols
-        Places of its rows and columns in the whole grid.
-    place
+        Indices of its rows and columns in the whole grid.
+    position
         Gives (r, c) of ``x_px`` or ``y_px``: where the points lie in camera 1's reference image.
     """
 
@@ -93,7 +93,7 @@ class FieldPart:
     values: NDArray[Any]
     rows: NDArray[np.intp]
     cols: NDArray[np.intp]
-    place: Callable[[str], NDArray[np.float64]]
+    position: Callable[[str], NDArray[np.float64]]
 
     @property
     def headers(self) -> dict[str, str]:
@@ -106,9 +106,9 @@ class FieldPart:
         }
 
 
-def _range(places: NDArray[np.intp]) -> str:
-    step = int(places[1] - places[0]) if len(places) > 1 else 1
-    return f"{int(places[0])}:{int(places[-1]) + 1}:{step}"
+def _range(indices: NDArray[np.intp]) -> str:
+    step = int(indices[1] - indices[0]) if len(indices) > 1 else 1
+    return f"{int(indices[0])}:{int(indices[-1]) + 1}:{step}"
 
 
 def take(name: str, read: Callable[[str], Variable], part: Part) -> FieldPart:
@@ -172,8 +172,8 @@ def _csv(part: FieldPart) -> bytes:
     rows, cols = (grid.ravel() for grid in np.meshgrid(part.rows, part.cols, indexing="ij"))
     whole = not np.issubdtype(part.values.dtype, np.floating)
     lines = [",".join(["row", "col", "x_px", "y_px", *names])]
-    places = (part.place(of).ravel() for of in ("x_px", "y_px"))
-    for row, col, x, y, values in zip(rows, cols, *places, flat, strict=True):
+    positions = (part.position(of).ravel() for of in ("x_px", "y_px"))
+    for row, col, x, y, values in zip(rows, cols, *positions, flat, strict=True):
         texts = [str(int(v)) if whole else (repr(float(v)) if np.isfinite(v) else "") for v in values]
         lines.append(",".join([str(row), str(col), f"{x:g}", f"{y:g}", *texts]))
     return ("\n".join(lines) + "\n").encode()
@@ -181,17 +181,17 @@ def _csv(part: FieldPart) -> bytes:
 
 def _netcdf(part: FieldPart) -> bytes:
     """Return a NetCDF-4 file with the variable, its place in the grid and in the image."""
-    pixels = {of: part.place(of) for of in ("x_px", "y_px")}
+    pixels = {of: part.position(of) for of in ("x_px", "y_px")}
 
     def fill(data: Any) -> None:
         data.setncattr("Conventions", "CF-1.8")
-        for name, places in (("row", part.rows), ("col", part.cols)):
-            data.createDimension(name, len(places))
-            data.createVariable(name, "i4", (name,))[:] = places
+        for name, indices in (("row", part.rows), ("col", part.cols)):
+            data.createDimension(name, len(indices))
+            data.createVariable(name, "i4", (name,))[:] = indices
         for name, values in pixels.items():
-            place = data.createVariable(name, "f8", ("row", "col"))
-            place[:] = values
-            place.units = "pixel"
+            position = data.createVariable(name, "f8", ("row", "col"))
+            position[:] = values
+            position.units = "pixel"
         if part.name not in ("x_px", "y_px"):
             more = tuple(f"component_{k}" for k in range(part.values.ndim - 2))
             for name, size in zip(more, part.values.shape[2:], strict=True):
@@ -220,8 +220,8 @@ def _png(part: FieldPart) -> bytes:
     grey = np.where(finite, np.clip((values - low) / span, 0.0, 1.0) * 255.0, 0.0).astype(np.uint8)
     colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
     colours[~finite] = _BLANK
-    factor = max(1, min(32, _LARGEST_PX // max(values.shape)))
-    shrunk = max(values.shape) / _LARGEST_PX
+    factor = max(1, min(32, _MAX_PX // max(values.shape)))
+    shrunk = max(values.shape) / _MAX_PX
     if shrunk > 1.0:
         size = (max(1, round(values.shape[1] / shrunk)), max(1, round(values.shape[0] / shrunk)))
         colours = cv2.resize(colours, size, interpolation=cv2.INTER_NEAREST)

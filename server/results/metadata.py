@@ -15,11 +15,11 @@ from pydantic import Field, StringConstraints, ValidationError
 
 from core.errors import FileFormatError
 from server.base.models import StepNumber
-from server.config.camera_facts import Above, CameraFacts, ClosedFacts, Text
+from server.config.camera_metadata import Above, CameraMetadata, ClosedMetadata, Text
 from server.results.gauges.request import GaugeRequest
 
 
-class TestFacts(ClosedFacts):
+class TestMetadata(ClosedMetadata):
     """Metadata of one test."""
 
     __test__ = False
@@ -48,8 +48,8 @@ class TestFacts(ClosedFacts):
     )
     frame_rate_hz: Above | None = Field(None, description="Rate at which the images were taken.")
     exposure_ms: Above | None = Field(None, description="Exposure of both cameras, where their records do not say it.")
-    cam1: CameraFacts | None = Field(None, description="Camera 1; goes before what the rig file says.")
-    cam2: CameraFacts | None = Field(None, description="Camera 2.")
+    cam1: CameraMetadata | None = Field(None, description="Camera 1; goes before what the rig file says.")
+    cam2: CameraMetadata | None = Field(None, description="Camera 2.")
     static_steps: list[StepNumber] | None = Field(
         None,
         description="Steps in which nothing moved since the reference: noise floor and bias come from them. Left out: "
@@ -59,7 +59,7 @@ class TestFacts(ClosedFacts):
     gauges: GaugeRequest | None = Field(None, description="Gauges whose histories the report shows.")
     notes: Annotated[str, StringConstraints(max_length=20_000)] | None = Field(None, description="Anything else.")
 
-    def camera(self, cam: str) -> CameraFacts | None:
+    def camera(self, cam: str) -> CameraMetadata | None:
         """Facts of one camera."""
         return self.cam1 if cam == "cam1" else self.cam2
 
@@ -68,7 +68,7 @@ class TestFacts(ClosedFacts):
         return self.model_dump(mode="json", exclude_none=True)
 
 
-def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
+def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata:
     """Read facts.
 
     Raises
@@ -77,7 +77,7 @@ def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
         ``metadata_invalid``, one line that names the first wrong field.
     """
     try:
-        return TestFacts.model_validate(dict(document))
+        return TestMetadata.model_validate(dict(document))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "file"
@@ -89,7 +89,7 @@ def parse_facts(document: Mapping[str, object], *, name: str) -> TestFacts:
         ) from error
 
 
-def load_facts(path: Path) -> TestFacts:
+def load_metadata(path: Path) -> TestMetadata:
     """Read a facts.toml.
 
     Raises
@@ -98,7 +98,7 @@ def load_facts(path: Path) -> TestFacts:
         ``file_missing``, ``file_unreadable``, ``metadata_invalid``.
     """
     try:
-        return parse_facts(tomllib.loads(path.read_text(encoding="utf-8")), name=str(path))
+        return parse_metadata(tomllib.loads(path.read_text(encoding="utf-8")), name=str(path))
     except FileNotFoundError as error:
         raise FileFormatError(f"{path} does not exist.", code="file_missing", remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

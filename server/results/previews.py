@@ -81,10 +81,10 @@ def predicted_error_px(pixels: NDArray[Any], full_scale: float, subset_px: int) 
         Error in px for noise of `NOISE_SHARE`, of subsets about ``max(rows, cols) / 64`` apart; infinite where
         nothing is to be seen.
     """
-    apart = max(max(pixels.shape) // _TILES_ACROSS, 1)
-    y, x = np.mgrid[tuple(slice(1 + apart // 2, size - 1, apart) for size in pixels.shape)]
-    places = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
-    return errors_at(pixels, places, NOISE_SHARE * full_scale, (subset_px,))[subset_px].reshape(x.shape)
+    pitch = max(max(pixels.shape) // _TILES_ACROSS, 1)
+    y, x = np.mgrid[tuple(slice(1 + pitch // 2, size - 1, pitch) for size in pixels.shape)]
+    positions = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+    return errors_at(pixels, positions, NOISE_SHARE * full_scale, (subset_px,))[subset_px].reshape(x.shape)
 
 
 def texture_map(pixels: NDArray[Any], full_scale: float, subset_px: int) -> Overlay:

@@ -19,13 +19,13 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
     path
         The result file, to say its checksum.
     """
-    said = step.attributes
+    recorded = step.attributes
     document: dict[str, object] = {
         "software": f"stereorig {software_version()}",
-        "measured_with": said.get("source", ""),
-        "measured": said.get("created", ""),
-        "kind": said.get("kind", ""),
-        "frame": said.get("frame", ""),
+        "measured_with": recorded.get("source", ""),
+        "measured": recorded.get("created", ""),
+        "kind": recorded.get("kind", ""),
+        "frame": recorded.get("frame", ""),
         "length_unit": "mm",
         "settings": _json(step, "settings"),
         "calibration_sha256": calibration_of(step),
@@ -34,11 +34,11 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
         **source.about,
     }
     for name in ("strain", "smoothing", "patch_choice", "transformation"):
-        if name in said:
+        if name in recorded:
             document[name] = _json(step, name)
     for name in ("strain_axes", "strain_note", "patch", "patch_reason", "made_from"):
-        if name in said:
-            document[name] = said[name]
+        if name in recorded:
+            document[name] = recorded[name]
     document["step"] = step.n
     document["label"], document["load_n"] = step.label, step.load_n
     if path is not None:
@@ -56,7 +56,7 @@ def calibration_of(step: StepResult) -> str | None:
 def notes_of(step: StepResult, source: Source) -> list[str]:
     """Return the few lines that a picture says of its provenance."""
     settings, strain = _json(step, "settings"), _json(step, "strain")
-    said = [
+    parts = [
         f"{name} {settings[key]}{unit}"
         for name, key, unit in (
             ("subset", "subset_px", " px"),
@@ -70,11 +70,11 @@ def notes_of(step: StepResult, source: Source) -> list[str]:
     ]
     if strain:
         mm = strain.get("gauge_mm")
-        said.append(f"gauge {strain['gauge_px']:g} px{'' if mm is None else f' = {mm:.3g} mm'}, {strain['tensor']}")
+        parts.append(f"gauge {strain['gauge_px']:g} px{'' if mm is None else f' = {mm:.3g} mm'}, {strain['tensor']}")
     calibration = source.about.get("calibration_id"), (calibration_of(step) or "")[:12]
     known = " ".join(str(part) for part in calibration if part) or "not known"
     frame, measured_with = (step.attributes.get(name, "") for name in ("frame", "source"))
-    return [f"frame: {frame}", f"{', '.join(said)}; calibration {known}; {measured_with}"]
+    return [f"frame: {frame}", f"{', '.join(parts)}; calibration {known}; {measured_with}"]
 
 
 def _json(step: StepResult, name: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from drivers.cameras.protocol import CameraDescription, CameraIdentity, CameraSe
 from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, AxisStatus, ControllerMessage, StageIdentity
 from server.base.models import Document, Reply, Reported
 from server.base.problem import JobProblem
-from server.config.camera_facts import CameraFacts
+from server.config.camera_metadata import CameraMetadata
 from server.config.rig_file import CalibrationSection, CameraSection, TargetSection
 from server.jobs.hardware import Holder
 
@@ -143,7 +143,7 @@ class RigReply(Reply):
 _KEPT_SETTINGS = ("exposure_ms", "gain_db", "frame_rate_hz", "pixel_format")
 
 
-class CameraKept(CameraFacts, CameraSettings):
+class CameraKept(CameraMetadata, CameraSettings):
     """A camera as a step's record keeps it: how it was set, and what only people know of it."""
 
 
@@ -164,7 +164,7 @@ def identity_of(description: CameraDescription) -> dict[str, str]:
     return {name: getattr(description, name) for name in CameraIdentity.__dataclass_fields__}
 
 
-def kept_camera(settings: CameraSettings, facts: CameraFacts) -> CameraKept:
+def kept_camera(settings: CameraSettings, facts: CameraMetadata) -> CameraKept:
     """Return what a step's record keeps of a camera; a fact that was not stated is not there."""
     has = asdict(settings)
     stated = facts.model_dump(mode="json", exclude_none=True)

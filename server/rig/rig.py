@@ -220,7 +220,7 @@ class Rig:
             frame_rate_hz=section.frame_rate_hz,
             max_skew_ms=section.skew_bound_ms,
             lighting=section.lighting,
-            cameras={cam: kept_camera(units[cam].settings, self.config.camera(cam).facts()) for cam in CAMERAS},
+            cameras={cam: kept_camera(units[cam].settings, self.config.camera(cam).metadata()) for cam in CAMERAS},
         )
 
     def _describe_stage_or_fault(self) -> StageReply:

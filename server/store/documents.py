@@ -46,7 +46,7 @@ class JobRecord(Document):
         return self.model_copy(update=change)
 
 
-class StepFound(Document):
+class StepOutcome(Document):
     """What was found in one step of an analysis; see :class:`server.formats.results.summary.StepSummary`."""
 
     n: int
@@ -56,7 +56,7 @@ class StepFound(Document):
 class Finished(Document):
     """What a job has measured so far of an analysis."""
 
-    steps: list[StepFound] = Field(default_factory=list)
+    steps: list[StepOutcome] = Field(default_factory=list)
     steps_failed: dict[str, JobProblem] = Field(default_factory=dict)
 
 
@@ -76,7 +76,7 @@ class Kept(Document):
         return self.model_dump(exclude_unset=True, exclude={"request"})
 
 
-class BurstPlace(Document):
+class BurstIndex(Document):
     """Where a step stands in its burst."""
 
     job_id: str
@@ -95,7 +95,7 @@ class Watched(Document):
     threshold: float | None = None
 
 
-class StepFacts(Kept):
+class StepMetadata(Kept):
     """What the client said of a step, and what it was taken for."""
 
     label: str | None = None
@@ -103,7 +103,7 @@ class StepFacts(Kept):
     timestamp_utc: str | None = None
     channels: dict[str, float] = Field(default_factory=dict)
     request: KeptRequest | None = None
-    burst: BurstPlace | None = None
+    burst: BurstIndex | None = None
     watch: Watched | None = None
 
 
@@ -113,7 +113,7 @@ class PairQuality(Document):
     code: str | None = None
 
 
-class StepRecord(StepFacts):
+class StepRecord(StepMetadata):
     """``step.json``."""
 
     n: int
@@ -187,7 +187,7 @@ class SummaryRecord(Document):
     """``summary.json`` of an analysis; see :class:`server.formats.results.summary.SequenceSummary`."""
 
     state: JobState = "interrupted"
-    steps: list[StepFound] = Field(default_factory=list)
+    steps: list[StepOutcome] = Field(default_factory=list)
     job_id: str | None = None
     problem: JobProblem | None = None
 

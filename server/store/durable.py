@@ -81,8 +81,8 @@ def record_of(kind: type[Record], document: object, path: Path) -> Record:
         return kind.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise FileFormatError(f"{path.name} holds a wrong {place}: {first['msg']}.", file=path.name) from error
+        key = ".".join(map(str, first["loc"]))
+        raise FileFormatError(f"{path.name} holds a wrong {key}: {first['msg']}.", file=path.name) from error
 
 
 def read_record(kind: type[Record], path: Path) -> Record:

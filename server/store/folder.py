@@ -188,7 +188,7 @@ class DataFolder:
         check_format(path)
 
     def _remove_temporaries(self) -> None:
-        # what a kill left half written; only names that `written_aside` makes
+        # what a kill left half written; only names that `written_temporary` makes
         for folder, _, names in os.walk(self.root):  # a start goes through all folders: rglob takes twice as long
             for name in names:
                 if name.startswith(".") and name.endswith(".part"):

@@ -109,7 +109,7 @@ def rebuild(
         Differences between index and folders, and files that cannot be read.
     """
     entries: list[Entry] = []
-    trouble = _look_into_trash(folder)
+    trouble = _check_trash(folder)
     lost = LostJobs()
     for calibration_id in calibrations.ids():
         folder.ids.seen(calibration_id)
@@ -138,7 +138,7 @@ def rebuild(
     return catalog.replace_entries(entries) + trouble
 
 
-def _look_into_trash(folder: DataFolder) -> list[str]:
+def _check_trash(folder: DataFolder) -> list[str]:
     """Put the trash in order; what lies there keeps its ids."""
     trash = Trash(folder.root)
     done = trash.tidy()

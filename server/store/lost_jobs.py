@@ -14,7 +14,7 @@ from server.store.catalog import Catalog
 from server.store.documents import (
     AnalysisJob,
     AnalysisRecord,
-    BurstPlace,
+    BurstIndex,
     JobRecord,
     KeptRequest,
     MadeRecord,
@@ -31,7 +31,7 @@ class LostJobs:
     def __init__(self) -> None:
         self._jobs: dict[str, JobRecord] = {}
         self._requests: dict[tuple[str, str], tuple[str, Ids]] = {}
-        self._bursts: dict[tuple[str, str], list[tuple[BurstPlace, StepRecord]]] = {}
+        self._bursts: dict[tuple[str, str], list[tuple[BurstIndex, StepRecord]]] = {}
 
     def made(self, request: KeptRequest | None, ids: Ids) -> None:
         """Take the request that something was made for."""
@@ -109,8 +109,8 @@ class LostJobs:
             burst, first = steps[0]
             subject: Ids = {"test_id": test_id}
             taken = [
-                {"index": place.index, "n": step.n, "quality": step.quality_code, "sha256": step.sha256}
-                for place, step in steps
+                {"index": burst.index, "n": step.n, "quality": step.quality_code, "sha256": step.sha256}
+                for burst, step in steps
             ]
             result = {**subject, "count": burst.count, "steps": taken, "failures": []}
             state: JobState = "succeeded" if len(steps) == burst.count else "interrupted"

@@ -22,7 +22,7 @@ from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.formats.results.settings import current_step, current_summary
-from server.store.documents import AnalysisJob, AnalysisRecord, StepFound, StepRecord, SummaryRecord, TestRecord
+from server.store.documents import AnalysisJob, AnalysisRecord, StepOutcome, StepRecord, SummaryRecord, TestRecord
 from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -51,7 +51,7 @@ def deleted_mark(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.deleted")
 
 
-def set_aside(folder: Path) -> Path:
+def quarantine(folder: Path) -> Path:
     """Rename an incomplete step's folder, so that nobody takes it for a step; returns its new path.
 
     Raises
@@ -60,13 +60,13 @@ def set_aside(folder: Path) -> Path:
         If it cannot be renamed.
     """
     number = len(list(folder.parent.glob("incomplete-*"))) + 1
-    aside = folder.parent / f"incomplete-{number}-{folder.name}"
+    quarantined = folder.parent / f"incomplete-{number}-{folder.name}"
     try:
-        _disk.disk.replace(folder, aside)
+        _disk.disk.replace(folder, quarantined)
         fsync_path(folder.parent)
     except OSError as error:
         raise storage_error(error, folder) from error
-    return aside
+    return quarantined
 
 
 class TestStore:
@@ -131,7 +131,7 @@ class TestStore:
         with self._lock:
             yield
 
-    def facts(self, test_id: str) -> dict[str, object]:
+    def metadata(self, test_id: str) -> dict[str, object]:
         """Return a test's metadata; empty where nothing was stated."""
         found = self.read(test_id).facts
         return found if isinstance(found, dict) else {}
@@ -243,7 +243,7 @@ class TestStore:
             else:
                 # an incomplete reference would leave the test without step 0 for good
                 for folder in [p for p in steps.iterdir() if p.name.isdigit()]:
-                    set_aside(folder)
+                    quarantine(folder)
                 n = 0
             if n > MAX_STEPS:
                 raise StateError(f"Test {test_id} is full: {n} steps.", code="test_full", remedy="Make a new test.")
@@ -368,12 +368,14 @@ class TestStore:
         """Write what was found in one step, beside its result."""
         write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
-    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepFound]:
+    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepOutcome]:
         """What was found, by step; only of steps whose result is there."""
         path = self.analysis_path(test_id, analysis_id)
         files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
         return {
-            n: record_of(StepFound, current_step(read_json(file)), file) for n, file in files.items() if file.is_file()
+            n: record_of(StepOutcome, current_step(read_json(file)), file)
+            for n, file in files.items()
+            if file.is_file()
         }
 
     def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:

@@ -103,7 +103,7 @@ class Trash:
         StorageError
             When the disk does not keep it; then nothing was deleted, or all of it.
         """
-        place = self.place(kind, ids)
+        original = self.original(kind, ids)
         trash_id = folder.ids.new("x")
         entry = self.root / trash_id
         if not self.root.exists():
@@ -114,13 +114,13 @@ class Trash:
             write_json(entry / "trash.json", document)
             if kind == "step":
                 # its number stays taken: it stands in results and in people's notes
-                write_json(deleted_mark(place), {"trash_id": trash_id})
-            _move(place, entry / _CONTENT)
+                write_json(deleted_mark(original), {"trash_id": trash_id})
+            _move(original, entry / _CONTENT)
         except StorageError:
-            if place.exists():
+            if original.exists():
                 shutil.rmtree(entry, ignore_errors=True)
                 if kind == "step":
-                    deleted_mark(place).unlink(missing_ok=True)
+                    deleted_mark(original).unlink(missing_ok=True)
             raise
         return trash_id
 
@@ -135,22 +135,22 @@ class Trash:
             ``place_taken`` if something lies there by now, ``parent_deleted`` if its test is not there.
         """
         entry = self.entry(trash_id)
-        place = self.place(entry.kind, entry.plain())
-        if place.exists():
+        original = self.original(entry.kind, entry.plain())
+        if original.exists():
             raise StateError(
-                f"{place.relative_to(self._data)} is there again.",
+                f"{original.relative_to(self._data)} is there again.",
                 code="place_taken",
                 remedy="Delete that first, or take the files out of the trash folder by hand.",
             )
-        if not place.parent.is_dir():
+        if not original.parent.is_dir():
             raise StateError(
-                f"{place.parent.relative_to(self._data)} is not there.",
+                f"{original.parent.relative_to(self._data)} is not there.",
                 code="parent_deleted",
                 remedy="Restore the test first.",
             )
-        _move(self.root / trash_id / _CONTENT, place)
+        _move(self.root / trash_id / _CONTENT, original)
         if entry.kind == "step":
-            deleted_mark(place).unlink(missing_ok=True)
+            deleted_mark(original).unlink(missing_ok=True)
         shutil.rmtree(self.root / trash_id, ignore_errors=True)
         return entry
 
@@ -181,7 +181,7 @@ class Trash:
                 done.append(f"removed what was left of trash/{entry.name}")
         return done
 
-    def place(self, kind: object, ids: Mapping[str, object]) -> Path:
+    def original(self, kind: object, ids: Mapping[str, object]) -> Path:
         """Return where something lies that is not deleted; ids that are none never become a path.
 
         Raises

@@ -287,16 +287,16 @@ def verify(root: Path) -> Verification:
     """
     root = root.absolute()
     require_data_folder(root)
-    found = _look_through(root)
+    found = _check_all(root)
     if found.findings and is_in_use(root):
         time.sleep(_WRITING_S)  # it may have been written, or deleted, just while it was looked at
-        again = _look_through(root)
+        again = _check_all(root)
         before = set(found.findings)
         found = replace(again, findings=tuple(finding for finding in again.findings if finding in before))
     return found
 
 
-def _look_through(root: Path) -> Verification:
+def _check_all(root: Path) -> Verification:
     walk = _Walk(root)
     try:
         walk.top()

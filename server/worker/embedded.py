@@ -20,7 +20,7 @@ from typing import Any
 
 from core.compiling import COMPILING
 from core.errors import Cancelled
-from server.base.logs import about, ids_now
+from server.base.logs import about, current_ids
 from server.worker.death import MemoryWatch, cause_of_death, resident_mib
 from server.worker.executor import TaskExecutor, TaskFuture, WorkerDiedError
 from server.worker.process import serve
@@ -40,7 +40,7 @@ class _Task:
     args: tuple[Any, ...]
     kwargs: dict[str, object]
     #: what its log lines name
-    ids: dict[str, str] = field(default_factory=ids_now)
+    ids: dict[str, str] = field(default_factory=current_ids)
 
 
 class ComputeWorker(TaskExecutor):

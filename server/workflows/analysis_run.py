@@ -20,7 +20,7 @@ from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
-from server.store.documents import AnalysisRecord, Finished, StepFound
+from server.store.documents import AnalysisRecord, Finished, StepOutcome
 from server.store.folder import now_utc
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
@@ -66,7 +66,7 @@ class AnalysisRun:
         self._service = service
         self._test_id = test_id
         self._loaded: AnalysisRecord | None = None
-        self._summaries: dict[int, StepFound] = {}  # of the steps that are finished
+        self._summaries: dict[int, StepOutcome] = {}  # of the steps that are finished
         self._failed: dict[int, StereorigError] = {}  # in this run
         self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from
         self._next = 0  # place of that step
@@ -217,7 +217,7 @@ class AnalysisRun:
         seconds = round(time.monotonic() - started, 3)
         found = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
         service.tests.put_step_summary(self._test_id, analysis_id, n, found)
-        self._summaries[n] = StepFound.model_validate(found)
+        self._summaries[n] = StepOutcome.model_validate(found)
         self._done[n] = service.tests.step(self._test_id, n)
         self._tell(job)
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})

@@ -9,7 +9,7 @@ from server.base.metrics import timed_capture
 from server.base.problem import JobProblem, problem_of
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
-from server.store.documents import BurstPlace, StepFacts, StepRecord
+from server.store.documents import BurstIndex, StepMetadata, StepRecord
 from server.workflows.capture import commit_pair
 from server.workflows.service import Service
 
@@ -28,7 +28,7 @@ class BurstIncompleteError(MeasurementError):
 def start_burst(
     service: Service,
     test_id: str,
-    facts: StepFacts,
+    facts: StepMetadata,
     *,
     count: int,
     interval_ms: float,
@@ -56,7 +56,7 @@ def start_burst(
 
 
 def _run(
-    service: Service, job: Job, test_id: str, facts: StepFacts, count: int, interval_ms: float, frames: int
+    service: Service, job: Job, test_id: str, facts: StepMetadata, count: int, interval_ms: float, frames: int
 ) -> dict[str, object]:
     steps: list[dict[str, object]] = []
     failures: list[dict[str, object]] = []
@@ -68,7 +68,7 @@ def _run(
     for index in range(count):
         job.progress("steps", index, count)
         _wait_until(job, began + index * interval_ms / 1000.0)
-        place = BurstPlace(job_id=job.id, index=index, count=count, interval_ms=interval_ms, since_first_ms=0.0)
+        place = BurstIndex(job_id=job.id, index=index, count=count, interval_ms=interval_ms, since_first_ms=0.0)
         try:
             step = _take(service, job, test_id, facts, frames, place, first_ns)
         except StereorigError as error:
@@ -93,7 +93,7 @@ def _run(
 
 @timed_capture("capture")
 def _take(
-    service: Service, job: Job, test_id: str, facts: StepFacts, frames: int, place: BurstPlace, first_ns: int | None
+    service: Service, job: Job, test_id: str, facts: StepMetadata, frames: int, place: BurstIndex, first_ns: int | None
 ) -> StepRecord:
     service.require_room()
     shot, positions_mm = service.rig.pair.shoot(frames, job.check), service.rig.positions_mm()

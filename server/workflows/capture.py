@@ -11,7 +11,7 @@ from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode_image, encode_tiff
 from server.results.quality import image_quality, pair_quality
 from server.rig.cameras import PairShot
-from server.store.documents import StepFacts, StepRecord
+from server.store.documents import StepMetadata, StepRecord
 from server.store.folder import now_utc
 from server.store.index import step_entry
 from server.workflows.camera_identity import check_same_cameras
@@ -22,7 +22,7 @@ OFF_ZERO_MM = 0.01
 
 
 @timed_capture("capture")
-def capture_step(service: Service, test_id: str, facts: StepFacts, *, frames: int) -> StepRecord:
+def capture_step(service: Service, test_id: str, facts: StepMetadata, *, frames: int) -> StepRecord:
     """Capture a pair and commit it as the test's next step; returns ``step.json``."""
     service.require_room()
     with service.gate.hold("the capture of a step", test_id=test_id):
@@ -31,7 +31,7 @@ def capture_step(service: Service, test_id: str, facts: StepFacts, *, frames: in
 
 
 def commit_pair(
-    service: Service, test_id: str, facts: StepFacts, shot: PairShot, positions_mm: dict[int, float]
+    service: Service, test_id: str, facts: StepMetadata, shot: PairShot, positions_mm: dict[int, float]
 ) -> StepRecord:
     """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
 
@@ -85,7 +85,7 @@ def commit_pair(
 
 
 @timed_capture("import")
-def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: StepFacts) -> StepRecord:
+def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: StepMetadata) -> StepRecord:
     """Commit two image files as the test's next step; returns ``step.json``.
 
     Raises

@@ -18,7 +18,7 @@ from server.base.metrics import Metrics
 from server.base.models import Ids
 from server.base.streams import Streams
 from server.config.rig_file import RigConfig
-from server.exports.aside import ExportProcess
+from server.exports.process import ExportProcess
 from server.jobs.events import EventHub
 from server.jobs.hardware import HardwareGate
 from server.jobs.idempotency import OneEffect, RequestMark

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from core.errors import StateError
 from server.base.errors import NotFoundError
-from server.store.documents import StepFacts, Watched, WatchRecord
+from server.store.documents import StepMetadata, Watched, WatchRecord
 from server.store.durable import read_json, read_record, write_json
 from server.store.folder import now_utc
 from server.workflows.capture import capture_step
@@ -22,7 +22,7 @@ from server.workflows.service import Service
 LOAD = "load_n"
 
 
-def value_of(step: StepFacts, channel: str) -> float | None:
+def value_of(step: StepMetadata, channel: str) -> float | None:
     """Value of a channel in a step's document, or in a reading's; None where it has none."""
     return step.load_n if channel == LOAD else step.channels.get(channel)
 
@@ -125,7 +125,7 @@ class Watches:
                 return n, value
         return None
 
-    def reading(self, test_id: str, facts: StepFacts) -> Outcome:
+    def reading(self, test_id: str, facts: StepMetadata) -> Outcome:
         """Take a step if the watched channel has changed enough.
 
         Parameters

@@ -16,7 +16,7 @@ import pytest
 import scipy.io
 from PIL import Image
 
-from server.exports.aside import FOLDER
+from server.exports.process import FOLDER
 from server.workflows.service import Service
 from tests.support.export_results import write_results
 
@@ -155,7 +155,7 @@ def test_a_client_that_goes_away_ends_its_export(client: httpx.Client, service: 
 
 
 def test_what_a_kill_left_is_removed_at_the_start(tmp_path: Path) -> None:
-    from server.exports.aside import ExportProcess
+    from server.exports.process import ExportProcess
 
     (tmp_path / FOLDER / "tmpabc").mkdir(parents=True)
     (tmp_path / FOLDER / "tmpabc" / "half.zip").write_bytes(b"x")

@@ -9,9 +9,9 @@ import httpx
 import pytest
 
 from core.errors import FileFormatError
-from server.config.camera_facts import CameraFacts, LensFacts, merged
+from server.config.camera_metadata import CameraMetadata, LensMetadata, merged
 from server.config.rig_file import parse_config
-from server.results.metadata import load_facts, parse_facts
+from server.results.metadata import load_metadata, parse_metadata
 from server.store.verify import verify
 from server.workflows.service import Service
 from tests.support.service_rig import TINY, new_test, tiny_config
@@ -90,25 +90,25 @@ def test_no_facts_of_no_test(client: httpx.Client) -> None:
 def test_a_file_of_facts(tmp_path: Path) -> None:
     path = tmp_path / "facts.toml"
     path.write_text('operator = "A"\nstatic_steps = [1]\n[cam2.lens]\nf_number = 5.6\n')
-    facts = load_facts(path)
-    assert facts.cam2 == CameraFacts(lens=LensFacts(f_number=5.6))
+    facts = load_metadata(path)
+    assert facts.cam2 == CameraMetadata(lens=LensMetadata(f_number=5.6))
     assert facts.document() == {"operator": "A", "static_steps": [1], "cam2": {"lens": {"f_number": 5.6}}}
     for text, code in (("operator = ", "file_unreadable"), ("operater = 'A'", "metadata_invalid")):
         path.write_text(text)
         with pytest.raises(FileFormatError) as caught:
-            load_facts(path)
+            load_metadata(path)
         assert caught.value.code == code
     with pytest.raises(FileFormatError, match=r"nothing\.toml"):
-        load_facts(tmp_path / "nothing.toml")
+        load_metadata(tmp_path / "nothing.toml")
     with pytest.raises(FileFormatError, match="standoff_mm"):
-        parse_facts({"standoff_mm": "far"}, name="facts")
+        parse_metadata({"standoff_mm": "far"}, name="facts")
 
 
 def test_the_tests_facts_go_before_the_rig_files() -> None:
     rig = {"maker": "Basler", "exposure_ms": 8.0, "lens": {"maker": "Zeiss", "f_number": 8.0}}
-    told = merged(CameraFacts(maker="IDS", lens=LensFacts(f_number=11.0)), rig)
-    assert told == CameraFacts(maker="IDS", lens=LensFacts(maker="Zeiss", f_number=11.0))
-    assert merged(None, None) == CameraFacts()
+    told = merged(CameraMetadata(maker="IDS", lens=LensMetadata(f_number=11.0)), rig)
+    assert told == CameraMetadata(maker="IDS", lens=LensMetadata(maker="Zeiss", f_number=11.0))
+    assert merged(None, None) == CameraMetadata()
 
 
 def test_a_captured_step_keeps_what_the_rig_file_tells(client: httpx.Client, service: Service) -> None:
@@ -121,5 +121,5 @@ def test_a_captured_step_keeps_what_the_rig_file_tells(client: httpx.Client, ser
     assert rig["cameras"]["cam1"]["exposure_ms"] == pytest.approx(10.0)
     assert "lens" not in rig["cameras"]["cam1"]
     text = TINY.replace("exposure_ms = 10.0\n", "exposure_ms = 10.0\nmaker = 'M'\nlens = { f_number = 8.0 }\n", 1)
-    assert parse_config(text).cam1.facts() == CameraFacts(maker="M", lens=LensFacts(f_number=8.0))
-    assert tiny_config().cam1.facts() == CameraFacts()
+    assert parse_config(text).cam1.metadata() == CameraMetadata(maker="M", lens=LensMetadata(f_number=8.0))
+    assert tiny_config().cam1.metadata() == CameraMetadata()

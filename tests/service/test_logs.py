@@ -16,7 +16,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, ids_now
+from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, current_ids
 from server.jobs.hardware import HardwareGate
 from server.worker.embedded import ComputeWorker
 from server.workflows.service import Service
@@ -89,8 +89,8 @@ def test_the_hardware_thread_knows_whose_work_it_does() -> None:
     gate = HardwareGate()
     try:
         with about(request_id="r2"):
-            assert gate.call(ids_now) == {"request_id": "r2"}
-        assert gate.call(ids_now) == {}
+            assert gate.call(current_ids) == {"request_id": "r2"}
+        assert gate.call(current_ids) == {}
     finally:
         gate.close()
 
@@ -129,14 +129,14 @@ def test_a_requests_lines_and_its_jobs_lines_can_be_told_apart(
 def test_ids_do_not_leak_between_threads() -> None:
     seen = []
     with about(request_id="r3"):
-        plain = threading.Thread(target=lambda: seen.append(ids_now()))
+        plain = threading.Thread(target=lambda: seen.append(current_ids()))
         context = contextvars.copy_context()
-        knowing = threading.Thread(target=lambda: seen.append(context.run(ids_now)))
+        knowing = threading.Thread(target=lambda: seen.append(context.run(current_ids)))
         for thread in (plain, knowing):
             thread.start()
             thread.join()
     assert seen == [{}, {"request_id": "r3"}]
-    assert ids_now() == {}
+    assert current_ids() == {}
 
 
 def test_serve_writes_json_lines_where_it_is_told(tmp_path: Path) -> None:

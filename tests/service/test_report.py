@@ -505,7 +505,7 @@ def test_command_line_on_a_data_folder_and_what_is_missing_is_listed(
     test = copy / "tests" / plate.test_id
     for place in (copy, test, test / "analyses" / plate.analysis_id):
         source = find_source(place)
-        assert (list(source.files), source.facts.operator) == (list(range(6)), FACTS["operator"])
+        assert (list(source.files), source.metadata.operator) == (list(range(6)), FACTS["operator"])
         assert not source.stale
 
 

@@ -174,7 +174,7 @@ class StepQuality(Reply):
     cam2: CameraQuality | None = Field(None, description="Camera 2's image.")
 
 
-class BurstPlace(Reply):
+class BurstIndex(Reply):
     """Where a step stands in its burst."""
 
     job_id: str = Field(description="Job of the burst.")
@@ -198,7 +198,7 @@ class StepReply(Reply):
     skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
     quality: StepQuality = Field(description="`code` (`ok` or what is wrong), and figures of each camera.")
     sha256: dict[str, str] = Field(description="Checksums of both image files.")
-    burst: BurstPlace | None = Field(None, description="Where it stands in its burst, if it is of one.")
+    burst: BurstIndex | None = Field(None, description="Where it stands in its burst, if it is of one.")
 
 
 class BurstAccepted(Accepted):

@@ -11,7 +11,7 @@ from core.errors import InputError
 from server.exports.request import FORMATS, ExportRequest, steps_in
 from server.exports.run import export
 from server.exports.source import find_source
-from server.formats.figure_options import COLOURS, Look
+from server.formats.figure_options import COLOURS, FigureStyle
 from server.formats.files import make_folder
 
 
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export; print the files' names."""
-    look = Look(
+    style = FigureStyle(
         limits=None if args.limits is None else _pair("--limits", args.limits),
         percentiles=_pair("--percentiles", args.percentiles),
         colours=args.colours,
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     request = ExportRequest(
         format=args.format,
         steps=steps_in(",".join(args.step)) if args.step else None,
-        look=look,
+        style=style,
         fps=args.fps,
         variables=[name for text in args.variable for name in text.split(",")] or None,
         over_image=args.over_image or args.image is not None,

@@ -29,7 +29,7 @@ from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.terminal import ProgressLine
-from server.compute.seeds import check_places
+from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.images import decode_image, read_file
 from server.formats.noise_json import load_noise
@@ -214,7 +214,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         cracks=args.crack,
         holes=args.hole,
     )
-    check_places(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
+    check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
     steps = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     settings = StoredSettings.model_validate(
         {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from core.errors import InputError
 from server.formats.files import make_folder, write_bytes
-from server.results.metadata import load_facts
+from server.results.metadata import load_metadata
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,8 +43,10 @@ def run(args: argparse.Namespace) -> int:
             code="output_unusable",
             remedy="Give file.html; a browser prints it as PDF.",
         )
-    facts = None if args.facts is None else load_facts(args.facts)
-    source = find_source(args.place, test=args.test, analysis=args.analysis, calibration=args.calibration, facts=facts)
+    metadata = None if args.facts is None else load_metadata(args.facts)
+    source = find_source(
+        args.place, test=args.test, analysis=args.analysis, calibration=args.calibration, metadata=metadata
+    )
     made = make_report(source)
     make_folder(args.out.absolute().parent)
     write_bytes(args.out, made.page)

@@ -21,7 +21,7 @@ from core.errors import MeasurementError
 from core.field.points.result import Field
 from core.settings import StoredSettings
 from server.cli.terminal import ProgressLine, duration
-from server.compute.compile_aside import CompileAside
+from server.compute.background_compilation import BackgroundCompilation
 from server.compute.overlap import ReadAhead, WriteBehind
 from server.compute.strain import smoothing_note
 from server.formats.calibrations.recognise import LoadedCalibration
@@ -76,18 +76,18 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
     def on_compiling() -> None:
         progress.note(f"{COMPILING} ...")
         if len(job.steps) > 1:
-            aside.start()
+            compilation.start()
 
     with (
         _output_folder(job.out),
-        CompileAside(job.settings.patch) as aside,
+        BackgroundCompilation(job.settings.patch) as compilation,
         report_compiling(on_compiling),
         WriteBehind[dict[str, Any]]() as written,
     ):
         runner = _Runner(job, progress, written)
         with ReadAhead(runner.sequence.read, job.steps[1:]) as pairs:
             runner.measure(None)
-            aside.wait()
+            compilation.wait()
             for images in pairs:
                 runner.measure(images)
         steps = written.finish()

@@ -22,7 +22,7 @@ ImageSize = tuple[int, int] | None
 KEYS = ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "R", "T")
 _LENGTHS = (4, 5, 8, 12, 14)
 _ORDER = ("k1", "k2", "p1", "p2", "k3")
-_MOST_NUMBERS = 100
+_MAX_NUMBERS = 100
 _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
 
 
@@ -86,7 +86,7 @@ def _number(value: Any) -> float:
 def _flat(value: Any, depth: int = 0) -> list[float]:
     if not isinstance(value, list):
         return [_number(value)]
-    if depth > 2 or len(value) > _MOST_NUMBERS:
+    if depth > 2 or len(value) > _MAX_NUMBERS:
         raise ValueError("nested too deeply or too long")
     return [number for part in value for number in _flat(part, depth + 1)]
 

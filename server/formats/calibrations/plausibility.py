@@ -15,7 +15,7 @@ from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from server.formats.calibrations.recognise import LoadedCalibration
 
-MOST_RESIDUAL_PX = 1e-3  # of a carried-over model against an independent projection; rounding is 1e-9
+MAX_RESIDUAL_PX = 1e-3  # of a carried-over model against an independent projection; rounding is 1e-9
 _ACROSS = (13, 11)
 _DEPTHS = np.geomspace(0.3, 300.0, 61)  # of the baseline
 _THICKNESS = (0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
@@ -86,10 +86,10 @@ def middle_depth_mm(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, 
     met = pair.triangulate(*middles)
     if bool(met.valid):
         depth = float(pair.cam1.cam_from_sys.apply(met.xyz_mm)[2])
-        if len(_seen_at(pair, size1, size2, depth)):
+        if len(_visible_at(pair, size1, size2, depth)):
             return depth
     depths = pair.baseline_mm * _DEPTHS
-    counts = np.array([len(_seen_at(pair, size1, size2, float(d))) for d in depths])
+    counts = np.array([len(_visible_at(pair, size1, size2, float(d))) for d in depths])
     if counts.max() == 0:
         return None
     return float(np.exp(np.log(depths[counts == counts.max()]).mean()))
@@ -104,15 +104,15 @@ def shared_points(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, in
     depth = middle_depth_mm(pair, size1, size2)
     if depth is None:
         return np.zeros((0, 3))
-    middle = _seen_at(pair, size1, size2, depth)
+    middle = _visible_at(pair, size1, size2, depth)
     for share in _THICKNESS:
-        outer = [_seen_at(pair, size1, size2, depth * (1 + s)) for s in (-share, share)]
+        outer = [_visible_at(pair, size1, size2, depth * (1 + s)) for s in (-share, share)]
         if min(map(len, outer)) >= 0.4 * len(middle):
             return np.concatenate([outer[0], middle, outer[1]])
     return middle
 
 
-def _seen_at(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, int], depth_mm: float) -> Float:
+def _visible_at(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, int], depth_mm: float) -> Float:
     width, height = size1
     x, y = np.meshgrid(np.linspace(0, width - 1, _ACROSS[0]), np.linspace(0, height - 1, _ACROSS[1]))
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -169,7 +169,7 @@ def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
         residual = Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2))
     if residual.points < _ENOUGH:
         warnings.append("both cameras see hardly any point in common: the poses or the image sizes may be wrong")
-    elif residual.max_px is not None and residual.max_px > MOST_RESIDUAL_PX:
+    elif residual.max_px is not None and residual.max_px > MAX_RESIDUAL_PX:
         raise FileFormatError(
             f"The calibration does not agree with its own numbers: points that both cameras see lie up to "
             f"{residual.max_px:.3g} px off their epipolar lines.",

@@ -24,7 +24,7 @@ from server.formats.calibrations.record import CalibrationRecord
 from server.formats.calibrations.vic3d_xml import looks_like_vic3d, parse_vic3d
 
 _MAX_BYTES = 64 << 20
-_LEAST_BASELINE = 1e-6  # of the stand-off
+_MIN_BASELINE = 1e-6  # of the stand-off
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class LoadedCalibration:
 
 
 IMPORTED = "imported"
-_DEEPEST = 30  # levels of nesting; our own files have six
+_MAX_DEPTH = 30  # levels of nesting; our own files have six
 
 
 def imported_content(data: bytes, *, name: str) -> dict[str, object]:
@@ -75,8 +75,8 @@ def imported_content(data: bytes, *, name: str) -> dict[str, object]:
     """
     loaded = parse_calibration(data, name=name)
     if loaded.details:
-        if _nested_deeper(loaded.details, _DEEPEST):
-            raise unreadable(name, f"it is nested more than {_DEEPEST} levels deep")
+        if _nested_deeper(loaded.details, _MAX_DEPTH):
+            raise unreadable(name, f"it is nested more than {_MAX_DEPTH} levels deep")
         return loaded.details
     try:
         text = data.decode("utf-8")
@@ -173,7 +173,7 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
         raise unreadable(name, "it is JSON, but has no cam1 and cam2")
     cam1, cam2 = (_camera(name, which, content.get(which)) for which in CAMERAS)
     pair = StereoPair(cam1, cam2)
-    if pair.baseline_mm <= _LEAST_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
+    if pair.baseline_mm <= _MIN_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
         raise invalid(name, "both cameras stand at the same place")
     sizes = [_size(content, which) for which in CAMERAS]
     return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)

@@ -41,8 +41,8 @@ def gauges_csv(readings: GaugeReadings) -> bytes:
     Missing numbers are empty, with the reason in the last column.
     """
     text = io.StringIO(newline="")
-    for name, said in readings.about().items():
-        text.write(f"# {name}: {json.dumps(said, ensure_ascii=False, sort_keys=True)}\n")
+    for name, value in readings.about().items():
+        text.write(f"# {name}: {json.dumps(value, ensure_ascii=False, sort_keys=True)}\n")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for row in table_rows(readings):
@@ -77,9 +77,9 @@ def _of_step(step: StepReadings) -> Iterator[Row]:
     for line in step.lines:
         for quantity, numbers in line.values.items():
             for k, (x, y, at) in enumerate(zip(line.x_px, line.y_px, line.distance_px, strict=True)):
-                place = replace(head, gauge=line.name, kind="line", x_px=x, y_px=y, distance_px=at)
+                position = replace(head, gauge=line.name, kind="line", x_px=x, y_px=y, distance_px=at)
                 number = Number(numbers.value[k], numbers.sigma[k], numbers.units)
-                yield from _rows(place, {quantity: number}, line.missing[k])
+                yield from _rows(position, {quantity: number}, line.missing[k])
 
 
 def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row]:

@@ -21,14 +21,14 @@ def number_of(path: Path) -> int:
     return int(path.stem.removeprefix("step_"))
 
 
-def first_results(folder: Path, places: Iterable[Path]) -> list[Path]:
+def first_results(folder: Path, folders: Iterable[Path]) -> list[Path]:
     """Return the result files of the first place that has any.
 
     Parameters
     ----------
     folder
         What the user named.
-    places
+    folders
         Where its results may lie.
 
     Raises
@@ -36,7 +36,7 @@ def first_results(folder: Path, places: Iterable[Path]) -> list[Path]:
     InputError
         ``results_missing``.
     """
-    files = next((found for place in places if (found := results_in(place))), None)
+    files = next((found for path in folders if (found := results_in(path))), None)
     if files is None:
         raise InputError(
             f"There is no step_0000.nc or another step's result in {folder}.",

@@ -13,7 +13,7 @@ FORMAT_VERSION = 2
 COMPARISONS = ("cam1_ref__cam2_ref", "cam1_ref__cam1_cur", "cam1_ref__cam2_cur")
 COVARIANCE_NAMES = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
 #: What steps that are matched against this one inherit: name in variables and in `References` -> its cause
-HANDED_ON = {"noise": "the cameras' noise", "pattern": "changes of the surface's pattern"}
+PROPAGATED_FROM = {"noise": "the cameras' noise", "pattern": "changes of the surface's pattern"}
 #: Entries of a symmetric matrix that a file holds
 ENTRIES = {"xx": (0, 0), "yy": (1, 1), "xy": (0, 1)}
 

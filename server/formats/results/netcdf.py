@@ -13,7 +13,7 @@ from typing import Any
 import netCDF4
 
 from core.errors import FileFormatError
-from server.formats.files import written_aside
+from server.formats.files import written_temporary
 
 #: the netCDF and HDF5 libraries are not built for several threads at once
 library = threading.RLock()
@@ -44,7 +44,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False) -> Iterator[Any]:
-    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_aside`.
+    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_temporary`.
 
     Parameters
     ----------
@@ -56,15 +56,15 @@ def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False)
     StorageError
         ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
     """
-    with written_aside(path, checksum=checksum) as aside:
+    with written_temporary(path, checksum=checksum) as temporary:
         try:
             with (
                 library,
-                netCDF4.Dataset(str(aside), "w", format="NETCDF4_CLASSIC" if classic else "NETCDF4") as dataset,
+                netCDF4.Dataset(str(temporary), "w", format="NETCDF4_CLASSIC" if classic else "NETCDF4") as dataset,
             ):
                 yield dataset
         except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
-            full = shutil.disk_usage(aside.parent).free < _NEARLY_FULL_BYTES
+            full = shutil.disk_usage(temporary.parent).free < _NEARLY_FULL_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
 
 

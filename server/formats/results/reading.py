@@ -19,7 +19,7 @@ from core.field.points.smoothing_record import Smoothing
 from core.field.region.cuts import Cuts, from_arrays
 from core.names import CameraName
 from core.status import PointStatus
-from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, HANDED_ON, MOTION, SHAPE
+from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, MOTION, PROPAGATED_FROM, SHAPE
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_entries, current_inputs, current_settings, variable_name
 
@@ -148,19 +148,19 @@ def read_head(path: str | Path) -> ResultHead:
     """
     path = Path(path)
     with _opened(path) as dataset:
-        said: dict[str, Any] = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
+        recorded: dict[str, Any] = {name: dataset.getncattr(name) for name in dataset.ncattrs()}
     return ResultHead(
-        step=int(said.get("step", 0)),
-        kind=str(said.get("kind", "")),
-        label=str(said.get("label", "")),
-        load_n=_number(said.get("load_n")),
-        frame=str(said.get("frame", "")),
-        created=str(said.get("created", "")),
-        software_version=str(said.get("software_version", "")),
-        reference_step=int(said["reference_step"]) if "reference_step" in said else None,
-        settings=current_settings(json.loads(said.get("settings", "{}"))),
-        inputs_sha256=current_inputs(json.loads(said.get("inputs_sha256", "{}"))),
-        attributes=said,
+        step=int(recorded.get("step", 0)),
+        kind=str(recorded.get("kind", "")),
+        label=str(recorded.get("label", "")),
+        load_n=_number(recorded.get("load_n")),
+        frame=str(recorded.get("frame", "")),
+        created=str(recorded.get("created", "")),
+        software_version=str(recorded.get("software_version", "")),
+        reference_step=int(recorded["reference_step"]) if "reference_step" in recorded else None,
+        settings=current_settings(json.loads(recorded.get("settings", "{}"))),
+        inputs_sha256=current_inputs(json.loads(recorded.get("inputs_sha256", "{}"))),
+        attributes=recorded,
     )
 
 
@@ -177,7 +177,7 @@ def _references_of(dataset: Any) -> References | None:
         return None
     steps = np.asarray(variables["reference_step"][...], dtype=np.int32)
     values: dict[str, NDArray[np.float64]] = {}
-    for what in HANDED_ON:
+    for what in PROPAGATED_FROM:
         values[what] = np.full((*steps.shape, 2, 2), np.nan)
         for name, (i, j) in ENTRIES.items():
             read = np.asarray(

@@ -28,7 +28,7 @@ _COMPARISONS = {
     "cam1_t0__cam2_t": "cam1_ref__cam2_cur",
 }
 _RECORDS = ("patch", "smoothing", "strain")
-_PROPAGATED, _HANDED_ON = "propagated_", "handed_on_"
+_PROPAGATED, _PROPAGATED_BEFORE = "propagated_", "handed_on_"
 
 
 def current_entries(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -39,7 +39,7 @@ def current_entries(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def variable_name(name: str, there: Container[str]) -> str:
     """Return the name under which a result file holds a variable."""
-    earlier = name.replace(_PROPAGATED, _HANDED_ON, 1) if name.startswith(_PROPAGATED) else name
+    earlier = name.replace(_PROPAGATED, _PROPAGATED_BEFORE, 1) if name.startswith(_PROPAGATED) else name
     return earlier if name not in there and earlier in there else name
 
 

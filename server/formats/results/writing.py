@@ -26,8 +26,8 @@ from server.formats.results.layout import (
     CURVATURE,
     ENTRIES,
     FORMAT_VERSION,
-    HANDED_ON,
     MOTION,
+    PROPAGATED_FROM,
     SHAPE,
 )
 from server.formats.results.netcdf import written_dataset
@@ -222,7 +222,7 @@ def _put_references(dataset: Any, references: References) -> None:
         long_name="step that the point was matched against; without numbers, the newest such step that shows it",
         sparse=True,
     )
-    for what, cause in HANDED_ON.items():
+    for what, cause in PROPAGATED_FROM.items():
         values = getattr(references, f"{what}_px2")
         for name, (i, j) in ENTRIES.items():
             _put(

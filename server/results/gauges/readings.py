@@ -46,8 +46,8 @@ from server.results.gauges.variables import STRAIN_NAMES, Variables, component_o
 from server.results.reader import read_variable
 from server.results.staleness import stale_results
 
-_Placed = dict[str | None, list[tuple[float, float]]]
-MOST_NUMBERS = 3_000_000
+_Positions = dict[str | None, list[tuple[float, float]]]
+MAX_NUMBERS = 3_000_000
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
 
@@ -96,7 +96,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     hashes, steps, heads = {}, [], []
     moved_by: set[str] = set()
     found: set[str] = set()
-    placed: _Placed = {}
+    positions: _Positions = {}
     numbers = 0
     for path in chosen:
         step = _read(path)
@@ -107,16 +107,16 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         if request.align is not None and alignment is None:
             alignment = _alignment(step, request)
         if first is step.head:
-            placed = _placed(step.field if alignment is None else aligned(step.field, alignment), request)
+            positions = _positions_of(step.field if alignment is None else aligned(step.field, alignment), request)
         numbers += _count(step.field, request.lines, len(request.variables or COVARIANCE_NAMES))
-        if numbers > MOST_NUMBERS:
+        if numbers > MAX_NUMBERS:
             raise InputError(
-                f"The lines hold more than {MOST_NUMBERS:,} numbers.",
+                f"The lines hold more than {MAX_NUMBERS:,} numbers.",
                 code="gauge_too_large",
                 remedy="Ask for fewer places, variables or steps.",
             )
         heads.append(step.head)
-        steps.append(_read_step(step, alignment, request, placed, found, fields))
+        steps.append(_read_step(step, alignment, request, positions, found, fields))
     for name in request.variables or ():
         if name not in found and any(s.problem is None for s in steps):
             read_variable(chosen[-1], name)  # says which there are
@@ -212,22 +212,22 @@ def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
     return align_3_2_1(step.field, asked.positions_px, shared=step.shared)
 
 
-def _placed(field: Field, request: GaugeRequest) -> _Placed:
+def _positions_of(field: Field, request: GaugeRequest) -> _Positions:
     """Return the pixels of each named point and extensometer; those given in mm are found on the first step's shape."""
-    placed: _Placed = {}
+    positions: _Positions = {}
     gauges: list[PointGauge | ExtensometerGauge] = [*request.points, *request.extensometers]
     for gauge in gauges:
-        places, in_mm = gauge.places()
-        xy = positions_from_mm(field, places) if in_mm else places
-        placed[gauge.name] = [(float(x), float(y)) for x, y in xy]
-    return placed
+        given, in_mm = gauge.positions()
+        xy = positions_from_mm(field, given) if in_mm else given
+        positions[gauge.name] = [(float(x), float(y)) for x, y in xy]
+    return positions
 
 
 def _read_step(
     step: _Step,
     alignment: Alignment | None,
     request: GaugeRequest,
-    placed: _Placed,
+    positions: _Positions,
     found: set[str],
     fields: FieldWriter | None,
 ) -> StepReadings:
@@ -250,16 +250,16 @@ def _read_step(
     found.update(names)
     return step.reading(
         rigid_motion=taken_out,
-        points=[_point(variables, names, p.name, *placed[p.name]) for p in request.points],
-        extensometers=[_extensometer(variables, e.name, *placed[e.name]) for e in request.extensometers],
+        points=[_point(variables, names, p.name, *positions[p.name]) for p in request.points],
+        extensometers=[_extensometer(variables, e.name, *positions[e.name]) for e in request.extensometers],
         lines=[_line(variables, names, line) for line in request.lines],
         areas=[_area(variables, names, a.name, a.corners()) for a in request.areas],
     )
 
 
-def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> dict[str, Numbers]:
-    own = np.arange(len(places.xy_px))
-    variance = np.diagonal(places.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
+def _at_positions(variables: Variables, names: Sequence[str], positions: Samples) -> dict[str, Numbers]:
+    own = np.arange(len(positions.xy_px))
+    variance = np.diagonal(positions.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
     out = {}
     for name in names:
         variable, sigma = variables.get(name)
@@ -267,30 +267,30 @@ def _at_places(variables: Variables, names: Sequence[str], places: Samples) -> d
         if k is not None:
             s = np.sqrt(variance[:, k])
         elif sigma is not None:
-            s = places.of(sigma)  # as if the errors of the points about it were one
+            s = positions.of(sigma)  # as if the errors of the points about it were one
         else:
             s = np.full(len(own), np.nan)
-        out[name] = Numbers(_list(places.of(variable.values)), _list(s), variable.units)
+        out[name] = Numbers(_list(positions.of(variable.values)), _list(s), variable.units)
     return out
 
 
 def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> PointReading:
-    places = sample(variables.field, [xy])
-    found = _at_places(variables, names, places)
+    positions = sample(variables.field, [xy])
+    found = _at_positions(variables, names, positions)
     values = {n: Number(reading.value[0], reading.sigma[0], reading.units) for n, reading in found.items()}
-    return PointReading(name, xy, places.missing[0], values)
+    return PointReading(name, xy, positions.missing[0], values)
 
 
 def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> LineReading:
     xy, distance = positions_along(variables.field, line.vertices_px, line.count)
-    places = sample(variables.field, xy)
+    positions = sample(variables.field, xy)
     return LineReading(
         name=line.name,
         x_px=xy[:, 0].tolist(),
         y_px=xy[:, 1].tolist(),
         distance_px=distance.tolist(),
-        missing=list(places.missing),
-        values=_at_places(variables, names, places),
+        missing=list(positions.missing),
+        values=_at_positions(variables, names, positions),
     )
 
 
@@ -313,8 +313,8 @@ def _area(
         variable, sigma = variables.get(n)
         # how far other variables' errors reach is not known here: no uncertainty of their mean
         known = sigma if component_of(n) is not None else None
-        of_place = component_of(n) in range(3)
-        shared = variables.shared.positions if of_place else variables.shared
+        of_position = component_of(n) in range(3)
+        shared = variables.shared.positions if of_position else variables.shared
         got = area_statistics(field, variable.values, known, inside, shared=shared)
         if n in STRAIN_NAMES and got.count:
             got = replace(got, mean_sigma=variables.mean_strain_sigma(inside)[STRAIN_NAMES.index(n)])

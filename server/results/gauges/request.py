@@ -10,8 +10,8 @@ from pydantic import ConfigDict, Field, StringConstraints, model_validator
 from core.settings import Pixel, Whole, disagreement
 from server.base.models import Number, Request, StepNumber, Switch, any_of, given, not_both, one_of
 
-Place = tuple[Pixel, Pixel]
-PlaceMm = tuple[Number, Number]
+PositionPx = tuple[Pixel, Pixel]
+PositionMm = tuple[Number, Number]
 Name = Annotated[str, StringConstraints(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f,;\"]+$")]
 Variable = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 _MOST = 200
@@ -26,9 +26,11 @@ class PointGauge(_Named):
 
     model_config = ConfigDict(json_schema_extra=one_of("xy_px", "xy_mm"))
 
-    xy_px: Place | None = Field(None, description="Where, in camera 1's reference image.", examples=[[210.0, 180.5]])
-    xy_mm: PlaceMm | None = Field(
-        None, description="Where, as X and Y of the reference in the frame asked for; in place of xy_px."
+    xy_px: PositionPx | None = Field(
+        None, description="Where, in camera 1's reference image.", examples=[[210.0, 180.5]]
+    )
+    xy_mm: PositionMm | None = Field(
+        None, description="Position, as X and Y of the reference in the frame asked for; instead of xy_px."
     )
 
     @model_validator(mode="after")
@@ -37,7 +39,7 @@ class PointGauge(_Named):
             raise ValueError("give xy_px or xy_mm")
         return self
 
-    def places(self) -> tuple[list[PlaceMm], bool]:
+    def positions(self) -> tuple[list[PositionMm], bool]:
         """Return the place, and True if it is given in mm."""
         return [p for p in (self.xy_px, self.xy_mm) if p is not None], self.xy_px is None
 
@@ -54,9 +56,9 @@ class ExtensometerGauge(_Named):
         }
     )
 
-    a_px: Place | None = Field(None, description="One end.", examples=[[150.0, 200.0]])
-    b_px: Place | None = Field(None, description="The other end.", examples=[[350.0, 200.0]])
-    ends_mm: tuple[PlaceMm, PlaceMm] | None = Field(
+    a_px: PositionPx | None = Field(None, description="One end.", examples=[[150.0, 200.0]])
+    b_px: PositionPx | None = Field(None, description="The other end.", examples=[[350.0, 200.0]])
+    ends_mm: tuple[PositionMm, PositionMm] | None = Field(
         None, description="Both ends as X and Y of the reference in the frame asked for; in place of a_px and b_px."
     )
 
@@ -67,7 +69,7 @@ class ExtensometerGauge(_Named):
             raise ValueError("give a_px and b_px, or ends_mm")
         return self
 
-    def places(self) -> tuple[list[PlaceMm], bool]:
+    def positions(self) -> tuple[list[PositionMm], bool]:
         """Return both ends, and True if they are given in mm."""
         if self.a_px is not None and self.b_px is not None:
             return [self.a_px, self.b_px], False
@@ -77,7 +79,7 @@ class ExtensometerGauge(_Named):
 class LineGauge(_Named):
     """Values along a polyline."""
 
-    vertices_px: list[Place] = Field(
+    vertices_px: list[PositionPx] = Field(
         description="Its corners.", min_length=2, max_length=1000, examples=[[[150.0, 200.0], [350.0, 200.0]]]
     )
     count: Annotated[Whole, Field(ge=2, le=100_000)] | None = Field(
@@ -91,7 +93,7 @@ class _Area(Request):
     rectangle_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None, description="x0, y0, x1, y1, inclusive.", examples=[[150, 100, 350, 300]]
     )
-    polygon_px: list[Place] | None = Field(None, description="Corners.", min_length=3, max_length=1000)
+    polygon_px: list[PositionPx] | None = Field(None, description="Corners.", min_length=3, max_length=1000)
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -134,7 +136,7 @@ class ThreeTwoOneAlignment(Request):
     """Three places on the plane Z = 0, two on the X axis, one at X = 0."""
 
     kind: Literal["3-2-1"] = Field(description="3-2-1.")
-    positions_px: Annotated[list[Place], Field(min_length=6, max_length=6)] = Field(
+    positions_px: Annotated[list[PositionPx], Field(min_length=6, max_length=6)] = Field(
         description="Six places: plane, plane, plane, from, to, origin."
     )
 

@@ -25,7 +25,7 @@ from server.exports.matlab import matlab_name
 from server.exports.request import ExportRequest
 from server.exports.run import export, export_packed
 from server.exports.source import find_source
-from server.formats.figure_options import Look
+from server.formats.figure_options import FigureStyle
 from server.formats.version import software_version
 from server.results.steps import Source
 from tests.support.export_results import (
@@ -82,7 +82,7 @@ def test_a_table_holds_every_number_to_its_last_bit(source: Source, stored: list
         assert named["status_name"] == "low_correlation"
         assert np.isnan(named["x_mm"])
         assert named["x_px"] == 40 + 7 * FAILED[0][1]
-    parts = pd.read_csv(paths[1], comment="#")["zncc_cam1_t0__cam2_t"].to_numpy().reshape(ROWS, COLS)
+    parts = pd.read_csv(paths[1], comment="#")["zncc_cam1_ref__cam2_cur"].to_numpy().reshape(ROWS, COLS)
     np.testing.assert_array_equal(parts.astype("f4"), stored[1].zncc.values[..., 2])
 
 
@@ -265,7 +265,7 @@ def test_netcdf_is_given_as_stored(source: Source, tmp_path: Path) -> None:
 
 
 def test_a_figure_has_the_scales_colours_units_and_origin(source: Source, tmp_path: Path) -> None:
-    (path,) = _made(source, tmp_path, "png", steps=[2], variables=["u_mm"], look=Look(width_px=700))
+    (path,) = _made(source, tmp_path, "png", steps=[2], variables=["u_mm"], style=FigureStyle(width_px=700))
     with Image.open(path) as opened:
         assert opened.width == 700
         assert json.loads(opened.text["Provenance"])["settings"] == SETTINGS  # type: ignore[attr-defined]
@@ -292,8 +292,8 @@ def test_an_svg_says_in_words_what_it_shows(source: Source, tmp_path: Path) -> N
 
 
 def test_limits_percentiles_and_states(source: Source, tmp_path: Path) -> None:
-    given = Look(limits=(-0.2, 0.3))
-    (path,) = _made(source, tmp_path, "svg", steps=[1], variables=["u_mm"], look=given)
+    given = FigureStyle(limits=(-0.2, 0.3))
+    (path,) = _made(source, tmp_path, "svg", steps=[1], variables=["u_mm"], style=given)
     ticks = {float(t.replace("−", "-")) for t in re.findall(r">(−?0\.\d+)</text>", path.read_text(encoding="utf-8"))}
     assert max(ticks) == 0.3
     assert min(ticks) == -0.2
@@ -308,7 +308,7 @@ def test_limits_percentiles_and_states(source: Source, tmp_path: Path) -> None:
         {"opacity": 0.0},
     ):
         with pytest.raises(InputError) as caught:
-            Look(**bad)  # type: ignore[arg-type]
+            FigureStyle(**bad)  # type: ignore[arg-type]
         assert caught.value.code == "figure_style_invalid"
 
 
@@ -317,8 +317,8 @@ def test_a_map_lies_over_the_image_where_its_points_are(source: Source, tmp_path
     image[:, 150:] = 190
     cv2.imwrite(str(tmp_path / "cam1.tif"), image)
     over = Source(source.files, "o", image=tmp_path / "cam1.tif")
-    look = Look(width_px=1000, opacity=1.0)
-    (path,) = _made(over, tmp_path, "png", steps=[1], variables=["u_mm"], over_image=True, look=look)
+    style = FigureStyle(width_px=1000, opacity=1.0)
+    (path,) = _made(over, tmp_path, "png", steps=[1], variables=["u_mm"], over_image=True, style=style)
     drawn = np.asarray(Image.open(path).convert("RGB")).astype(int)
     grey = np.ptp(drawn, axis=2) <= 6
     dark, light = grey & (np.abs(drawn[..., 0] - 60) < 50), grey & (drawn[..., 0] > 150) & (drawn[..., 0] < 250)
@@ -334,8 +334,8 @@ def test_a_map_lies_over_the_image_where_its_points_are(source: Source, tmp_path
 
 
 def test_films_have_a_frame_a_step_on_one_scale(source: Source, tmp_path: Path) -> None:
-    look = Look(width_px=500)
-    (gif,) = _made(source, tmp_path, "gif", look=look, fps=4.0)
+    style = FigureStyle(width_px=500)
+    (gif,) = _made(source, tmp_path, "gif", style=style, fps=4.0)
     with Image.open(gif) as opened:
         assert opened.n_frames == 2  # type: ignore[attr-defined]  # the reference has no displacement
         assert opened.info["duration"] == 250
@@ -347,7 +347,7 @@ def test_films_have_a_frame_a_step_on_one_scale(source: Source, tmp_path: Path) 
     # w is uniform, -0.05 and -0.10 mm: the first is at the scale's upper end, the second at its lower one
     assert np.abs(seen[0] - (253, 231, 37)).max() < 60
     assert np.abs(seen[1] - (68, 1, 84)).max() < 60
-    (mp4,) = _made(source, tmp_path, "mp4", look=look, fps=4.0)
+    (mp4,) = _made(source, tmp_path, "mp4", style=style, fps=4.0)
     film = cv2.VideoCapture(str(mp4))
     frames = []
     while (got := film.read())[0]:

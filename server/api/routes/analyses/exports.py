@@ -18,7 +18,7 @@ from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
-from server.formats.figure_options import COLOURS, WIDTHS_PX, Look
+from server.formats.figure_options import COLOURS, WIDTHS_PX, FigureStyle
 from server.worker.executor import TaskFuture
 from server.workflows import analysis_start
 from server.workflows.service import Service
@@ -33,7 +33,7 @@ _POLL_S = 0.05
 class _Drawn:
     """How figures and films look."""
 
-    look: Look
+    style: FigureStyle
     over_image: bool
     fps: float
 
@@ -56,13 +56,13 @@ def _drawn(
     over_image: Annotated[bool, Query(description="Draw over camera 1's reference image.")] = False,
     fps: Annotated[float, Query(ge=0.1, le=60.0, description="Steps a second in a film.")] = 2.0,
 ) -> _Drawn:
-    look = Look(
+    style = FigureStyle(
         limits=None if limits is None else _pair(limits),
         percentiles=_pair(percentiles),
         colours=colours,
         width_px=width_px,
     )
-    return _Drawn(look, over_image, fps)
+    return _Drawn(style, over_image, fps)
 
 
 def _pair(text: str) -> tuple[float, float]:
@@ -130,7 +130,7 @@ async def export(
             files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
         )
     names = None if variables is None else variables.split(",")
-    wish = ExportRequest(format, None, names, drawn.look, drawn.over_image, drawn.fps)
+    wish = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
         made = Path(await _made(request, service, files, wish, folder))

@@ -10,15 +10,15 @@ from core.errors import StateError
 from server.api.protocol.conditional import etag_of, tagged
 from server.api.protocol.dependencies import ServiceDep, TestId
 from server.api.protocol.problems import errors
-from server.results.metadata import TestFacts
+from server.results.metadata import TestMetadata
 
 router = APIRouter(prefix="/tests/{test_id}/facts", tags=["tests"])
 
 
 @router.get("", summary="Metadata of a test", response_model_exclude_none=True, responses=errors(404))
-def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> TestFacts:
+def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> TestMetadata:
     """Return the facts, empty where nothing was stated; the header ETag names this state of them."""
-    return TestFacts.model_validate(tagged(response, service.tests.facts(test_id)))
+    return TestMetadata.model_validate(tagged(response, service.tests.metadata(test_id)))
 
 
 @router.put(
@@ -30,16 +30,16 @@ def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> Te
 def put_metadata(
     service: ServiceDep,
     test_id: TestId,
-    body: TestFacts,
+    body: TestMetadata,
     response: Response,
     if_match: Annotated[
         str | None, Header(max_length=200, description="ETag of the state that is replaced; another one is refused.")
     ] = None,
-) -> TestFacts:
+) -> TestMetadata:
     """Replace all facts of the test: lens, light, pattern, specimen, static steps and the like; a report shows them."""
     expected = None
     if if_match is not None and if_match.strip() != "*":
-        expected = service.tests.facts(test_id)
+        expected = service.tests.metadata(test_id)
         if etag_of(expected) not in [tag.strip() for tag in if_match.split(",")]:
             raise StateError(
                 f"The facts of test {test_id} are not those that If-Match names.",
@@ -49,4 +49,4 @@ def put_metadata(
             )
     document = body.document()
     service.tests.put_metadata(test_id, document, expected)
-    return TestFacts.model_validate(tagged(response, document))
+    return TestMetadata.model_validate(tagged(response, document))

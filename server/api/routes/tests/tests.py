@@ -35,7 +35,7 @@ from server.api.protocol.problems import errors
 from server.base.models import FormNumber, Ids
 from server.formats.images import read_image
 from server.jobs.idempotency import RequestMark
-from server.store.documents import StepFacts
+from server.store.documents import StepMetadata
 from server.store.index import step_entry, test_entry
 from server.workflows.burst import start_burst
 from server.workflows.capture import capture_step, import_step
@@ -125,11 +125,11 @@ async def create_step(
     return await run_in_threadpool(_capture, service, test_id, body, key)
 
 
-def step_facts(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepFacts:
+def step_facts(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepMetadata:
     """What the client said of a step, as its document keeps it."""
     stamp = None if body.timestamp_utc is None else utc_text(body.timestamp_utc)
     said = {"label": body.label, "load_n": body.load_n, "timestamp_utc": stamp, "channels": body.channels}
-    return StepFacts.model_validate({**said, **sent.document()})
+    return StepMetadata.model_validate({**said, **sent.document()})
 
 
 def _capture(service: Service, test_id: str, body: StepRequest, key: str | None) -> StepReply:
@@ -214,7 +214,7 @@ def import_images(
 
     def make() -> Ids:
         sent = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
-        facts = StepFacts.model_validate({**sent, **request.document()})
+        facts = StepMetadata.model_validate({**sent, **request.document()})
         return {"n": import_step(service, test_id, data, facts).n}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)

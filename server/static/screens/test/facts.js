@@ -3,7 +3,7 @@ import * as api from "../../lib/api.js";
 import { h, replace, field, number, action, notify, problemText } from "../../lib/dom.js";
 
 /** @import { Model } from "#routes" */
-/** @typedef {Model<"TestFacts">} Facts */
+/** @typedef {Model<"TestMetadata">} Facts */
 /** @typedef {Record<string, unknown>} Read what the fields say */
 /** @typedef {readonly [name: string, label: string, unit?: string]} Row */
 

@@ -20,7 +20,7 @@ from server.worker.embedded import ComputeWorker
 from server.worker.executor import TaskFuture
 
 FOLDER = ".exports"
-_MOST_WAITING = 4
+_MAX_WAITING = 4
 _REST_AFTER_S = 60.0
 
 
@@ -73,7 +73,7 @@ class ExportProcess:
             ``exports_waiting`` if four are on their way.
         """
         with self._lock:
-            if self._closed or self._waiting >= _MOST_WAITING:
+            if self._closed or self._waiting >= _MAX_WAITING:
                 raise QueueFullError(f"{self._waiting} exports are being made.", code="exports_waiting")
             if self._rest is not None:
                 self._rest.cancel()

@@ -15,10 +15,10 @@ import numpy as np
 
 from server.base.priority import end_with_parent
 
-_LONGEST_S = 300.0
+_MAX_WAIT_S = 300.0
 
 
-class CompileAside:
+class BackgroundCompilation:
     """A process that compiles what a displacement needs.
 
     Parameters
@@ -53,11 +53,11 @@ class CompileAside:
         self._wanted = False
         if self._process is not None:
             try:
-                self._process.wait(_LONGEST_S)
+                self._process.wait(_MAX_WAIT_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
 
-    def __enter__(self) -> CompileAside:
+    def __enter__(self) -> BackgroundCompilation:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:

@@ -14,13 +14,13 @@ Text = Annotated[str, StringConstraints(min_length=1, max_length=500, strip_whit
 Above = Annotated[float, Field(strict=True, gt=0.0, le=1e6, allow_inf_nan=False)]
 
 
-class ClosedFacts(BaseModel):
+class ClosedMetadata(BaseModel):
     """Facts: closed and frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class LensFacts(ClosedFacts):
+class LensMetadata(ClosedMetadata):
     """[cam1.lens], [cam2.lens]: what is printed on the lens; for reports, nothing is computed from it."""
 
     maker: Text | None = Field(None, description="Maker of the lens.", examples=["Schneider-Kreuznach"])
@@ -30,23 +30,23 @@ class LensFacts(ClosedFacts):
     note: Text | None = Field(None, description="Filters, extension tubes, polarisers.")
 
 
-class CameraFacts(ClosedFacts):
+class CameraMetadata(ClosedMetadata):
     """What a camera's data sheet says; for reports, nothing is computed from it but lengths on the sensor."""
 
     maker: Text | None = Field(None, description="Maker of the camera.", examples=["Basler"])
     model: Text | None = Field(None, description="Model; what the camera itself says goes before it.")
     sensor: Text | None = Field(None, description="The sensor.", examples=["Sony IMX250, CMOS, global shutter"])
     pixel_um: Above | None = Field(None, description="Width of a pixel on the sensor.", examples=[3.45])
-    lens: LensFacts | None = Field(None, description="The lens.")
+    lens: LensMetadata | None = Field(None, description="The lens.")
 
 
-def merged(over: CameraFacts | None, under: Mapping[str, object] | None) -> CameraFacts:
+def merged(over: CameraMetadata | None, under: Mapping[str, object] | None) -> CameraMetadata:
     """Facts of a camera, one by one: those of ``over`` go before those of ``under``, as a step's record has them."""
-    stated = CameraFacts.model_validate({k: v for k, v in (under or {}).items() if k in CameraFacts.model_fields})
+    stated = CameraMetadata.model_validate({k: v for k, v in (under or {}).items() if k in CameraMetadata.model_fields})
     if over is None:
         return stated
     document, lens = over.model_dump(exclude_none=True), over.lens
     both = {**stated.model_dump(exclude_none=True), **document}
     if lens is not None and stated.lens is not None:
         both["lens"] = {**stated.lens.model_dump(exclude_none=True), **lens.model_dump(exclude_none=True)}
-    return CameraFacts.model_validate(both)
+    return CameraMetadata.model_validate(both)

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from server.compute.compile_aside import CompileAside
+from server.compute.background_compilation import BackgroundCompilation
 
 WOULD_COMPILE = """
 import sys
@@ -35,9 +35,9 @@ def two_processors(monkeypatch):
 @pytest.mark.deep
 def test_what_it_compiled_nobody_compiles_again(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
-    with CompileAside("auto") as aside:
-        aside.start()
-        aside.wait()
+    with BackgroundCompilation("auto") as compilation:
+        compilation.start()
+        compilation.wait()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     done = subprocess.run([sys.executable, "-c", WOULD_COMPILE], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
@@ -47,18 +47,18 @@ def test_what_it_compiled_nobody_compiles_again(tmp_path, monkeypatch):
 def test_after_the_wait_nothing_is_started(tmp_path, monkeypatch):
     started = []
     monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(a))
-    with CompileAside("auto") as aside:
-        aside.wait()
-        aside.start()
+    with BackgroundCompilation("auto") as compilation:
+        compilation.wait()
+        compilation.start()
     assert not started
 
 
 def test_leaving_early_ends_the_process(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     before = time.monotonic()
-    with CompileAside("quadratic") as aside:
-        aside.start()
-        process = aside._process
+    with BackgroundCompilation("quadratic") as compilation:
+        compilation.start()
+        process = compilation._process
     assert process is not None
     assert process.poll() is not None
     assert time.monotonic() - before < 10.0
