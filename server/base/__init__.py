@@ -1,1 +1,1 @@
-"""What every part of the service may use: errors, problems, logs, metrics, wire models' base."""
+"""Parts that the whole service uses: errors, problems, logs, metrics, wire models' base."""

@@ -1,4 +1,4 @@
-"""What the service adds to the exception tree: unknown things, held hardware, full queues."""
+"""The service's own exceptions: unknown things, held hardware, full queues."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class NotFoundError(InputError):
 
 
 class BusyError(StateError):
-    """The hardware is held by somebody else."""
+    """The hardware is held by another client."""
 
     code = "hardware_busy"
     remedy = "Wait until the holder is done, or cancel its job."

@@ -1,4 +1,4 @@
-"""Log lines with the request and the job that they belong to, as text for people or as JSON lines for programs."""
+"""Log lines with the request and the job that they belong to, as text or as JSON lines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FORMATS: tuple[LogFormat, ...] = ("text", "json")
 
 _about: contextvars.ContextVar[dict[str, str] | None] = contextvars.ContextVar("stereorig_log_about", default=None)
 _jobs = logging.getLogger("stereorig.jobs")
-# what a logger's caller gave as `extra`, and not what every record has
+# attributes that a logger's caller gave as `extra`, not those that every record has
 _USUAL = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "about", "taskName"}
 # a client's text must not begin a line of its own, nor talk to a terminal
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")
@@ -41,7 +41,7 @@ class AboutFilter(logging.Filter):
     """Puts the ids into each record."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Add; refuse nothing."""
+        """Add the ids; let every record pass."""
         if not hasattr(record, "about"):
             record.about = current_ids()
         return True
@@ -85,7 +85,7 @@ def configure(level: str, form: LogFormat) -> None:
     Parameters
     ----------
     level
-        Name of the lowest level that is shown.
+        Name of the minimum level that is shown.
     form
         ``text`` or ``json``.
     """
@@ -98,7 +98,7 @@ def configure(level: str, form: LogFormat) -> None:
 
 
 def log_job_event(name: str, data: Mapping[str, Any]) -> None:
-    """Write a line where the event hub tells of a job's new state."""
+    """Write a line where the event hub reports a job's new state."""
     if name != "job" or data.get("change") == "progress":
         return
     problem = data.get("problem") or {}

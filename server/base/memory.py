@@ -1,4 +1,4 @@
-"""Rounds of the garbage collector that spare what stays: no long pauses to look through old objects.
+"""Rounds of the garbage collector that spare what stays: no long pauses over old objects.
 
 That memory stays what it is over days is the allocator's part: MALLOC_ARENA_MAX in the systemd unit.
 """

@@ -1,4 +1,4 @@
-"""What the service counts and times while it works; `metrics_state` adds how things stand at a scrape."""
+"""Counters and times of the service at work; `metrics_state` adds its state at a scrape."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _JOB_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0, 7200.0, 3600
 _FINAL = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 _MAX_JOBS = 10_000
 
-disable_created_metrics()  # type: ignore[no-untyped-call]  # a second series for each counter, which nobody asks for
+disable_created_metrics()  # type: ignore[no-untyped-call]  # a second series for each counter, which no client asks for
 
 
 class Metrics:
@@ -100,7 +100,7 @@ class Metrics:
         return generate_latest(self.registry)
 
     def on_event(self, name: str, data: Mapping[str, Any]) -> None:
-        """Count what the event hub tells; by the monotonic clock, since the other one may be set."""
+        """Count the events of the hub; by the monotonic clock, since the other one may be set."""
         if name == "result":
             self.results.inc()
         elif name == "job":

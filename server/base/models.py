@@ -1,4 +1,4 @@
-"""What all models share: strict numbers, closed requests, open replies."""
+"""Base of all models: strict numbers, closed requests, open replies."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _in_utc(value: datetime) -> datetime:
     try:
         return value.astimezone(UTC)
     except OverflowError as error:
-        raise ValueError("lies outside the calendar in UTC") from error
+        raise ValueError("is outside the calendar in UTC") from error
 
 
 def utc_text(value: datetime) -> str:
@@ -104,7 +104,7 @@ def one_of(*names: str) -> JsonDict:
 
 
 def any_of(*names: str) -> JsonDict:
-    """Return the schema's words for: at least one of these fields, and not null."""
+    """Return the schema for: at least one of these fields, and not null."""
     return {"anyOf": [given(name) for name in names]}
 
 
@@ -135,7 +135,7 @@ class Reply(BaseModel):
 
 
 def always_there(schema: JsonDict) -> None:
-    """Say in a model's schema that none of its fields is ever left out."""
+    """State in a model's schema that none of its fields is ever left out."""
     properties = schema["properties"]
     assert isinstance(properties, dict)
     schema["required"] = list(properties)
@@ -145,20 +145,20 @@ def always_there(schema: JsonDict) -> None:
 
 
 class Reported(Reply):
-    """What a device says: the fields of a driver's dataclass, whose defaults are the driver's business."""
+    """A device's report: the fields of a driver's dataclass; their defaults are the driver's."""
 
     model_config = ConfigDict(json_schema_extra=always_there)
 
 
-#: what names a thing that was made: ids, a step's number, a reading's value
+#: ids of a thing that was made: ids, a step's number, a reading's value
 Ids = dict[str, str | int | float]
 
 
 class Document(BaseModel):
-    """A document as it is kept; it may hold more than this version knows."""
+    """A document as it is kept; it may hold entries that are unknown to this version."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
     def plain(self) -> dict[str, object]:
-        """Return what the document says, and nothing that it does not."""
+        """Return the entries that the document has, and no others."""
         return self.model_dump(exclude_unset=True)

@@ -1,6 +1,6 @@
-"""Who gets the processor first when everybody wants it: a stop before a picture, a picture before an analysis.
+"""Priorities of the processes: a stop before a picture, a picture before an analysis.
 
-The systemd unit says so too. Started by hand, a user without the right to raise a priority runs the service at the
+The systemd unit sets them too. Started by hand, a user without the right to raise a priority runs the service at the
 usual one. Linux may share the processors out by session first (autogroups), and by niceness only within a session.
 """
 

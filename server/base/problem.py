@@ -10,7 +10,7 @@ from server.base.models import Document
 
 
 class JobProblem(Document):
-    """Why a job has no result."""
+    """Reason why a job has no result."""
 
     code: str = Field(description="Stable code.")
     cause: str = Field(description="The cause, with the values that disagree.")

@@ -1,4 +1,4 @@
-"""How many streams are open: each holds a connection for hours, so each kind has its limit."""
+"""Number of open streams: each holds a connection for hours, so each kind has its limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Streams:
     Parameters
     ----------
     live_view, events
-        How many of each may be open.
+        Maximum number of open streams of each kind.
     """
 
     def __init__(self, *, live_view: int, events: int) -> None:
@@ -33,7 +33,7 @@ class Streams:
             return dict(self._open)
 
     def check(self, kind: StreamKind) -> None:
-        """Refuse before an answer begins.
+        """Raise an error before an answer begins.
 
         Raises
         ------

@@ -1,1 +1,1 @@
-"""Computations behind the process wall; also behind the command line. Knows no service and no HTTP."""
+"""Computations of the worker process and of the command line; independent of service and HTTP."""

@@ -19,7 +19,7 @@ _MAX_WAIT_S = 300.0
 
 
 class BackgroundCompilation:
-    """A process that compiles what a displacement needs.
+    """A process that compiles the kernels of a displacement.
 
     Parameters
     ----------
@@ -32,10 +32,10 @@ class BackgroundCompilation:
         self._process: subprocess.Popen[bytes] | None = None
         from core.threads import available_threads  # loads numba
 
-        self._wanted = available_threads() > 1  # a single processor has nothing to give
+        self._wanted = available_threads() > 1  # a single processor has no time to spare
 
     def start(self) -> None:
-        """Begin, unless it has begun or is not worth it any more."""
+        """Start, unless it was started or it is too late to be of use."""
         if not self._wanted:
             return
         self._wanted = False
@@ -67,7 +67,7 @@ class BackgroundCompilation:
 
 
 def main() -> int:
-    """Fit one point that has no start, and judge it: compiled code is needed to find that out."""
+    """Fit one point that has no start, and compute its covariance: this compiles all kernels."""
     end_with_parent()
     from core.cameras.camera import Camera
     from core.cameras.stereo import StereoPair

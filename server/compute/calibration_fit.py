@@ -43,7 +43,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     Raises
     ------
     TargetError
-        The grid was not found in a view; ``view`` and ``camera`` say where.
+        The grid was not found in a view; ``view`` and ``camera`` name the image.
     CalibrationError
         No usable minimum, ``calibration_rejected`` by its verdict, or ``grid_moved`` while the views were taken.
     """
@@ -52,7 +52,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     rig, plan = task.plan["rig"], task.plan
     target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
     measured = [view for view in task.views if view["role"] in ("fitted", "held_out")]
-    # averages are scaled: the type's largest number is not where the sensor saturated
+    # averages are scaled: the type's maximum is not the level at which the sensor saturates
     grid_options = GridOptions(saturation=float(min(view["full_scale"] for view in task.views)))
     found = calibrate_views(
         [
@@ -115,7 +115,7 @@ def nominals_of(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
 def _drift(
     folder: Path, views: list[dict[str, Any]], known: dict[str, GridView], detect: Callable[[GrayImage], GridView]
 ) -> dict[str, float]:
-    """Mean shift of the intersections between the first and the last view at zero, per camera."""
+    """Return the mean shift of the intersections between the first and the last view at zero, per camera."""
     drift: dict[str, float] = {}
     for cam in CAMERAS:
         at_zero = [v["file"] for v in views if v["camera"] == cam and v["dz_commanded_mm"] == 0.0]
@@ -157,10 +157,10 @@ def _three(check: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, GridView]) -> None:
-    """Write where each intersection was found and by how much the model misses it, (view, i, j, xy)."""
+    """Write each intersection's position and its residual, (view, i, j, xy)."""
     residuals = np.stack([view.residual_px for view in result.views])
     found = np.stack([grids[view.name].xy_px for view in result.views])
-    facts = [
+    view_records = [
         {
             "name": v.name,
             "camera": v.camera,
@@ -175,9 +175,9 @@ def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, Gri
     with written_dataset(path, checksum=True) as data:
         for name, size in zip(("view", "i", "j", "xy"), residuals.shape, strict=True):
             data.createDimension(name, size)
-        _put(data, "found_px", found, "place of the intersection in the image")
-        _put(data, "residual_px", residuals, "measured minus projected place")
-        data.setncatts({"views": json.dumps(facts), "title": "residuals of a calibration"})
+        _put(data, "found_px", found, "position of the intersection in the image")
+        _put(data, "residual_px", residuals, "measured minus projected position")
+        data.setncatts({"views": json.dumps(view_records), "title": "residuals of a calibration"})
 
 
 def _put(data: Any, name: str, values: NDArray[np.float64], text: str) -> None:

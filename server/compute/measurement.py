@@ -1,8 +1,8 @@
 """One step of an analysis, in the worker: images by path, the result as a file in the analysis' folder.
 
-What the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of points, the
-last fields) is kept between tasks, and the next step's images are read while a step is fitted; a fresh worker makes
-all of it again from the files, so a step measured anywhere gives the same result to the last bit.
+The parts that the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of
+points, the last fields) are kept between tasks, and the next step's images are read while a step is fitted; a fresh
+worker makes them again from the files, so a step measured anywhere gives the same result to the last bit.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def measure_step(task: StepTask) -> dict[str, object]:
     compute_s = round(time.perf_counter() - began, 3)
     finished = sequence.finish(task.step, result, about=task.about, in_service=True, keep_starts=task.keeps_starts)
     if task.previous not in (None, task.reference.n):
-        # nobody starts from there any more
+        # no later step starts from there
         starts_file(sequence.file_of(task.previous)).unlink(missing_ok=True)
     return {**finished.summary, "compute_s": compute_s}
 
@@ -106,7 +106,7 @@ def _begin(task: StepTask) -> SequenceMeasurement:
 def warm_up(threads: int) -> None:
     """Load the kernels of the default settings and run them once on a small pair of images."""
     set_threads(threads)
-    # a plane seen by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
+    # a plane imaged by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.normal(size=(128, 150)), (0, 0), 1.3)
     texture = np.clip(128.0 + 45.0 * noise / noise.std(), 0, 255).astype(np.uint8)

@@ -27,7 +27,7 @@ class ReadAhead(Generic[Item, Result]):
     read
         Called on a thread of its own.
     items
-        What to read, in the order in which it will be taken.
+        Items to read, in the order in which they are taken.
     """
 
     def __init__(self, read: Callable[[Item], Result], items: Iterable[Item]) -> None:

@@ -21,7 +21,7 @@ Position = Sequence[float]
 
 
 def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[int, int]) -> None:
-    """Refuse a seed whose two places cannot be one point.
+    """Raise an error for a seed whose two positions cannot be one point.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[i
 
 
 def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int, int]) -> None:
-    """Refuse seeds whose places in camera 2 lie outside its image, or cannot be the points of camera 1.
+    """Raise an error for seeds whose positions in camera 2 are outside its image, or cannot be the points of camera 1.
 
     Raises
     ------
@@ -57,10 +57,10 @@ def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int
         assert seed.xy2_px is not None
         if not (0.0 <= seed.xy2_px[0] <= size2_px[0] - 1 and 0.0 <= seed.xy2_px[1] <= size2_px[1] - 1):
             raise RegionError(
-                f"The seed's place ({seed.xy2_px[0]:g}, {seed.xy2_px[1]:g}) lies outside camera 2's image of "
+                f"The seed's position ({seed.xy2_px[0]:g}, {seed.xy2_px[1]:g}) lies outside camera 2's image of "
                 f"{size2_px[0]} x {size2_px[1]} px.",
                 code="seed_outside",
-                remedy="Give places inside camera 2's reference image.",
+                remedy="Give positions inside camera 2's reference image.",
             )
     off = distances_px(pair, seeds)
     worst = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
@@ -71,12 +71,12 @@ def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int
             f"The seed ({one[0]:g}, {one[1]:g}) cannot be at ({two[0]:g}, {two[1]:g}) in camera 2: that lies "
             f"{off[worst]:.1f} px from its epipolar line; {FARTHEST_PX:g} px are allowed.",
             code="seed_off_epipolar",
-            remedy="Click the same point in both views, or leave camera 2's place out.",
+            remedy="Click the same point in both views, or leave camera 2's position out.",
         )
 
 
 def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
-    """Return the distance (n,) of each seed's place in camera 2 from its epipolar line; NaN where there is none."""
+    """Return the distance (n,) of each seed's position in camera 2 from its epipolar line; NaN where there is none."""
     out = np.full(len(seeds), np.nan)
     for k, seed in enumerate(seeds):
         if seed.xy2_px is not None:
@@ -85,7 +85,7 @@ def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
 
 
 def epipolar_line(pair: StereoPair, xy_px: Position, size2_px: tuple[int, int]) -> list[list[float]]:
-    """Return where camera 2 may see a point of camera 1, about 32 places along the line; empty if nowhere."""
+    """Return camera 2's possible positions of a point of camera 1, about 32 along the epipolar line; empty if none."""
     position = np.asarray(xy_px, dtype=np.float64)
     depths = visible_depths(pair, position, (size2_px[1], size2_px[0]), spacing_px=max(*size2_px) / 32.0)
     if not len(depths):

@@ -1,7 +1,7 @@
 """The measurement of a sequence, a step at a time: read, measure, smooth, mark, strain, write, summarise.
 
 The worker and the command line both measure with it, so a folder measured through either gives the same files. A step
-depends on the files alone: what is kept from the step before is what its file holds.
+depends on the files alone: nothing is kept from the step before but the content of its file.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class FinishedStep:
 
 @dataclass(eq=False)
 class SequenceMeasurement:
-    """What the steps of one measurement share, and how each is measured and finished.
+    """The measurement of a sequence: the parts that its steps share, and the measuring and finishing of each.
 
     Parameters
     ----------
     calibration, settings
-        What is measured with, and how.
+        The calibration, and the settings of the measurement.
     mask
         (rows, cols) True where points may lie, or None.
     reference
@@ -112,7 +112,7 @@ class SequenceMeasurement:
         self.pair = ReferencePair(self.calibration.pair, *images)
 
     def read(self, step: StepImages) -> Pair:
-        """Read both images of a step; what will be asked of them is found on the calling thread."""
+        """Read both images of a step; everything derived from them is computed on the calling thread."""
         one, two = (
             MeasureImage(read_image(path), str(path), noise=None if model is None else model.averaged(*step.averages))
             for path, model in zip(step.files, self._models, strict=True)
@@ -147,7 +147,7 @@ class SequenceMeasurement:
         FileFormatError
             An earlier step's file is missing, or its images were replaced.
         Cancelled
-            If the token said so.
+            If the token was set.
         """
         more: dict[str, Any] = {"progress": progress, "cancel": cancel}
         seeds = seeds_of(self.settings)
@@ -246,7 +246,7 @@ class SequenceMeasurement:
     def _field(self, n: int) -> Field:
         """Field of an earlier step as it was measured: before smoothing, and without the calibration's own error.
 
-        What later steps propagate of it is the images' noise; the calibration's error is added once, to the total.
+        Later steps propagate the noise of its images; the calibration's error is added once, to the total.
         """
         if n not in self._fields:
             path = self.file_of(n)

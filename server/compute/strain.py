@@ -37,10 +37,10 @@ def smoothed_step(field: Field, window: int | None, *, subset_px: float) -> Fiel
 
 
 def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_window: int | None) -> str:
-    """Say what a smoothed displacement, and strain from it, can still tell apart."""
+    """Return a text that states the spatial resolution of a smoothed displacement, and of strain from it."""
     mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
     text = (
-        f"displacements are smoothed over {smoothing.window} points: what is distinguished is "
+        f"displacements are smoothed over {smoothing.window} points: details are resolved that are "
         f"{smoothing.resolution_px:g} px{mm} wide, {smoothing.subset_px:g} px without smoothing"
     )
     if gauge_px is None or strain_window is None:
@@ -58,7 +58,7 @@ def strain_of_step(field: Field, options: StrainOptions | None, *, subset_px: in
 
 @dataclass(frozen=True)
 class PatchStrain:
-    """Strain of the patches themselves, and what it differs by from that over the window; microstrain by component."""
+    """Strain of the patches themselves, and its difference from that over the window; microstrain by component."""
 
     mean_microstrain: dict[str, float | None]
     difference_mean_microstrain: dict[str, float | None]
@@ -76,7 +76,7 @@ class StrainSummary:
     gauge_px, gauge_mm
         Width of the strain gauge; of smoothed displacements with the smoothing's window.
     points, status
-        How many points have strain, and the counts by state.
+        Number of points with strain, and the counts by state.
     mean_microstrain, sd_microstrain
         Over the field, of exx, eyy, exy.
     noise_floor_microstrain

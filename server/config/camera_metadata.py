@@ -1,6 +1,6 @@
-"""What only people know about a camera and its lens: from the rig file, kept with every step.
+"""Metadata of a camera and its lens: stated in the rig file, kept with every step.
 
-A fact that the operator did not state is None, never a guess.
+An entry that the operator did not state is None, never a guess.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ Above = Annotated[float, Field(strict=True, gt=0.0, le=1e6, allow_inf_nan=False)
 
 
 class ClosedMetadata(BaseModel):
-    """Facts: closed and frozen."""
+    """Base of metadata: closed and frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class LensMetadata(ClosedMetadata):
-    """[cam1.lens], [cam2.lens]: what is printed on the lens; for reports, nothing is computed from it."""
+    """[cam1.lens], [cam2.lens]: the lens, as printed on it; for reports, nothing is computed from it."""
 
     maker: Text | None = Field(None, description="Maker of the lens.", examples=["Schneider-Kreuznach"])
     model: Text | None = Field(None, description="Model of the lens.", examples=["Xenoplan 2.8/50"])
@@ -31,17 +31,17 @@ class LensMetadata(ClosedMetadata):
 
 
 class CameraMetadata(ClosedMetadata):
-    """What a camera's data sheet says; for reports, nothing is computed from it but lengths on the sensor."""
+    """A camera by its data sheet; for reports, nothing is computed from it but lengths on the sensor."""
 
     maker: Text | None = Field(None, description="Maker of the camera.", examples=["Basler"])
-    model: Text | None = Field(None, description="Model; what the camera itself says goes before it.")
+    model: Text | None = Field(None, description="Model; the camera's own report takes precedence.")
     sensor: Text | None = Field(None, description="The sensor.", examples=["Sony IMX250, CMOS, global shutter"])
     pixel_um: Above | None = Field(None, description="Width of a pixel on the sensor.", examples=[3.45])
     lens: LensMetadata | None = Field(None, description="The lens.")
 
 
 def merged(over: CameraMetadata | None, under: Mapping[str, object] | None) -> CameraMetadata:
-    """Facts of a camera, one by one: those of ``over`` go before those of ``under``, as a step's record has them."""
+    """Merge the metadata of a camera entry by entry: ``over`` takes precedence over ``under``, a step's record."""
     stated = CameraMetadata.model_validate({k: v for k, v in (under or {}).items() if k in CameraMetadata.model_fields})
     if over is None:
         return stated

@@ -1,4 +1,4 @@
-"""The rig file's keys, written down from the model itself: a page for people, a JSON schema for editors."""
+"""The rig file's keys, written down from the model itself: a page for users, a JSON schema for editors."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Definitions = dict[str, JsonSchemaValue]
 
 _HEAD = """# The rig file
 
-A rig file is TOML. It names two cameras, a stage, the calibration target and a calibration plan, and serves
-`stereorig serve` and `stereorig doctor`; `stereorig calibrate` takes the nominal camera data from it. A key that is not
-listed here is refused, and so is a value outside its range; the message names the key. `stereorig rigfile FILE` checks
-a file without opening any device, and `stereorig rigfile --schema` prints a JSON schema, with which editors complete
-and check keys while you write.
+A rig file is TOML. It names two cameras, a stage, the calibration target and a calibration plan, and serves `stereorig
+serve` and `stereorig doctor`; `stereorig calibrate` takes the nominal camera data from it. A key that is not listed
+here is an error, and so is a value outside its range; the message names the key. `stereorig rigfile FILE` checks a file
+without opening any device, and `stereorig rigfile --schema` prints a JSON schema, with which editors complete and check
+keys while you write.
 
 This page is made from the model that reads the file (`make reference`). Complete
 examples with comments are in `config/`.

@@ -23,7 +23,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Whole = Annotated[int, Field(ge=0, le=65535)]
 
-# Skew may shift one image against the other by this much, a third of what correlation scatters by
+# Skew may shift one image against the other by this much, a third of the standard deviation of correlation
 SKEW_PX = 0.01
 DEFAULT_SKEW_MS = 5.0
 
@@ -38,30 +38,31 @@ class RigSection(_Closed):
     name: str = Field(description="Name of the rig, shown to users and kept with every result.", max_length=200)
     kind: Literal["simulated", "real"] = Field(description="`simulated` starts a simulated world with its controllers.")
     trigger: Literal["software", "hardware", "free"] = Field(
-        "software", description="What starts the exposures of both cameras: a call, pulses on their lines, nothing."
+        "software", description="Start of both cameras' exposures: a call, pulses on their lines, nothing."
     )
     frame_rate_hz: Positive | None = Field(
         None, description="Rate of free-running cameras, or of the pulses of a hardware trigger where they are regular."
     )
     pairing: Literal["auto", "time", "frame"] = Field(
         "auto",
-        description="How frames of two streams find each other: by time, or by frame number aligned by time. `auto`: "
+        description="Pairing of the frames of two streams: by time, or by frame number aligned by time. `auto`: "
         "by frame number under a hardware trigger with a known rate, else by time.",
     )
     max_skew_ms: Positive | None = Field(
         None,
-        description="A pair whose exposures began further apart is refused. Left out: 0.01 px at image_speed_px_s.",
+        description="A pair is rejected if its exposures began at times that differ by more. "
+        "Left out: 0.01 px at image_speed_px_s.",
     )
     image_speed_px_s: Positive | None = Field(
         None,
-        description="How fast the image may move while a pair is taken; gives the skew limit if max_skew_ms is left "
-        "out. With neither, the limit is 5 ms, and 0.01 px at the speed seen where several frames are averaged.",
+        description="Maximum speed of the image while a pair is taken; gives the skew limit if max_skew_ms is left "
+        "out. With neither, the limit is 5 ms, and 0.01 px at the measured speed where several frames are averaged.",
     )
     capture_timeout_s: Annotated[float, Field(gt=0.0, le=3600.0)] = Field(
-        10.0, description="How long a capture waits for a pulse of a hardware trigger that has no frame_rate_hz."
+        10.0, description="Maximum wait of a capture for a pulse of a hardware trigger that has no frame_rate_hz."
     )
     auto_reconnect: bool = Field(True, description="Connect a camera again by itself when it comes back after a loss.")
-    description: str = Field("", description="Free text for people.", max_length=2000)
+    description: str = Field("", description="Free text.", max_length=2000)
     lighting: Text | None = Field(None, description="Lamps and their arrangement; kept with every step, for reports.")
 
     @model_validator(mode="after")
@@ -74,7 +75,7 @@ class RigSection(_Closed):
 
     @property
     def skew_bound_ms(self) -> float:
-        """Largest skew of a pair that may be measured with."""
+        """Return the maximum skew of a pair that is measured."""
         if self.max_skew_ms is not None:
             return self.max_skew_ms
         return DEFAULT_SKEW_MS if self.image_speed_px_s is None else 1000.0 * SKEW_PX / self.image_speed_px_s
@@ -117,7 +118,7 @@ class CameraSection(_Closed):
     )
     buffers: int = Field(16, ge=2, le=1000, description="Frames that may be under way between camera and reader.")
     packet_size_bytes: int | None = Field(
-        None, ge=576, le=16000, description="GigE Vision packets; left out: the largest that passes."
+        None, ge=576, le=16000, description="GigE Vision packets; left out: the maximum that passes."
     )
     ptp: bool = Field(False, description="Switch the camera's IEEE 1588 clock on.")
     trigger_source: str = Field("Line1", description="GenICam line of the hardware trigger.")
@@ -139,7 +140,7 @@ class CameraSection(_Closed):
         return self
 
     def metadata(self) -> CameraMetadata:
-        """What the file tells of camera and lens for reports."""
+        """Return the file's metadata of camera and lens, for reports."""
         return CameraMetadata(maker=self.maker, model=None, sensor=self.sensor, pixel_um=self.pixel_um, lens=self.lens)
 
 
@@ -156,7 +157,9 @@ class StageAxisSection(_Closed):
     settle_ms: Annotated[float, Field(ge=0.0, le=60000.0)] | None = Field(None, description="Wait after motion.")
     tolerance_mm: Positive | None = Field(None, description="A position read back further away is a fault.")
     zero_mm: Finite | None = Field(None, description="Stage position of dZ = 0.")
-    assume_homed: bool | None = Field(None, description="Trust an ESP301's position although nobody homed it here.")
+    assume_homed: bool | None = Field(
+        None, description="Trust an ESP301's position although this service did not home it."
+    )
     home_mode: Annotated[int, Field(ge=0, le=6)] | None = Field(None, description="ESP301: parameter of OR.")
 
     @model_validator(mode="after")
@@ -181,7 +184,7 @@ class StageSection(_Closed):
         None, description="Where it is not the controller's usual one."
     )
     reply_timeout_ms: Annotated[float, Field(ge=50.0, le=10000.0)] = Field(
-        500.0, description="How long a reply may take; longer over a slow network."
+        500.0, description="Maximum wait for a reply; longer over a slow network."
     )
     soft_limits_mm: tuple[Finite, Finite] = Field(description="Lowest and highest position; tightens the controller's.")
     velocity_mm_s: Positive | None = Field(None, description="Velocity set when the stage is opened.")
@@ -193,7 +196,7 @@ class StageSection(_Closed):
     settle_ms: Annotated[float, Field(ge=0.0, le=60000.0)] = Field(0.0, description="Wait after the end of motion.")
     tolerance_mm: Positive = Field(0.002, description="A position read back further from its target is a fault.")
     zero_mm: Finite = Field(0.0, description="Stage position of dZ = 0, where the cameras measure.")
-    assume_homed: bool = Field(False, description="Trust an ESP301's position although nobody homed it here.")
+    assume_homed: bool = Field(False, description="Trust an ESP301's position although this service did not home it.")
     home_mode: Annotated[int, Field(ge=0, le=6)] | None = Field(None, description="ESP301: parameter of OR.")
     home_at_start: bool | None = Field(None, description="Home when opened; only simulated stages do if left out.")
     axes: dict[Annotated[int, Field(ge=1, le=31)], StageAxisSection] = Field(
@@ -219,7 +222,9 @@ class TargetSection(_Closed):
         description="Number of lines crossed when walking along X_sys and along Y_sys."
     )
     line_width_mm: Positive = Field(description="Width of a line.")
-    node_tolerance_mm: Annotated[float, Field(ge=0.0)] = Field(0.0, description="Maker's tolerance of the line places.")
+    node_tolerance_mm: Annotated[float, Field(ge=0.0)] = Field(
+        0.0, description="Maker's tolerance of the line positions."
+    )
     dark_lines: bool = Field(True, description="Dark lines on a bright ground, or the other way round.")
 
 
@@ -268,7 +273,7 @@ class ServiceSection(_Closed):
     @model_validator(mode="before")
     @classmethod
     def _ignore_retention(cls, section: Any) -> Any:
-        # a machine that runs by itself must come up again after an upgrade; what it did not delete is lost to nobody
+        # a machine that runs by itself must come up again after an upgrade; nothing that it did not delete is lost
         if isinstance(section, dict) and "retention_days" in section:
             _log.warning(
                 "[service] retention_days is ignored: the service moves nothing to the trash by itself any more. Take "
@@ -334,7 +339,7 @@ class RigConfig(_Closed):
 
     @property
     def home_at_start(self) -> bool:
-        """Whether opening homes the stage: nothing moves by itself unless it is simulated or the file says so."""
+        """Return True if opening homes the stage: it must be simulated, or the file must require it."""
         wanted = self.stage.home_at_start
         return self.stage.url == "sim" if wanted is None else wanted
 

@@ -53,7 +53,7 @@ def matlab_name(name: str) -> str:
 
 
 def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
-    """Write ``step_<nnnn>``, a struct for each step, and one ``about_<nnnn>`` that says what it holds.
+    """Write ``step_<nnnn>``, a struct for each step, and one ``about_<nnnn>`` that describes it.
 
     A step's struct has ``n``, ``load_n`` (NaN where not known), ``label`` and each variable as a double array: rows
     and columns of the grid, NaN where a point has no number. ``about_<nnnn>`` has ``units`` and ``meaning`` by
@@ -91,7 +91,7 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
             about["parts"] = {names[name]: " ".join(v.parts) for name, v in step.variables.items() if v.parts}
             content = {f"step_{step.n:04d}": held, f"about_{step.n:04d}": about}
             # on an open file, each call adds to what is there
-            save: Any = scipy.io.savemat  # its stubs know names of files alone
+            save: Any = scipy.io.savemat  # its stubs have names of files alone
             save(out, content, long_field_names=True, do_compression=True)
 
 

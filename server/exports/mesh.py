@@ -19,7 +19,7 @@ def triangles_of(
     Parameters
     ----------
     x_px, y_px, valid
-        (r, c) places in camera 1's reference image, and which of them are points.
+        (r, c) positions in camera 1's reference image, and True where they are points.
     cuts
         Lines over which no triangle reaches.
     mask
@@ -28,8 +28,7 @@ def triangles_of(
     Notes
     -----
     Each quadrilateral of four neighbours gives two; with one corner failed, the triangle of the other three. No side
-    meets a cut, and no cut lies inside one. They turn as x to the right and y down does: clockwise as seen in the
-    image.
+    meets a cut, and no cut lies inside one. They turn as x to the right and y down does: clockwise in the image.
     """
     rows, cols = valid.shape
     index = np.arange(rows * cols).reshape(rows, cols)
@@ -54,7 +53,7 @@ def triangles_of(
 
 
 def _over_black(corners: Float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether a side of a triangle (m, 3, 2) passes a pixel that the mask leaves out; looked at every half pixel."""
+    """Return True if a triangle's (m, 3, 2) side passes a pixel that the mask leaves out; checks every half pixel."""
     sides = np.roll(corners, -1, axis=1) - corners
     steps = max(2, int(np.ceil(2.0 * np.abs(sides).max())) + 1)
     met = np.zeros(len(corners), dtype=bool)
@@ -67,7 +66,7 @@ def _over_black(corners: Float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _holds_a_cut(corners: Float, cuts: Cuts) -> NDArray[np.bool_]:
-    """Whether a whole cut lies inside a triangle (m, 3, 2): its first point does, and no side is met."""
+    """Return True if a whole cut lies inside a triangle (m, 3, 2): its first point does, and it meets no side."""
     held = np.zeros(len(corners), dtype=bool)
     low, high = corners.min(axis=1), corners.max(axis=1)
     for line in cuts.lines_px:

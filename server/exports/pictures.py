@@ -1,4 +1,4 @@
-"""Steps as figures and films: one variable as a colour map, with units and where it comes from."""
+"""Steps as figures and films: one variable as a colour map, with units and provenance."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def write_figure(path: Path, picture: Picture, style: FigureStyle, form: Picture
 
 
 def common_style(source: Source, steps: Sequence[int] | None, name: str, style: FigureStyle) -> FigureStyle:
-    """Return the look with one colour scale for all steps; percentiles are those of all steps' values together."""
+    """Return the style with one colour scale for all steps; percentiles are those of all steps' values together."""
     if style.limits is not None:
         return style
     samples = []
@@ -146,7 +146,7 @@ def frames(
         size = (pixels.shape[0], pixels.shape[1])
         yield pixels
     if size is None and last is not None:
-        picture_of(last, name, source)  # says which there are
+        picture_of(last, name, source)  # the error names those that there are
 
 
 def write_gif(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float, comment: str) -> None:
@@ -217,7 +217,7 @@ def _writer_of(writer: cv2.VideoWriter) -> Callable[[NDArray[np.uint8]], None]:
 
 
 def check_fps(fps: float) -> None:
-    """Refuse a frame rate that no player plays."""
+    """Raise an error for a frame rate that no player plays."""
     if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         raise InputError(
             f"{fps:g} frames a second is not between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}.",

@@ -1,4 +1,4 @@
-"""Exports beside the service: a process of their own, begun with the first and ended when none was asked for lately.
+"""Exports in a process of their own, started with the first and ended some time after the last.
 
 Drawing and compressing hold Python's interpreter for tenths of a second; in the service's process they would delay its
 answers, in the measuring worker an analysis.
@@ -25,7 +25,7 @@ _REST_AFTER_S = 60.0
 
 
 def export_task(folder: str, files: list[str], request: ExportRequest, out: str) -> str:
-    """Export an analysis' result files as one file; return its path. Runs in the process aside."""
+    """Export an analysis' result files as one file; return its path. Runs in the export process."""
     # matplotlib and SciPy are loaded here alone
     from server.exports.run import export_packed
     from server.exports.source import source_of
@@ -35,12 +35,12 @@ def export_task(folder: str, files: list[str], request: ExportRequest, out: str)
 
 
 class ExportProcess:
-    """Runs exports one after the other, in a process that lives while it is wanted.
+    """Runs exports one after the other, in a process that ends when it was idle for a while.
 
     Parameters
     ----------
     data
-        The data folder: what is being made lies under it, on the disk whose room is watched.
+        The data folder: unfinished files are under it, on the disk whose free space is monitored.
     """
 
     def __init__(self, data: Path) -> None:
@@ -52,11 +52,11 @@ class ExportProcess:
         self._closed = False
 
     def clear(self) -> None:
-        """Remove what a kill left."""
+        """Remove files that a kill left."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def new_folder(self) -> Path:
-        """Make a folder for one export; who asked removes it."""
+        """Make a folder for one export; the caller removes it."""
         self._folder.mkdir(exist_ok=True)
         return Path(tempfile.mkdtemp(dir=self._folder))
 
@@ -65,7 +65,7 @@ class ExportProcess:
         return self.run(export_task, str(folder), [str(f) for f in files], request, str(out))
 
     def run(self, task: Callable[..., Any], *args: Any) -> TaskFuture:
-        """Begin a task in the process aside; everything must pickle.
+        """Begin a task in the export process; everything must pickle.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What can be asked for as an export; apart from the making, which takes seconds to load."""
+"""Requests for exports; separate from the exporting code, which takes seconds to load."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _HIGHEST = 9999
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What to export.
+    """An export to make.
 
     Attributes
     ----------

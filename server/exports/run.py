@@ -1,4 +1,4 @@
-"""An export from the wish to the files, one step in memory at a time."""
+"""An export from the request to the files, one step in memory at a time."""
 
 from __future__ import annotations
 

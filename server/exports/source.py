@@ -1,4 +1,4 @@
-"""Where results lie: an analysis of a data folder, a test's folder, or what ``stereorig measure`` wrote."""
+"""Folders of results: an analysis of a data folder, a test's folder, or the output of ``stereorig measure``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from server.store.durable import known_json
 
 
 def find_source(folder: Path, analysis: str | None = None) -> Source:
-    """Return the results of a folder, with what lies beside them.
+    """Return the results of a folder, with the records beside them.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def source_of(folder: Path, files: list[Path]) -> Source:
 
 
 def _mask(folder: Path, settings: object) -> Path | None:
-    """The mask that points were laid in, where it is still there: an analysis keeps its own copy."""
+    """Return the mask of the points, where it is still there: an analysis keeps its own copy."""
     region = settings.get("region") if isinstance(settings, dict) else None
     named = region.get("mask") if isinstance(region, dict) else None
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):

@@ -20,7 +20,7 @@ _COMMON = ("x_px", "y_px")
 def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names: Sequence[str] | None) -> None:
     """Write one file of all steps, one step in memory at a time.
 
-    Datasets have the axes step, row, col (MATLAB, which counts from the other end, sees col, row, step); ``x_px`` and
+    Datasets have the axes step, row, col (MATLAB, which counts from the other end, has col, row, step); ``x_px`` and
     ``y_px`` are the same in every step and have row, col. ``step``, ``load_n``, ``label`` and ``provenance`` (JSON
     text) have one entry a step. A variable that a step lacks is NaN there, or -1 if it counts. Units and meanings are
     attributes. The file is netCDF-4, which is HDF5.
@@ -47,7 +47,10 @@ def _begin(data: Any, step: StepResult, count: int) -> None:
         data.createDimension(name, size)
     _describe(data.createVariable("step", "i4", ("step",)), "1", "number of the step")
     _describe(data.createVariable("load_n", "f8", ("step",), fill_value=np.nan), "N", "load, where it is known")
-    for name, meaning in (("label", "what the user called the step"), ("provenance", "where it comes from, JSON")):
+    for name, meaning in (
+        ("label", "the step's label, given by the user"),
+        ("provenance", "where it comes from, JSON"),
+    ):
         _describe(data.createVariable(name, str, ("step",)), "1", meaning)
 
 

@@ -1,4 +1,4 @@
-"""A step as a CSV table: one line a point, what it says of itself in comment lines above the header."""
+"""A step as a CSV table: one line a point, its provenance in comment lines above the header."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _LINES_AT_ONCE = 2000
 def write_table(path: Path, step: StepResult, source: Source) -> None:
     """Write one step as CSV.
 
-    Lines that begin with ``#`` say name by name where the numbers come from and each column's unit and meaning. The
-    header follows, then one line a grid point: ``row, col``, then the variables. A number that is not there is empty;
-    a variable of states is written as its number, with the name in the next column.
+    Lines that begin with ``#`` state the provenance name by name, and each column's unit and meaning. The header
+    follows, then one line a grid point: ``row, col``, then the variables. A number that is not there is empty; a
+    variable of states is written as its number, with the name in the next column.
     """
     columns = columns_of(step)
     with written_temporary(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as out:

@@ -37,7 +37,7 @@ def write_vtu(
     step
         With the variables of :data:`NEEDS` that it has.
     source
-        Where it comes from.
+        Its provenance.
     mask
         Camera 1's image, False where no triangle may lie.
     at_rest
@@ -46,9 +46,9 @@ def write_vtu(
     Notes
     -----
     Points that failed are not in the file. ``displacement`` and ``normal`` are vectors; warping by ``displacement``
-    gives the surface as it is at the step. A point that no triangle holds stands as a vertex. Triangles turn so that
-    their normals point as ``normal`` does. Units, frame and settings stand as JSON in a comment at the top, and in the
-    field data (``provenance_json_utf8``, its bytes); arrays carry VTK's UNITS_LABEL.
+    gives the surface as it is at the step. A point of no triangle is written as a vertex. Triangles turn so that their
+    normals point as ``normal`` does. Units, frame and settings are JSON in a comment at the top, and in the field data
+    (``provenance_json_utf8``, its bytes); arrays carry VTK's UNITS_LABEL.
     """
     columns = columns_of(step)
     keep = np.flatnonzero(step.valid.ravel())
@@ -114,7 +114,7 @@ def _field_data(out: TextIO, step: StepResult, about: str) -> None:
     _array(out, "TimeValue", np.array([float(step.n)]), tuples=1)
     if step.load_n is not None:
         _array(out, "load_n", np.array([step.load_n]), tuples=1)
-    # as bytes: readers other than VTK's own refuse its arrays of text
+    # as bytes: readers other than VTK's own do not take its arrays of text
     text = np.frombuffer(about.encode(), dtype=np.uint8)
     _array(out, "provenance_json_utf8", text, tuples=text.size)
 
@@ -123,7 +123,7 @@ def _about(step: StepResult, source: Source, columns: dict[str, Variable]) -> st
     units = {name: v.units for name, v in columns.items()} | {"displacement": "mm", "normal": "1", "Points": "mm"}
     states = {name: {str(k): t for k, t in v.flags.items()} for name, v in columns.items() if v.flags is not None}
     document = {**provenance(step, source), "units": units, "states": states}
-    # two hyphens may not stand in an XML comment
+    # an XML comment must not hold two hyphens
     return json.dumps(document, sort_keys=True).replace("--", "-\\u002d")
 
 

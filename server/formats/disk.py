@@ -1,4 +1,4 @@
-"""Every change that our code makes to the disk, in one place; tests put one in its stead that fails at some call."""
+"""Every change that our code makes to the disk; tests replace the module's object by one that fails at some call."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Disk:
             os.close(fd)
 
     def replace(self, path: Path, target: Path) -> None:
-        """Give a file its real name, in place of what had it."""
+        """Give a file its real name; replaces a file of that name."""
         path.replace(target)
 
     def make_folder(self, path: Path) -> None:

@@ -38,7 +38,7 @@ _drawing = threading.Lock()
 
 @dataclass(frozen=True)
 class Picture:
-    """What is drawn.
+    """Content of a picture.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ def _metadata(picture: Picture, form: PictureForm) -> dict[str, str]:
     texts = {"Title": picture.title, **picture.metadata}
     if form == "png":
         return texts
-    # SVG knows Dublin Core's words alone
+    # SVG takes the terms of Dublin Core alone
     known = {"Title": picture.title, "Creator": picture.metadata.get("Software", "stereorig")}
     return {**known, "Description": json.dumps(texts, ensure_ascii=False, sort_keys=True)}
 

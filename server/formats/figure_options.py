@@ -1,4 +1,4 @@
-"""How a field is drawn; apart from the drawing, which takes a second to load."""
+"""Options of drawing a field; separate from the drawing, which takes a second to load."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTHS_PX = (200, 4000)
 
 @dataclass(frozen=True)
 class FigureStyle:
-    """How a field is drawn.
+    """Options of drawing a field.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class FigureStyle:
     opacity
         Of the map over the camera's image.
     dots_per_inch
-        What an inch of the picture has: where it is larger, so are lettering and lines.
+        Resolution; the larger, the larger are lettering and lines.
 
     Raises
     ------

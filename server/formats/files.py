@@ -1,4 +1,4 @@
-"""Files on disk: written aside, synced, renamed; and their checksums.
+"""Files on disk: written under a temporary name, synced, renamed; and their checksums.
 
 A file written here is either the whole new one or the old one, whatever happens in between.
 """
@@ -49,7 +49,7 @@ _MAX_HASHES = 100_000
 def known_sha256(path: Path) -> str:
     """As `sha256_of`, but a file that was not touched since is not read again."""
     stat = path.stat()
-    # the time of the inode's change, which nobody can set
+    # the time of the inode's change, which no program can set
     key = str(path), stat.st_ino, stat.st_ctime_ns, stat.st_size
     if key not in _hashes:
         if len(_hashes) >= _MAX_HASHES:
@@ -59,12 +59,12 @@ def known_sha256(path: Path) -> str:
 
 
 def checksum_file(path: Path) -> Path:
-    """Where a file's checksum stands, in the form that ``sha256sum -c`` reads."""
+    """Path of a file's checksum, in the form that ``sha256sum -c`` reads."""
     return path.with_name(f"{path.name}.sha256")
 
 
 def recorded_sha256(path: Path) -> str | None:
-    """Return the checksum that stands beside a file; None where there is none."""
+    """Return the checksum kept beside a file; None where there is none."""
     try:
         text = checksum_file(path).read_text(encoding="ascii").split()
     except (OSError, UnicodeDecodeError):
@@ -83,7 +83,7 @@ def mismatch(name: str, of: str, folder: str) -> FileFormatError:
 
 
 def require_recorded(path: Path, of: str, folder: str) -> None:
-    """Refuse a file that does not match the checksum beside it, where there is one.
+    """Raise an error if a file does not match the checksum beside it, where there is one.
 
     Raises
     ------

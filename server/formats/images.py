@@ -1,7 +1,7 @@
 """Image files: gray, 8 or 16 bit, in and out, with every number as the camera gave it.
 
 Read: TIFF, PNG, BMP, JPEG. A colour file is taken only if its channels are equal everywhere (a gray image saved as
-colour); true colour is refused, since how it was made gray is part of the measurement. Size and type are checked in
+colour); true colour is refused, since the conversion to gray is part of the measurement. Size and type are checked in
 the header, before anything is decoded.
 """
 
@@ -61,7 +61,7 @@ def _check_size(name: str, width: int, height: int) -> None:
 
 
 def _one_channel(name: str, pixels: NDArray[Any]) -> GrayImage:
-    """Reduce (rows, cols[, channels]) of one gray image to (rows, cols), or refuse."""
+    """Reduce (rows, cols[, channels]) of one gray image to (rows, cols), or raise an error."""
     if pixels.dtype not in (np.uint8, np.uint16):
         raise _unsupported(name, f"its pixels are {pixels.dtype}")
     if pixels.ndim == 3:
@@ -239,7 +239,7 @@ def encode_tiff(image: GrayImage) -> bytes:
 
 
 def write_image(path: str | Path, image: GrayImage) -> None:
-    """Write (rows, cols) uint8 or uint16 as an uncompressed TIFF, written aside and renamed.
+    """Write (rows, cols) uint8 or uint16 as an uncompressed TIFF, under a temporary name, then renamed.
 
     Raises
     ------

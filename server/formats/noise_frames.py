@@ -1,4 +1,4 @@
-"""Frames for a noise measurement, read one by one: no more is kept of large ones than is looked at."""
+"""Frames for a noise measurement, read one by one: of large ones, only the rows that are evaluated are kept."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class LoadedNoise:
     sha256
         Of the file's bytes.
     created
-        When it was measured, as the file says it.
+        Time of the measurement, as the file states it.
     """
 
     models: tuple[NoiseModel | None, NoiseModel | None]
@@ -51,7 +51,7 @@ class LoadedNoise:
 def noise_content(
     models: Mapping[str, NoiseModel], *, sources: Mapping[str, object] | None = None, **more: object
 ) -> dict[str, object]:
-    """Return the content of noise.json; ``sources`` says by camera what was measured."""
+    """Return the content of noise.json; ``sources`` names the frames by camera."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -63,7 +63,7 @@ def noise_content(
 
 
 def write_noise(path: Path, content: Mapping[str, object], *, checksum: bool = False) -> None:
-    """Write noise.json aside, sync it and rename it.
+    """Write noise.json as a temporary file, sync it and rename it.
 
     Raises
     ------

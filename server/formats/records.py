@@ -15,7 +15,7 @@ from pydantic import (
 
 
 class Record(BaseModel):
-    """What a file says, read leniently: an entry that is not there, or is of another kind, has its default.
+    """Entries of a file, read leniently: one that is not there, or is of another kind, has its default.
 
     Without an entry that has none, the whole record counts as missing.
     """

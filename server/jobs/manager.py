@@ -64,7 +64,7 @@ class JobManager:
 
     def _interrupt_left_overs(self) -> None:
         for document in self._catalog.jobs():
-            self._ids.seen(document.id)
+            self._ids.reserve(document.id)
         for document in self._catalog.jobs(states=ACTIVE):
             self._catalog.put_job(document.ended("interrupted", now_utc(), problem_of(RESTART)))
 

@@ -1,4 +1,4 @@
-"""A report from top to bottom: everything gathered, then shown by the templates."""
+"""A report from top to bottom: everything gathered, then filled into the templates."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Report:
     page
         One HTML file that needs nothing else.
     policy
-        The Content-Security-Policy that suffices for it; it stands in the page too.
+        The Content-Security-Policy that suffices for it; the page holds it too.
     missing
-        What is not stated in it, and how it can be.
+        Items that are not stated in it, each with a remedy.
     """
 
     page: bytes
@@ -116,7 +116,7 @@ def make_report(source: Source) -> Report:
 
 
 def _under(source: Source, measured: Measured, made_utc: str) -> list[str]:
-    """What stands under the title."""
+    """Return the lines under the title."""
     kind = "displacement" if any(s.max_displacement_mm is not None for s in measured.steps) else "shape"
     under = [f"Report of a {kind} measurement with two cameras", f"{len(measured.steps)} steps"]
     under += [f"test {source.test_record.id}"] if source.test_record.id else []
@@ -146,7 +146,7 @@ def _boxes(source: Source, measured: Measured) -> list[Box]:
         Box("Calibration", verdict or "no record", held_text, _LEVELS.get(verdict or "", "")),
         Box("Cameras since then", level or "not known", off, _LEVELS.get(level or "", "")),
         Box(
-            "Valid points, least of the steps",
+            "Valid points, minimum of the steps",
             f"{100.0 * share:.1f} %",
             f"of {measured.steps[0].summary.points} in the region",
         ),

@@ -17,7 +17,7 @@ from server.report.steps import Measured
 _CHECKS = (
     ("rbe_px", "RBE (mean distance of found and projected intersections)", "px"),
     ("raz_mm", "RAZ (mean distance of intersections and found ones, projected back on the target)", "mm"),
-    ("nsce", "NSCE (the same over what a pixel's rounding would make of it)", ""),
+    ("nsce", "NSCE (the same over the error that rounding to pixels would make)", ""),
 )
 _UNITS = {"px2": "1/px\u00b2", "px": "px", "rad": "rad", "mm": "mm"}
 _KINDS = {"dice_xml": "DICe XML", "opencv_yaml": "OpenCV YAML"}
@@ -44,7 +44,7 @@ class Parameter:
 
 
 class CalibrationPart:
-    """What a report shows of a calibration's file."""
+    """A calibration's file in a report."""
 
     def __init__(self, loaded: LoadedCalibration) -> None:
         self._loaded, self._record = loaded, loaded.record
@@ -65,7 +65,7 @@ class CalibrationPart:
 
     @property
     def made(self) -> list[str]:
-        """The checks that were made, and what the calibration leaves uncertain."""
+        """The checks that were made, and the uncertainty that the calibration leaves."""
         assert self._record.checks is not None
         lines = [f"{c.name.replace('_', ' ')}: {c.text}" for c in self._record.checks.made if c.text]
         found = self._record.uncertainty
@@ -140,7 +140,7 @@ def _with_sd(value: float, sd: float | None) -> str:
 
 
 def calibration_gaps(source: Source, measured: Measured) -> list[Missing]:
-    """What is missing from the calibration's record and the analysis' check of it."""
+    """Return the entries that the calibration's record and the analysis' check of it lack."""
     record = CalibrationRecord() if source.calibration is None else source.calibration.record
     gaps = []
     if source.calibration is None:

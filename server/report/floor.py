@@ -22,12 +22,12 @@ _MAX_BYTES = 96 << 20
 
 
 def static_steps(stated: Sequence[int] | None, labels: Mapping[int, str], reference: int) -> tuple[list[int], str]:
-    """Return the static steps and how they are known.
+    """Return the static steps, and the source that names them.
 
     Parameters
     ----------
     stated
-        What the metadata say; None: nothing.
+        The steps that the metadata name; None: they name none.
     labels
         By measured step.
     reference
@@ -46,16 +46,16 @@ class Floor:
     Attributes
     ----------
     bias
-        Mean over points and steps; None for places, whose truth nobody knows.
+        Mean over points and steps; None for positions, whose true values are not known.
     bias_range
-        Smallest and largest mean of a step.
+        Minimum and maximum mean of a step.
     temporal_sd
         Standard deviation from step to step, root mean square over the points; None with fewer than two steps.
     spatial_sd
-        Standard deviation over the points of a step, root mean square over the steps; for places, of what a step
-        differs by from the mean of the steps.
+        Standard deviation over the points of a step, root mean square over the steps; for positions, of a step's
+        difference from the mean of the steps.
     points, steps
-        How many went in.
+        Their numbers.
     """
 
     bias: float | None
@@ -76,17 +76,17 @@ class Quantity:
 
     @property
     def is_position(self) -> bool:
-        """Whether it is a position, of which nobody knows the truth."""
+        """True for a position, whose true value is not known."""
         return self.name in "XYZ"
 
     @property
     def factor(self) -> float:
-        """From a length in mm or a pure number to ``unit``."""
+        """Factor from a length in mm or a pure number to ``unit``."""
         return 1e6 if self.name in STRAINS else 1e3
 
     @property
     def unit(self) -> str:
-        """In which it reads well."""
+        """Unit in which it reads well."""
         return "microstrain" if self.name in STRAINS else UM
 
 
@@ -155,7 +155,7 @@ def _floor(stack: Float, *, position: bool) -> Floor:
 
 
 def reported_sigma(field: Field, strain: StrainField | None) -> dict[str, float | None]:
-    """Median of the standard deviations that a step's points carry, by quantity."""
+    """Return the median of the points' standard deviations in a step, by quantity."""
     sigma = field.sigma_mm
     names = ("X", "Y", "Z", "U", "V", "W")[: sigma.shape[-1]]
     reported: dict[str, float | None] = {name: _median(sigma[..., k][field.valid]) for k, name in enumerate(names)}

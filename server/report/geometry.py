@@ -1,6 +1,6 @@
-"""What follows from the calibration and the measured surface: stereo angle, stand-off, scale, field of view.
+"""Geometry of the rig from the calibration and the measured surface: stereo angle, stand-off, scale, field of view.
 
-All of it holds at the middle of what was measured, on the plane that fits the surface best.
+All of it holds at the middle of the measured points, on the plane that fits the surface best.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class View:
     scale_mm_per_px
         Along the rows and down the columns, on the surface, at its middle.
     field_of_view_mm
-        Width and height of what the image shows of the plane, through the image's middle; None without image size.
+        Width and height of the part of the plane in the image, through the image's middle; None without image size.
     """
 
     standoff_mm: float
@@ -49,7 +49,7 @@ class Geometry:
     stereo_angle_rad
         Between the optical axes.
     viewing_angle_rad
-        Between both lines of sight to the middle of what was measured.
+        Between both lines of sight to the middle of the measured points.
     baseline_mm
         Between the pinholes.
     views
@@ -65,7 +65,7 @@ class Geometry:
 def geometry(
     pair: StereoPair, surface: Field, sizes: tuple[tuple[int, int] | None, tuple[int, int] | None]
 ) -> Geometry | None:
-    """Return the geometry of a measurement; None where fewer than four points stand.
+    """Return the geometry of a measurement; None with fewer than four valid points.
 
     Parameters
     ----------
@@ -113,11 +113,13 @@ def _view(camera: Camera, middle: Float, normal: Float, size: tuple[int, int] | 
 
     ends = on_plane(xy + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
     scale = (float(np.linalg.norm(ends[1] - ends[0])), float(np.linalg.norm(ends[3] - ends[2])))
-    seen = None
+    field_of_view = None
     if size is not None:
         width, height = size
         x, y = 0.5 * (width - 1), 0.5 * (height - 1)
         edges = on_plane(np.array([[-0.5, y], [width - 0.5, y], [x, -0.5], [x, height - 0.5]]))
         spans = float(np.linalg.norm(edges[1] - edges[0])), float(np.linalg.norm(edges[3] - edges[2]))
-        seen = spans if np.isfinite(spans).all() else None
-    return View(standoff_mm=float(((middle - centre) @ normal) / slant), scale_mm_per_px=scale, field_of_view_mm=seen)
+        field_of_view = spans if np.isfinite(spans).all() else None
+    return View(
+        standoff_mm=float(((middle - centre) @ normal) / slant), scale_mm_per_px=scale, field_of_view_mm=field_of_view
+    )

@@ -116,7 +116,7 @@ def _lens_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> li
         ),
         each("lens.aperture", "Lens, aperture", aperture, f"f_number {where}"),
     ]
-    if any(lens.note for lens in lenses.values()):  # most have nothing on them: that is no item that is missing
+    if any(lens.note for lens in lenses.values()):  # most lenses have none: then the item is not listed as missing
         note = "Lens, accessories"
         items.append(each("lens.note", note, lambda cam: of_text(lenses[cam].note, _IN_FILE) or Value("none stated")))
     how = "of the fitted camera; longer than the focal length, since the lens is focused near"
@@ -127,8 +127,8 @@ def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
     views: dict[str, View] = {} if found is None else found.views
 
     def field_of_view(cam: CameraName) -> Value | None:
-        seen = views[cam].field_of_view_mm if views else None
-        return None if seen is None else Value("{:.4g} x {:.4g} mm".format(*seen), seen[0], CALIBRATION)
+        extent = views[cam].field_of_view_mm if views else None
+        return None if extent is None else Value("{:.4g} x {:.4g} mm".format(*extent), extent[0], CALIBRATION)
 
     def scale(cam: CameraName) -> Value | None:
         if not views:
@@ -146,14 +146,14 @@ def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
             "Field of view",
             field_of_view,
             _NEEDS_CALIBRATION,
-            "width and height of what the image shows of the surface's plane, through the image's middle",
+            "width and height of the part of the surface's plane in the image, through the image's middle",
         ),
         each(
             "image_scale",
             "Image scale",
             scale,
             _NEEDS_CALIBRATION,
-            "on the surface, in the middle of what was measured",
+            "on the surface, in the middle of the measured points",
         ),
         each(
             "stand_off",
@@ -230,7 +230,7 @@ def _sizes(source: Source) -> dict[str, tuple[tuple[int, int], str] | None]:
 
 
 def image_sizes(source: Source) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
-    """Width and height of both cameras' images, None where nothing says so."""
+    """Width and height of both cameras' images, None where they are not known."""
     one, two = (_sizes(source)[cam] for cam in CAMERAS)
     return None if one is None else one[0], None if two is None else two[0]
 
@@ -257,7 +257,7 @@ def _synchronisation(source: Source, measured: Measured) -> Value | None:
     rig = source.rig
     trigger = f"{rig.trigger} trigger; " if rig.trigger else ""
     limit = "" if rig.max_skew_ms is None else f", at most {rig.max_skew_ms:g} ms is allowed"
-    return Value(f"{trigger}largest skew of a pair {max(skews):.3g} ms{limit}", max(skews), RECORD)
+    return Value(f"{trigger}maximum skew of a pair {max(skews):.3g} ms{limit}", max(skews), RECORD)
 
 
 def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
@@ -275,7 +275,7 @@ def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list
     items = [one("pattern.size", "Pattern feature size", feature, needs, how)]
     if metadata.pattern_feature_mm is not None:
         feature = of_number(metadata.pattern_feature_mm, "g", "mm", STATED)
-        method = metadata.pattern_feature_method or "how it is known was not stated"
+        method = metadata.pattern_feature_method or "the method was not stated"
         items.append(one("pattern.stated", "Pattern feature size, as stated", feature, "", method))
     of = "standard deviation of the pattern's grey levels in the same region"
     return [*items, one("pattern.contrast", "Pattern contrast", contrast, needs, of)]

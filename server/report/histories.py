@@ -17,14 +17,14 @@ from server.report.source import Source
 from server.report.steps import Measured, StepFigures
 from server.results.gauges.readings import read_gauges
 
-#: a gauge's values in every step, and why there are none
+#: a gauge's values in every step, or the reason why there are none
 _Readings = Sequence[tuple[Mapping[str, Number], str]]
 _EXTENSOMETER = ("elongation_mm", "strain")
 
 
 @dataclass(frozen=True)
 class GaugeTable:
-    """A gauge over the steps; a value without a number says why there is none."""
+    """A gauge over the steps; a value without a number has the reason."""
 
     name: str
     title: str
@@ -43,7 +43,7 @@ class Gauges:
 
 @dataclass(frozen=True)
 class _Axis:
-    """What courses are drawn over: time since the reference, or the step's number."""
+    """Abscissa of the curves: time since the reference, or the step's number."""
 
     positions: list[float]
     label: str

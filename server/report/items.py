@@ -1,4 +1,4 @@
-"""The items of the report's tables: a value, where it comes from, or that nobody stated it."""
+"""The items of the report's tables: a value with its source, or the note that it was not stated."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CALIBRATION, MEASURED, STATED, RECORD, SETTINGS = (
 
 @dataclass(frozen=True)
 class Missing:
-    """Something that a reader may want and nobody stated, and how it can be stated."""
+    """An item that was not stated, and how it can be stated."""
 
     name: str
     remedy: str
@@ -28,7 +28,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Value:
-    """What is known of an item: text, the number behind it in the unit that the text says, where it comes from."""
+    """Value of an item: text, the number behind it in the unit of the text, its source."""
 
     text: str
     number: float | None = None
@@ -48,9 +48,9 @@ class Item:
     values
         One for the rig, or one for each camera; None where it is not stated.
     remedy
-        How it can be stated.
+        Instruction how to state it.
     comment
-        How it was found, or what it means.
+        Method by which it was found, or its meaning.
     """
 
     key: str
@@ -61,13 +61,13 @@ class Item:
 
     @property
     def remarks(self) -> str:
-        """Where its values come from, and the comment."""
+        """Return the sources of its values, and the comment."""
         origins = dict.fromkeys(v.origin for v in self.values if v is not None)
         return "; ".join(text for text in (*origins, self.comment) if text)
 
     @property
     def missing(self) -> list[Missing]:
-        """What is not stated: the item, or the cameras that lack it."""
+        """Return the part that is not stated: the item, or the cameras that lack it."""
         if all(v is None for v in self.values):
             return [Missing(self.label, self.remedy)]
         lacking = [cam for cam, v in zip(CAMERAS, self.values, strict=False) if v is None]

@@ -1,4 +1,4 @@
-"""The page: its templates filled, its style, and what a browser may do with it."""
+"""The page: its templates filled, its style, and its permissions in a browser."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Picture:
     data, media_type
         The file.
     text
-        What it shows, for those who do not see it.
+        Description, for readers who do not see it.
     caption
-        What stands below.
+        Text below it.
     half
-        Whether two of its kind stand side by side.
+        True if two of its kind are set side by side.
     """
 
     data: bytes
@@ -44,14 +44,14 @@ class Picture:
 
 
 def _printable(value: object) -> object:
-    """Return what is put out without what no page may hold."""
+    """Return the text without the characters that a page must not hold."""
     if isinstance(value, Markup):
         return value
     return "".join(c for c in str(value) if c in "\n\t" or c >= " ")
 
 
 def _tight(markup: Markup) -> Markup:
-    """Return markup without space between its elements: what a cell holds is its text alone."""
+    """Return markup without space between its elements: a cell holds its text alone."""
     return Markup(re.sub(r">\s+<", "><", markup.strip()))
 
 
@@ -67,9 +67,9 @@ def render(head: str, **content: object) -> tuple[bytes, str]:
     Parameters
     ----------
     head
-        What stands at the head of every printed page.
+        Text at the head of every printed page.
     content
-        What the templates name.
+        Variables of the templates.
 
     Returns
     -------

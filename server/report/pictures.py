@@ -1,4 +1,4 @@
-"""The report's pictures: what the cameras saw, the fields, the course of the test."""
+"""The report's pictures: the cameras' images, the fields, the course of the test."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def field_map(
 
 
 def status_map(field: Field, title: str) -> bytes:
-    """Draw what can be said about each point; PNG."""
+    """Draw the state of each point; PNG."""
     names = {s.value: s.name.lower().replace("_", " ") for s in PointStatus}
     drawn = Picture(field.status, field.x_px, field.y_px, "status", "1", title, cuts=field.cuts, flags=names)
     return _cropped(draw(drawn, _HALF, "png"))
@@ -92,9 +92,9 @@ def region(
     Parameters
     ----------
     positions_px
-        (n, 2) where the camera sees the points; NaN where it does not.
+        (n, 2) positions of the points in the image; NaN where they have none.
     valid
-        (n,) whether they were measured.
+        (n,) True where they were measured.
     outline_px
         (m, 2) corners of the region that was asked for.
     """
@@ -170,5 +170,5 @@ def course(x: Sequence[float], lines: Lines, *, x_label: str, y_label: str, titl
 
 
 def _plain(text: str) -> str:
-    """Text as it may stand in a legend: printable, and no underscore in front, which would hide it."""
+    """Return a text as a legend takes it: printable, and no underscore in front, which would hide it."""
     return "".join(c if c.isprintable() else " " for c in text)[:60].lstrip("_") or "-"

@@ -1,4 +1,4 @@
-"""What a report reads of the records beside the results: of the test, its steps, the rig, the analysis."""
+"""Parts of the records beside the results that a report reads: of the test, its steps, the rig, the analysis."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class AnalysisRecord(Record):
 
 
 class RegionRecord(Record):
-    """Where points were laid, px of camera 1's reference image."""
+    """Region of the points, px of camera 1's reference image."""
 
     rectangle: tuple[float, float, float, float] | None = None
     polygon: list[tuple[float, float]] | None = None

@@ -10,9 +10,9 @@ from server.report.source import Source
 from server.report.steps import Measured
 
 _SHAPES = {
-    "rigid": "plane patch, rigid motion (9 unknowns), seen through both calibrated cameras",
-    "affine": "plane patch, rigid motion and in-plane stretch (12 unknowns), seen through both calibrated cameras",
-    "quadratic": "patch of second order in shape and motion, seen through both calibrated cameras",
+    "rigid": "plane patch, rigid motion (9 unknowns), projected by both calibrated cameras",
+    "affine": "plane patch, rigid motion and in-plane stretch (12 unknowns), projected by both calibrated cameras",
+    "quadratic": "patch of second order in shape and motion, projected by both calibrated cameras",
 }
 _TENSORS = {
     "green_lagrange": "Green-Lagrange, E = (C - I) / 2",
@@ -41,7 +41,7 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
         mm = "" if scale is None else f" = {px * scale:.4g} mm"
         return Value(f"{px:g} px{mm}{what}", float(px), SETTINGS)
 
-    needs = "the result files do not say it: measure again with this program"
+    needs = "the result files do not state it: measure again with this program"
     head = source.heads[max(source.heads)]
     version = f"stereorig {head.software_version} (results), stereorig {software_version()} (this report)"
     interpolation = settings.interpolation
@@ -86,7 +86,7 @@ def _smoothing(measured: Measured) -> Value:
         return Value("none", None, SETTINGS)
     mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
     text = f"polynomial of order {smoothing.order} over {smoothing.window} x {smoothing.window} points; "
-    text += f"{smoothing.resolution_px:g} px{mm} are distinguished"
+    text += f"{smoothing.resolution_px:g} px{mm} are resolved"
     return Value(text, float(smoothing.resolution_px), SETTINGS)
 
 

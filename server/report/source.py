@@ -1,4 +1,4 @@
-"""The sources of a report: result files, the records that lie about them, the calibration, the metadata."""
+"""The sources of a report: result files, the records beside them, the calibration, the metadata."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Source:
     files
         Result files by step, ascending.
     heads
-        What they say of themselves.
+        Attributes of the files.
     test
-        The test's folder, None where the results lie alone; ``test_record`` is its ``test.json``.
+        The test's folder, None where the results are alone; ``test_record`` is its ``test.json``.
     analysis
         ``analysis.json`` of the service, or ``summary.json`` of ``stereorig measure``; empty without either.
     steps
@@ -44,9 +44,9 @@ class Source:
     metadata
         Metadata stated by the operator.
     stale
-        What is gone or was replaced since the results were written.
+        Inputs that are gone or were replaced since the results were written.
     doubts
-        What the report's reader must know of what was not found.
+        Warnings about inputs that were not found.
     """
 
     files: dict[int, Path]
@@ -107,7 +107,7 @@ class Source:
 
 
 def find_source(
-    place: Path,
+    origin: Path,
     *,
     test: str | None = None,
     analysis: str | None = None,
@@ -118,10 +118,10 @@ def find_source(
 
     Parameters
     ----------
-    place
+    origin
         A data folder, a test's folder, an analysis' folder, or what ``stereorig measure --out`` wrote.
     test, analysis
-        Which of a data folder's tests, and of a test's analyses; left out: the only test, the newest analysis with
+        One of a data folder's tests, and of a test's analyses; left out: the only test, the newest analysis with
         results.
     calibration
         Its file, where it is not beside the results.
@@ -137,7 +137,7 @@ def find_source(
     FileFormatError
         A result file that cannot be read, metadata that cannot be.
     """
-    folder = _results_folder(place, test, analysis)
+    folder = _results_folder(origin, test, analysis)
     files = {number_of(path): path for path in results_in(folder)}
     if not files:
         raise InputError(
@@ -170,26 +170,26 @@ def find_source(
     )
 
 
-def _results_folder(place: Path, test: str | None, analysis: str | None) -> Path:
-    if not place.is_dir():
-        raise InputError(f"{place} is no folder.", code="results_missing", remedy="Give a folder with results.")
-    if (place / "tests").is_dir():
-        place = _one_test(place / "tests", test)
+def _results_folder(origin: Path, test: str | None, analysis: str | None) -> Path:
+    if not origin.is_dir():
+        raise InputError(f"{origin} is no folder.", code="results_missing", remedy="Give a folder with results.")
+    if (origin / "tests").is_dir():
+        origin = _one_test(origin / "tests", test)
     elif test is not None:
         raise InputError(
-            f"{place} is no data folder, so it has no test {test}.",
+            f"{origin} is no data folder, so it has no test {test}.",
             code="option_conflict",
             remedy="Give the data folder, or leave the test out.",
         )
-    if (place / "steps").is_dir():
-        return _one_analysis(place, analysis)
-    if analysis is not None and place.name != analysis:
+    if (origin / "steps").is_dir():
+        return _one_analysis(origin, analysis)
+    if analysis is not None and origin.name != analysis:
         raise InputError(
-            f"{place} is no test's folder, so it has no analysis {analysis}.",
+            f"{origin} is no test's folder, so it has no analysis {analysis}.",
             code="option_conflict",
             remedy="Give the test's folder, or leave the analysis out.",
         )
-    return place
+    return origin
 
 
 def _one_test(tests: Path, wanted: str | None) -> Path:
@@ -243,5 +243,5 @@ def _calibration(
             )
         doubts.append(f"{path.name} is not the calibration that was measured with; nothing is reported from it.")
     if given is not None:
-        load_calibration(given)  # says what is wrong with it
+        load_calibration(given)  # raises the error that names the defect
     return None, None

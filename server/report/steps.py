@@ -32,7 +32,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class StepFigures:
-    """What the tables say of one step.
+    """Figures of one step in the tables.
 
     Attributes
     ----------
@@ -43,9 +43,9 @@ class StepFigures:
     summary, strain
         As :func:`summarise` and :func:`summarise_strain` make them.
     skew_ms, quality
-        Of the pair of images; None where nobody recorded them.
+        Of the pair of images; None where they were not recorded.
     static
-        Whether it counts as static.
+        True if it counts as static.
     """
 
     n: int
@@ -62,7 +62,7 @@ class StepFigures:
 
     @property
     def min_zncc(self) -> float | None:
-        """Smallest of the comparisons' medians."""
+        """Minimum of the comparisons' medians."""
         return min((v for v in self.summary.zncc_median.values() if v is not None), default=None)
 
     @property
@@ -73,7 +73,7 @@ class StepFigures:
 
     @property
     def max_displacement_mm(self) -> float | None:
-        """Largest component of any point's displacement; None for a shape."""
+        """Maximum component of any point's displacement; None for a shape."""
         moved = self.summary.displacement_mm or {}
         ends = [abs(v) for component in moved.values() if component for v in (component.min, component.max)]
         return max(ends) if ends else None
@@ -81,7 +81,7 @@ class StepFigures:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Everything that the result files tell.
+    """Content of the result files.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Measured:
     floor
         By quantity; empty without static steps.
     static, static_how, static_left_out
-        Which steps the floor is from, how they are known, and which did not fit into memory.
+        Steps of the floor, the source that names them, and the steps that did not fit into memory.
     reported
         Median of the predicted standard deviations by quantity, of the first displacement or else of the shape.
     noise_grey
@@ -113,7 +113,7 @@ class Measured:
 
     @property
     def quantities(self) -> list[Quantity]:
-        """What is known of the noise of each quantity."""
+        """Return the noise of each quantity, as far as it is known."""
         return [
             Quantity(name, self.floor.get(name), self.reported.get(name))
             for name in (*LENGTHS, *STRAINS)
@@ -122,7 +122,7 @@ class Measured:
 
     @property
     def loaded(self) -> bool:
-        """Whether any step has a load."""
+        """Return True if any step has a load."""
         return any(s.load_n is not None for s in self.steps)
 
     @property
@@ -173,7 +173,7 @@ def read_steps(source: Source) -> Measured:
         last = Shown(n, "the last step", field, strain)
         size = abs(loads[n] or 0.0) if by_load else step.max_displacement_mm
         if size is not None and size > height:
-            why = "the step of the highest load" if by_load else "the step of the largest displacement"
+            why = "the step of maximum load" if by_load else "the step of maximum displacement"
             height, peak = size, Shown(n, why, field, strain)
     assert reference is not None
     shown = [s for s in (peak, last) if s is not None]
@@ -228,7 +228,7 @@ def _seconds(source: Source, n: int) -> float | None:
     """Time since the reference, by the host's monotonic clock where both have it, else by the wall clock."""
     one, two = source.reference_step, source.steps[n]
     if "import" in (one.source, two.source):
-        return None  # when a file was imported says nothing of when it was taken
+        return None  # the time of an import is not the time of the exposure
     begin, end = one.host_monotonic_ns, two.host_monotonic_ns
     # the clock begins anew with the machine: only what also agrees with the order of the steps is used
     if begin is not None and end is not None and (end - begin) * (n - source.reference) >= 0:

@@ -19,7 +19,7 @@ from server.results.steps import read_step
 
 @dataclass(frozen=True)
 class EpipolarComparison:
-    """The epipolar residuals of two calibrations over the points of a result, whose file's name stands first."""
+    """The epipolar residuals of two calibrations over the points of a result, whose file's name comes first."""
 
     results: str
     measured_with: Residual
@@ -32,11 +32,11 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
     Parameters
     ----------
     loaded
-        The calibration to look at.
+        The calibration to check.
     files
         Result files; the first is read.
     measured_with
-        The calibration that they were measured with, which says where camera 2 saw each point.
+        The calibration that they were measured with, which gives each point's position in camera 2.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
 
 
 def _visible_in_camera2(pair: StereoPair, xy1: Float, xyz_mm: Float, offset_px: Float) -> Float:
-    """Where camera 2 saw the points: beside the epipolar line by the offset that was measured."""
+    """Positions of the points in camera 2: off the epipolar line by the offset that was measured."""
     on_line = pair.cam2.project(xyz_mm).xy
     h = 0.01
     gradient = np.stack(

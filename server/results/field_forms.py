@@ -85,7 +85,7 @@ class FieldPart:
     rows, cols
         Indices of its rows and columns in the whole grid.
     position
-        Gives (r, c) of ``x_px`` or ``y_px``: where the points lie in camera 1's reference image.
+        Gives (r, c) of ``x_px`` or ``y_px``: the points' positions in camera 1's reference image.
     """
 
     name: str
@@ -97,7 +97,7 @@ class FieldPart:
 
     @property
     def headers(self) -> dict[str, str]:
-        """What a reader of plain bytes must know."""
+        """Headers that describe the plain bytes."""
         return {
             "X-Shape": ",".join(str(n) for n in self.values.shape),
             "X-Units": self.variable.units,
@@ -180,7 +180,7 @@ def _csv(part: FieldPart) -> bytes:
 
 
 def _netcdf(part: FieldPart) -> bytes:
-    """Return a NetCDF-4 file with the variable, its place in the grid and in the image."""
+    """Return a NetCDF-4 file with the variable, its indices in the grid and its positions in the image."""
     pixels = {of: part.position(of) for of in ("x_px", "y_px")}
 
     def fill(data: Any) -> None:

@@ -1,7 +1,7 @@
-"""Metadata of a test that no device knows: lenses, light, pattern, specimen, purpose.
+"""Metadata of a test that no device reports: lenses, light, pattern, specimen, purpose.
 
-Nothing here is measured or guessed. A fact that was not stated is None, and a report lists it as not stated. Those of
-cameras and lenses come from the rig file and are kept with every captured step; those of a test go before them.
+Nothing here is measured or guessed. An entry that was not stated is None, and a report lists it as not stated. Those of
+cameras and lenses come from the rig file and are kept with every captured step; those of a test take precedence.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class TestMetadata(ClosedMetadata):
     purpose: Text | None = Field(None, description="What the test is for.")
     laboratory: Text | None = Field(None, description="Laboratory, address.")
     operator: Text | None = Field(None, description="Who ran it.")
-    specimen: Text | None = Field(None, description="The specimen; in place of the test's own field of that name.")
+    specimen: Text | None = Field(None, description="The specimen; instead of the test's own field of that name.")
     material: Text | None = Field(None, description="Its material.", examples=["Aluminium 6061-T6"])
     loading: Text | None = Field(None, description="How it is loaded: machine, rate, control, load cell.")
     environment: Text | None = Field(None, description="Temperature, humidity, vibration.")
@@ -38,17 +38,17 @@ class TestMetadata(ClosedMetadata):
         None, description="How the pattern was applied.", examples=["matt white ground, black spray paint"]
     )
     pattern_feature_mm: Above | None = Field(
-        None, description="Size of the pattern's features as the operator knows it; a report measures it besides."
+        None, description="Size of the pattern's features as stated by the operator; a report measures it besides."
     )
     pattern_feature_method: Text | None = Field(
-        None, description="How the operator knows pattern_feature_mm.", examples=["stamp of 0.18 mm dots"]
+        None, description="Source of pattern_feature_mm.", examples=["stamp of 0.18 mm dots"]
     )
     standoff_mm: Above | None = Field(
         None, description="Distance from the lens to the specimen by a ruler; a report computes the pinhole's besides."
     )
     frame_rate_hz: Above | None = Field(None, description="Rate at which the images were taken.")
-    exposure_ms: Above | None = Field(None, description="Exposure of both cameras, where their records do not say it.")
-    cam1: CameraMetadata | None = Field(None, description="Camera 1; goes before what the rig file says.")
+    exposure_ms: Above | None = Field(None, description="Exposure of both cameras, where their records do not have it.")
+    cam1: CameraMetadata | None = Field(None, description="Camera 1; takes precedence over the rig file.")
     cam2: CameraMetadata | None = Field(None, description="Camera 2.")
     static_steps: list[StepNumber] | None = Field(
         None,
@@ -60,7 +60,7 @@ class TestMetadata(ClosedMetadata):
     notes: Annotated[str, StringConstraints(max_length=20_000)] | None = Field(None, description="Anything else.")
 
     def camera(self, cam: str) -> CameraMetadata | None:
-        """Facts of one camera."""
+        """Return the metadata of one camera."""
         return self.cam1 if cam == "cam1" else self.cam2
 
     def document(self) -> dict[str, object]:
@@ -69,7 +69,7 @@ class TestMetadata(ClosedMetadata):
 
 
 def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata:
-    """Read facts.
+    """Validate metadata.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata
             f"{name}: {where}: {first['msg']}.",
             code="metadata_invalid",
             field=where,
-            remedy="Correct it; docs/how_to/report.md lists what can be stated.",
+            remedy="Correct it; docs/how_to/report.md lists the entries.",
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Where the points of a result lie in a step's own image."""
+"""Positions of a result's points in a step's own image."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Pictures for people: 8-bit previews, and maps that are laid over an image.
+"""8-bit previews of images, and maps that are laid over an image.
 
 A preview is not the measurement's image: grey levels are brought to 8 bit and it may be smaller. Maps are transparent
-where they have nothing to say.
+where they have no value.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Overlay:
     png
         RGBA image; the page stretches it over the camera's image.
     legend
-        One line for people.
+        One line of text.
     """
 
     png: bytes
@@ -54,12 +54,12 @@ def preview(pixels: NDArray[Any], full_scale: float, width_px: int | None = None
 
 
 def saturation_map(pixels: NDArray[Any], full_scale: float) -> Overlay:
-    """Mark pixels at full scale in red, each a little widened so that single ones are seen."""
+    """Mark pixels at full scale in red, each a little widened so that single ones are visible."""
     clipped = pixels >= full_scale
     share = float(np.mean(clipped))
-    seen = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    marked = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rgba = np.zeros((*pixels.shape, 4), np.uint8)
-    rgba[seen] = (255, 0, 40, 230)
+    rgba[marked] = (255, 0, 40, 230)
     return Overlay(_rgba_png(rgba), f"red: at full scale, {100 * share:.3g} % of the image")
 
 
@@ -71,15 +71,15 @@ def predicted_error_px(pixels: NDArray[Any], full_scale: float, subset_px: int) 
     pixels
         Image (rows, cols).
     full_scale
-        Largest grey level.
+        Maximum grey level.
     subset_px
         Width of the subset.
 
     Returns
     -------
     ndarray
-        Error in px for noise of `NOISE_SHARE`, of subsets about ``max(rows, cols) / 64`` apart; infinite where
-        nothing is to be seen.
+        Error in px for noise of `NOISE_SHARE`, of subsets about ``max(rows, cols) / 64`` apart; infinite where there is
+        no texture.
     """
     pitch = max(max(pixels.shape) // _TILES_ACROSS, 1)
     y, x = np.mgrid[tuple(slice(1 + pitch // 2, size - 1, pitch) for size in pixels.shape)]

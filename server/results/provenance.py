@@ -1,4 +1,4 @@
-"""Where a step's numbers come from, as every export says it."""
+"""Provenance of a step's numbers, as every export states it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from server.results.steps import Source, StepResult
 
 
 def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, object]:
-    """Return what every export says: software, frame, settings, calibration, inputs; values are plain.
+    """Return the provenance that every export states: software, frame, settings, calibration, inputs; values are plain.
 
     Parameters
     ----------
     path
-        The result file, to say its checksum.
+        The result file, whose checksum is stated.
     """
     recorded = step.attributes
     document: dict[str, object] = {
@@ -48,13 +48,13 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
 
 
 def calibration_of(step: StepResult) -> str | None:
-    """Return the SHA-256 of the calibration that a step was measured with; None where the file does not say."""
+    """Return the SHA-256 of the calibration that a step was measured with; None where the file does not state it."""
     inputs = _json(step, "inputs_sha256")
     return inputs.get("calibration")
 
 
 def notes_of(step: StepResult, source: Source) -> list[str]:
-    """Return the few lines that a picture says of its provenance."""
+    """Return the lines that state a picture's provenance."""
     settings, strain = _json(step, "settings"), _json(step, "strain")
     parts = [
         f"{name} {settings[key]}{unit}"

@@ -58,7 +58,7 @@ def gradients(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
-    """Judge one image (rows, cols)."""
+    """Rate one image (rows, cols)."""
     full = float(2**bit_depth - 1)
     a = pixels.astype(np.float32)
     mean, contrast = float(a.mean()), float(a.std())

@@ -73,7 +73,7 @@ def read_variable(path: Path, name: str) -> Variable:
 
 @dataclass(frozen=True)
 class VariableHead:
-    """What there is to know of a variable without its values.
+    """Description of a variable, without its values.
 
     Attributes
     ----------
@@ -144,7 +144,8 @@ class ViewResiduals:
     Attributes
     ----------
     found_px, residual_px
-        Rows of lines of pairs: where each intersection was found, and measured minus projected place; None: not seen.
+        Rows of lines of pairs: where each intersection was found, and measured minus projected position; None: not
+        found.
     """
 
     name: str
@@ -162,10 +163,10 @@ def read_residuals(path: Path) -> list[ViewResiduals]:
     """Return a calibration's residuals, view by view."""
     with opened(path) as data:
         found, residual = data.variables["found_px"][...], data.variables["residual_px"][...]
-        facts = json.loads(data.getncattr("views"))
+        view_records = json.loads(data.getncattr("views"))
     return [
-        ViewResiduals(**fact, found_px=_number(xy), residual_px=_number(r))
-        for fact, xy, r in zip(facts, found, residual, strict=True)
+        ViewResiduals(**record, found_px=_number(xy), residual_px=_number(r))
+        for record, xy, r in zip(view_records, found, residual, strict=True)
     ]
 
 

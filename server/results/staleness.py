@@ -1,4 +1,4 @@
-"""Whether results still belong to what lies beside them: inputs that are gone or were replaced since make them stale.
+"""Staleness of results: their inputs are gone or were replaced since.
 
 A result file holds the SHA-256 of everything it was made from. Files that have not been touched since their step was
 committed are not read again.
@@ -26,7 +26,7 @@ def stale_inputs(
     calibration_sha256: str | None,
     reference: int,
 ) -> list[str]:
-    """Return what is gone or differs in a test's folder from what an analysis was made of; empty: it stands.
+    """Return the inputs of an analysis that are gone from a test's folder or differ in it; empty: it is up to date.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[st
     files
         Result files of one measurement.
     heads
-        What each says of itself.
+        Attributes of each.
     """
     folder = files[0].absolute().parent
     summary = current_summary(known_json(folder / "summary.json"))
@@ -81,7 +81,7 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[st
     elif isinstance(summary.get("calibration"), dict):
         calibration = Path(str(summary["calibration"].get("file")))
         if test is not None and calibration.name == "calibration.json" and calibration.parent.name == test.name:
-            calibration = test / "calibration.json"  # whatever folder the measurement was started from
+            calibration = test / "calibration.json"  # independent of the folder that the measurement was started from
         elif not calibration.is_absolute() and not calibration.is_file():
             calibration = None
     sha256 = heads[0].inputs_sha256.get("calibration")
@@ -119,7 +119,7 @@ def _changed(path: Path, sha256: str | None, what: str) -> list[str]:
 
 
 def _touched_after(image: Path, mark: Path) -> bool:
-    """Whether an image's inode changed after its step was committed, which comes last; nobody can set that time."""
+    """Return True if an image's inode changed after its step was committed; no program can set that time."""
     return image.stat().st_ctime_ns > mark.stat().st_ctime_ns
 
 

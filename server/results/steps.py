@@ -64,30 +64,30 @@ class StepResult:
 
     @property
     def label(self) -> str:
-        """What the user called the step."""
+        """The step's label, given by the user."""
         return str(self.attributes.get("label", ""))
 
 
 @dataclass(frozen=True)
 class Source:
-    """Results to export, and what is known about where they come from.
+    """Results to export, and their provenance.
 
     Attributes
     ----------
     files
         Result files of one measurement, by step.
     name
-        What names of files start with.
+        Prefix of the files' names.
     title
-        For people: the test's name.
+        The test's name.
     image
         Camera 1's reference image, where it is known.
     about
-        Further facts for every export: ids of test, analysis and calibration.
+        Further entries for every export: ids of test, analysis and calibration.
     mask
-        The image that says where points may lie, where there was one.
+        Mask of the points, where there was one.
     stale_reasons
-        What is gone or was replaced since they were measured.
+        Inputs that are gone or were replaced since they were measured.
     """
 
     files: Sequence[Path]
@@ -100,7 +100,7 @@ class Source:
 
 
 def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
-    """Return the result files of the steps asked for; all without a wish.
+    """Return the result files of the steps asked for; all if none are named.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def read_step(path: Path, names: Sequence[str] | None = None, *, always: Sequenc
     names
         Variables to read; those of ``always`` are read in any case. None: all over the grid of points.
     always
-        What the form needs: places and status.
+        Variables that the form needs: positions and status.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | Non
 
 
 def require_known(files: Sequence[Path], names: Sequence[str] | None) -> None:
-    """Refuse a variable that no file has.
+    """Raise an error for a variable that no file has.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def require_known(files: Sequence[Path], names: Sequence[str] | None) -> None:
     there = [set(variables_of(path)) for path in files] if names else []
     for name in names or ():
         if not any(name in found for found in there):
-            read_step(files[-1], [name])  # says which there are
+            read_step(files[-1], [name])  # the error names those that there are
 
 
 def variables_of(path: Path) -> list[str]:
@@ -218,7 +218,7 @@ def variables_of(path: Path) -> list[str]:
 
 
 def require_same_grid(step: StepResult, first: StepResult) -> None:
-    """Refuse steps that lie on different grids of points.
+    """Raise an error for steps that have different grids of points.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def require_same_grid(step: StepResult, first: StepResult) -> None:
 
 
 def columns_of(step: StepResult) -> dict[str, Variable]:
-    """Return a step's variables with one number a point each: comparisons apart, without covariance matrices."""
+    """Return a step's variables with one number a point each: comparisons separate, without covariance matrices."""
     flat: dict[str, Variable] = {}
     for name, variable in step.variables.items():
         values = variable.values

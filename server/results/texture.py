@@ -1,4 +1,4 @@
-"""Whether a texture carries a measurement: the random error that subsets of a region may be expected to have."""
+"""Speckle quality of a region, rated by SSSIG: the random error to expect of its subsets."""
 
 from __future__ import annotations
 
@@ -73,15 +73,15 @@ class SubsetShare:
 
 
 @dataclass(frozen=True)
-class TextureVerdict:
-    """How a region's texture carries subsets of a width, and which width would do.
+class SpeckleQuality:
+    """Speckle quality of a region for subsets of a width, and the width to choose.
 
     Attributes
     ----------
     subset_px, subsets
-        Width that was asked about, and how many subsets were looked at.
+        Width that is rated, and the number of subsets.
     noise_grey
-        Standard deviation of the noise that was reckoned with.
+        Standard deviation of the noise that was assumed.
     level
         ``good``, ``usable`` or ``poor``.
     median_error_px
@@ -89,7 +89,7 @@ class TextureVerdict:
     good_share, usable_share, good_px, usable_px
         Shares of the subsets whose error stays below the limits, and these.
     proposed_subset_px
-        Smallest width that would do; None: none would.
+        Minimum width that suffices; None: none does.
     sizes
         The shares of other widths.
     """
@@ -107,19 +107,19 @@ class TextureVerdict:
     sizes: list[SubsetShare]
 
 
-def texture_verdict(
+def speckle_quality(
     pixels: NDArray[Any], full_scale: float, xy_px: NDArray[np.float64], subset_px: int, noise_grey: float | None = None
-) -> TextureVerdict:
-    """Say how a region's texture carries subsets of this width, and which width would do.
+) -> SpeckleQuality:
+    """Rate a region's texture for subsets of this width, and propose a width.
 
     Parameters
     ----------
     pixels, full_scale
-        Image and its largest grey level.
+        Image and its maximum grey level.
     xy_px
         (n, 2) centres of the subsets.
     subset_px
-        Width that is asked about.
+        Width to rate.
     noise_grey
         Standard deviation of the noise; `NOISE_SHARE` of full scale where not known.
     """
@@ -137,7 +137,7 @@ def texture_verdict(
     if own.good_share < ENOUGH:
         level = "usable" if own.usable_share >= ENOUGH else "poor"
     median = float(np.median(errors[subset_px]))
-    return TextureVerdict(
+    return SpeckleQuality(
         subset_px=subset_px,
         subsets=len(xy_px),
         noise_grey=noise,

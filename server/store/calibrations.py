@@ -1,7 +1,7 @@
 """Calibrations on disk: the plan, the views as taken, the result.
 
 ``plan.json`` is written first, ``view.json`` when every view is there, ``calibration.json`` last: only a folder that
-holds it is a calibration. What a verdict refused lies in ``rejected.json`` in its place.
+holds it is a calibration. A calibration that failed its verdict is kept as ``rejected.json`` instead.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class CalibrationStore:
     def read(self, calibration_id: str) -> CalibrationRecord:
         """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``).
 
-        One that failed its verdict has the result that was refused.
+        One that failed its verdict has the rejected result.
         """
         path = self.path(calibration_id)
         document: dict[str, object] = {
@@ -103,11 +103,11 @@ class CalibrationStore:
             require_recorded(
                 path / "calibration.json", f"calibration {calibration_id}", f"calibrations/{calibration_id}"
             )
-            # a file from elsewhere may hold anything; what the service itself says comes last
+            # a file from elsewhere may hold anything; the service's own entries come last
             document = {**read_json(path / "calibration.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
-            if (path / REJECTED).exists():  # what its verdict refused is there to be looked at
+            if (path / REJECTED).exists():  # a rejected calibration is kept for inspection
                 document = {**read_json(path / REJECTED), **document}
         kept = next((path / name for name in _REVIEWS if (path / name).exists()), None)
         review = {} if kept is None else read_json(kept)

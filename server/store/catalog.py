@@ -1,7 +1,7 @@
 """The catalogue: an index of the data folder and the table of jobs, in SQLite.
 
-One thread writes, everyone else asks it. WAL and ``synchronous=FULL``: a job that was acknowledged is on disk. The
-index of calibrations, tests, steps and analyses can be lost at any time; it is rebuilt from the folders.
+One thread writes for all others. WAL and ``synchronous=FULL``: a job that was acknowledged is on disk. The index of
+calibrations, tests, steps and analyses can be lost at any time; it is rebuilt from the folders.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state);
 class Catalog:
     """``catalog.sqlite`` with its one writer thread.
 
-    A file that SQLite cannot read is set aside (``catalog.corrupt-<n>.sqlite``) and begun anew; ``was_reset`` says so.
+    A file that SQLite cannot read is quarantined (``catalog.corrupt-<n>.sqlite``) and begun anew; ``was_reset`` is then
+    True.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,7 +125,7 @@ class Catalog:
         """Run ``function`` in a transaction on the writer thread, and wait for its commit."""
         future: Future[T] = Future()
         self._work.put((function, future))
-        # a disk that is busy for so long still commits; giving up would leave unknown what came of it
+        # a disk that is busy for so long still commits; giving up would leave the outcome unknown
         while not wait([future], timeout=_PATIENCE_S).done and self.alive:
             _log.warning("The catalogue has not committed for %.0f s: the disk is slow.", _PATIENCE_S)
         if not future.done():
@@ -133,7 +134,7 @@ class Catalog:
 
     @property
     def alive(self) -> bool:
-        """Whether the writer runs."""
+        """Return True if the writer runs."""
         return self._thread.is_alive()
 
     def close(self) -> None:

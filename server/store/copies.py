@@ -1,4 +1,4 @@
-"""Acknowledgement that a copy of a test lies elsewhere: kept with the test, for whoever frees room by hand."""
+"""Acknowledgement that a copy of a test exists elsewhere: kept with the test, for operators who free space by hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from server.store.tests import TestStore
 
 @dataclass(frozen=True)
 class Content:
-    """What there is of a test to copy: complete steps, result files, and the SHA-256 of all their checksums."""
+    """The parts of a test to copy: complete steps, result files, and the SHA-256 of all their checksums."""
 
     steps: int
     results: int
@@ -36,7 +36,7 @@ def content_of(tests: TestStore, test_id: str) -> Content:
 
 
 def acknowledge_export(tests: TestStore, test_id: str, *, steps: int, results: int, by: str) -> dict[str, object]:
-    """Keep with the test that a copy of it lies elsewhere; return what was kept.
+    """Record with the test that a copy of it exists elsewhere; return the record.
 
     Raises
     ------

@@ -1,6 +1,7 @@
 """Documents that the data folder keeps, as they are read: lenient, so that older and hand-copied folders stay readable.
 
-What a document lacks is missing; what a later version added is kept. Replies of the API derive from these.
+Entries that a document lacks are missing; those that a later version added are kept. Replies of the API derive from
+these.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from server.formats.records import Record
 
 
 class Progress(Document):
-    """How far a job is."""
+    """Progress of a job."""
 
     stage: str = Field(description="What it is doing.", examples=["views"])
     done: int = Field(description="Units done in this stage.")
@@ -47,14 +48,14 @@ class JobRecord(Document):
 
 
 class StepOutcome(Document):
-    """What was found in one step of an analysis; see :class:`server.formats.results.summary.StepSummary`."""
+    """Summary of one step of an analysis; see :class:`server.formats.results.summary.StepSummary`."""
 
     n: int
     wall_s: float | None = None
 
 
 class Finished(Document):
-    """What a job has measured so far of an analysis."""
+    """Steps of an analysis that a job has measured so far."""
 
     steps: list[StepOutcome] = Field(default_factory=list)
     steps_failed: dict[str, JobProblem] = Field(default_factory=dict)
@@ -77,7 +78,7 @@ class Kept(Document):
 
 
 class BurstIndex(Document):
-    """Where a step stands in its burst."""
+    """Index of a step in its burst."""
 
     job_id: str
     index: int
@@ -96,7 +97,7 @@ class Watched(Document):
 
 
 class StepMetadata(Kept):
-    """What the client said of a step, and what it was taken for."""
+    """A step's metadata: the client's entries, and the reason for taking it."""
 
     label: str | None = None
     load_n: float | None = None
@@ -108,7 +109,7 @@ class StepMetadata(Kept):
 
 
 class PairQuality(Document):
-    """What a pair of images is worth."""
+    """Quality of a pair of images."""
 
     code: str | None = None
 
@@ -209,7 +210,7 @@ class Failure(JobProblem):
 
 
 class MadeRecord(Document):
-    """A calibration or noise measurement as its folder tells of it: what was found stands beside these fields."""
+    """A calibration or noise measurement as its folder has it: results are beside these fields."""
 
     id: str
     state: Literal["unfinished", "failed", "complete"]
@@ -218,7 +219,7 @@ class MadeRecord(Document):
 
 
 class Decided(Document):
-    """``review.json``: what somebody decided on a calibration."""
+    """``review.json``: an operator's decision on a calibration."""
 
     decision: str | None = None
     note: str | None = None
@@ -264,7 +265,7 @@ class TrashEntry(Record, Document):
     analysis_id: str | None = Field(None, description="Id of an analysis.")
     calibration_id: str | None = Field(None, description="Id of a calibration.")
     noise_id: str | None = Field(None, description="Id of a noise measurement.")
-    name: str = Field("", description="As people called it.")
+    name: str = Field("", description="Its name, as users gave it.")
     deleted_utc: str | None = Field(None, description="When it was deleted.")
     deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
     why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")

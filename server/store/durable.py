@@ -1,7 +1,7 @@
 """Files that survive a kill at any instant.
 
-Every document of the data folder comes into being here: written aside in its own folder, fsynced, renamed, and the
-folder fsynced (:mod:`server.formats.files`). Whoever finds a file under its real name finds all of it.
+Every document of the data folder comes into being here: written under a temporary name in its own folder, fsynced,
+renamed, and the folder fsynced (:mod:`server.formats.files`). A file under its real name is complete.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def write_bytes(path: Path, data: bytes, *, checksum: bool = False) -> str:
 
 
 def write_json(path: Path, document: Any, *, checksum: bool = False) -> None:
-    """Write a JSON document durably, with its checksum beside it if wanted; NaN has no place in it and becomes null."""
+    """Write a JSON document durably, with its checksum beside it if wanted; NaN becomes null."""
     text = json.dumps(without_nan(document), indent=1, ensure_ascii=False, allow_nan=False)
     write_bytes(path, text.encode() + b"\n", checksum=checksum)
 
@@ -75,7 +75,7 @@ def record_of(kind: type[Record], document: object, path: Path) -> Record:
     Raises
     ------
     FileFormatError
-        If it says what cannot be, naming the file and the field.
+        If an entry is invalid, naming the file and the field.
     """
     try:
         return kind.model_validate(document)

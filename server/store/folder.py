@@ -22,17 +22,17 @@ _ID = re.compile(r"[a-z]\d{6}-[0-9a-f]{6}")
 
 
 def now_utc() -> str:
-    """Wall-clock time for people, ISO 8601 in UTC; order never depends on it."""
+    """Wall-clock time for display, ISO 8601 in UTC; order never depends on it."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def is_id(text: str, letter: str) -> bool:
-    """Whether ``text`` has the form of an id that this service makes; nothing else ever becomes a path."""
+    """Return True if ``text`` has the form of an id that this service makes; nothing else ever becomes a path."""
     return text.startswith(letter) and _ID.fullmatch(text) is not None
 
 
 def check_format(path: Path) -> None:
-    """Refuse the ``format.json`` of a newer version.
+    """Raise an error for the ``format.json`` of a newer version.
 
     Raises
     ------
@@ -42,20 +42,20 @@ def check_format(path: Path) -> None:
     found = read_json(path).get("format")
     if not isinstance(found, int) or isinstance(found, bool) or found > FORMAT:
         raise FileFormatError(
-            f"The data folder has format {found}, this version knows up to {FORMAT}.",
+            f"The data folder has format {found}, this version reads up to {FORMAT}.",
             code="data_format_newer",
             remedy="Use the version that wrote it, or a newer one.",
         )
 
 
 class IdMaker:
-    """Ids that sort in the order of their making, whatever the clock does: a counter and six random digits."""
+    """Ids that sort in the order of their making, independent of the clock: a counter and six random digits."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._last: dict[str, int] = {}
 
-    def seen(self, name: str) -> None:
+    def reserve(self, name: str) -> None:
         """Take note of an id that exists."""
         with self._lock:
             self._last[name[0]] = max(self._last.get(name[0], 0), int(name[1:7]))
@@ -105,21 +105,21 @@ class DataFolder:
 
     @property
     def calibrations(self) -> Path:
-        """Where calibrations live."""
+        """Folder of the calibrations."""
         return self.root / "calibrations"
 
     @property
     def tests(self) -> Path:
-        """Where tests live."""
+        """Folder of the tests."""
         return self.root / "tests"
 
     def require_room(self, reserve_mib: float) -> None:
-        """Refuse to begin something new while the disk is nearly full: what runs must still be able to end well.
+        """Raise an error for new work while the disk is nearly full: running work must still be able to end well.
 
         Raises
         ------
         StorageError
-            ``storage_full``, with what is left.
+            ``storage_full``, with the space that is left.
         """
         free_mib = self.free_mib()
         if free_mib < reserve_mib:
@@ -158,7 +158,7 @@ class DataFolder:
         if not _keeps_out(path):
             file.close()
             raise StorageError(
-                f"The data folder {self.root} cannot be used: a lock there keeps nobody else out.",
+                f"The data folder {self.root} cannot be used: a lock there does not keep others out.",
                 code="data_folder_unusable",
                 remedy="Give a folder on a local disk with --data.",
             )
@@ -170,7 +170,7 @@ class DataFolder:
     def _probe(self) -> None:
         probe = self.root / ".probe"
         try:
-            for content in (b"once", b"twice"):  # a rename must replace what is there
+            for content in (b"once", b"twice"):  # a rename must replace an existing file
                 write_bytes(probe, content)
                 if probe.read_bytes() != content:
                     raise StorageError("A file that was renamed is not there.")
@@ -188,7 +188,7 @@ class DataFolder:
         check_format(path)
 
     def _remove_temporaries(self) -> None:
-        # what a kill left half written; only names that `written_temporary` makes
+        # files that a kill left half written; only names that `written_temporary` makes
         for folder, _, names in os.walk(self.root):  # a start goes through all folders: rglob takes twice as long
             for name in names:
                 if name.startswith(".") and name.endswith(".part"):
@@ -202,13 +202,13 @@ class DataFolder:
 
 
 def is_in_use(root: Path) -> bool:
-    """Whether a service runs on a data folder."""
+    """Return True if a service runs on a data folder."""
     path = root / "service.lock"
     return path.exists() and _keeps_out(path)
 
 
 def _keeps_out(path: Path) -> bool:
-    """Whether a lock that is held is felt by others."""
+    """Return True if others are kept out by a lock that is held."""
     with path.open("rb") as other:
         try:
             fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)

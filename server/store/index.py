@@ -21,7 +21,7 @@ Entry = tuple[str, str, str, Mapping[str, object]]  # kind, parent, id, document
 
 
 def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, object]:
-    """What a list shows of a calibration."""
+    """A calibration's entry in a list."""
     made = store.read(calibration_id)
     return {
         "id": calibration_id,
@@ -34,24 +34,24 @@ def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str,
 
 
 def test_entry(test: TestRecord) -> dict[str, object]:
-    """What a list shows of a test."""
+    """A test's entry in a list."""
     return {name: getattr(test, name) for name in ("id", "name", "specimen", "calibration_id", "created_utc")}
 
 
 def step_entry(step: StepRecord) -> dict[str, object]:
-    """What a list shows of a step."""
+    """A step's entry in a list."""
     names = ("n", "label", "load_n", "timestamp_utc", "source", "captured_utc", "skew_ms")
     return {**{name: getattr(step, name) for name in names}, "quality": step.quality_code}
 
 
 def analysis_entry(analysis: AnalysisRecord, job_id: str | None = None) -> dict[str, object]:
-    """What a list shows of an analysis, and of the last job that worked on it."""
+    """Entry of an analysis in a list, with the last job that worked on it."""
     names = ("id", "kind", "label", "created_utc")
     return {**{name: getattr(analysis, name) for name in names}, "job_id": job_id}
 
 
 def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: list[str]) -> list[Entry]:
-    """Everything that the index holds of a test; what cannot be read is left out and reported.
+    """Everything that the index holds of a test; documents that cannot be read are left out and reported.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def rebuild(
     tests: TestStore,
     noise: NoiseStore | None = None,
 ) -> list[str]:
-    """Make the index say what the folders hold; also take over ids, Idempotency-Keys and ended jobs found there.
+    """Make the index agree with the folders; also take over ids, Idempotency-Keys and ended jobs found there.
 
     Returns
     -------
@@ -112,10 +112,10 @@ def rebuild(
     trouble = _check_trash(folder)
     lost = LostJobs()
     for calibration_id in calibrations.ids():
-        folder.ids.seen(calibration_id)
+        folder.ids.reserve(calibration_id)
         try:
             if calibrations.read(calibration_id).state == "unfinished":
-                # nobody works on it any more: the job that did ended with the last service
+                # no job works on it any more: the job that did ended with the last service
                 calibrations.put_failure(calibration_id, problem_of(RESTART).plain())
             lost.calibration(calibrations.read(calibration_id))
             entries.append(("calibration", "", calibration_id, calibration_entry(calibrations, calibration_id)))
@@ -128,27 +128,27 @@ def rebuild(
             except (FileFormatError, KeyError) as error:
                 trouble.append(f"noise measurement {noise_id}: {error}")
     for test_id in tests.ids():
-        folder.ids.seen(test_id)
+        folder.ids.reserve(test_id)
         found = entries_of_test(tests, test_id, lost, trouble)
         entries += found
         for kind, _, name, _ in found:
             if kind == "analysis":
-                folder.ids.seen(name)
+                folder.ids.reserve(name)
     lost.restore(catalog, folder.ids)
     return catalog.replace_entries(entries) + trouble
 
 
 def _check_trash(folder: DataFolder) -> list[str]:
-    """Put the trash in order; what lies there keeps its ids."""
+    """Put the trash in order; its entries keep their ids."""
     trash = Trash(folder.root)
     done = trash.tidy()
     for trash_id in trash.ids():
-        folder.ids.seen(trash_id)
+        folder.ids.reserve(trash_id)
         try:
             ids = trash.entry(trash_id).plain()
         except (FileFormatError, NotFoundError):
-            continue  # `stereorig verify` and the list of the trash say so
+            continue  # `stereorig verify` and the list of the trash report it
         for name, letter in (("test_id", "t"), ("analysis_id", "a"), ("calibration_id", "c"), ("noise_id", "n")):
             if is_id(str(ids.get(name)), letter):
-                folder.ids.seen(str(ids[name]))
+                folder.ids.reserve(str(ids[name]))
     return done

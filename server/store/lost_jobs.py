@@ -1,7 +1,7 @@
-"""What the folders know of jobs and requests, for a catalogue that was lost, or did not have them yet when a kill came.
+"""Jobs and requests as the folders have them, for a catalogue that was lost, or did not have them yet at a kill.
 
-Whatever a job makes bears the job's id and the Idempotency-Key that asked for it. From there both are known again:
-a client that sends its request once more gets what it made, with its job as it ended.
+Everything that a job makes bears the job's id and the Idempotency-Key that asked for it. Both are recovered from there:
+a client that repeats its request gets the result of the first, with its job as it ended.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class LostJobs:
         result: Mapping[str, object] | None,
         problem: JobProblem | None,
     ) -> None:
-        if not is_id(job_id, "j"):  # a folder from elsewhere may say anything
+        if not is_id(job_id, "j"):  # a folder from elsewhere may hold anything
             return
         known_problem = None if problem is None else JobProblem.model_validate(problem.plain())
         if state != "succeeded" and known_problem is None:
@@ -118,11 +118,11 @@ class LostJobs:
             self.made(first.request, {**subject, "job_id": job_id})
 
     def restore(self, catalog: Catalog, ids: IdMaker) -> None:
-        """Add what the catalogue does not know."""
+        """Add the jobs and requests that the catalogue lacks."""
         self._end_bursts()
         known_jobs, known_keys = catalog.job_ids(), catalog.request_keys()
         for job_id in self._jobs:
-            ids.seen(job_id)
+            ids.reserve(job_id)
         catalog.restore(
             [document for job_id, document in self._jobs.items() if job_id not in known_jobs],
             [

@@ -27,12 +27,12 @@ class NoiseStore:
         self._folder = folder
 
     def end_unfinished(self) -> None:
-        """Take note of the ids that exist, and say of every unfinished measurement that it failed."""
+        """Take note of the ids that exist, and mark every unfinished measurement as failed."""
         for noise_id in self.ids():
-            self._folder.ids.seen(noise_id)
+            self._folder.ids.reserve(noise_id)
             with contextlib.suppress(FileFormatError):  # one that is damaged must not keep the service from starting
                 if self.read(noise_id).state == "unfinished":
-                    # nobody works on it any more: the job that did ended with the last service
+                    # no job works on it any more: the job that did ended with the last service
                     self.put_failure(noise_id, problem_of(RESTART).plain())
 
     @property
@@ -72,9 +72,11 @@ class NoiseStore:
         name = f"frames/{index:03d}_{cam}.tif"
         return {"camera": cam, "file": name, "sha256": write_bytes(self.path(noise_id) / name, encode_tiff(image))}
 
-    def put_frames_done(self, noise_id: str, frames: Sequence[Mapping[str, str]], facts: Mapping[str, object]) -> None:
+    def put_frames_done(
+        self, noise_id: str, frames: Sequence[Mapping[str, str]], entries: Mapping[str, object]
+    ) -> None:
         """Write ``frames.json``: every frame with camera and checksum, and the cameras' settings."""
-        write_json(self.path(noise_id) / "frames.json", {**facts, "frames": frames})
+        write_json(self.path(noise_id) / "frames.json", {**entries, "frames": frames})
 
     def put_failure(self, noise_id: str, problem: Mapping[str, object]) -> None:
         """Record why there are no models."""

@@ -1,4 +1,4 @@
-"""Putting a data folder in order: what a crash left is set aside, and the catalogue is made anew from the folders."""
+"""Repair of a data folder: leftovers of a crash are quarantined, the catalogue is made anew from the folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from server.store.verify import Verification, require_data_folder, verify
 
 @dataclass(frozen=True)
 class Repair:
-    """What was done, and what a look through the folder finds afterwards.
+    """The repairs, and the findings of a verification afterwards.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class Repair:
 
 
 def repair(root: Path) -> Repair:
-    """Set incomplete steps aside, remove what was half written, make the catalogue say what the folders hold.
+    """Quarantine incomplete steps, remove half-written files, make the catalogue agree with the folders.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def repair(root: Path) -> Repair:
         catalog = Catalog(folder.root / "catalog.sqlite").open()
         try:
             if catalog.was_reset:
-                done.append("the catalogue could not be read; it was set aside and begun anew")
+                done.append("the catalogue could not be read; it was quarantined and begun anew")
             NoiseStore(folder).end_unfinished()
             done += rebuild(catalog, folder, CalibrationStore(folder), tests)
         finally:

@@ -1,7 +1,7 @@
 """Tests on disk: steps and analyses.
 
 A step's folder is a step only once it holds ``step.json``, which is written last and carries the checksums of both
-images. What a kill left without it is listed as incomplete and never read.
+images. A folder that a kill left without it is listed as incomplete and never read.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ class StepFiles:
 
 
 def number_of(name: str) -> int | None:
-    """Return the number in the name of a step's folder, also of one that was set aside; None for other names."""
+    """Return the number in the name of a step's folder, also of a quarantined one; None for other names."""
     found = _STEP_FOLDER.fullmatch(name)
     return None if found is None else int(found[1])
 
 
 def deleted_mark(folder: Path) -> Path:
-    """Where it is kept that a step was deleted: its number is not given again."""
+    """Path of the mark that a step was deleted: its number is not given again."""
     return folder.with_name(f"{folder.name}.deleted")
 
 
 def quarantine(folder: Path) -> Path:
-    """Rename an incomplete step's folder, so that nobody takes it for a step; returns its new path.
+    """Rename an incomplete step's folder, so that it is not taken for a step; returns its new path.
 
     Raises
     ------
@@ -137,14 +137,14 @@ class TestStore:
         return found if isinstance(found, dict) else {}
 
     def put_metadata(
-        self, test_id: str, facts: Mapping[str, object], expected: Mapping[str, object] | None = None
+        self, test_id: str, metadata: Mapping[str, object], expected: Mapping[str, object] | None = None
     ) -> None:
         """Replace a test's metadata; durable when this returns.
 
         Parameters
         ----------
         expected
-            What the caller takes for the facts so far; None: whatever they are.
+            The metadata that the caller wants to replace; None: any.
 
         Raises
         ------
@@ -155,14 +155,14 @@ class TestStore:
             document = read_json(self.path(test_id) / "test.json")
             if expected is not None and document.get("facts", {}) != expected:
                 raise StateError(
-                    f"The facts of test {test_id} were changed meanwhile.",
+                    f"The metadata of test {test_id} were changed meanwhile.",
                     code="metadata_changed",
                     remedy="Read them again, then send the change.",
                 )
-            write_json(self.path(test_id) / "test.json", document | {"facts": facts})
+            write_json(self.path(test_id) / "test.json", document | {"facts": metadata})
 
     def is_calibrated(self, test_id: str) -> bool:
-        """Whether the test has a calibration to measure with."""
+        """Return True if the test has a calibration to measure with."""
         return (self.path(test_id) / "calibration.json").is_file()
 
     def calibration_file(self, test_id: str) -> Path:
@@ -195,7 +195,7 @@ class TestStore:
     def step_documents(self, test_id: str) -> Iterator[tuple[int, StepRecord | FileFormatError]]:
         """Return the number and ``step.json`` of every complete step, ascending, or why it cannot be read.
 
-        A start reads them all: with ten thousand steps, each look at a path counts.
+        A start reads them all: with ten thousand steps, each access of a path counts.
         """
         steps = str(self.path(test_id) / "steps")
         names = sorted(os.listdir(steps)) if Path(steps).is_dir() else []  # noqa: PTH208 - names, not paths
@@ -218,7 +218,7 @@ class TestStore:
                 yield int(name), record
 
     def incomplete_steps(self, test_id: str) -> list[int]:
-        """Numbers of step folders without their commit mark, those set aside among them."""
+        """Numbers of step folders without their commit mark, quarantined ones among them."""
         steps = self.path(test_id) / "steps"
         return sorted(
             n for p in steps.iterdir() if (n := number_of(p.name)) is not None and not (p / "step.json").is_file()
@@ -230,7 +230,7 @@ class TestStore:
         marks = {int(found[1]) for p in steps.iterdir() if (found := _DELETED.fullmatch(p.name)) is not None}
         return sorted(marks.difference(self.step_numbers(test_id)))
 
-    def add_step(self, test_id: str, images: dict[str, bytes], facts: Mapping[str, object]) -> StepRecord:
+    def add_step(self, test_id: str, images: dict[str, bytes], metadata: Mapping[str, object]) -> StepRecord:
         """Commit a step: both images, then ``step.json`` with their checksums.
 
         Returns when it is durable. A number is never used twice, also not that of an incomplete step.
@@ -251,7 +251,7 @@ class TestStore:
             make_folder(folder)
             try:
                 sha256 = {cam: write_bytes(folder / f"{cam}.tif", images[cam]) for cam in CAMERAS}
-                document = {"n": n, "test_id": test_id, **facts, "sha256": sha256}
+                document = {"n": n, "test_id": test_id, **metadata, "sha256": sha256}
                 write_json(folder / "step.json", document)
                 self._commits += 1
             except StorageError:
@@ -369,7 +369,7 @@ class TestStore:
         write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
     def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepOutcome]:
-        """What was found, by step; only of steps whose result is there."""
+        """Return the summaries by step; only of steps whose result is there."""
         path = self.analysis_path(test_id, analysis_id)
         files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
         return {
@@ -411,7 +411,7 @@ class TestStore:
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
         """Remove what a worker that was ended left of a result: half a file, a checksum without its result.
 
-        Nobody may write into the analysis meanwhile. Returns what was removed.
+        Nothing may write into the analysis meanwhile. Returns the removed files.
         """
         folder = self.analysis_path(test_id, analysis_id)
         lone = [path for path in folder.glob("step_[0-9]*.nc.sha256") if not path.with_suffix("").exists()]
@@ -421,7 +421,7 @@ class TestStore:
         return removed
 
     def put_summary(self, test_id: str, analysis_id: str, document: Mapping[str, object]) -> None:
-        """Write what the analysis found, step by step."""
+        """Write the analysis' summary, step by step."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
         write_json(path, document)
 

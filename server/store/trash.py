@@ -1,4 +1,4 @@
-"""The trash: what was deleted lies here, whole, until somebody empties it.
+"""The trash: deleted data stay here, whole, until a client empties it.
 
 Deleting is one rename. An entry's folder with its ``trash.json`` is made first; then the folder that is deleted becomes
 its ``content``. Killed before that rename, nothing is deleted; after it, all is. Emptying begins with a rename too, so
@@ -55,7 +55,7 @@ class Trash:
         NotFoundError
             If there is none with this id.
         FileFormatError
-            If ``trash.json`` cannot be read; ``trash_unreadable`` if it does not say what it was.
+            If ``trash.json`` cannot be read; ``trash_unreadable`` if it does not state the kind of the entry.
         """
         try:
             return TrashEntry.model_validate({"id": trash_id, **self._document(trash_id)})
@@ -69,7 +69,7 @@ class Trash:
         return read_json(folder / "trash.json")
 
     def entries(self) -> list[TrashEntry]:
-        """Return every entry, with its size; one whose description cannot be read says so."""
+        """Return every entry, with its size; one whose description cannot be read is marked."""
         found = []
         for trash_id in self.ids():
             try:
@@ -92,11 +92,11 @@ class Trash:
         folder
             The data folder, opened.
         kind, ids
-            What it is: ``test_id``, ``n``, ``analysis_id``, ``calibration_id``, ``noise_id``.
+            Kind and ids: ``test_id``, ``n``, ``analysis_id``, ``calibration_id``, ``noise_id``.
         name
-            As people call it.
+            Its name, as users gave it.
         by, why
-            Who deleted it, and on what occasion.
+            The client that deleted it, and the occasion.
 
         Raises
         ------
@@ -113,7 +113,7 @@ class Trash:
             document = {"kind": kind, **ids, "name": name, "deleted_utc": now_utc(), "deleted_by": by, "why": why}
             write_json(entry / "trash.json", document)
             if kind == "step":
-                # its number stays taken: it stands in results and in people's notes
+                # its number stays taken: results and notes refer to it
                 write_json(deleted_mark(original), {"trash_id": trash_id})
             _move(original, entry / _CONTENT)
         except StorageError:
@@ -132,7 +132,7 @@ class Trash:
         NotFoundError
             If there is no such entry.
         StateError
-            ``place_taken`` if something lies there by now, ``parent_deleted`` if its test is not there.
+            ``place_taken`` if there is something by now, ``parent_deleted`` if its test is not there.
         """
         entry = self.entry(trash_id)
         original = self.original(entry.kind, entry.plain())
@@ -182,7 +182,7 @@ class Trash:
         return done
 
     def original(self, kind: object, ids: Mapping[str, object]) -> Path:
-        """Return where something lies that is not deleted; ids that are none never become a path.
+        """Return the path of something that is not deleted; ids that are none never become a path.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class Trash:
 
 def _unreadable() -> FileFormatError:
     return FileFormatError(
-        "trash.json does not say what lies there.",
+        "trash.json does not state the kind of the entry.",
         code="trash_unreadable",
         remedy="Take the files out of the trash folder by hand.",
     )

@@ -21,11 +21,11 @@ from server.store.tests import number_of
 
 Level = Literal["damaged", "incomplete", "index", "foreign"]
 
-# What lies beside the data: made and unmade by a service that runs
+# Files beside the data: made and removed by a running service
 _OURS = frozenset(
     {"format.json", "service.lock", "catalog.sqlite", "catalog.sqlite-wal", "catalog.sqlite-shm", "keys.json"}
 )
-# What the service writes into a folder of each kind
+# Names that the service writes into a folder of each kind
 _KNOWN = {
     "calibration": r"(plan|target|view|review|judgement|failure|rejected)\.json|"
     r"(calibration\.json|residuals\.nc)(\.sha256)?|views",
@@ -46,11 +46,11 @@ class Finding:
     ----------
     level
         ``damaged``: data that were there are not as they were written. ``incomplete``: left by a crash, never
-        acknowledged. ``index``: the catalogue does not say what the folders hold. ``foreign``: no file of ours.
+        acknowledged. ``index``: the catalogue disagrees with the folders. ``foreign``: no file of ours.
     path
         Relative to the data folder.
     text
-        What is wrong.
+        The defect.
     """
 
     level: Level
@@ -60,7 +60,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was looked at, and what was found.
+    """Extent and findings of a verification.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Verification:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is damaged; incomplete, foreign and index findings lose nothing."""
+        """True if nothing is damaged; incomplete, foreign and index findings lose nothing."""
         return all(finding.level != "damaged" for finding in self.findings)
 
 
@@ -92,7 +92,7 @@ class _Walk:
         self.findings: list[Finding] = []
         self.there: set[tuple[str, str, str]] = set()  # kind, parent, id, as the catalogue names them
 
-    def say(self, level: Level, path: Path, text: str) -> None:
+    def report(self, level: Level, path: Path, text: str) -> None:
         self.findings.append(Finding(level, path.relative_to(self.root).as_posix(), text))
 
     def document(self, path: Path) -> dict[str, Any] | None:
@@ -100,7 +100,7 @@ class _Walk:
         try:
             return read_json(path)
         except FileFormatError as error:
-            self.say("damaged", path, error.cause)
+            self.report("damaged", path, error.cause)
             return None
 
     def documents(self, folder: Path, *names: str) -> None:
@@ -113,21 +113,21 @@ class _Walk:
         """Report strange files in a folder; half-written ones are reported elsewhere."""
         for path in sorted(folder.iterdir()):
             if re.fullmatch(_KNOWN[kind], path.name) is None and not path.name.endswith(".part"):
-                self.say("foreign", path, "this name is not one that the service makes")
+                self.report("foreign", path, "this name is not one that the service makes")
 
     def compare(self, path: Path, sha256: object) -> None:
         """Compare a file with its checksum on record."""
         if not path.is_file():
-            self.say("damaged", path, "the file is gone")
+            self.report("damaged", path, "the file is gone")
         elif not isinstance(sha256, str):
             self.unknown += 1
         elif sha256_of(path) != sha256:
-            self.say("damaged", path, "does not match its checksum")
+            self.report("damaged", path, "does not match its checksum")
         else:
             self.files += 1
 
     def compare_beside(self, path: Path) -> None:
-        """Compare a file with the checksum that stands beside it."""
+        """Compare a file with the checksum beside it."""
         self.compare(path, recorded_sha256(path))
 
     def entries(self, folder: Path, letter: str, mark: str) -> Iterator[Path]:
@@ -136,11 +136,11 @@ class _Walk:
             return
         for path in sorted(folder.iterdir()):
             if not is_id(path.name, letter) or not path.is_dir():
-                self.say("foreign", path, "this name is not one that the service makes")
+                self.report("foreign", path, "this name is not one that the service makes")
             elif (path / mark).exists():
                 yield path
             else:
-                self.say("incomplete", path, f"has no {mark}: it was never acknowledged")
+                self.report("incomplete", path, f"has no {mark}: it was never acknowledged")
 
     def calibration(self, path: Path) -> None:
         self.there.add(("calibration", "", path.name))
@@ -155,7 +155,7 @@ class _Walk:
             self.document(path / "calibration.json")
             self.compare_beside(path / "calibration.json")
         elif not (path / "failure.json").is_file():
-            self.say("incomplete", path, "neither a result nor the reason why there is none")
+            self.report("incomplete", path, "neither a result nor the reason why there is none")
         if (path / "residuals.nc").is_file():
             self.compare_beside(path / "residuals.nc")
 
@@ -177,7 +177,7 @@ class _Walk:
         if document is not None and (path / "calibration.json").exists():
             self.compare(path / "calibration.json", document.get("calibration_sha256"))
         elif document is not None and document.get("calibration_sha256") is not None:
-            self.say("damaged", path / "calibration.json", "the file is gone")
+            self.report("damaged", path / "calibration.json", "the file is gone")
         self.strangers(path, "test")
         self.documents(path, "watch.json")
         for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
@@ -190,10 +190,10 @@ class _Walk:
             return
         number = number_of(path.name)
         if number is None or not path.is_dir():
-            self.say("foreign", path, "this name is not one that the service makes")
+            self.report("foreign", path, "this name is not one that the service makes")
         elif not (path / "step.json").is_file():
             if path.name.isdigit():
-                self.say("incomplete", path, "has no step.json: it was never acknowledged")
+                self.report("incomplete", path, "has no step.json: it was never acknowledged")
         else:
             self.there.add(("step", test_id, f"{number:04d}"))
             self.step_files(path)
@@ -216,40 +216,40 @@ class _Walk:
         for beside in sorted(path.glob("step_[0-9]*.nc.sha256")):
             result = beside.with_suffix("")
             if not result.is_file():
-                self.say("incomplete", beside, "a checksum without its result: it was never announced")
+                self.report("incomplete", beside, "a checksum without its result: it was never announced")
         for summary in sorted(path.glob("step_[0-9]*.json")):
             self.document(summary)
         self.documents(path, "summary.json", "noise.json", "jobs.json")
         self.strangers(path, "analysis")
 
     def trashed(self, path: Path) -> None:
-        """What was deleted can come back: looked at like the rest, after the catalogue, which does not know it."""
+        """Check the trash, whose entries can be restored; after the catalogue, which does not list them."""
         document = self.document(path / "trash.json")
-        look: dict[str, Callable[[Path], None]] = {
+        checks: dict[str, Callable[[Path], None]] = {
             "calibration": self.calibration,
             "noise": self.noise,
             "test": self.test,
             "step": self.step_files,
             "analysis": lambda content: self.analysis("", content),
         }
-        if document is not None and (found := look.get(str(document.get("kind")))) is not None:
+        if document is not None and (found := checks.get(str(document.get("kind")))) is not None:
             found(path / "content")
 
     def top(self) -> None:
         for path in sorted(self.root.iterdir()):
             numbered = path.name.startswith(("catalog.corrupt-", "audit.log"))
             if path.name not in _OURS | _FOLDERS and not numbered and not path.name.endswith(".part"):
-                self.say("foreign", path, "this name is not one that the service makes")
+                self.report("foreign", path, "this name is not one that the service makes")
         for path in sorted(self.root.rglob(".*.part")):
-            self.say("incomplete", path, "half written when the service ended")
+            self.report("incomplete", path, "half written when the service ended")
 
     def catalog(self) -> None:
         path = self.root / "catalog.sqlite"
         if not path.is_file():
-            self.say("index", path, "the catalogue is gone; it is made anew at the next start")
+            self.report("index", path, "the catalogue is gone; it is made anew at the next start")
             return
         try:
-            # without the right to write beside it, SQLite opens the file only as one that nobody changes
+            # without the right to write beside it, SQLite opens the file only as one that does not change
             log = path.with_name(path.name + "-wal")
             still = not os.access(path.parent, os.W_OK) and not (log.exists() and log.stat().st_size)
             mode = "mode=ro&immutable=1" if still else "mode=ro"
@@ -262,12 +262,12 @@ class _Walk:
                 connection.close()
             entries = {(kind, parent, name) for kind, parent, name, text in rows if json.loads(text) is not None}
         except (sqlite3.Error, ValueError) as error:
-            self.say("index", path, f"the catalogue cannot be read ({error}); it is made anew at the next start")
+            self.report("index", path, f"the catalogue cannot be read ({error}); it is made anew at the next start")
             return
         for kind, parent, name in sorted(entries ^ self.there):
             where = f"{kind} {f'{parent}/' if parent else ''}{name}"
             text = "has no folder" if (kind, parent, name) in entries else "is not in the catalogue"
-            self.say("index", path, f"{where} {text}")
+            self.report("index", path, f"{where} {text}")
 
 
 def verify(root: Path) -> Verification:
@@ -276,7 +276,7 @@ def verify(root: Path) -> Verification:
     Parameters
     ----------
     root
-        A data folder; a service may run on it: then only what is found twice, a moment apart, is reported.
+        A data folder; a service may run on it: then only findings that repeat a moment later are reported.
 
     Raises
     ------
@@ -289,7 +289,7 @@ def verify(root: Path) -> Verification:
     require_data_folder(root)
     found = _check_all(root)
     if found.findings and is_in_use(root):
-        time.sleep(_WRITING_S)  # it may have been written, or deleted, just while it was looked at
+        time.sleep(_WRITING_S)  # it may have been written, or deleted, just while it was checked
         again = _check_all(root)
         before = set(found.findings)
         found = replace(again, findings=tuple(finding for finding in again.findings if finding in before))
@@ -315,7 +315,7 @@ def _check_all(root: Path) -> Verification:
 
 
 def require_data_folder(root: Path) -> None:
-    """Refuse what is no data folder, or a newer version's; see `verify`."""
+    """Raise an error for a folder that is no data folder, or a newer version's; see `verify`."""
     if not (root / "format.json").is_file() and not (root / "tests").is_dir():
         raise FileFormatError(
             f"{root} is no data folder: it has neither format.json nor tests/.",

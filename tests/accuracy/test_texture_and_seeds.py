@@ -14,7 +14,7 @@ from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.field.seeding.seeds import Seed, seeds_of
 from server.formats.results.settings import stored_settings
-from server.results.texture import errors_at, texture_verdict
+from server.results.texture import errors_at, speckle_quality
 from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(180)
@@ -48,13 +48,13 @@ def test_the_expected_error_is_the_scatter_that_noise_gives(size: int) -> None:
 def test_no_texture_is_no_texture_and_lines_are_not_enough() -> None:
     points = np.array([[x, y] for x in range(60, 200, 10) for y in range(60, 180, 10)], dtype=float)
     flat = 128.0 + np.random.default_rng(3).normal(0, 2.0, (HEIGHT, WIDTH))
-    told = texture_verdict(flat, 255.0, points, 33)
+    told = speckle_quality(flat, 255.0, points, 33)
     assert (told.level, told.proposed_subset_px, told.good_share) == ("poor", None, 0.0)
     lines = np.tile(128.0 + 60.0 * np.sin(np.arange(WIDTH) / 2.0), (HEIGHT, 1))
-    assert texture_verdict(lines, 255.0, points, 33).level == "poor"
-    good = texture_verdict(speckle(4), 255.0, points, 33)
+    assert speckle_quality(lines, 255.0, points, 33).level == "poor"
+    good = speckle_quality(speckle(4), 255.0, points, 33)
     assert good.level == "good"
-    faint = texture_verdict(speckle(4, contrast=12.0), 255.0, points, 33)
+    faint = speckle_quality(speckle(4, contrast=12.0), 255.0, points, 33)
     assert faint.median_error_px > 3 * good.median_error_px
     # the proposed size does what it is proposed for, and the next smaller one does not
     sizes = {row.subset_px: row.good_share for row in faint.sizes}

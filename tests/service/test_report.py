@@ -250,7 +250,7 @@ def test_every_item_of_the_guide_is_there_with_a_value(page: Page) -> None:
     for key in GUIDE - {"floor.X", "floor.Y", "floor.Z"}:
         assert not any("not stated" in cell for cell in page.rows[key].cells), (key, page.rows[key])
     # what nobody can know is said to be so
-    assert [page.rows[f"floor.{k}"].cells[1] for k in "XYZ"] == ["cannot be told"] * 3
+    assert [page.rows[f"floor.{k}"].cells[1] for k in "XYZ"] == ["cannot be stated"] * 3
 
 
 def test_angle_standoff_scale_and_view_are_the_rigs_own(page: Page, plate: Measurement) -> None:

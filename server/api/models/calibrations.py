@@ -154,7 +154,7 @@ class ViewResiduals(Reply):
     found_px: Nested = Field(
         description="Column and row where each intersection was found: rows of lines of pairs; null: not seen."
     )
-    residual_px: Nested = Field(description="Measured minus projected place, in the same order.")
+    residual_px: Nested = Field(description="Measured minus projected position, in the same order.")
 
 
 class ResidualsReply(Reply):

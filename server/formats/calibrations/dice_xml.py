@@ -37,7 +37,7 @@ _NOT_CARRIED = ("FS", "K4", "K5", "K6", "S1", "S2", "S3", "S4", "T1", "T2")
 
 
 def looks_like_dice(data: bytes) -> bool:
-    """Tell whether the bytes are an XML file of DICe's kind."""
+    """Return True if the bytes are an XML file of DICe's kind."""
     return b"<ParameterList" in data[:4096] and b"CAMERA" in data
 
 
@@ -48,7 +48,7 @@ def _parameters(name: str, where: str, element: Element) -> dict[str, str]:
         if key is None or value is None:
             raise unreadable(name, f"a Parameter of {where} has no name or no value")
         if key in values:
-            raise unreadable(name, f"{key} stands twice in {where}")
+            raise unreadable(name, f"{key} occurs twice in {where}")
         values[key] = value
     return values
 

@@ -53,7 +53,7 @@ _TANGENTIAL = {"opencv": True, "dice": True, "matchid": True, "vic3d": False}
 _NOTES: dict[CalibrationForm, tuple[str, ...]] = {
     "json": (),
     "paper": ("covariance, checks and verdict are not carried over",),
-    "opencv": ("OpenCV's functions know no skew",),
+    "opencv": ("OpenCV's functions have no skew",),
     "dice": ("camera 0 is camera 1 here; extrinsics relative from camera to camera",),
     "matchid": ("the format is not published: angles taken as R = Rz(Psi) Ry(Phi) Rx(Theta) in degrees",),
     "vic3d": (
@@ -65,7 +65,7 @@ _NOTES: dict[CalibrationForm, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class LensError:
-    """What a fitted lens is off over the image."""
+    """Error of a fitted lens over the image."""
 
     rms_px: float
     max_px: float
@@ -73,7 +73,7 @@ class LensError:
 
 @dataclass(frozen=True)
 class ReadBack(Residual):
-    """What the written file makes of points that both cameras see, and how far off it triangulates them."""
+    """Epipolar and triangulation errors of the written file, over points that both cameras see."""
 
     rms_mm: float | None
     max_mm: float | None
@@ -81,24 +81,24 @@ class ReadBack(Residual):
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What became of a calibration on its way into another form.
+    """Report of a calibration's conversion into another form.
 
     Attributes
     ----------
     format, software
-        What was written, by which version.
+        The written format, and the version that wrote it.
     source, source_sha256
-        What was read.
+        The calibration that was read.
     units, frame, image_size_px
         Of the written file.
     exact
-        Whether both lenses are the same but for rounding.
+        True if both lenses are the same but for rounding.
     lens
-        By camera, what the fit leaves.
+        By camera, the error of the fit.
     read_back
         Over a grid of points that both cameras see, projected by independent formulas with the original.
     notes
-        What was assumed.
+        Assumptions that were made.
     """
 
     format: CalibrationForm
@@ -116,7 +116,7 @@ class ConversionReport:
 
 @dataclass(frozen=True)
 class ConvertedCalibration:
-    """A calibration in another form: the file's bytes, and what became of it."""
+    """A calibration in another form: the file's bytes, and the report of the conversion."""
 
     data: bytes
     report: ConversionReport
@@ -128,7 +128,7 @@ def convert_calibration(loaded: LoadedCalibration, form: CalibrationForm, origin
     Parameters
     ----------
     loaded
-        What was read.
+        The calibration that was read.
     form
         ``json``: as this program keeps it, another program's file whole within; ``paper``: the eleven parameters of
         each camera; else another program's.
@@ -143,7 +143,7 @@ def convert_calibration(loaded: LoadedCalibration, form: CalibrationForm, origin
         If what was written does not read back.
     """
     try:
-        with np.errstate(all="ignore"):  # numbers of any size may stand in a file
+        with np.errstate(all="ignore"):  # a file may hold numbers of any size
             return _convert(loaded, form, original)
     except (np.linalg.LinAlgError, cv2.error, ArithmeticError) as error:
         raise CalibrationError(
@@ -186,7 +186,7 @@ def _convert(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) 
 
 
 def read_back(pair: StereoPair, again: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> ReadBack:
-    """Return what a pair makes of places that another projects points of the shared volume to."""
+    """Return a pair's errors at the image positions to which another one projects points of the shared volume."""
     points = shared_points(pair, size1, size2)
     if not len(points):
         return ReadBack(0, None, None, None, None)
@@ -212,7 +212,8 @@ def _paper(
     pair, size = loaded.pair, sizes or image_sizes(loaded)[:2]
     to_sys = RigidTransform.identity()
     if min(camera.cam_from_sys.translation_mm[2] for camera in (pair.cam1, pair.cam2)) <= 0.0:
-        # the paper's system frame lies before the cameras: where both look, with camera 1's axes
+        # the paper's system frame lies in front of the cameras: in the middle of their common view, with camera 1's
+        # axes
         depth = middle_depth_mm(pair, *size)
         if depth is None:
             raise CalibrationError(

@@ -22,14 +22,14 @@ from server.formats.views import find_views
 
 @dataclass(frozen=True)
 class FolderCalibration:
-    """A calibration, with what its file records of its origin."""
+    """A calibration with its origin, as its file records it."""
 
     result: CalibrationResult
     target: GridTarget
     provenance: dict[str, object]
 
     def content(self) -> dict[str, object]:
-        """Return what calibration.json holds."""
+        """Return the content of calibration.json."""
         return calibration_content(self.result, self.target, provenance=self.provenance)
 
     def write(self, path: Path) -> None:

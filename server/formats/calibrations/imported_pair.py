@@ -1,4 +1,4 @@
-"""A stereo pair from another program's numbers, after they were looked at.
+"""A stereo pair from another program's numbers, after they were checked.
 
 Imported rigs keep their own lens model (OpenCV's k1 k2 p1 p2 k3); the system frame is camera 1's own frame.
 """
@@ -86,7 +86,7 @@ def pair_of(
     Raises
     ------
     FileFormatError
-        ``calibration_invalid`` if R is no rotation, T not finite, or the cameras stand at one place.
+        ``calibration_invalid`` if R is no rotation, T not finite, or both cameras have one position.
     """
     R = proper_rotation(name, "R", rotation)
     t = np.asarray(translation_mm, dtype=np.float64).ravel()
@@ -95,7 +95,7 @@ def pair_of(
     if not np.isfinite(t).all():
         raise invalid(name, "T holds a number that is not finite")
     if not np.linalg.norm(t) > 0.0:
-        raise invalid(name, "both cameras stand at the same place (T is zero)")
+        raise invalid(name, "both cameras have the same position (T is zero)")
     return StereoPair(Camera(lens1, RigidTransform.identity()), Camera(lens2, RigidTransform(R, t)))
 
 

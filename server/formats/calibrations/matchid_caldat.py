@@ -43,7 +43,7 @@ _LINE = re.compile(r"\s*([^;=:]+?)\s*[;=:]\s*(\S+)\s*")
 
 
 def looks_like_caldat(data: bytes) -> bool:
-    """Tell whether the bytes are lines of MatchID's kind."""
+    """Return True if the bytes are lines of MatchID's kind."""
     return re.search(rb"^\s*Cam\d_F[xy]\b", data[:65536], re.MULTILINE | re.IGNORECASE) is not None
 
 
@@ -82,7 +82,7 @@ def _values(data: bytes, name: str) -> dict[str, float]:
             raise unreadable(name, f"line {number} is no name and value")
         key = _key(found[1])
         if key in values:
-            raise unreadable(name, f"{found[1]} stands twice in it")
+            raise unreadable(name, f"{found[1]} occurs twice in it")
         try:
             values[key] = float(found[2])
         except ValueError as error:

@@ -1,7 +1,8 @@
 """calibration.json: both cameras with their covariance, checks and verdict.
 
 A file that holds only ``cam1`` and ``cam2``, the eleven parameters each, is enough to measure with
-(:func:`server.formats.calibrations.recognise.load_calibration` reads any of them); the rest says how far to trust it.
+(:func:`server.formats.calibrations.recognise.load_calibration` reads any of them); the rest states its uncertainty and
+checks.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ def calibration_content(
     result
         The calibration.
     target
-        What it was made with.
+        The target of the calibration.
     provenance
-        Further facts to keep (software version, localiser, hashes of the views); nothing is computed from them.
+        Further entries to keep (software version, localiser, hashes of the views); nothing is computed from them.
     """
     return {
         "format": "stereorig calibration",
@@ -88,7 +89,7 @@ def calibration_content(
 def write_calibration(
     path: str | Path, result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, object] | None = None
 ) -> None:
-    """Write calibration.json aside, sync it and rename it.
+    """Write calibration.json as a temporary file, sync it and rename it.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def write_calibration(
         ``storage_full`` or ``storage_failed``; an older file of that name is then untouched.
     """
     content = calibration_content(result, target, provenance=provenance)
-    # a number that is not finite has no place in JSON, and none in a calibration
+    # JSON has no numbers that are not finite, and a calibration must not have any
     write_bytes(Path(path), (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 

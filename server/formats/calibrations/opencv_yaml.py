@@ -27,7 +27,7 @@ _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
 
 
 def looks_like_opencv(data: bytes) -> bool:
-    """Tell whether the bytes name OpenCV's stereo parameters."""
+    """Return True if the bytes name OpenCV's stereo parameters."""
     return b"cameraMatrix1" in data[:_MAX_BYTES]
 
 
@@ -48,7 +48,7 @@ def _load(name: str, text: str) -> dict[str, object]:
     try:
         if text.lstrip().startswith("<"):
             return _load_xml(text)
-        # OpenCV's own first line, %YAML:1.0, is not the directive that YAML knows
+        # OpenCV's own first line, %YAML:1.0, is not the directive of YAML
         lines = [line for line in text.splitlines(keepends=True) if not line.startswith("%YAML")]
         content = yaml.load("".join(lines), Loader=_Loader)
     except (yaml.YAMLError, cv2.error, SystemError, ValueError, RecursionError) as error:
@@ -163,7 +163,7 @@ def opencv_text(
     sizes: tuple[tuple[int, int], tuple[int, int]] | None,
     comment: str,
 ) -> str:
-    """Return a stereo calibration as ``cv2.FileStorage`` reads it; the skew, which OpenCV does not know, must be 0.
+    """Return a stereo calibration as ``cv2.FileStorage`` reads it; the skew, which OpenCV does not have, must be 0.
 
     The image size is given where both cameras share one.
     """

@@ -41,7 +41,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """What a look at a calibration found.
+    """Result of a plausibility check of a calibration.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class CalibrationCheck:
     pixels_with_ray
         Share of each image where the lens can be inverted.
     image_size_known
-        Whether the file says the images' sizes.
+        True if the file states the images' sizes.
     warnings
         Sentences.
     """
@@ -64,7 +64,7 @@ class CalibrationCheck:
 
 
 def image_sizes(loaded: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int], bool]:
-    """Return both image sizes, and whether the file says them; else twice the principal point, rounded."""
+    """Return both image sizes, and True if the file states them; else twice the principal point, rounded."""
     sizes = []
     for camera, size in ((loaded.pair.cam1, loaded.image_size1_px), (loaded.pair.cam2, loaded.image_size2_px)):
         lens = camera.lens
@@ -78,9 +78,9 @@ def _twice(centre_px: float) -> int:
 
 
 def middle_depth_mm(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> float | None:
-    """Return the depth in camera 1 at which both cameras look at the same: where the images' middles meet.
+    """Return the depth in camera 1 at which the cameras' views overlap best: where the images' middles meet.
 
-    Of cameras that look past each other, the depth at which the images share most; None where they share nothing.
+    Of cameras whose axes do not meet, the depth at which the images share most; None where they share nothing.
     """
     middles = [np.array([(n - 1) / 2 for n in size]) for size in (size1, size2)]
     met = pair.triangulate(*middles)
@@ -140,7 +140,7 @@ def independent_projection(camera: Any, points_mm: Float) -> Float:
 
 
 def check_calibration(loaded: LoadedCalibration) -> CalibrationCheck:
-    """Look a calibration over: what both cameras see of one volume, by an independent projection, must agree.
+    """Check a calibration: independent projections of one volume into both cameras must agree with it.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def check_calibration(loaded: LoadedCalibration) -> CalibrationCheck:
         ``calibration_inconsistent`` if the model that was carried over differs from the file's numbers.
     """
     try:
-        with np.errstate(all="ignore"):  # numbers of any size may stand in a file
+        with np.errstate(all="ignore"):  # a file may hold numbers of any size
             return _checked(loaded)
     except (np.linalg.LinAlgError, cv2.error, ArithmeticError) as error:
         raise FileFormatError(
@@ -182,7 +182,7 @@ def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
         if shares[name] < 1.0:
             warnings.append(f"{name}: {1 - shares[name]:.1%} of the image has no ray, its lens folds back there")
     if not known:
-        warnings.append("the file does not say the image size: twice the principal point was taken")
+        warnings.append("the file does not state the image size: twice the principal point was taken")
     return CalibrationCheck(
         volume=residual,
         pixels_with_ray=shares,

@@ -1,4 +1,4 @@
-"""Whatever calibration file a user has: recognised by its content, read, and checked."""
+"""Calibration files of any supported kind: recognised by their content, read, and checked."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LoadedCalibration:
     pair
         The cameras; the system frame is the target's for a calibration.json, camera 1's own for the imports.
     image_size1_px, image_size2_px
-        (width, height) the calibration was made for, None where the file does not say.
+        (width, height) the calibration was made for, None where the file does not state it.
     source
         ``calibration_json``, ``dice_xml``, ``opencv_yaml``, ``matchid_caldat`` or ``vic3d_xml``.
     sha256
@@ -54,7 +54,7 @@ class LoadedCalibration:
 
     @cached_property
     def record(self) -> CalibrationRecord:
-        """How the cameras were calibrated; empty where the file does not say."""
+        """Settings of the calibration; empty where the file does not state them."""
         return CalibrationRecord.model_validate(self.details)
 
 
@@ -128,7 +128,7 @@ def _size(content: Mapping[str, object], which: str) -> tuple[int, int] | None:
 
 
 def _wraps_another(data: bytes) -> bool:
-    # the wrapped text would be taken for the file itself: our own layout is looked for first
+    # the wrapped text would be taken for the file itself: our own layout is checked for first
     return data.lstrip()[:1] == b"{" and f'"{IMPORTED}"'.encode() in data
 
 
@@ -141,12 +141,14 @@ def _unwrapped(data: bytes, digest: str, name: str) -> LoadedCalibration:
     text = part.get("text") if isinstance(part, dict) else None
     known = text.encode("utf-8", "replace") if isinstance(text, str) else b""
     if _wraps_another(known) or not _of_another(known):
-        raise unreadable(name, "what it says was imported is no calibration")
+        raise unreadable(name, "the imported text in it is no calibration")
     return replace(parse_calibration(known, name=name), sha256=digest, details=content)
 
 
 def _of_another(data: bytes) -> bool:
-    return any(looks(data) for looks in (looks_like_dice, looks_like_opencv, looks_like_caldat, looks_like_vic3d))
+    return any(
+        recognises(data) for recognises in (looks_like_dice, looks_like_opencv, looks_like_caldat, looks_like_vic3d)
+    )
 
 
 def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
@@ -174,7 +176,7 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     cam1, cam2 = (_camera(name, which, content.get(which)) for which in CAMERAS)
     pair = StereoPair(cam1, cam2)
     if pair.baseline_mm <= _MIN_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
-        raise invalid(name, "both cameras stand at the same place")
+        raise invalid(name, "both cameras have the same position")
     sizes = [_size(content, which) for which in CAMERAS]
     return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
 

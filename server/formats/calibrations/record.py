@@ -44,7 +44,7 @@ class VerdictRecord(Record):
 
 
 class UncertaintyRecord(Record):
-    """What the calibration's covariance leaves in a shape; ``scale`` is a pure number."""
+    """Standard uncertainty of a shape from the calibration's covariance; ``scale`` is a pure number."""
 
     shape_rms_mm: float | None = None
     predicted_shape_rms_mm: float | None = None
@@ -60,7 +60,7 @@ class ViewRecord(Measures):
 
 
 class TargetRecord(Record):
-    """The grid that was looked at."""
+    """The grid that was observed."""
 
     lines: tuple[int, int]
     pitch_mm: float
@@ -70,14 +70,14 @@ class TargetRecord(Record):
 
 
 class CameraIdentity(Record):
-    """What a camera says of itself."""
+    """Identity of a camera, as it reports it."""
 
     model: str | None = None
     serial: str | None = None
 
 
 class OriginRecord(Record):
-    """Where a calibration comes from."""
+    """Origin of a calibration."""
 
     localiser: str | None = None
     frames: int | None = None
@@ -93,7 +93,7 @@ class SettingsRecord(Record):
 
 
 class CalibrationRecord(Record):
-    """What a calibration.json says; a file of another program has none of it, one of parameters alone only these."""
+    """Content of a calibration.json; another program's file has none of it, one of parameters alone only these."""
 
     cam1: dict[str, float] = Field(default={})
     cam2: dict[str, float] = Field(default={})

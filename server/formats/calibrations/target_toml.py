@@ -1,4 +1,4 @@
-"""TARGET.toml and RIG.toml: what the command line knows of the grid and of the rig."""
+"""TARGET.toml and RIG.toml: the command line's description of the grid and of the rig."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ _DISTORTION = ("k1", "k2", "k3")
 
 
 def looks_like_vic3d(data: bytes) -> bool:
-    """Tell whether the bytes are XML with VIC-3D's calibration."""
+    """Return True if the bytes are XML with VIC-3D's calibration."""
     return b"<calibration" in data and b"<camera" in data and b"<orientation" in data
 
 
@@ -46,8 +46,8 @@ def parse_vic3d(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
     Returns
     -------
     tuple
-        The pair (system frame = its camera 0) and the image size (width, height) that a project's area of interest
-        tells; None where there is none.
+        The pair (system frame = its camera 0) and the image size (width, height) of a project's area of interest; None
+        where there is none.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a calibration.json tells a measurement besides its cameras: the calibrated volume and its own error."""
+"""Calibrated volume and reprojection error of a calibration.json."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from server.formats.calibrations.record import ChecksRecord
 
 
 def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
-    """Return where a pair was calibrated; None if its file does not say (other programs', or parameters alone).
+    """Return a pair's calibrated volume; None if its file does not state it (other programs', or parameters alone).
 
     Raises
     ------

@@ -17,7 +17,7 @@ class Number:
 
 @dataclass(frozen=True)
 class PointReading:
-    """Variables at a place of camera 1's reference image."""
+    """Variables at a position of camera 1's reference image."""
 
     name: str | None
     xy_px: tuple[float, float]
@@ -27,7 +27,7 @@ class PointReading:
 
 @dataclass(frozen=True)
 class ExtensometerReading:
-    """Lengths and strains between two places."""
+    """Lengths and strains between two positions."""
 
     name: str | None
     a_px: tuple[float, float]
@@ -38,7 +38,7 @@ class ExtensometerReading:
 
 @dataclass(frozen=True)
 class Numbers:
-    """One number for each place of a line."""
+    """One number for each position of a line."""
 
     value: Sequence[float | None]
     sigma: Sequence[float | None]
@@ -47,7 +47,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class LineReading:
-    """Variables at places along a line; ``missing`` says for each of them why there is nothing."""
+    """Variables at positions along a line; ``missing`` gives for each of them the reason why there is none."""
 
     name: str | None
     x_px: Sequence[float]
@@ -113,7 +113,7 @@ class RigidMotionReading:
 
 @dataclass(frozen=True)
 class Problem:
-    """Why a step has no readings."""
+    """Reason why a step has no readings."""
 
     code: str
     cause: str
@@ -180,7 +180,7 @@ class GaugeReadings:
         return [step for step in self.steps if step.problem is None]
 
     def about(self) -> dict[str, object]:
-        """Return what stands above a table of readings."""
+        """Return the entries above a table of readings."""
         return {
             "software_version": self.software_version,
             "stale_reasons": self.stale_reasons,

@@ -84,7 +84,7 @@ def _of_step(step: StepReadings) -> Iterator[Row]:
 
 def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row]:
     for quantity, number in values.items():
-        # the place may be there, but this variable has nothing there
+        # the position may be valid, but this variable has no value there
         why = missing or ("no value" if number.value is None else "")
         yield replace(head, quantity=quantity, value=number.value, sigma=number.sigma, units=number.units, missing=why)
 

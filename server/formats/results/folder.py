@@ -22,7 +22,7 @@ def number_of(path: Path) -> int:
 
 
 def first_results(folder: Path, folders: Iterable[Path]) -> list[Path]:
-    """Return the result files of the first place that has any.
+    """Return the result files of the first folder that has any.
 
     Parameters
     ----------

@@ -12,14 +12,14 @@ from core.field.points.result import Field
 FORMAT_VERSION = 2
 COMPARISONS = ("cam1_ref__cam2_ref", "cam1_ref__cam1_cur", "cam1_ref__cam2_cur")
 COVARIANCE_NAMES = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")
-#: What steps that are matched against this one inherit: name in variables and in `References` -> its cause
+#: Propagated to steps that are matched against this one: name in variables and in `References` -> its cause
 PROPAGATED_FROM = {"noise": "the cameras' noise", "pattern": "changes of the surface's pattern"}
 #: Entries of a symmetric matrix that a file holds
 ENTRIES = {"xx": (0, 0), "yy": (1, 1), "xy": (0, 1)}
 
 
 class Variable(NamedTuple):
-    """One two-dimensional variable: where it stands in a Field, and how it is described."""
+    """One two-dimensional variable: its attribute of a Field, and its description."""
 
     name: str
     attribute: str

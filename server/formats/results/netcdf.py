@@ -1,4 +1,4 @@
-"""NetCDF files, opened for reading and for writing: the one place, with the one lock."""
+"""NetCDF files, opened for reading and for writing by this module alone, under one lock."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False)
     Parameters
     ----------
     classic
-        Keep to the classic model, which every reader knows; without it there are texts and unlimited dimensions.
+        Keep to the classic model, which every reader takes; without it there are texts and unlimited dimensions.
 
     Raises
     ------

@@ -105,7 +105,7 @@ def read_measured(path: str | Path) -> Field:
 
 @dataclass(frozen=True)
 class ResultHead:
-    """What a result file says of itself.
+    """Head of a result file: its attributes.
 
     Attributes
     ----------
@@ -134,12 +134,12 @@ class ResultHead:
     attributes: Mapping[str, object]
 
     def image_file(self, cam: CameraName) -> str:
-        """Where the step's image lay; empty where the file does not say."""
+        """Path of the step's image; empty where the file does not state it."""
         return str(self.attributes.get(f"{cam}_file", ""))
 
 
 def read_head(path: str | Path) -> ResultHead:
-    """Read what a result file says of itself.
+    """Read a result file's attributes.
 
     Raises
     ------

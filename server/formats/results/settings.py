@@ -1,4 +1,4 @@
-"""Settings and input hashes of result files in today's form; the one place that knows the older ones.
+"""Settings and input hashes of result files in their current form; older forms are read by this module alone.
 
 Format 1 had two dialects. The service wrote ``calibration.json``, ``step_cam1``, ``step_cam2`` and ``noise.json`` among
 the input hashes; ``stereorig measure`` wrote its region as ``roi``, ``cracks``, ``holes`` and ``mask`` beside the other

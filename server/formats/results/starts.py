@@ -1,6 +1,6 @@
 """The matcher's own unknowns of a step, kept beside its result for as long as the analysis may have to go on from it.
 
-A result file has what was measured; what the next step starts from is not all in it. An analysis that goes on in
+A result file has the measured values; the start values of the next step are not all in it. An analysis that goes on in
 another process finds the same starts here, and comes to the same numbers, to the last bit.
 """
 
@@ -22,12 +22,12 @@ _SINGLE = ("covariance", "zncc", "epipolar_px", "noise_grey")
 
 
 def starts_file(result: Path) -> Path:
-    """Where the starts lie that belong to a result file."""
+    """Path of the starts that belong to a result file."""
     return result.with_name(result.stem.replace("step_", "starts_") + ".npz")
 
 
 def write_starts(path: Path, measured: Field, *, reference: bool) -> None:
-    """Write durably what a measured field has besides its result file.
+    """Write durably the parts of a measured field that its result file does not hold.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def write_starts(path: Path, measured: Field, *, reference: bool) -> None:
 
 
 def with_starts(measured: Field, path: Path) -> Field:
-    """Return a field with what lies beside its result file; where that cannot be read, starts are found anew."""
+    """Return a field with the starts beside its result file; where they cannot be read, they are searched again."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             exact = {name: arrays[name] for name in _SINGLE if name in arrays}

@@ -1,4 +1,4 @@
-"""What one field comes to in a few numbers, for ``summary.json`` and the API."""
+"""Summary of a field in a few numbers, for ``summary.json`` and the API."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _rms(values: NDArray[np.float64]) -> float | None:
 
 @dataclass(frozen=True)
 class Span:
-    """Mean, smallest and largest of a displacement's component, mm."""
+    """Mean, minimum and maximum of a displacement's component, mm."""
 
     mean: float
     min: float
@@ -57,13 +57,13 @@ class StepSummary:
     epipolar_residual_rms_px
         The error left in each image when both cameras share the misfit equally: half of ``epipolar_offset_rms_px``.
     epipolar_check
-        Whether the cameras still stand as calibrated.
+        Check that the cameras are still as calibrated.
     plane_residual_rms_mm
         Of the reference positions.
     zncc_median, sigma_median_mm
         By comparison, and by coordinate (``x_mm`` ...).
     smoothing
-        How the displacement was smoothed and what is still distinguished.
+        Smoothing of the displacement, and its spatial resolution.
     patch
         What the field was measured with, why, and the numbers of the choice.
     reference_step, points_by_reference, displacement_mm
@@ -155,18 +155,18 @@ def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0)
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceSummary:
-    """``summary.json``: what a measurement found in its steps, whatever became of it.
+    """``summary.json``: summaries of a measurement's steps, also of one that failed or was stopped.
 
     Attributes
     ----------
     state
-        ``succeeded``, or how the analysis' job ended.
+        ``succeeded``, or another final state of the analysis' job.
     calibration
         ``sha256``; ``file`` and ``source`` where it was named by its file.
     settings
         As :class:`core.settings.StoredSettings`.
     seconds
-        That the measurement took.
+        Duration of the measurement.
     steps
         An entry a finished step, in their order.
     steps_failed

@@ -1,7 +1,7 @@
 """Result files: one field, one NetCDF-4 file (classic model: xarray, MATLAB and ncdump all open it).
 
-Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` that says why. Files are written aside, so
-that a half-written one cannot be met. :mod:`server.formats.results.reading` reads them back.
+Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` with the reason. Files are written under
+temporary names, so that a half-written one cannot be met. :mod:`server.formats.results.reading` reads them back.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _FRAMES = {
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; written into its file.
+    """Origin of a result; written into its file.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def _put_references(dataset: Any, references: References) -> None:
                 ("row", "col"),
                 units="pixel2",
                 dtype="f8",
-                long_name=f"covariance by {cause} of where camera 1 sees the point, as far as later steps inherit it "
+                long_name=f"covariance by {cause} of the point's position in camera 1, propagated to later steps "
                 "that are matched against this one",
             )
 
@@ -289,7 +289,7 @@ def write_field(
     measured: Field | None = None,
     checksum: bool = False,
 ) -> None:
-    """Write one result file: aside, synced, renamed.
+    """Write one result file: under a temporary name, synced, renamed.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def write_field(
     result
         A shape (no ``uvw_mm``) or a displacement field.
     provenance
-        What it was made from and how.
+        Origin of the result.
     strain
         Of the same points, if it was computed; :func:`server.formats.results.strain.read_strain` reads it back.
     measured

@@ -30,7 +30,7 @@ class FieldWriter:
     source
         Where the results come from.
     request
-        What was asked for.
+        The request.
 
     Raises
     ------

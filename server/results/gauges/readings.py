@@ -113,13 +113,13 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
             raise InputError(
                 f"The lines hold more than {MAX_NUMBERS:,} numbers.",
                 code="gauge_too_large",
-                remedy="Ask for fewer places, variables or steps.",
+                remedy="Ask for fewer positions, variables or steps.",
             )
         heads.append(step.head)
         steps.append(_read_step(step, alignment, request, positions, found, fields))
     for name in request.variables or ():
         if name not in found and any(s.problem is None for s in steps):
-            read_variable(chosen[-1], name)  # says which there are
+            read_variable(chosen[-1], name)  # the error names those that there are
     assert first is not None
     stale = stale_results(chosen, heads)
     frame = first.frame
@@ -167,13 +167,15 @@ def _read(path: Path) -> _Step:
     subset = head.settings.get("subset_px")
     if not isinstance(subset, int | float):
         raise InputError(
-            f"{path.name} does not say its subset.", code="settings_missing", remedy="Measure again with this program."
+            f"{path.name} does not state its subset.",
+            code="settings_missing",
+            remedy="Measure again with this program.",
         )
     return _Step(path, sha256_of(path), head, field, SharedPixels.of(field, float(subset)))
 
 
 def _check_same(step: _Step, first: ResultHead, grid: tuple[Float, Float], path: Path, refs: set[str]) -> None:
-    """Refuse files that are no one measurement: other points, calibration, subset or reference."""
+    """Raise an error for files of different measurements: other points, calibration, subset or reference."""
     inputs, others = step.head.inputs_sha256, first.inputs_sha256
     field = step.field
     if step.field.has_motion:

@@ -1,4 +1,4 @@
-"""What is asked of a set of gauges; the same for the command line and the API."""
+"""Request for a set of gauges; the same for the command line and the API."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _Named(Request):
 
 
 class PointGauge(_Named):
-    """Values at one place."""
+    """Values at one position."""
 
     model_config = ConfigDict(json_schema_extra=one_of("xy_px", "xy_mm"))
 
@@ -40,7 +40,7 @@ class PointGauge(_Named):
         return self
 
     def positions(self) -> tuple[list[PositionMm], bool]:
-        """Return the place, and True if it is given in mm."""
+        """Return the position, and True if it is given in mm."""
         return [p for p in (self.xy_px, self.xy_mm) if p is not None], self.xy_px is None
 
 
@@ -59,7 +59,7 @@ class ExtensometerGauge(_Named):
     a_px: PositionPx | None = Field(None, description="One end.", examples=[[150.0, 200.0]])
     b_px: PositionPx | None = Field(None, description="The other end.", examples=[[350.0, 200.0]])
     ends_mm: tuple[PositionMm, PositionMm] | None = Field(
-        None, description="Both ends as X and Y of the reference in the frame asked for; in place of a_px and b_px."
+        None, description="Both ends as X and Y of the reference in the frame asked for; instead of a_px and b_px."
     )
 
     @model_validator(mode="after")
@@ -83,7 +83,7 @@ class LineGauge(_Named):
         description="Its corners.", min_length=2, max_length=1000, examples=[[[150.0, 200.0], [350.0, 200.0]]]
     )
     count: Annotated[Whole, Field(ge=2, le=100_000)] | None = Field(
-        None, description="Number of places, both ends included; one a grid step if left out."
+        None, description="Number of positions, both ends included; one a grid spacing if left out."
     )
 
 
@@ -120,7 +120,7 @@ class AreaGauge(_Area, _Named):
 class RigidRemoval(_Area):
     """Take the best rigid motion out of every step, fitted over an area or the whole field."""
 
-    robust: Switch = Field(False, description="Do not let single points far off the others draw the fit.")
+    robust: Switch = Field(False, description="Fit robustly: outliers have little weight.")
 
 
 class PlaneAlignment(_Area):
@@ -133,11 +133,11 @@ class PlaneAlignment(_Area):
 
 
 class ThreeTwoOneAlignment(Request):
-    """Three places on the plane Z = 0, two on the X axis, one at X = 0."""
+    """Three positions on the plane Z = 0, two on the X axis, one at X = 0."""
 
     kind: Literal["3-2-1"] = Field(description="3-2-1.")
     positions_px: Annotated[list[PositionPx], Field(min_length=6, max_length=6)] = Field(
-        description="Six places: plane, plane, plane, from, to, origin."
+        description="Six positions: plane, plane, plane, from, to, origin."
     )
 
 
@@ -160,7 +160,7 @@ class GaugeRequest(Request):
         }
     )
 
-    points: list[PointGauge] = Field(default_factory=list, description="Places.", max_length=_MOST)
+    points: list[PointGauge] = Field(default_factory=list, description="Points.", max_length=_MOST)
     extensometers: list[ExtensometerGauge] = Field(
         default_factory=list, description="Virtual extensometers.", max_length=_MOST
     )
@@ -186,13 +186,13 @@ class GaugeRequest(Request):
             "l": self.lines,
             "a": self.areas,
         }
-        seen: set[str] = set()
+        names: set[str] = set()
         for letter, gauges in lists.items():
             for k, gauge in enumerate(gauges):
                 gauge.name = gauge.name or f"{letter}{k + 1}"
-                if gauge.name in seen:
+                if gauge.name in names:
                     raise disagreement(f"two gauges have the name {gauge.name}")
-                seen.add(gauge.name)
-        if not seen and self.align is None and self.remove_rigid is None:
+                names.add(gauge.name)
+        if not names and self.align is None and self.remove_rigid is None:
             raise ValueError("give a point, an extensometer, a line, an area, align or remove_rigid")
         return self

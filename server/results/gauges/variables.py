@@ -84,5 +84,5 @@ class Variables:
 
 
 def component_of(name: str) -> int | None:
-    """Return the place of a variable in the points' covariance; None for others."""
+    """Return the index of a variable in the points' covariance; None for others."""
     return COVARIANCE_NAMES.index(name) if name in COVARIANCE_NAMES else None

@@ -22,7 +22,7 @@ from server.compute.seeds import distances_px, epipolar_line
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import decode_mask, read_image
 from server.formats.noise_json import load_noise
-from server.results.texture import texture_verdict
+from server.results.texture import speckle_quality
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 
@@ -116,7 +116,7 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
         model = load_noise(service.noise.file(body.noise_id)).models[0]
         noise = None if model is None else math.sqrt(float(model.variance(float(pixels.mean()))))
     return TextureReply.model_validate(
-        asdict(texture_verdict(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise))
+        asdict(speckle_quality(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise))
     )
 
 
