@@ -61,7 +61,7 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: utc, level, logger, message, ids, what else the caller gave, and the traceback."""
+    """One JSON object a line: utc, level, logger, message, ids, the caller's further entries, and the traceback."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""

@@ -1,4 +1,4 @@
-"""Rounds of the garbage collector that spare what stays: no long pauses over old objects.
+"""Rounds of the garbage collector that leave out lasting objects: no long pauses.
 
 That memory stays what it is over days is the allocator's part: MALLOC_ARENA_MAX in the systemd unit.
 """
@@ -14,7 +14,7 @@ def hurry() -> None:
 
 
 def settle() -> None:
-    """Take what there is now, modules above all, out of the garbage collector's rounds: they last as long as we do."""
+    """Take the present objects, modules above all, out of the garbage collector's rounds: they are never freed."""
     gc.collect()
     gc.freeze()
     gc.enable()

@@ -96,7 +96,7 @@ class Metrics:
         self._jobs: dict[str, dict[str, float]] = {}
 
     def text(self) -> bytes:
-        """Return what was counted, in the text format of Prometheus."""
+        """Return the counters, in the text format of Prometheus."""
         return generate_latest(self.registry)
 
     def on_event(self, name: str, data: Mapping[str, Any]) -> None:

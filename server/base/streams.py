@@ -28,7 +28,7 @@ class Streams:
         self._lock = threading.Lock()
 
     def counts(self) -> dict[StreamKind, int]:
-        """Return how many are open."""
+        """Return the number of open streams."""
         with self._lock:
             return dict(self._open)
 

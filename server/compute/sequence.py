@@ -179,8 +179,7 @@ class SequenceMeasurement:
         about
             Further text attributes of the file.
         in_service
-            Put the file's SHA-256 and its summary beside it: what a kill leaves is a step with all that belongs to it,
-            or none.
+            Put the file's SHA-256 and its summary beside it: after a kill, a step is complete or not there.
         keep_starts
             Keep the matcher's own unknowns beside the file, for a process that goes on from there.
 
@@ -217,7 +216,7 @@ class SequenceMeasurement:
 
     def _updating(self, shape: Field) -> Updating:
         if self._sequence is None:
-            own = weakref.proxy(self)  # no circle: what is dropped, images above all, is to go at once
+            own = weakref.proxy(self)  # no circle: dropped objects, images above all, are to be freed at once
             self._sequence = self.pair.sequence(
                 shape,
                 self.grid,

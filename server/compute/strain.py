@@ -67,7 +67,7 @@ class PatchStrain:
 
 @dataclass(frozen=True)
 class StrainSummary:
-    """One step's strain in a few numbers; what is not known is None.
+    """One step's strain in a few numbers; unknown values are None.
 
     Attributes
     ----------

@@ -145,7 +145,7 @@ class CameraSection(_Closed):
 
 
 class StageAxisSection(_Closed):
-    """[stage.axes.N]: what differs on axis N from [stage]; what is left out is as there."""
+    """[stage.axes.N]: settings of axis N that differ from [stage]."""
 
     soft_limits_mm: tuple[Finite, Finite] | None = Field(None, description="Lowest and highest position.")
     velocity_mm_s: Positive | None = Field(None, description="Velocity set when the stage is opened.")
@@ -175,7 +175,7 @@ def _check_order(limits_mm: tuple[float, float]) -> None:
 
 
 class StageSection(_Closed):
-    """[stage]: the motion controller, and how its axes are used."""
+    """[stage]: the motion controller and its axes."""
 
     driver: Literal["esp301", "smc100", "conex-cc"] = Field(description="Protocol of the controller.")
     url: str = Field(description="pyserial URL or port; `sim` starts a simulated controller.", min_length=1)

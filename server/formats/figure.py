@@ -180,7 +180,7 @@ def _wrapped(text: str, width: int) -> str:
 def _draw_image(axis: Any, image: NDArray[Any], style: FigureStyle) -> None:
     rows, cols = image.shape[:2]
     shrink = cols / (2.0 * style.width_px)
-    if shrink > 1.0:  # what the picture cannot show is not carried into it
+    if shrink > 1.0:  # the picture is not given more pixels than it can show
         size = (round(cols / shrink), max(1, round(rows / shrink)))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     low, high = np.percentile(image, (0.5, 99.5))

@@ -73,7 +73,7 @@ def recorded_sha256(path: Path) -> str | None:
 
 
 def mismatch(name: str, of: str, folder: str) -> FileFormatError:
-    """Return the error for a file that is not what was written."""
+    """Return the error for a file that differs from the one that was written."""
     return FileFormatError(
         f"{name} of {of} does not match its checksum.",
         code="checksum_mismatch",

@@ -89,7 +89,7 @@ def _decode_tiff(name: str, data: bytes) -> GrayImage:
                 raise _unsupported(name, f"its pixels are {page.dtype or 'of an unknown type'}")
             if page.samplesperpixel > 4:
                 raise _unsupported(name, f"it has {page.samplesperpixel} channels")
-            # tifffile fills what is missing with zeros; a measurement must not
+            # tifffile fills missing data with zeros; a measurement must not
             ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)]
             if not ends or min(page.databytecounts) == 0 or max(ends) > len(data):
                 raise _unreadable(name, f"it is truncated ({len(data)} bytes, {max(ends, default=0)} expected)")
@@ -145,7 +145,7 @@ def decode_image(data: bytes, *, name: str = "the image") -> GrayImage:
     data
         The whole file.
     name
-        What error messages call it.
+        Its name in error messages.
 
     Returns
     -------

@@ -16,7 +16,7 @@ def read_frames(files: Sequence[Path]) -> list[GrayImage]:
     Raises
     ------
     ImageError
-        ``image_size_mismatch``, or what a file has wrong with it.
+        ``image_size_mismatch``, or the error of a file.
     """
     frames: list[GrayImage] = []
     shape: tuple[int, ...] = ()

@@ -40,7 +40,7 @@ class LoadedNoise:
     created: object
 
     def record(self) -> dict[str, object]:
-        """Return what a result file keeps of it: the numbers that were used, and where they come from."""
+        """Return the entries for a result file: the numbers that were used, and their source."""
         cameras: dict[str, object] = {
             cam: None if model is None else {"coefficients": list(model.coefficients), "frames": model.frames}
             for cam, model in zip(CAMERAS, self.models, strict=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from core.errors import InputError
 from core.names import CAMERAS, CameraName
 
-# read-back positions of the two stages may differ by some micrometres at what is one position
+# read-back positions of the two stages may differ by some micrometres at one nominal position
 PAIR_TOLERANCE_MM = 0.05
 _NAME = re.compile(r"(?i)(cam[12])_([+-]?(?:\d+\.?\d*|\.\d+))mm\.(?:tif|tiff|png)")
 _EXAMPLE = "Name the views cam1_+0.000mm.tif, cam2_+0.000mm.tif, cam1_+5.000mm.tif and so on."

@@ -59,7 +59,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Origin:
-    """Settings and metadata as they are on file, and by result file the checksums of what it was made from."""
+    """Settings and metadata as they are on file, and by result file the checksums of its inputs."""
 
     settings: str
     metadata: str

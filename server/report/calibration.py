@@ -95,7 +95,7 @@ class CalibrationPart:
 
     @property
     def target(self) -> str:
-        """The target, and how the calibration was made."""
+        """The target, and the method of the calibration."""
         target, origin, tilt = self._record.target, self._record.provenance, self._record.settings.axis_tilt_sigma_rad
         assert target is not None
         more = [

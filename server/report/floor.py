@@ -41,7 +41,7 @@ def static_steps(stated: Sequence[int] | None, labels: Mapping[int, str], refere
 
 @dataclass(frozen=True)
 class Floor:
-    """One quantity over the static steps; lengths in mm, strains as pure numbers. What is not known is None.
+    """One quantity over the static steps; lengths in mm, strains as pure numbers. Unknown values are None.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class FloorKeeper:
         if self._origin is None:
             self._origin = np.array(np.where(np.isfinite(xyz), xyz, 0.0))
         for k, name in enumerate("XYZ"):
-            # single precision is enough for what is left
+            # single precision is enough for the differences
             self._put(name, xyz[..., k] - self._origin[..., k])
         if strain is not None:
             for k, name in enumerate(STRAINS):

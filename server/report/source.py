@@ -40,7 +40,7 @@ class Source:
     steps
         ``step.json`` of every file's step; empty where there is none.
     calibration, calibration_file
-        None where it was not found or is not the one that was measured with.
+        None where it was not found or is not that of the measurement.
     metadata
         Metadata stated by the operator.
     stale
@@ -119,14 +119,14 @@ def find_source(
     Parameters
     ----------
     origin
-        A data folder, a test's folder, an analysis' folder, or what ``stereorig measure --out`` wrote.
+        A data folder, a test's folder, an analysis' folder, or the output of ``stereorig measure --out``.
     test, analysis
         One of a data folder's tests, and of a test's analyses; left out: the only test, the newest analysis with
         results.
     calibration
         Its file, where it is not beside the results.
     metadata
-        Metadata stated by the operator; left out: what is kept with the test.
+        Metadata stated by the operator; left out: those kept with the test.
 
     Raises
     ------

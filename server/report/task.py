@@ -8,7 +8,7 @@ NAME = "report.html"
 
 
 def report_task(results: str, out: str) -> tuple[str, int]:
-    """Make the report of an analysis' folder; return its Content-Security-Policy and how many items are not stated."""
+    """Make an analysis' report; return its Content-Security-Policy and the number of items that are not stated."""
     # matplotlib is loaded here alone
     from server.report.build import make_report
     from server.report.source import find_source

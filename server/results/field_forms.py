@@ -48,7 +48,7 @@ class Part:
     stride: int = 1
 
     def slices(self, shape: tuple[int, ...]) -> tuple[slice, slice]:
-        """Return what it takes of a grid.
+        """Return the indices that it takes of a grid.
 
         Raises
         ------

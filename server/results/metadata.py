@@ -64,7 +64,7 @@ class TestMetadata(ClosedMetadata):
         return self.cam1 if cam == "cam1" else self.cam2
 
     def document(self) -> dict[str, object]:
-        """Return what was stated, nothing else."""
+        """Return the entries that were stated."""
         return self.model_dump(mode="json", exclude_none=True)
 
 

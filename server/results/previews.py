@@ -23,7 +23,7 @@ _GOOD, _USABLE, _POOR = (40, 170, 90, 90), (240, 170, 20, 110), (220, 40, 40, 13
 
 @dataclass(frozen=True)
 class Overlay:
-    """A map as PNG, and what its colours mean.
+    """A map as PNG, and the meaning of its colours.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def predicted_error_px(pixels: NDArray[Any], full_scale: float, subset_px: int) 
 
 
 def texture_map(pixels: NDArray[Any], full_scale: float, subset_px: int) -> Overlay:
-    """Colour an image by how well its texture can be matched."""
+    """Colour an image by its speckle quality."""
     error = predicted_error_px(pixels, full_scale, subset_px)
     rgba = np.empty((*error.shape, 4), np.uint8)
     rgba[...] = _POOR

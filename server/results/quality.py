@@ -27,7 +27,7 @@ _TILE_PX = 32
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Figures of one image; grey levels in counts, ``mean_share`` of full scale: how it was exposed."""
+    """Figures of one image; grey levels in counts, ``mean_share`` of full scale."""
 
     code: str
     mean_grey: float

@@ -127,7 +127,7 @@ def read_cut_pieces(path: Path) -> list[list[float]]:
 
 
 def read_point_positions(path: Path) -> NDArray[np.float64]:
-    """Return (rows, cols, 3) where each point is at the step, mm; NaN where it was not measured."""
+    """Return (rows, cols, 3) positions of the points at the step, mm; NaN where it was not measured."""
     with opened(path) as data:
         held = data.variables
         position = np.stack([held[f"{axis}_mm"][...] for axis in "xyz"], axis=-1)

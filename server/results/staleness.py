@@ -60,7 +60,7 @@ def stale_inputs(
 
 
 def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[str]:
-    """Return what was found to be gone or replaced since result files were written.
+    """Return the inputs that are gone or were replaced since result files were written.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[st
         return found + stale_inputs(
             test, steps, calibration=calibration, calibration_sha256=sha256, reference=reference
         )
-    if calibration is not None and calibration.is_file():  # one that was moved away may well be what it was
+    if calibration is not None and calibration.is_file():  # one that was moved away may be unchanged
         found += _changed(calibration, sha256, calibration.name)
     for head in heads:
         for cam in CAMERAS:

@@ -79,11 +79,11 @@ class CalibrationStore:
         write_json(self.path(calibration_id) / "view.json", {"views": views})
 
     def put_failure(self, calibration_id: str, problem: Mapping[str, object]) -> None:
-        """Record why there is no calibration."""
+        """Record the reason why there is no calibration."""
         write_json(self.path(calibration_id) / "failure.json", problem)
 
     def put_review(self, calibration_id: str, document: Mapping[str, object] | None) -> None:
-        """Keep what was decided on a calibration beside it; None takes it back."""
+        """Keep the review of a calibration beside it; None removes it."""
         path = self.path(calibration_id) / _REVIEWS[0]
         write_json(path, {"decision": None} if document is None else document)
 

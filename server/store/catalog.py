@@ -115,7 +115,7 @@ class Catalog:
                 future.set_exception(
                     StorageError(f"The catalogue was not written: {error}.", code="storage_full" if full else None)
                 )
-            except BaseException as error:  # noqa: BLE001 - handed to the caller, who waits for it
+            except BaseException as error:  # noqa: BLE001 - passed to the caller, who waits for it
                 future.set_exception(error)
             else:
                 future.set_result(result)
@@ -138,7 +138,7 @@ class Catalog:
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Finish what is queued and close."""
+        """Finish the queue and close."""
         self._work.put(None)
         self._thread.join(timeout=30.0)
 
@@ -223,7 +223,7 @@ class Catalog:
         return self.transact(write)
 
     def put_request(self, scope: str, key: str, body_sha256: str, made: Ids) -> None:
-        """Remember what a request with an Idempotency-Key made."""
+        """Record the result of a request with an Idempotency-Key."""
         text = json.dumps(made)
         self.transact(
             lambda c: c.execute("INSERT OR REPLACE INTO requests VALUES (?, ?, ?, ?)", (scope, key, body_sha256, text))

@@ -21,7 +21,7 @@ class Content:
 
 
 def content_of(tests: TestStore, test_id: str) -> Content:
-    """Return how many complete steps and result files a test has, and the SHA-256 of all their checksums."""
+    """Return the numbers of a test's complete steps and result files, and the SHA-256 of all their checksums."""
     digest = hashlib.sha256()
     steps = tests.step_numbers(test_id)
     for n in steps:

@@ -73,7 +73,7 @@ class Kept(Document):
     """Anything that a request makes."""
 
     def shown(self) -> dict[str, object]:
-        """Return what the API shows of it."""
+        """Return the entries that the API shows."""
         return self.model_dump(exclude_unset=True, exclude={"request"})
 
 
@@ -194,7 +194,7 @@ class SummaryRecord(Document):
 
 
 class Plan(Kept):
-    """``plan.json`` of a calibration or a noise measurement; what else it holds depends on which."""
+    """``plan.json`` of a calibration or a noise measurement; further entries depend on the kind."""
 
     created_utc: str
     label: str = ""
@@ -204,7 +204,7 @@ class Plan(Kept):
 
 
 class Failure(JobProblem):
-    """``failure.json``: why nothing came of it, and how its job ended."""
+    """``failure.json``: the reason of the failure, and the final state of the job."""
 
     job_state: JobState = "interrupted"
 
@@ -244,7 +244,7 @@ class CalibrationRecord(MadeRecord):
 
 
 class WatchRecord(Document):
-    """``watch.json``, and what the next reading is compared with."""
+    """``watch.json``, with the value that the next reading is compared with."""
 
     channel: str
     threshold: float

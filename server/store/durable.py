@@ -70,7 +70,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def record_of(kind: type[Record], document: object, path: Path) -> Record:
-    """Return what a file holds as a record.
+    """Return a file's content as a record.
 
     Raises
     ------

@@ -79,7 +79,7 @@ class NoiseStore:
         write_json(self.path(noise_id) / "frames.json", {**entries, "frames": frames})
 
     def put_failure(self, noise_id: str, problem: Mapping[str, object]) -> None:
-        """Record why there are no models."""
+        """Record the reason why there are no models."""
         write_json(self.path(noise_id) / "failure.json", problem)
 
     def read(self, noise_id: str) -> MadeRecord:

@@ -193,7 +193,7 @@ class TestStore:
         return (self.path(test_id) / "steps").stat().st_mtime_ns, self._commits
 
     def step_documents(self, test_id: str) -> Iterator[tuple[int, StepRecord | FileFormatError]]:
-        """Return the number and ``step.json`` of every complete step, ascending, or why it cannot be read.
+        """Return the number and ``step.json`` of every complete step, ascending, or the reason why it cannot be read.
 
         A start reads them all: with ten thousand steps, each access of a path counts.
         """
@@ -365,7 +365,7 @@ class TestStore:
         return record_of(AnalysisRecord, document, path)
 
     def put_step_summary(self, test_id: str, analysis_id: str, n: int, summary: Mapping[str, object]) -> None:
-        """Write what was found in one step, beside its result."""
+        """Write the summary of one step beside its result."""
         write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
     def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepOutcome]:
@@ -404,12 +404,12 @@ class TestStore:
         return path
 
     def drop_starts(self, test_id: str, analysis_id: str) -> None:
-        """Remove what only an unfinished analysis needs, see :mod:`server.formats.results.starts`."""
+        """Remove files that only an unfinished analysis needs, see :mod:`server.formats.results.starts`."""
         for path in self.analysis_path(test_id, analysis_id).glob("starts_[0-9]*.npz"):
             path.unlink(missing_ok=True)
 
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
-        """Remove what a worker that was ended left of a result: half a file, a checksum without its result.
+        """Remove the remains of a result of a worker that was ended: half a file, a checksum without its result.
 
         Nothing may write into the analysis meanwhile. Returns the removed files.
         """

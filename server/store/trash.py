@@ -41,14 +41,14 @@ class Trash:
         self._data = root
         self.root = root / "trash"
 
-    # what lies in it -------------------------------------------------------------------------------------------
+    # its entries -------------------------------------------------------------------------------------------
 
     def ids(self) -> list[str]:
         """Ids of all entries, in the order of their deletion."""
         return sorted(p.parent.name for p in self.root.glob(f"x*/{_CONTENT}") if is_id(p.parent.name, "x"))
 
     def entry(self, trash_id: str) -> TrashEntry:
-        """Return what an entry was, when and by whom it was deleted.
+        """Return an entry's kind and ids, and the time and the client of its deletion.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class Trash:
         return trash_id
 
     def restore(self, trash_id: str) -> TrashEntry:
-        """Move an entry's content back to where it was; return what it is.
+        """Move an entry's content back to its original path; return the entry.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class Trash:
             raise storage_error(error, entry) from error
 
     def tidy(self) -> list[str]:
-        """Remove what a kill left of entries that were being made, restored or removed; return a line for each."""
+        """Remove leftovers of entries that were being made, restored or removed at a kill; return a line for each."""
         done = []
         for entry in sorted(self.root.glob("x*")):
             if is_id(entry.name, "x") and not (entry / _CONTENT).exists():

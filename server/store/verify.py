@@ -1,4 +1,4 @@
-"""Looking through a data folder: what is damaged, incomplete, foreign, or unknown to the catalogue; changes nothing."""
+"""Verification of a data folder: finds damaged, incomplete and foreign files, and those not in the catalogue."""
 
 from __future__ import annotations
 

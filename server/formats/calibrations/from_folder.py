@@ -75,7 +75,7 @@ def calibrate_folder(
     hold_out_mm
         Positions to leave out of the fit and check with.
     localiser
-        How intersections are found.
+        Method of locating the intersections.
     progress
         Reports (phase, done, total).
 

@@ -19,7 +19,7 @@ _ROTATION_TOLERANCE = 1e-4  # files carry six digits and more; a wrong axis orde
 
 
 def unreadable(name: str, why: str) -> FileFormatError:
-    """Return the error for a file that is not what it should be."""
+    """Return the error for a file that is no calibration of its kind."""
     return FileFormatError(
         f"{name} cannot be read as a calibration: {why}.",
         code="calibration_unreadable",

@@ -98,8 +98,8 @@ def middle_depth_mm(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, 
 def shared_points(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> Float:
     """Return points (n, 3) of the system frame that both cameras see: a grid at three depths about the middle.
 
-    The outer depths are as far off as both images still share nearly half of what they share in the middle, 5 % at
-    most. Empty where they share nothing.
+    The outer depths are those at which both images share nearly half as much as in the middle, 5 % off at most. Empty
+    where they share nothing.
     """
     depth = middle_depth_mm(pair, size1, size2)
     if depth is None:

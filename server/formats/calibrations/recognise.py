@@ -29,7 +29,7 @@ _MIN_BASELINE = 1e-6  # of the stand-off
 
 @dataclass(frozen=True)
 class LoadedCalibration:
-    """A pair of cameras and where it came from.
+    """A pair of cameras and its origin.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The entries of a calibration.json: the cameras' parameters, how they were calibrated, and how well."""
+"""The entries of a calibration.json: the cameras' parameters, the settings and the checks of the calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The readings of a set of gauges in every step; what is missing is None, with the reason beside it."""
+"""The readings of a set of gauges in every step; missing values are None, with the reason beside them."""
 
 from __future__ import annotations
 
@@ -150,11 +150,11 @@ class GaugeReadings:
     Attributes
     ----------
     settings
-        What was asked for.
+        The request.
     inputs_sha256
         Of each result file, by its name.
     stale, stale_reasons
-        Whether inputs or results are gone or were replaced since, and which.
+        Inputs or results that are gone or were replaced since.
     frame
         The frame of positions and displacements.
     smoothing_window

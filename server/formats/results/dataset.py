@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def as_dataset(result: Field, provenance: Provenance, strain: StrainField | None = None) -> xarray.Dataset:
-    """Return what ``xarray.open_dataset`` reads from the field's result file.
+    """Return the dataset that ``xarray.open_dataset`` reads from the field's result file.
 
     Raises
     ------

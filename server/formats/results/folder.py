@@ -27,7 +27,7 @@ def first_results(folder: Path, folders: Iterable[Path]) -> list[Path]:
     Parameters
     ----------
     folder
-        What the user named.
+        The folder that the user named.
     folders
         Where its results may lie.
 

@@ -1,4 +1,4 @@
-"""The layout of result files: which variables hold what of a field, in which unit."""
+"""The layout of result files: the variables of a field and their units."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ class ResultHead:
     frame, created, software_version
         As written.
     reference_step
-        What it was matched against; None for a shape.
+        The step it was matched against; None for a shape.
     settings, inputs_sha256
         In today's form, see :mod:`server.formats.results.settings`.
     attributes

@@ -17,7 +17,7 @@ from core.field.points.result import Field
 from core.field.points.starts import Starts
 from server.formats.files import write_bytes
 
-#: what a result file holds in single precision
+#: values that a result file holds in single precision
 _SINGLE = ("covariance", "zncc", "epipolar_px", "noise_grey")
 
 

@@ -1,4 +1,4 @@
-"""Strain in a result file: its variables, and how it was computed."""
+"""Strain in a result file: its variables and options."""
 
 from __future__ import annotations
 

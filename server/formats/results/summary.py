@@ -41,7 +41,7 @@ class Span:
 
 @dataclass(frozen=True)
 class StepSummary:
-    """One field in a few numbers; what is not known is None.
+    """One field in a few numbers; unknown values are None.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class StepSummary:
     smoothing
         Smoothing of the displacement, and its spatial resolution.
     patch
-        What the field was measured with, why, and the numbers of the choice.
+        The patch of the measurement, with the reason and the numbers of the choice.
     reference_step, points_by_reference, displacement_mm
         Of displacements alone: what the step was matched against, valid points by what they were matched against, and
         the components' spans.
@@ -91,7 +91,7 @@ class StepSummary:
     displacement_mm: dict[str, Span | None] | None = None
 
     def document(self) -> dict[str, object]:
-        """Return it as plain values; a shape has no entries for what only displacements have."""
+        """Return it as plain values; a shape has no entries of displacements."""
         of_motion = ("reference_step", "points_by_reference", "displacement_mm")
         return {k: v for k, v in asdict(self).items() if self.kind == "displacement" or k not in of_motion}
 

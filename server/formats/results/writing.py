@@ -34,7 +34,7 @@ from server.formats.results.netcdf import written_dataset
 from server.formats.results.strain import put_strain
 
 # measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
-# the file. What repeats is always deflated; everything is where at least this share of the points has no numbers
+# the file. Repeating values are always deflated; everything is where at least this share of the points has no numbers
 _MANY_EMPTY = 0.2
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
 _FRAMES = {
@@ -56,7 +56,7 @@ class Provenance:
     software_version
         Of this program.
     frame
-        ``target`` or ``camera1``: what the system frame is; or its description.
+        ``target`` or ``camera1``, which defines the system frame; or its description.
     step
         Number of the step, 0 = the reference.
     reference
@@ -238,7 +238,7 @@ def _put_references(dataset: Any, references: References) -> None:
 
 
 def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
-    """Write what later steps go on from, where the field that is shown has something else."""
+    """Write the start values of later steps, where they differ from the field that is shown."""
     if result.smoothing is not None and measured.uvw_mm is not None:
         for k, name in enumerate(("u", "v", "w")):
             _put(

@@ -313,7 +313,7 @@ def _area(
     values = {}
     for n in names:
         variable, sigma = variables.get(n)
-        # how far other variables' errors reach is not known here: no uncertainty of their mean
+        # the correlation of other variables' errors is not known here: no uncertainty of their mean
         known = sigma if component_of(n) is not None else None
         of_position = component_of(n) in range(3)
         shared = variables.shared.positions if of_position else variables.shared

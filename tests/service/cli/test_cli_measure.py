@@ -337,7 +337,7 @@ def test_bad_calibrations(folder: Path, tmp_path: Path, capfd: Any) -> None:
     path.write_text(json.dumps({**content, "image_size_px": {"cam1": [512, 480], "cam2": [512, 480]}}))
     fails(command(folder, tmp_path / "out"), "image_size_mismatch", "512 x 480", capfd)
     path.write_text(json.dumps({"cam1": content["cam1"], "cam2": content["cam1"]}))
-    fails(command(folder, tmp_path / "out"), "calibration_invalid", "same place", capfd)
+    fails(command(folder, tmp_path / "out"), "calibration_invalid", "same position", capfd)
     assert not (tmp_path / "out").exists()
 
 

@@ -129,7 +129,7 @@ def test_coefficient_vectors_of_every_length(tmp_path: Path, length: int) -> Non
         ({"cameraMatrix1": np.where(K1 == 981.5, np.inf, K1)}, "calibration_invalid", "cameraMatrix1"),
         ({"R": R * 1.01}, "calibration_invalid", "rotation"),
         ({"R": np.diag([1.0, 1.0, -1.0])}, "calibration_invalid", "rotation"),
-        ({"T": np.zeros(3)}, "calibration_invalid", "same place"),
+        ({"T": np.zeros(3)}, "calibration_invalid", "same position"),
         ({"T": np.array([1.0, np.nan, 0.0])}, "calibration_invalid", "T"),
         ({"cameraMatrix1": np.diag([-5.0, 5.0, 1.0])}, "calibration_invalid", "fx"),
         ({"cameraMatrix1": K1.T}, "calibration_invalid", "form"),
@@ -354,4 +354,4 @@ def test_our_own_file_with_a_bad_number(tmp_path: Path, key: str, value: object,
     assert error.code == code
     assert key in error.cause
     path.write_text(json.dumps({"cam1": OURS, "cam2": OURS}))
-    assert "same place" in refused(path).cause
+    assert "same position" in refused(path).cause
