@@ -161,11 +161,16 @@ def test_decisions_are_kept_and_heeded(client: httpx.Client, calibration: str) -
 
 
 def test_the_decision_survives_a_rebuilt_index(client: httpx.Client, service: Service, calibration: str) -> None:
-    client.put(f"/api/v1/calibrations/{calibration}/review", json={"decision": "accepted"}).raise_for_status()
+    # by its earlier address, too
+    client.put(f"/api/v1/calibrations/{calibration}/judgement", json={"decision": "accepted"}).raise_for_status()
     service.catalog.put_entry("calibration", "", calibration, {"id": calibration, "state": "unfinished"})
     rebuild(service.catalog, service.folder, service.calibrations, service.tests)
     entry = next(e for e in service.catalog.entries("calibration") if e["id"] == calibration)
     assert entry["decision"] == "accepted"
+    kept = service.calibrations.path(calibration) / "review.json"
+    kept.rename(kept.with_name("judgement.json"))  # as earlier versions named it
+    assert client.get(f"/api/v1/calibrations/{calibration}").json()["review"]["decision"] == "accepted"
+    kept.with_name("judgement.json").rename(kept)
 
 
 def test_a_noise_whose_square_is_nothing_is_refused(client: httpx.Client) -> None:
