@@ -338,7 +338,7 @@ def test_auto_patches_say_why_step_by_step(client: httpx.Client, calibration_id:
     shape, moved = (step["patch"] for step in reply["summary"]["steps"])
     assert reply["settings"]["patch"] == "auto"
     assert shape["patch"] == "quadratic"
-    assert shape["reason"].startswith("curved: plane patches have a bias of")
+    assert shape["reason"].startswith("quadratic: plane patches have a bias of")
     assert shape["plane_error_mm"] > shape["quadratic_noise_mm"] > shape["plane_noise_mm"] > 0.0
     assert moved["patch"] == "affine"  # a sphere that moves as a block does not bend
     url = f"{API}/tests/{test_id}/analyses/{accepted['analysis_id']}/steps/0/fields/curvature_1"

@@ -30,7 +30,7 @@ _SURELY = 1.0
 
 
 def advise(choice: PatchChoice, estimate: PlaneError | None) -> PatchChoice:
-    """Return the user's choice of plane patches with their bias, and advice if curved ones have less total error.
+    """Return the user's choice of plane patches with their bias, and advice if quadratic ones have less total error.
 
     Parameters
     ----------
@@ -46,13 +46,13 @@ def advise(choice: PatchChoice, estimate: PlaneError | None) -> PatchChoice:
         return choice
     text = (
         f"plane patches have a bias of {format_length(estimate.error_mm)} (rms) in {_quantity(choice.patch)} here, "
-        f"besides {format_length(estimate.noise_mm)} of noise; curved ones would have the smaller total error"
+        f"besides {format_length(estimate.noise_mm)} of noise; quadratic ones would have the smaller total error"
     )
     return replace(choice, quadratic_advised=True, reason=f"{choice.reason}; {text}")
 
 
 def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: PlaneError | None) -> PatchChoice:
-    """Decide between the plane patches that a field was measured with, and curved ones.
+    """Decide between the plane patches that a field was measured with, and quadratic ones.
 
     Parameters
     ----------
@@ -68,14 +68,14 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
     Returns
     -------
     PatchChoice
-        ``curved`` if that leaves clearly (1.1 times) less error in all, rms over a sample of the field.
+        ``quadratic`` if that leaves clearly (1.1 times) less error in all, rms over a sample of the field.
     """
     plane: UsedPatch = "plane" if fitter.comparisons == 1 else "affine"
     if estimate is not None and estimate.below_mm < _SURELY * estimate.noise_mm:
         text = (
             f"plane patches have a bias of {_format_bias(estimate)} (rms) in {_quantity(plane)} here and "
-            f"{format_length(estimate.noise_mm)} of noise besides; curved ones have about {_CURVED_NOISE:g} times that "
-            "noise"
+            f"{format_length(estimate.noise_mm)} of noise besides; quadratic ones have about "
+            f"{_CURVED_NOISE:g} times that noise"
         )
         return replace(
             _simple(plane, f"{plane}: {text}", 0), plane_error_mm=estimate.error_mm, plane_noise_mm=estimate.noise_mm
@@ -91,7 +91,7 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
     good = curved.ok & ~curved_fitter.far_from_start(xy, curved, flat.w, start_G, _FAR_PX)
     if good.mean() < _SHARE or good.sum() < _MIN_POINTS:
         share = f"{100.0 * (1.0 - good.mean()):.0f} %"
-        return _simple(plane, f"{plane}: curved patches do not converge on {share} of the points tried", len(index))
+        return _simple(plane, f"{plane}: quadratic patches do not converge on {share} of the points tried", len(index))
     kept = np.flatnonzero(good)
     a, b = flat.take(kept), curved.take(kept)
     return decide(*_compared(fitter, xy[kept], a, b), plane=plane)
@@ -137,7 +137,7 @@ def decide(difference_mm: Float, plane_mm2: Float, curved_mm2: Float, *, plane: 
     bias = format_length(error) if error2 > shown else f"less than {format_length(np.sqrt(error2 + shown))}"
     numbers = (
         f"plane patches have a bias of {bias} (rms) in {_quantity(plane)} here and {format_length(plane_noise)} of "
-        f"noise besides; curved ones have {format_length(curved_noise)} of noise"
+        f"noise besides; quadratic ones have {format_length(curved_noise)} of noise"
     )
     return PatchChoice(
         patch="quadratic" if curved else plane,

@@ -71,9 +71,9 @@ def test_auto_decides_shape_and_motion_apart_keeps_to_it_and_says_why(
 ) -> None:
     assert main(command(folder, tmp_path / "out", patch="auto")) == 0
     said = capfd.readouterr().err
-    assert "shape: curved: plane patches have a bias of" in said
-    assert "step 1: stretch: plane patches have a bias of less than" in said
-    assert "step 2: curved: plane patches have a bias of" in said
+    assert "shape: quadratic: plane patches have a bias of" in said
+    assert "step 1: affine: plane patches have a bias of less than" in said
+    assert "step 2: quadratic: plane patches have a bias of" in said
     steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
     assert [step["patch"]["patch"] for step in steps] == ["quadratic", "affine", "quadratic", "quadratic"]
     assert [step["patch"]["kept"] for step in steps] == [False, False, False, True]
@@ -106,8 +106,8 @@ def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
     assert main(command(folder, tmp_path / "out", patch="affine", **two)) == 0
     said = capfd.readouterr().err
     assert "shape: plane: asked for; plane patches have a bias of" in said
-    assert "step 1: stretch: asked for; plane patches have a bias of" in said
-    assert said.count("curved ones would have the smaller total error") == 2
+    assert "step 1: affine: asked for; plane patches have a bias of" in said
+    assert said.count("quadratic ones would have the smaller total error") == 2
     with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
         z, _ = errors_um(rig, data, "still")
         choice = json.loads(data.attrs["patch_choice"])
@@ -121,7 +121,7 @@ def test_curved_patches_asked_for_are_taken_for_both(rig: SimRig, folder: Path, 
     assert main(command(folder, tmp_path / "out", patch="quadratic")) == 0
     for n, state in enumerate(STATES):
         with xr.open_dataset(tmp_path / "out" / f"step_{n:04d}.nc") as data:
-            assert data.attrs["patch_reason"] == "curved: asked for"
+            assert data.attrs["patch_reason"] == "quadratic: asked for"
             z, uvw = errors_um(rig, data, state)
             assert abs(z.mean()) < 0.1
             assert uvw.size == 0 or np.abs(uvw.mean(0)).max() < 0.15

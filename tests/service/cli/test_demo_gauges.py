@@ -104,7 +104,7 @@ def test_strain_along_a_direction_and_its_sigma() -> None:
         assert value.std() / sigma[0, 0] == pytest.approx(1.0, abs=0.02)
         off = difference(value, np.full_like(value, n @ matrix @ n), sigma, strain.valid)
         assert off.chi == pytest.approx(1.0, abs=0.02)
-        assert off.rms == pytest.approx(off.told, rel=0.02)
+        assert off.rms == pytest.approx(off.reported, rel=0.02)
     assert whole_gauges(strain).sum() == 192**2
     assert 1.0 < chi_limit(strain) < 1.2
     assert np.isnan(difference(value, value, sigma, ~strain.valid).rms)

@@ -35,7 +35,7 @@ def test_a_bias_above_the_cost_in_noise_makes_it_curved(bias_um: float) -> None:
     assert choice.patch == "quadratic"
     assert choice.plane_error_mm is not None
     assert abs(1e3 * choice.plane_error_mm / bias_um - 1.0) < 0.1
-    assert choice.reason.startswith("curved: plane patches have a bias of ")
+    assert choice.reason.startswith("quadratic: plane patches have a bias of ")
     assert "0.38 um of noise" in choice.reason
     assert choice.sample >= 240
 
@@ -45,7 +45,7 @@ def test_a_bias_below_it_leaves_it_plane(bias_um: float) -> None:
     for seed in range(20):
         choice = sample(bias_um, seed=seed)
         assert choice.patch == "affine"
-        assert choice.reason.startswith("stretch: plane patches have a bias of ")
+        assert choice.reason.startswith("affine: plane patches have a bias of ")
     if bias_um == 0.0:
         assert "less than 0." in choice.reason
 
