@@ -24,7 +24,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")
 
 @contextmanager
 def about(**ids: str) -> Iterator[None]:
-    """Let every log line of the block, in this thread or task and what it starts, name these ids."""
+    """Add these ids to every log line of the block, in this thread or task and those it starts."""
     token = _about.set({**(_about.get() or {}), **ids})
     try:
         yield

@@ -9,12 +9,12 @@ import gc
 
 
 def hurry() -> None:
-    """Let the garbage collector rest while modules are loaded, which all stay: a seventh of a start went into it."""
+    """Pause the garbage collector while modules are loaded, which are never freed: it took a seventh of a start."""
     gc.disable()
 
 
 def settle() -> None:
-    """Take the present objects, modules above all, out of the garbage collector's rounds: they are never freed."""
+    """Exclude the present objects, modules above all, from the garbage collector's rounds: they are never freed."""
     gc.collect()
     gc.freeze()
     gc.enable()

@@ -138,7 +138,7 @@ S = TypeVar("S", bound=_HasMetrics)
 
 
 def timed_capture(source: str) -> Callable[[Callable[Concatenate[S, P], T]], Callable[Concatenate[S, P], T]]:
-    """Let a function that takes a step be timed, or its failure counted; its first argument is the service."""
+    """Decorate a function that takes a step, service first: its time, or its failure, is counted."""
 
     def decorate(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
         @functools.wraps(function)

@@ -22,14 +22,14 @@ _AUTOGROUP = Path("/proc/self/autogroup")
 
 
 def raise_service() -> None:
-    """Let this process come first where the system allows it (root, or a limit that permits it)."""
+    """Raise this process' priority where the system allows it (root, or a limit that permits it)."""
     # a thread that asks for the interpreter, such as a stop's, gets it after this long (Python's own value is 5 ms)
     sys.setswitchinterval(_SWITCH_S)
     _set_nice(_SERVICE_NICE)
 
 
 def lower_worker() -> None:
-    """Let this process come last, in a session of its own: it would use up the share of the service's."""
+    """Lower this process' priority, in a session of its own: it would use up the share of the service's."""
     with contextlib.suppress(OSError, AttributeError):
         os.setsid()
     _set_nice(_WORKER_NICE)

@@ -15,7 +15,7 @@ from core.settings import AnalysisSettings
 from server.formats.calibrations.recognise import load_calibration
 
 #: a click is good to some pixels; further from the epipolar line it is another point
-FARTHEST_PX = 8.0
+MAX_EPIPOLAR_PX = 8.0
 
 Position = Sequence[float]
 
@@ -64,12 +64,12 @@ def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int
             )
     off = distances_px(pair, seeds)
     worst = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
-    if not off[worst] <= FARTHEST_PX:
+    if not off[worst] <= MAX_EPIPOLAR_PX:
         one, two = seeds[worst].xy_px, seeds[worst].xy2_px
         assert two is not None
         raise RegionError(
             f"The seed ({one[0]:g}, {one[1]:g}) cannot be at ({two[0]:g}, {two[1]:g}) in camera 2: that lies "
-            f"{off[worst]:.1f} px from its epipolar line; {FARTHEST_PX:g} px are allowed.",
+            f"{off[worst]:.1f} px from its epipolar line; {MAX_EPIPOLAR_PX:g} px are allowed.",
             code="seed_off_epipolar",
             remedy="Click the same point in both views, or leave camera 2's position out.",
         )

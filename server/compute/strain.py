@@ -40,8 +40,8 @@ def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_windo
     """Return a text that states the spatial resolution of a smoothed displacement, and of strain from it."""
     mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
     text = (
-        f"displacements are smoothed over {smoothing.window} points: details are resolved that are "
-        f"{smoothing.resolution_px:g} px{mm} wide, {smoothing.subset_px:g} px without smoothing"
+        f"displacements are smoothed over {smoothing.window} points: their spatial resolution is "
+        f"{smoothing.resolution_px:g} px{mm}, {smoothing.subset_px:g} px without smoothing"
     )
     if gauge_px is None or strain_window is None:
         return text

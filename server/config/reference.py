@@ -72,7 +72,7 @@ def _section(title: str, section: JsonSchemaValue, known: Definitions, *, prefix
 
 
 def _core(field: JsonSchemaValue) -> JsonSchemaValue:
-    """Take the alternative `null` away: a key that may be left out."""
+    """Remove the alternative `null`: a key that may be left out."""
     options = [option for option in field.get("anyOf", [field]) if option.get("type") != "null"]
     return options[0] if len(options) == 1 else {"anyOf": options}
 

@@ -16,7 +16,7 @@ from server.formats.files import written_temporary
 from server.results.provenance import provenance
 from server.results.steps import Source, StepResult
 
-_LONGEST = 63  # namelengthmax
+_MAX_NAME = 63  # namelengthmax
 _KEYWORDS = frozenset(
     {
         "break",
@@ -49,7 +49,7 @@ def matlab_name(name: str) -> str:
     name = re.sub(r"[^A-Za-z0-9_]", "_", name)
     if not name or not name[0].isalpha() or name in _KEYWORDS:
         name = f"v_{name}"
-    return name[:_LONGEST]
+    return name[:_MAX_NAME]
 
 
 def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:

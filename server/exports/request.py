@@ -22,7 +22,7 @@ MEDIA_TYPES: dict[ExportFormat, str] = {
     "gif": "image/gif",
     "mp4": "video/mp4",
 }
-_HIGHEST = 9999
+_MAX_STEP = 9999
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def steps_in(text: str) -> list[int]:
             low, high = int(first), int(last or first)
         except ValueError:
             low, high = 0, -1
-        if not 0 <= low <= high <= _HIGHEST:
+        if not 0 <= low <= high <= _MAX_STEP:
             raise InputError(
                 f"{part!r} is neither a step's number nor a range of them.",
                 code="step_invalid",

@@ -97,7 +97,7 @@ def require_recorded(path: Path, of: str, folder: str) -> None:
 
 @contextlib.contextmanager
 def written_temporary(path: Path, *, checksum: bool = False) -> Iterator[Path]:
-    """Give a temporary path in the same folder; on leaving, sync it, rename it to ``path``, sync the folder.
+    """Yield a temporary path in the same folder; on leaving, sync it, rename it to ``path``, sync the folder.
 
     With ``checksum``, its SHA-256 is put beside it first, so that a file under its real name never lacks it. If the
     body raises, the temporary file is removed and ``path`` is left as it was.

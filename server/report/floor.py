@@ -101,7 +101,7 @@ class FloorKeeper:
         self.left_out: list[int] = []
 
     def add(self, n: int, field: Field, strain: StrainField | None) -> None:
-        """Take a step."""
+        """Add a step."""
         if self._bytes > _MAX_BYTES:
             self.left_out.append(n)
             return

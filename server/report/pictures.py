@@ -30,7 +30,7 @@ _VALID, _INVALID = "#00d9a0", "#ff4060"
 
 
 def _cropped(data: bytes) -> bytes:
-    """Take the white border of a PNG away, but for a little."""
+    """Crop the white border of a PNG to a few pixels."""
     with Image.open(io.BytesIO(data)) as image:
         plain = image.convert("RGB")
     box = ImageChops.difference(plain, Image.new("RGB", plain.size, "white")).getbbox()

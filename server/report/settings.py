@@ -86,7 +86,7 @@ def _smoothing(measured: Measured) -> Value:
         return Value("none", None, SETTINGS)
     mm = "" if smoothing.resolution_mm is None else f" ({smoothing.resolution_mm:.3g} mm)"
     text = f"polynomial of order {smoothing.order} over {smoothing.window} x {smoothing.window} points; "
-    text += f"{smoothing.resolution_px:g} px{mm} are resolved"
+    text += f"spatial resolution {smoothing.resolution_px:g} px{mm}"
     return Value(text, float(smoothing.resolution_px), SETTINGS)
 
 

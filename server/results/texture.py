@@ -18,7 +18,7 @@ GOOD_PX, USABLE_PX = 0.01, 0.05
 #: subsets that are tried for a proposal, px
 SIZES = (11, 15, 19, 23, 27, 31, 35, 41, 47, 55, 65, 77, 91)
 #: share of a region's subsets that the proposed size has below GOOD_PX, or below USABLE_PX where none has
-ENOUGH = 0.95
+MIN_SHARE = 0.95
 
 
 def errors_at(
@@ -129,13 +129,13 @@ def speckle_quality(
         size: SubsetShare(size, float(np.mean(error <= GOOD_PX)), float(np.mean(error <= USABLE_PX)))
         for size, error in errors.items()
     }
-    proposed = next((s for s in SIZES if shares[s].good_share >= ENOUGH), None)
+    proposed = next((s for s in SIZES if shares[s].good_share >= MIN_SHARE), None)
     if proposed is None:
-        proposed = next((s for s in SIZES if shares[s].usable_share >= ENOUGH), None)
+        proposed = next((s for s in SIZES if shares[s].usable_share >= MIN_SHARE), None)
     own = shares[subset_px]
     level: Literal["good", "usable", "poor"] = "good"
-    if own.good_share < ENOUGH:
-        level = "usable" if own.usable_share >= ENOUGH else "poor"
+    if own.good_share < MIN_SHARE:
+        level = "usable" if own.usable_share >= MIN_SHARE else "poor"
     median = float(np.median(errors[subset_px]))
     return SpeckleQuality(
         subset_px=subset_px,

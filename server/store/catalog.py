@@ -196,7 +196,7 @@ class Catalog:
         return [json.loads(row[0]) for row in rows]
 
     def remove_entry(self, kind: str, parent: str, entry_id: str) -> None:
-        """Take something out of the index; with a test, its steps and analyses."""
+        """Remove something from the index; with a test, its steps and analyses."""
 
         def write(c: sqlite3.Connection) -> None:
             c.execute("DELETE FROM entries WHERE kind = ? AND parent = ? AND id = ?", (kind, parent, entry_id))

@@ -56,7 +56,7 @@ class IdMaker:
         self._last: dict[str, int] = {}
 
     def reserve(self, name: str) -> None:
-        """Take note of an id that exists."""
+        """Reserve an id that exists."""
         with self._lock:
             self._last[name[0]] = max(self._last.get(name[0], 0), int(name[1:7]))
 
@@ -195,7 +195,7 @@ class DataFolder:
                     Path(folder, name).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Release the lock."""
         if self._lock_file is not None:
             self._lock_file.close()
             self._lock_file = None

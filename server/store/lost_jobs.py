@@ -34,7 +34,7 @@ class LostJobs:
         self._bursts: dict[tuple[str, str], list[tuple[BurstIndex, StepRecord]]] = {}
 
     def made(self, request: KeptRequest | None, ids: Ids) -> None:
-        """Take the request that something was made for."""
+        """Record the request that something was made for."""
         if request is not None:
             self._requests.setdefault((request.scope, request.key), (request.body_sha256, ids))
 

@@ -27,7 +27,7 @@ class NoiseStore:
         self._folder = folder
 
     def end_unfinished(self) -> None:
-        """Take note of the ids that exist, and mark every unfinished measurement as failed."""
+        """Reserve the ids that exist, and mark every unfinished measurement as failed."""
         for noise_id in self.ids():
             self._folder.ids.reserve(noise_id)
             with contextlib.suppress(FileFormatError):  # one that is damaged must not keep the service from starting

@@ -127,7 +127,7 @@ class TestStore:
 
     @contextlib.contextmanager
     def still(self) -> Iterator[None]:
-        """Let no step be added and no test changed meanwhile."""
+        """Hold the lock: no step is added and no test changed meanwhile."""
         with self._lock:
             yield
 

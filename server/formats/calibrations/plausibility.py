@@ -19,7 +19,7 @@ MAX_RESIDUAL_PX = 1e-3  # of a carried-over model against an independent project
 _ACROSS = (13, 11)
 _DEPTHS = np.geomspace(0.3, 300.0, 61)  # of the baseline
 _THICKNESS = (0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
-_ENOUGH = 20
+_MIN_POINTS = 20
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
         xy1 = independent_projection(loaded.pair.cam1, points)
         xy2 = independent_projection(loaded.pair.cam2, points)
         residual = Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2))
-    if residual.points < _ENOUGH:
+    if residual.points < _MIN_POINTS:
         warnings.append("both cameras see hardly any point in common: the poses or the image sizes may be wrong")
     elif residual.max_px is not None and residual.max_px > MAX_RESIDUAL_PX:
         raise FileFormatError(

@@ -22,7 +22,7 @@ _NEARLY_FULL_BYTES = 1 << 20
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Give a file's data set to read; values come as they are stored, without masks.
+    """Yield a file's data set to read; values come as they are stored, without masks.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False) -> Iterator[Any]:
-    """Give an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_temporary`.
+    """Yield an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_temporary`.
 
     Parameters
     ----------

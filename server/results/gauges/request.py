@@ -14,7 +14,7 @@ PositionPx = tuple[Pixel, Pixel]
 PositionMm = tuple[Number, Number]
 Name = Annotated[str, StringConstraints(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f,;\"]+$")]
 Variable = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
-_MOST = 200
+_MAX_GAUGES = 200
 
 
 class _Named(Request):
@@ -118,7 +118,7 @@ class AreaGauge(_Area, _Named):
 
 
 class RigidRemoval(_Area):
-    """Take the best rigid motion out of every step, fitted over an area or the whole field."""
+    """Remove the best-fit rigid motion from every step, fitted over an area or the whole field."""
 
     robust: Switch = Field(False, description="Fit robustly: outliers have little weight.")
 
@@ -160,12 +160,12 @@ class GaugeRequest(Request):
         }
     )
 
-    points: list[PointGauge] = Field(default_factory=list, description="Points.", max_length=_MOST)
+    points: list[PointGauge] = Field(default_factory=list, description="Points.", max_length=_MAX_GAUGES)
     extensometers: list[ExtensometerGauge] = Field(
-        default_factory=list, description="Virtual extensometers.", max_length=_MOST
+        default_factory=list, description="Virtual extensometers.", max_length=_MAX_GAUGES
     )
-    lines: list[LineGauge] = Field(default_factory=list, description="Lines.", max_length=_MOST)
-    areas: list[AreaGauge] = Field(default_factory=list, description="Areas.", max_length=_MOST)
+    lines: list[LineGauge] = Field(default_factory=list, description="Lines.", max_length=_MAX_GAUGES)
+    areas: list[AreaGauge] = Field(default_factory=list, description="Areas.", max_length=_MAX_GAUGES)
     variables: Annotated[list[Variable], Field(min_length=1, max_length=50)] | None = Field(
         None,
         description="Variables of the result files to read at points, lines and areas; position and displacement if "
@@ -173,7 +173,7 @@ class GaugeRequest(Request):
         examples=[["u_mm", "w_mm"]],
     )
     align: Alignment | None = Field(None, description="Frame to express everything in; the system frame if left out.")
-    remove_rigid: RigidRemoval | None = Field(None, description="Take the rigid motion out first; null leaves it in.")
+    remove_rigid: RigidRemoval | None = Field(None, description="Remove the rigid motion first; null keeps it.")
     steps: Annotated[list[StepNumber], Field(min_length=1, max_length=10_000)] | None = Field(
         None, description="Steps to read; all if left out."
     )

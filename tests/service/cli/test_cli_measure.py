@@ -470,7 +470,7 @@ def test_smoothing_is_told_and_the_measurement_stays_reproducible(
 ) -> None:
     assert main(command(originals, tmp_path / "out", smooth="5")) == 0
     said = capfd.readouterr()
-    assert "smoothed over 5 points: details are resolved that are 61 px" in said.err + said.out
+    assert "smoothed over 5 points: their spatial resolution is 61 px" in said.err + said.out
     assert "gauge grows from 101 to 141 px" in said.err + said.out
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["settings"]["smoothing_window"] == 5
