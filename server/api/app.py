@@ -53,7 +53,7 @@ def create_app(
     hosts
         Host names under which it may be addressed.
     keys_required
-        Whether every request needs a key; left out, as the rig file says.
+        True if every request needs a key; left out, as the rig file says.
     close_service
         Close the service when the app shuts down.
     """

@@ -1,4 +1,4 @@
-"""Progress on the terminal: one line that is rewritten, or a line now and then where nobody watches."""
+"""Progress on the terminal: one line that is rewritten, or a line now and then where the output is no terminal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def duration(seconds: float) -> str:
 
 
 class ProgressLine:
-    """Shows how far the work is and an estimate of the time left, on stderr; any thread may tell it.
+    """Shows how far the work is and an estimate of the time left, on stderr; any thread may report.
 
     Parameters
     ----------

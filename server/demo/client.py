@@ -36,7 +36,7 @@ class AnalysisHandle:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration that has ended: its record, and what the service says of its checks."""
+    """A calibration that has ended: its record, and the checks that the service made."""
 
     id: str
     record: CalibrationRecord
@@ -136,7 +136,7 @@ class ServiceClient:
         self.call("PUT", "/sim/scene", json=body | ({"params": params} if params else {}))
 
     def calibrate(self, **plan: Any) -> Calibrated:
-        """Run the calibration sequence; return what ``GET /calibrations/{id}`` then says."""
+        """Run the calibration sequence; return the reply of ``GET /calibrations/{id}``."""
         accepted = self.call("POST", "/calibrations", json=plan).json()
         self.wait(accepted["job"]["id"])
         calibration_id = str(accepted["calibration_id"])

@@ -43,7 +43,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within the limit; NaN never is."""
+        """Return True if the error is within the limit; NaN never is."""
         return bool(abs(self.error) <= self.limit)
 
 

@@ -29,7 +29,7 @@ class Difference:
     mean, rms
         Of measured minus the other.
     reported
-        Root mean square of the standard deviations that the results tell.
+        Root mean square of the standard deviations that the results report.
     chi
         Root mean square of the difference in units of its own sigma: 1 where noise explains all of it.
     """

@@ -33,7 +33,7 @@ class _Timex(ctypes.Structure):
 
 
 def check_software(book: Notebook) -> None:
-    """Note the versions that matter when somebody reports trouble."""
+    """Note the versions that matter in a report of trouble."""
     found, missing = [], []
     for name in _PACKAGES:
         try:
@@ -129,7 +129,7 @@ class ClockWatch:
         self._before = time.time() - time.monotonic()
 
     def check(self, book: Notebook) -> None:
-        """Note what became of the wall clock since this watch was made."""
+        """Note how the wall clock ran since this watch was made."""
         step = time.time() - time.monotonic() - self._before
         book.note(
             "machine",

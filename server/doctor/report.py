@@ -50,7 +50,7 @@ class Notebook:
     Parameters
     ----------
     tell
-        Called with each check at once, for somebody who watches.
+        Called with each check at once.
     """
 
     def __init__(self, tell: Callable[[Check], None] | None = None) -> None:
@@ -109,7 +109,7 @@ class Notebook:
 
 
 def line_of(check: Check) -> str:
-    """Write a check for people: one line, and one with the remedy where there is something to do."""
+    """Return a check as text: one line, and one with the remedy where there is something to do."""
     limit = f"   [limit: {check.limit}]" if check.limit else ""
     text = f"{check.state:<12}{check.part + ' ' + check.name:<28}{check.found}{limit}"
     return text if check.remedy is None else f"{text}\n{'':<12}-> {check.remedy}"

@@ -1,6 +1,6 @@
 """Who may do what: keys with a name and a role, stored as hashes in the data folder.
 
-A key is 256 random bits, so a plain SHA-256 of it tells nothing to who reads the file; slow hashes are for passwords.
+A key is 256 random bits, so a plain SHA-256 of it tells nothing to a reader of the file; slow hashes are for passwords.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Person:
     role: Role
 
     def may(self, role: Role) -> bool:
-        """Whether their role is this one or a higher one."""
+        """Return True if their role is this one or a higher one."""
         return ROLES.index(self.role) >= ROLES.index(role)
 
 
@@ -83,7 +83,7 @@ class KeyFile:
         Raises
         ------
         FileFormatError
-            ``keys_unreadable``: then nobody is let in.
+            ``keys_unreadable``: then no client is let in.
         """
         with self._lock:
             try:
@@ -116,7 +116,7 @@ class KeyFile:
         return keys
 
     def who(self, key: str) -> Person | None:
-        """Return whose key this is; None when it is nobody's."""
+        """Return whose key this is; None for an unknown key."""
         digest = _hash(key)
         found = None
         for stored in self.keys():  # every one is compared, so that time tells nothing
@@ -178,7 +178,7 @@ class KeyFile:
             os.close(descriptor)
 
     def _write(self, keys: tuple[StoredKey, ...]) -> None:
-        earlier = os.umask(0o077)  # nobody else's to read
+        earlier = os.umask(0o077)  # private
         try:
             write_json(self.path, {"format": 1, "keys": [asdict(stored) for stored in keys]})
         finally:

@@ -108,12 +108,12 @@ class LimitedProtocol(H11Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether a request is being answered."""
+        """Return True if a request is being answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
     @property
     def is_live_view(self) -> bool:
-        """Whether it carries a live view."""
+        """Return True if it carries a live view."""
         return self.busy and str(self.scope["path"]).endswith("/stream.mjpg")
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

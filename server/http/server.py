@@ -30,7 +30,7 @@ class OrderlyServer(uvicorn.Server):
     Parameters
     ----------
     app, service
-        What it serves, and what stands behind it.
+        What it serves, and the service behind it.
     limits
         What a connection may take; by default those of the rig file.
     notifier

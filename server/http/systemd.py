@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """Tells systemd how things stand; silent where nobody listens.
+    """Reports the state to systemd; silent without it.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Notifier:
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
-            channel.setblocking(False)  # nobody's silence may hold up the service
+            channel.setblocking(False)  # a silent reader must not block the service
             channel.sendto("\n".join(lines).encode(), self._address)
 
     def ready(self, status: str) -> None:
@@ -46,7 +46,7 @@ class Notifier:
         self._send("WATCHDOG=1")
 
     def is_due(self) -> bool:
-        """Whether it is time for :meth:`alive` again; twice in each of the watchdog's periods."""
+        """Return True if it is time for :meth:`alive` again; twice in each of the watchdog's periods."""
         now = time.monotonic()
         if self._every_s <= 0.0 or not self._address or now < self._due:
             return False

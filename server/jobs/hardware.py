@@ -73,7 +73,7 @@ class HardwareGate:
         raise BusyError(holder.plain())
 
     def while_held_by(self, job_id: str, function: Callable[[], None]) -> bool:
-        """Call ``function`` if a job has the hold, and return whether; nobody else gets the hold before it is done."""
+        """Call ``function`` if a job has the hold, and return whether; no other job gets the hold before it is done."""
         with self._acting:
             with self._lock:
                 if self._hold is None or self._hold.details.get("job_id") != job_id:
@@ -82,7 +82,7 @@ class HardwareGate:
             return True
 
     def shut(self) -> None:
-        """Let nobody take the hold from now on; who has it keeps it."""
+        """Allow no new hold; the present one stays."""
         with self._lock:
             self._shut = True
 

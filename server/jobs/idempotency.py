@@ -1,4 +1,4 @@
-"""Requests that have one effect however often they come: the Idempotency-Key and what it stands for.
+"""Requests that have one effect however often they come: the Idempotency-Key and what it identifies.
 
 What a key made is remembered in the catalogue, and in the document of what was made: a catalogue that is lost learns
 it again from the folders.
@@ -21,7 +21,7 @@ _log = logging.getLogger("stereorig.service")
 
 @dataclass(frozen=True)
 class RequestMark:
-    """An Idempotency-Key with what it stands for; kept with whatever the request made.
+    """An Idempotency-Key with what it identifies; kept with whatever the request made.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class RequestMark:
 
 
 class OneEffect:
-    """Runs what a key stands for once."""
+    """Runs the request of a key once."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog

@@ -29,7 +29,7 @@ class Phase:
 
 
 class Waiting(Exception):
-    """Raised by a compute phase that has nothing to do until somebody wakes its job; it is run again then."""
+    """Raised by a compute phase that has nothing to do until its job is woken; it is run again then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Work:
 
     @property
     def computes(self) -> bool:
-        """Whether it needs the compute lane."""
+        """Return True if it needs the compute lane."""
         return any(phase.lane == "compute" for phase in self.phases)
 
 
@@ -160,7 +160,7 @@ class Job:
 
     @property
     def cancelled(self) -> bool:
-        """Whether the job should stop (:class:`core.progress.CancelToken`)."""
+        """Return True if the job should stop (:class:`core.progress.CancelToken`)."""
         return self._cancel.is_set()
 
     def check(self) -> None:

@@ -100,7 +100,7 @@ class JobManager:
         Raises
         ------
         BusyError
-            The first phase needs the hardware and somebody has it.
+            The first phase needs the hardware, which another job holds.
         QueueFullError
             Too many computations wait.
         """
@@ -163,7 +163,7 @@ class JobManager:
         return [active.get(d.id, d) for d in self._catalog.jobs(limit=limit, before=before)]
 
     def is_active(self, job_id: str) -> bool:
-        """Whether a job is not finished."""
+        """Return True if a job is not finished."""
         with self._lock:
             return job_id in self._active
 
@@ -357,7 +357,7 @@ class JobManager:
         ended = now_utc()
         if job.let_go is not None:
             job.let_go()
-        # nobody sees a job's end before it is on disk
+        # a job's end is visible only once it is on disk
         final = job.document().ended(state, ended, job.record.problem)
         self._save(job, final)
         with self._lock:
@@ -399,7 +399,7 @@ class JobManager:
 
     @property
     def alive(self) -> bool:
-        """Whether the compute lane runs."""
+        """Return True if the compute lane runs."""
         return self._thread.is_alive() or self._closing
 
     def close(self) -> None:

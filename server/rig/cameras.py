@@ -46,9 +46,9 @@ class PairShot:
     settings
         Exposure (ms) and gain (dB) of each camera, as read back.
     frame_counts
-        What became of each camera's frames while it was taken.
+        Counters of each camera's frames during the capture.
     pair_counts
-        What became of the triggers meanwhile.
+        Counters of the triggers during the capture.
     """
 
     pixels: dict[str, Pixels]
@@ -105,7 +105,7 @@ class CameraPair:
     make_source
         Makes the source; called again after anything that arms a camera anew.
     skew_is_set
-        Whether the rig's skew limit was set by its user. Else a pair whose skew moves the image by more than 0.01 px,
+        True if the rig's skew limit was set by its user. Else a pair whose skew moves the image by more than 0.01 px,
         at the speed that was seen, is refused too.
     """
 
@@ -125,7 +125,7 @@ class CameraPair:
         self._source.start()
 
     def account(self) -> dict[str, int]:
-        """What became of every trigger."""
+        """Counters of the triggers."""
         now = self._source.account()
         return {f.name: getattr(self._earlier, f.name) + getattr(now, f.name) for f in fields(PairingAccount)}
 

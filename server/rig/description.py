@@ -23,13 +23,13 @@ from server.jobs.hardware import Holder
 
 
 class NominalCamera(CameraSection):
-    """What the rig file says of a camera."""
+    """Nominal values of a camera from the rig file."""
 
     model_config = ConfigDict(extra="allow")
 
 
 class NominalTarget(TargetSection):
-    """What the rig file says of the target."""
+    """The target as the rig file describes it."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -44,7 +44,7 @@ class UsualPlan(CalibrationSection):
 
 
 class CameraDevice(Reported, CameraDescription):
-    """Who a camera is and what it can do, as it says itself; ranges are null where it has no such setting."""
+    """Identity and capabilities of a camera, as it reports them; ranges are null where it has no such setting."""
 
 
 class CameraSettingsReply(Reported, CameraSettings):
@@ -55,8 +55,8 @@ class CameraReply(Reply):
     """One camera of the rig."""
 
     name: CameraName = Field(description="Which camera.")
-    nominal: NominalCamera = Field(description="What the rig file says.")
-    device: CameraDevice | None = Field(description="What the device says; null while it is not connected.")
+    nominal: NominalCamera = Field(description="Nominal values from the rig file.")
+    device: CameraDevice | None = Field(description="What the device reports; null while it is not connected.")
     settings: CameraSettingsReply | None = Field(description="Its settings as read back; null while not connected.")
     fault: JobProblem | None = Field(None, description="Why it cannot be used now; null: it can.")
     reconnections: int = Field(0, description="How often it was lost and connected again.")
@@ -83,13 +83,13 @@ class AxisReply(Reported, AxisStatus):
 
 
 class AxisIdentityReply(Reported, AxisIdentity):
-    """What stands on an axis."""
+    """Identity of an axis' controller."""
 
 
 class StageIdentityReply(Reported, StageIdentity):
     """Who the motion controller is."""
 
-    axes: tuple[AxisIdentityReply, ...] = Field(description="What stands on each axis.")
+    axes: tuple[AxisIdentityReply, ...] = Field(description="The controller of each axis.")
 
 
 class StageReply(Reply):
@@ -113,7 +113,7 @@ class StageMessage(Reply, ControllerMessage):
 
 
 class SceneReply(Reply):
-    """What stands before a simulated rig's cameras; parameters of the scene stand beside these two."""
+    """The scene before a simulated rig's cameras, with its parameters."""
 
     scene: str = Field(description="Name of the scene.", examples=["plate"])
     load: float = Field(description="kPa for `plate`, kN for `panel`, per cent for `strip`, a share for `block`.")
@@ -124,8 +124,8 @@ class RigReply(Reply):
 
     name: str = Field(description="Name of the rig.")
     description: str = Field(description="Free text of the rig file.")
-    sim: bool = Field(description="Whether it is a simulated rig.")
-    connected: bool = Field(description="Whether cameras and stage are open.")
+    sim: bool = Field(description="True if it is a simulated rig.")
+    connected: bool = Field(description="True if cameras and stage are open.")
     fault: JobProblem | None = Field(description="Why the rig cannot be used; null: it can.")
     holder: Holder | None = Field(description="What holds the hardware now; null: nothing.")
     scene: SceneReply | None = Field(description="What a simulated rig sees; null on a real one.")
@@ -144,7 +144,7 @@ _KEPT_SETTINGS = ("exposure_ms", "gain_db", "frame_rate_hz", "pixel_format")
 
 
 class CameraKept(CameraMetadata, CameraSettings):
-    """A camera as a step's record keeps it: how it was set, and what only people know of it."""
+    """A camera as a step's record keeps it: how it was set, and its metadata."""
 
 
 class RigKept(Document):

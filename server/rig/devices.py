@@ -201,7 +201,7 @@ def _same(found: FoundDevice, held: HeldDevice) -> bool:
 
 
 def is_called(found: FoundDevice | ListedDevice, name: str) -> bool:
-    """Whether a rig file may mean this camera by ``name``: its id, address, serial number, or any path to it."""
+    """Return True if a rig file may mean this camera by ``name``: its id, address, serial number, or any path to it."""
     known = {found.device, found.address, found.serial} - {""}
     return name in known or any(_same_path(path, name) for path in (found.device, found.extra.get("node", "")))
 

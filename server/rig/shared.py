@@ -10,12 +10,12 @@ T = TypeVar("T")
 
 
 class SharedReading(Generic[T]):
-    """Reads for everybody who waits; nobody gets a reading that began before they asked.
+    """Shares readings between callers; none gets a reading that began before its call.
 
     Parameters
     ----------
     read
-        Takes one reading; what it raises, everybody gets who waits for it.
+        Takes one reading; every waiting caller gets its error.
     """
 
     def __init__(self, read: Callable[[], T]) -> None:
@@ -49,7 +49,7 @@ class SharedReading(Generic[T]):
         taken: tuple[T, None] | tuple[None, BaseException]
         try:
             taken = self._read(), None
-        except BaseException as error:  # noqa: BLE001 - it is everybody's
+        except BaseException as error:  # noqa: BLE001 - every caller gets it
             taken = None, error
         with self._changed:
             self._last = taken

@@ -34,7 +34,7 @@ class MemoryWatch:
         return cls({place: count for place in places if (count := _oom_kills(place)) is not None})
 
     def killed_since(self) -> bool:
-        """Whether any count has grown."""
+        """Return True if any count has grown."""
         later = MemoryWatch.now().kills
         return any(later.get(place, count) > count for place, count in self.kills.items())
 
@@ -80,7 +80,7 @@ def cause_of_death(exit_code: int | None, *, out_of_memory: bool, memory_mib: fl
     exit_code
         As `multiprocessing` has it: negative for a signal.
     out_of_memory
-        Whether the kernel killed for want of memory meanwhile.
+        True if the kernel killed for want of memory meanwhile.
     memory_mib
         What it held when last looked at.
     """

@@ -40,7 +40,7 @@ class TaskChannel:
 
     @property
     def cancelled(self) -> bool:
-        """Whether the task should stop."""
+        """Return True if the task should stop."""
         return self._cancel is not None and self._cancel.is_set()
 
     def check(self) -> None:

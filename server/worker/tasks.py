@@ -67,7 +67,7 @@ class StepTask:
         By number, the steps between the reference and this one that were measured: this one may be matched against
         them.
     keeps_starts
-        Whether later steps start from what this one finds.
+        True if later steps start from what this one finds.
     """
 
     folder: Path

@@ -35,7 +35,7 @@ class StepsFailedError(MeasurementError):
     """Some steps could not be measured; the others were, and are kept."""
 
     code = "steps_failed"
-    remedy = "Read each step's problem in the summary; the other steps' results stand."
+    remedy = "Read each step's problem in the summary; the other steps' results are valid."
 
 
 def calibration_changed(where: str) -> FileFormatError:
@@ -49,7 +49,7 @@ def calibration_changed(where: str) -> FileFormatError:
 
 
 def is_independent(document: AnalysisRecord) -> bool:
-    """Whether the steps of an analysis need no step but the reference."""
+    """Return True if the steps of an analysis need no step but the reference."""
     return document.kind == "profile" or document.settings.get("start_from") == "reference"
 
 
@@ -309,7 +309,7 @@ def images_of(n: int, step: StepFiles) -> StepImages:
 
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
-    """Write ``summary.json``: what was found in the steps that were finished, whatever became of the job."""
+    """Write ``summary.json``: what was found in the steps that were finished, however the job ended."""
     found, document = Finished.model_validate(job.result or {}), service.tests.analysis(test_id, analysis_id)
     summary = SequenceSummary(
         state=state,

@@ -210,7 +210,7 @@ def continue_analysis(
     StateError
         ``analysis_running``, ``analysis_finished``, ``analysis_stale`` or ``software_changed``.
     """
-    with service.continuing:  # two at once would both find nobody at work
+    with service.continuing:  # two at once would both find it idle
         return _continue(service, test_id, analysis_id, request, other_version=other_version)
 
 

@@ -1,4 +1,4 @@
-"""Plans of calibrations before they are carried out, and what people decide on calibrations afterwards."""
+"""Plans of calibrations before they are carried out, and decisions on calibrations afterwards."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None,
 
 
 def decide(service: Service, calibration_id: str, decision: Decision | None, note: str, by: str) -> None:
-    """Keep what somebody decided on a calibration; None takes an earlier decision back.
+    """Keep the decision on a calibration; None takes an earlier decision back.
 
     Raises
     ------

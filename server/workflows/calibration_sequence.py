@@ -1,4 +1,4 @@
-"""The calibration sequence: move, settle, average, read back; return to zero and look whether the grid is where it was.
+"""The calibration sequence: move, settle, average, read back; return to zero and check that the grid is where it was.
 
 Each camera travels along its own optical axis. Every position is arrived at from one side (the stage driver takes up
 backlash), positions that enter the computation are read back. The fit runs in the worker once the hardware is free

@@ -62,7 +62,7 @@ def restore(service: Service, trash_id: str) -> TrashEntry:
 
 
 def _name(service: Service, kind: Kind, ids: Ids) -> str:
-    """What people call it; also finds out whether it is there."""
+    """Return its name; raise an error if it is not there."""
     if kind == "test":
         service.tests.path(str(ids["test_id"]))
         try:

@@ -1,4 +1,4 @@
-"""How things stand at the moment of a scrape: queue, cameras, disk, worker, stage."""
+"""State at the moment of a scrape: queue, cameras, disk, worker, stage."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _gauge(name: str, text: str, value: float) -> GaugeMetricFamily:
 
 
 def metrics_text(service: Service) -> bytes:
-    """Return what was counted and how things stand now, in the text format of Prometheus."""
+    """Return counters and the present state, in the text format of Prometheus."""
     state = CollectorRegistry()
     state.register(StateCollector(service))
     return service.metrics.text() + generate_latest(state)
@@ -52,9 +52,9 @@ class StateCollector(Collector):
         info.add_metric([software_version()], 1)
         yield info
         yield _gauge("uptime_seconds", "Time since the service began.", time.monotonic() - service.started_monotonic)
-        yield _gauge("ready", "Whether it can capture and compute (/readyz).", not service.not_ready())
-        yield _gauge("rig_fault", "Whether the rig could not be opened.", service.rig.fault is not None)
-        yield _gauge("hardware_held", "Whether somebody uses the hardware.", service.gate.holder is not None)
+        yield _gauge("ready", "1 if it can capture and compute (/readyz).", not service.not_ready())
+        yield _gauge("rig_fault", "1 if the rig could not be opened.", service.rig.fault is not None)
+        yield _gauge("hardware_held", "1 while a job holds the hardware.", service.gate.holder is not None)
 
     def _jobs(self) -> Iterator[Metric]:
         jobs = self._service.jobs
@@ -73,7 +73,7 @@ class StateCollector(Collector):
     def _worker(self) -> Iterator[Metric]:
         worker = self._service.worker
         yield CounterMetricFamily("stereorig_worker_starts", "How often the compute worker was started.", worker.starts)
-        yield _gauge("worker_ready", "Whether the worker takes tasks.", worker.ready.is_set())
+        yield _gauge("worker_ready", "1 if the worker takes tasks.", worker.ready.is_set())
         memory_mib = None if worker.pid is None else resident_mib(worker.pid)
         if memory_mib is not None:
             yield _gauge("worker_resident_bytes", "Memory of the worker.", memory_mib * _MIB)
@@ -86,9 +86,9 @@ class StateCollector(Collector):
 
     def _cameras(self) -> Iterator[Metric]:
         pair = self._service.rig.pair
-        frames = CounterMetricFamily("stereorig_frames", "What became of the frames.", labels=["camera", "what"])
+        frames = CounterMetricFamily("stereorig_frames", "Frames by outcome.", labels=["camera", "what"])
         own = GaugeMetricFamily("stereorig_camera_driver", "The driver's own counts.", labels=["camera", "what"])
-        faults = GaugeMetricFamily("stereorig_camera_fault", "Whether the camera is lost.", labels=["camera"])
+        faults = GaugeMetricFamily("stereorig_camera_fault", "1 if the camera is lost.", labels=["camera"])
         again = CounterMetricFamily("stereorig_camera_reconnections", "Times it came back.", labels=["camera"])
         for cam, unit in pair.units.items():
             for what, number in unit.counters().items():
@@ -100,13 +100,13 @@ class StateCollector(Collector):
                     own.add_metric([cam, what], figure)
             except DeviceError as error:  # it was lost just now
                 _log.info("no figures of %s: %s", cam, error)
-        pairs = CounterMetricFamily("stereorig_pairs", "What became of the triggers.", labels=["what"])
+        pairs = CounterMetricFamily("stereorig_pairs", "Triggers by outcome.", labels=["what"])
         for what, number in pair.account().items():
             pairs.add_metric([what], number)
         yield from (frames, own, faults, again, pairs)
 
     def _stage(self) -> Iterator[Metric]:
-        answers = GaugeMetricFamily("stereorig_stage_up", "Whether the motion controller answers.")
+        answers = GaugeMetricFamily("stereorig_stage_up", "1 if the motion controller answers.")
         places = GaugeMetricFamily("stereorig_axis_position_mm", "Position that was read back.", labels=["axis"])
         states = GaugeMetricFamily("stereorig_axis_state", "1 for the state the axis is in.", labels=["axis", "state"])
         try:

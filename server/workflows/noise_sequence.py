@@ -1,4 +1,4 @@
-"""The noise measurement on the rig: frames of whatever stands before the cameras, then the models in the worker."""
+"""The noise measurement on the rig: frames of the present scene, then the models in the worker."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def fit(service: Service, job: Job, noise_id: str) -> dict[str, object]:
 
 
 def close(service: Service, job: Job, noise_id: str, state: str) -> None:
-    """Leave a record of a measurement that did not come to be, and tell who listens."""
+    """Leave a record of a measurement that did not come to be, and publish the end."""
     if state != "succeeded" and job.record.problem is not None:
         service.noise.put_failure(noise_id, {**job.record.problem.plain(), "job_state": state})
     service.hub.publish("noise", {"noise_id": noise_id, "state": service.noise.read(noise_id).state})

@@ -209,7 +209,7 @@ class Service:
                 _log.debug("stopping again failed: %s", error)
 
     def is_alive(self) -> bool:
-        """Whether the threads that everything waits for run."""
+        """Return True if the threads that everything waits for run."""
         return self.catalog.alive and self.jobs.alive
 
     def begin_end(self) -> None:
@@ -221,7 +221,7 @@ class Service:
             self._end_motion()
 
     def _end_motion(self) -> None:
-        """Let nobody begin a motion any more, and stop the one that runs until its job has let the hardware go."""
+        """Allow no new motion, and stop the one that runs until its job has let the hardware go."""
         self.closing = True
         self.gate.shut()
         self.jobs.begin_close()

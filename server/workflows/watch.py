@@ -29,7 +29,7 @@ def value_of(step: StepMetadata, channel: str) -> float | None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a reading.
+    """Outcome of a reading.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class Watches:
         Raises
         ------
         StateError
-            ``watch_off`` when nothing is watched; ``hardware_busy`` when somebody has the cameras.
+            ``watch_off`` when nothing is watched; ``hardware_busy`` when a job holds the cameras.
         CameraError, StorageError
             No step was taken; the same reading may be sent again.
         """

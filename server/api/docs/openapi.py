@@ -19,7 +19,7 @@ _BODY_METHODS = ("post", "put", "patch")
 _BOUNDS = {"ge": "minimum", "le": "maximum", "gt": "exclusiveMinimum", "lt": "exclusiveMaximum"}
 _ETAG = {"description": "Names this state of it, for If-None-Match and If-Match.", "schema": {"type": "string"}}
 _TAGS = {
-    "system": "Whether the service is well, figures, events.",
+    "system": "Health, figures, events.",
     "access": "Who asks: keys and the page's cookie.",
     "rig": "Cameras, live views, devices, the simulated scene.",
     "stage": "Where the axes are, moves, homing, stop.",
@@ -30,7 +30,7 @@ _TAGS = {
     "results": "Fields, points, gauges and files of an analysis.",
     "trash": "Deleting, restoring, and what goes by itself.",
     "jobs": "Whatever takes longer than a request.",
-    "looks": "Pictures for people: previews, and maps to lay over an image.",
+    "looks": "Previews: 8-bit pictures, and maps over an image; nothing is measured in them.",
 }
 
 #: what a small simulated rig was asked and answered (tests/bench/documents/api_examples.py)

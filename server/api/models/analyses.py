@@ -58,7 +58,7 @@ class AnalysisRequest(settings.AnalysisSettings):
     )
     region: Region = Field(description="Where points may lie.")
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
-        None, description="Noise measurement whose models weigh the pixels; without it, residuals tell the noise."
+        None, description="Noise measurement that weighs the pixels; without it, residuals give the noise."
     )
     steps: Annotated[list[StepNumber], Field(min_length=1, max_length=10000)] | None = Field(
         None, description="Steps to measure; all if left out. The reference is always measured."
@@ -127,13 +127,13 @@ class AnalysisReply(Reply):
     kind: Literal["profile", "displacement"] = Field(description="What it computes.")
     state: JobState = Field(description="State of its job.")
     job_id: str | None = Field(None, description="Its job; the last one, where it was continued.")
-    follow: bool = Field(False, description="Whether it goes on with each step that lands.")
+    follow: bool = Field(False, description="True if it goes on with each step that lands.")
     steps: list[int] = Field(default_factory=list, description="Steps that it measures, the reference first.")
     settings: StoredSettings = Field(description="Settings, fixed.")
     steps_finished: list[int] = Field(description="Steps whose results can be read now.")
     summary: AnalysisSummary | None = Field(None, description="Counts, residuals and timings of each step.")
     stale: bool = Field(
-        False, description="Whether steps, the reference or the calibration are gone or were replaced since."
+        False, description="True if steps, the reference or the calibration are gone or were replaced since."
     )
     stale_reasons: list[str] = Field(default_factory=list, description="What is gone or was replaced.")
 
@@ -218,10 +218,10 @@ class GaugesReply(Reply):
     software_version: str = Field(description="Program that read them.")
     settings: GaugeRequest = Field(description="The request, with its defaults.")
     inputs_sha256: dict[str, str] = Field(description="Checksum of each result file.")
-    stale: bool = Field(False, description="Whether inputs or results are gone or were replaced since.")
+    stale: bool = Field(False, description="True if inputs or results are gone or were replaced since.")
     stale_reasons: list[str] = Field(default_factory=list, description="What is gone or was replaced.")
     frame: str = Field(description="Frame of all positions and displacements.")
-    subset_px: float = Field(description="Subset of the measurement; tells which pixels neighbours share.")
+    subset_px: float = Field(description="Subset of the measurement; determines which pixels neighbours share.")
     smoothing_window: int | None = Field(None, description="Points over which displacements were smoothed.")
     alignment: FrameReading | None = Field(None, description="The frame that was laid, and its uncertainty.")
     steps: list[GaugeStep] = Field(description="Readings of each step.")

@@ -88,7 +88,7 @@ class ExpectReply(Reply):
     centre_px: float = Field(description="Largest standard deviation of an image centre.")
     standoff_relative: float = Field(description="Largest standard deviation of a standoff, relative.")
     seen_share: dict[str, float] = Field(description="Share of the intersections seen at the worst position.")
-    refused: bool = Field(description="Whether views at these positions would be refused.")
+    refused: bool = Field(description="True if views at these positions would be refused.")
     reasons: list[str] = Field(description="Why.")
 
 
@@ -102,7 +102,7 @@ class ReviewRequest(Request):
 
 
 class Review(Reply):
-    """What somebody decided on a calibration."""
+    """An operator's decision on a calibration."""
 
     decision: Literal["accepted", "discarded"] = Field(description="The decision.")
     note: str = Field("", description="Why.")
@@ -147,7 +147,7 @@ class ViewResiduals(Reply):
     name: str = Field(description="Name of the view.", examples=["cam1 dZ 5.000 mm"])
     camera: int | str = Field(description="Which camera.")
     dz_mm: float = Field(description="Travel of the camera.")
-    held_out: bool = Field(description="Whether it was kept for the check.")
+    held_out: bool = Field(description="True if it was kept for the check.")
     rbe_px: float | None = Field(description="Rms residual.")
     raz_mm: float | None = Field(description="Rms error in space.")
     nsce: float | None = Field(description="Normalised stereo calibration error.")
@@ -185,11 +185,11 @@ class CalibrationReply(Reply):
     plan: PlanReply = Field(description="Positions, frames and localiser asked for.")
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Why there is no calibration.")
-    review: Review | None = Field(None, description="What somebody decided on it; null: nothing yet.")
+    review: Review | None = Field(None, description="The operator's decision; null: none yet.")
 
 
 class CalibrationFile(Reply):
-    """calibration.json, which `stereorig measure` reads; its statistics stand beside these."""
+    """calibration.json, which `stereorig measure` reads; its statistics are beside these."""
 
     cam1: dict[str, float] | None = Field(None, description="Camera 1: its parameters by name, the unit in the name.")
     cam2: dict[str, float] | None = Field(None, description="Camera 2.")
@@ -214,7 +214,7 @@ class CalibrationEntry(Reply):
     label: str = Field(description="Free text.")
     created_utc: str = Field(description="When it was begun or imported.")
     verdict: VerdictReply | None = Field(description="Its verdict; null: none, as of most imported ones.")
-    decision: str | None = Field(None, description="`accepted`, `discarded`; null: nobody decided.")
+    decision: str | None = Field(None, description="`accepted`, `discarded`; null: no decision.")
 
 
 class CalibrationList(Listing):
@@ -233,7 +233,7 @@ class ConversionReply(Reply):
     units: str = Field(description="Of the numbers.")
     frame: Literal["target", "camera 1"] = Field(description="System frame of the file.")
     image_size_px: list[list[int]] | None = Field(description="Width and height of both images; null: not known.")
-    exact: bool = Field(description="Whether both lenses were carried over to the last digits.")
+    exact: bool = Field(description="True if both lenses were carried over to the last digits.")
     lens: dict[str, dict[str, float]] = Field(
         description="By camera, what is left between both lens models over the image.",
         examples=[{"cam1": {"rms_px": 0.016, "max_px": 0.065}, "cam2": {"rms_px": 0.013, "max_px": 0.051}}],

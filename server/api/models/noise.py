@@ -16,7 +16,7 @@ class NoiseRequest(Request):
     """How to measure the cameras' noise."""
 
     frames: Annotated[Whole, Field(ge=2, le=200)] = Field(
-        16, description="Pairs of frames; the scene must stand still."
+        16, description="Pairs of frames; the scene must be at rest."
     )
     label: Label = Field("", description="Free text.")
 

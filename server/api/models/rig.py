@@ -37,7 +37,7 @@ class MoveRequest(Request):
     positions_mm: AxisValues | None = Field(
         None, description="Absolute position of each axis.", examples=[{"1": 5.0, "2": 5.0}]
     )
-    by_mm: AxisValues | None = Field(None, description="Travel of each axis from where it stands.")
+    by_mm: AxisValues | None = Field(None, description="Travel of each axis from its position.")
     dz_mm: dict[CameraName, Number] | None = Field(
         None, description="Travel of each camera from its zero, positive away from the target.", min_length=1
     )
@@ -110,7 +110,7 @@ class StopReply(Reply):
 
 
 class SceneRequest(Request):
-    """What stands before a simulated rig's cameras."""
+    """The scene before a simulated rig's cameras."""
 
     scene: Literal["grid", "steel", "plate", "panel", "block", "strip", "sphere"] = Field(
         description="Name of the scene."
@@ -137,11 +137,11 @@ class CameraSet(Reply):
 
 
 class FrameCounts(Reported, FrameCounters):
-    """What became of a camera's frames since it was opened."""
+    """Counters of a camera's frames since it was opened."""
 
 
 class PairCounts(Reported, PairingAccount):
-    """What became of the triggers: triggered = paired + unpaired + incomplete + dropped."""
+    """Counters of the triggers: triggered = paired + unpaired + incomplete + dropped."""
 
 
 class FrameQuality(Reply):
@@ -157,7 +157,7 @@ class FrameQuality(Reply):
 
 
 class CameraStats(Reply):
-    """What became of a camera's frames, and the newest one's quality."""
+    """Counters of a camera's frames, and the newest one's quality."""
 
     name: CameraName = Field(description="Which camera.")
     frames: FrameCounts = Field(description="Its frames since it was opened.")

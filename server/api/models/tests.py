@@ -22,7 +22,7 @@ class TestRequest(Request):
         description="Calibration to measure with, copied into the test; `accepted`: the newest one accepted.",
         max_length=40,
     )
-    specimen: Label = Field("", description="The specimen, for people.")
+    specimen: Label = Field("", description="The specimen, free text.")
     notes: Annotated[str, StringConstraints(max_length=20000)] = Field("", description="Free text.")
 
 
@@ -151,7 +151,7 @@ class CameraQuality(Reply):
     gain_db: float | None = Field(None, description="Gain as read back; null where there is none.", examples=[0.0])
     frames: dict[str, int] | None = Field(
         None,
-        description="What became of the camera's frames during the capture: delivered, dropped, incomplete ...",
+        description="Counters of the camera's frames during the capture: delivered, dropped, incomplete ...",
         examples=[{"delivered": 1, "overrun": 0, "dropped": 0, "incomplete": 0, "duplicates": 0, "out_of_order": 0}],
     )
 
@@ -166,7 +166,7 @@ class StepQuality(Reply):
     max_skew_ms: float | None = Field(None, description="What the rig allows.", examples=[1.0])
     pairs: dict[str, int] | None = Field(
         None,
-        description="What became of the triggers during the capture: triggered = paired + unpaired + incomplete + "
+        description="Counters of the triggers during the capture: triggered = paired + unpaired + incomplete + "
         "dropped.",
         examples=[{"triggered": 1, "paired": 1, "unpaired": 0, "incomplete": 0, "dropped": 0, "refused": 0, "late": 0}],
     )
@@ -175,7 +175,7 @@ class StepQuality(Reply):
 
 
 class BurstIndex(Reply):
-    """Where a step stands in its burst."""
+    """Index of a step in its burst."""
 
     job_id: str = Field(description="Job of the burst.")
     index: int = Field(description="Number in the burst, from 0.")
@@ -198,7 +198,7 @@ class StepReply(Reply):
     skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
     quality: StepQuality = Field(description="`code` (`ok` or what is wrong), and figures of each camera.")
     sha256: dict[str, str] = Field(description="Checksums of both image files.")
-    burst: BurstIndex | None = Field(None, description="Where it stands in its burst, if it is of one.")
+    burst: BurstIndex | None = Field(None, description="Its index in its burst, if it is of one.")
 
 
 class BurstAccepted(Accepted):
@@ -223,7 +223,7 @@ class WatchRequest(Request):
 class WatchReply(Reply):
     """What is watched."""
 
-    active: bool = Field(description="Whether readings take steps.")
+    active: bool = Field(description="True if readings take steps.")
     channel: str = Field(description="The channel.")
     threshold: float = Field(description="Difference that makes a step.")
     frames: int = Field(description="Frames averaged in each step.")
@@ -247,9 +247,9 @@ class ReadingRequest(Request):
 
 
 class ReadingReply(Reply):
-    """What became of a reading."""
+    """Outcome of a reading."""
 
-    taken: bool = Field(description="Whether it took a step.")
+    taken: bool = Field(description="True if it took a step.")
     reason: Literal["first", "changed", "below_threshold", "channel_absent"] = Field(description="Why, or why not.")
     value: float | None = Field(None, description="Value of the watched channel; null where it was absent.")
     last_value: float | None = Field(None, description="Value that it was compared with; null: there was none.")

@@ -35,7 +35,7 @@ _MOST_CLIENTS = 10_000
 
 
 class Sessions:
-    """What the page's cookies stand for; in memory, so that a restart ends them all."""
+    """Sessions of the page's cookies; in memory, so that a restart ends them all."""
 
     def __init__(self) -> None:
         self._known: OrderedDict[str, tuple[Person, float]] = OrderedDict()
@@ -99,7 +99,7 @@ class AccessRules:
     keys
         The keys there are.
     required
-        Whether a key is asked for.
+        True if a key is asked for.
     requests_per_s
         Of one client, for ever; ten times as many at once.
     """
@@ -117,7 +117,7 @@ def role_for(method: str, path: str) -> Role:
 
 
 class Door:
-    """Lets requests through with their person in ``scope["state"]``, or says why not."""
+    """Lets requests through with their person in ``scope["state"]``, or answers with the reason."""
 
     def __init__(self, app: ASGIApp, rules: AccessRules, sessions: Sessions) -> None:
         self._app = app

@@ -28,7 +28,7 @@ class Page:
         self.limit, self.after = limit, after
 
     def of(self, things: Sequence[Any], key: Callable[[Any], str], *, newest_first: bool = False) -> list[Any]:
-        """Return the page of a list that is in the order of its keys, and tell where the next one begins."""
+        """Return the page of a list that is in the order of its keys, with the cursor of the next one."""
         rest = [t for t in things if self.after is None or self._is_after(key(t), newest_first)]
         return self.cut(rest, key)
 

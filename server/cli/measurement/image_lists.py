@@ -16,7 +16,7 @@ from server.worker.tasks import averages_of
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The two image files of one step, its number in its test, and what its record says (None without a record)."""
+    """The two image files of one step, its number in its test, and its record (None without one)."""
 
     cam1: Path
     cam2: Path
@@ -82,7 +82,7 @@ def pair_up(cam1: Sequence[Path], cam2: Sequence[Path]) -> list[ImagePair]:
     Raises
     ------
     InputError
-        ``counts_differ`` if the lists differ in length, ``same_image`` if a file stands in both.
+        ``counts_differ`` if the lists differ in length, ``same_image`` if a file is in both.
     """
     if len(cam1) != len(cam2):
         raise InputError(

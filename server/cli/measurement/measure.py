@@ -260,7 +260,7 @@ def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
 
 
 def _check_cameras(pair: ImagePair, calibration_file: Path) -> None:
-    """Refuse a pair that its record says was taken with other cameras than were calibrated."""
+    """Refuse a pair that was taken with other cameras than were calibrated, by its record."""
     record = pair.cam1.parent / "step.json"
     if record.is_file() and calibration_file.suffix == ".json":
         check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")

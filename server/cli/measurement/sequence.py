@@ -41,7 +41,7 @@ _RESULT = re.compile(r"step_\d{4}\.nc")
 
 
 def _strain_noise(strain: dict[str, Any] | None) -> str:
-    """What a step's line says of its strain."""
+    """Return the part of a step's line on its strain."""
     if strain is None:
         return ""
     if strain["points"] == 0:
@@ -126,7 +126,7 @@ def _output_folder(out: Path) -> Iterator[None]:
 
 
 class _Runner:
-    """Measures the steps in order, and says on the terminal what a user should know of each."""
+    """Measures the steps in order, and prints a line for each on the terminal."""
 
     def __init__(self, job: MeasureJob, progress: ProgressLine, written: WriteBehind[dict[str, Any]]) -> None:
         # the kernels' modules take seconds to load: after the input was checked is early enough
@@ -239,7 +239,7 @@ class _Runner:
         return show
 
     def _doubt_noise(self, shape: Field) -> None:
-        """Say so where the residuals and the noise file tell different stories."""
+        """Say so where residuals and noise file disagree."""
         options = self.sequence.options
         image = self.sequence.pair.image1.prepared(options.interpolation, None, options.blur)
         stated = image.noise_variance

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report(listing: DeviceListing) -> str:
-    """Write the list for people."""
+    """Return the list as text."""
     lines = ["Cameras"]
     lines += _table(("driver", "device", "model", "serial", "address", "state"), listing.cameras)
     lines += ["", "Serial ports"]

@@ -1,4 +1,4 @@
-"""``stereorig rigfile``: check rig files, and say what may stand in one."""
+"""``stereorig rigfile``: check rig files, and print what one may hold."""
 
 from __future__ import annotations
 

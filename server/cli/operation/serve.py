@@ -71,7 +71,7 @@ def default_config() -> Path:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
+    """Return True if only this machine reaches an address."""
     if host == "localhost":
         return True
     try:
@@ -128,7 +128,7 @@ def check_tls(certificate: Path | None, key: Path | None) -> None:
 
 
 def tls_is_missing(host: str, certificate: Path | None) -> bool:
-    """Whether keys would travel where others can read them."""
+    """Return True if keys would travel where others can read them."""
     return certificate is None and not is_loopback(host)
 
 

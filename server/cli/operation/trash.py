@@ -93,7 +93,7 @@ def _deleted_before(entry: TrashEntry, moment: datetime) -> bool:
     try:
         return datetime.fromisoformat(entry.deleted_utc or "") < moment
     except ValueError:
-        return False  # nobody knows when
+        return False  # when is not known
 
 
 def _what(entry: TrashEntry) -> str:

@@ -41,7 +41,7 @@ def record(found: Verification) -> dict[str, object]:
 
 
 def report(found: Verification) -> list[str]:
-    """Write it for people, the worst first."""
+    """Return it as text, the worst first."""
     order = ("damaged", "incomplete", "index", "foreign")
     lines = [
         f"{finding.level}: {finding.path}: {finding.text}"

@@ -15,7 +15,7 @@ from sim.truth import subset_planes
 ROI_PX = (56.0, 85.0, 456.0, 395.0)  # 400 x 310 px, as in the paper
 SUBSET_PX, SPACING_PX = 21, 15  # 27 x 21 = 567 points; the paper has 566
 MOTION_STEP_PX = 10
-CAPTURES = 5  # one is the measurement, all of them tell its noise
+CAPTURES = 5  # one is the measurement, all of them determine its noise
 LIMIT_PERCENT = 3.0
 
 

@@ -27,7 +27,7 @@ MOTIONS = (
 )
 STRAINS = ("exx", "eyy", "exy")
 FALSE_LIMIT = 20.0  # microstrain, mean of the worst component: what the project asks of itself
-FEW = 20  # every 20th point is enough to tell what the calibration does
+FEW = 20  # every 20th point is enough to see what the calibration does
 OF_MANY = 4.0  # standard deviations that chance is given in the worst of many
 
 

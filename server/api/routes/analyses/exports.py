@@ -120,8 +120,8 @@ async def export(
 ) -> Response:
     """Answer with the file once it is made; several files are one ZIP archive.
 
-    Every form says units, frame, settings, calibration and version; docs/reference/exports.md describes each. The
-    header X-Stale says what is gone or was replaced since the analysis. A client that goes away ends its export.
+    Every form states units, frame, settings, calibration and version; docs/reference/exports.md describes each. The
+    header X-Stale lists what is gone or was replaced since the analysis. A client that goes away ends its export.
     """
     wanted = [step] if step is not None else None if steps is None else steps_in(steps)
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, wanted)

@@ -1,4 +1,4 @@
-"""Pictures for people: grey value of a pixel, previews, maps over an image."""
+"""Previews: grey value of a pixel, 8-bit pictures, maps over an image."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class TextureRequest(Request):
     subset_px: SubsetPx = SUBSET_PX.default
     spacing_px: SpacingPx = SPACING_PX.default
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
-        None, description="Noise measurement that tells camera 1's noise; 1 % of full scale is assumed without it."
+        None, description="Noise measurement for camera 1's noise; 1 % of full scale is assumed without it."
     )
     noise_grey: Annotated[Real, Field(gt=0.0, le=65535.0)] | None = Field(
         None, description="Standard deviation of the noise, grey levels, in place of the above."
@@ -87,14 +87,14 @@ class SeedPlace(Reply):
 
 
 class SeedsReply(Reply):
-    """What the calibration says of the seeds."""
+    """Epipolar check of the seeds."""
 
     seeds: list[SeedPlace] = Field(description="One each.")
 
 
 @router.post(
     "/steps/{n}/texture",
-    summary="Whether a region's texture carries subsets of a size",
+    summary="Speckle quality of a region for a subset size",
     responses=errors(404, 409, 422),
 )
 def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:

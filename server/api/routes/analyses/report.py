@@ -26,7 +26,7 @@ router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["resu
     responses=errors(404, 409, 422, 503, 507)
     | {
         200: {
-            "description": "One HTML file that needs nothing else; X-Not-Stated: how many items nobody stated.",
+            "description": "One HTML file that needs nothing else; X-Not-Stated: number of items without a statement.",
             "content": {"text/html": {"example": '<!doctype html><html lang="en">...'}},
         }
     },
@@ -34,7 +34,7 @@ router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["resu
 async def get_report(request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> Response:
     """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
 
-    What no device knows comes from `PUT /tests/{test_id}/facts`; what nobody stated is listed as such.
+    What no device knows comes from `PUT /tests/{test_id}/facts`; what is not stated is listed as such.
     """
     results, stale = await run_in_threadpool(_prepared, service, test_id, analysis_id)
     service.require_room()

@@ -91,7 +91,7 @@ def import_calibration(
 ) -> CalibrationReply:
     """Store another program's stereo calibration, or one of another data folder, to measure imported steps with.
 
-    `plan.check` says what both cameras make of points that both see (epipolar residual), and what to doubt.
+    `plan.check` has the epipolar residual of points in both images, and warnings.
     """
     data = file.file.read()
     request = mark("calibrations:import", key, None, data, label.encode())
@@ -146,7 +146,7 @@ def list_views(service: ServiceDep, calibration_id: CalibrationId) -> ViewList:
 def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> ResidualsReply:
     """Return, for each view, where every intersection was found and by how much the model misses it.
 
-    A calibration that failed its verdict has them too: they tell what was wrong.
+    A calibration that failed its verdict has them too, to find the cause.
     """
     path = service.calibrations.path(calibration_id)
     if not (path / REJECTED).exists():

@@ -46,7 +46,7 @@ def _converted(service: Service, calibration_id: str, form: CalibrationForm) -> 
     | {200: {"content": {media.split(";")[0]: _OURS.get(media, {}) for media in dict.fromkeys(MEDIA_TYPES.values())}}},
 )
 def export_calibration(service: ServiceDep, calibration_id: CalibrationId, format: Form) -> Response:  # noqa: A002
-    """Return the file; a lens model that the form does not have is fitted, `export/report` says with what residual.
+    """Return the file; a lens model that the form does not have is fitted, `export/report` states the residual.
 
     The headers X-Lens-Residual-Px and X-Epipolar-Residual-Px have the largest residuals.
     """

@@ -24,7 +24,7 @@ NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurem
 
 @router.post("", summary="Measure both cameras' noise", status_code=202, responses=errors(409, 422, 503, 507))
 def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: KeyHeader = None) -> NoiseAccepted:
-    """Take frames of what stands still before the cameras, as they are set now; fit variance against grey level."""
+    """Take frames of a scene at rest with the present settings; fit variance against grey level."""
     body = body or NoiseRequest.model_validate({})
     request = mark("noise", key, body)
 

@@ -1,4 +1,4 @@
-"""Calibrations before and after: what a plan may be expected to leave, and what somebody decides."""
+"""Calibrations before and after: expected uncertainty of a plan; decisions."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def put_review(
 ) -> CalibrationReply:
     """Keep a decision: tests that name `accepted` take the newest accepted; none can be made with a discarded one.
 
-    If-Match, with the ETag of the calibration, refuses if somebody else decided meanwhile.
+    If-Match, with the ETag of the calibration, is refused (412) if another client decided meanwhile.
     """
     service.calibrations.path(calibration_id)
-    with service.changes:  # nobody else's decision comes between the look and ours
+    with service.changes:  # no other decision comes between the check and this one
         if if_match is not None:
             now = etag_of(service.calibrations.read(calibration_id).plain())
             require_match(if_match, now, f"calibration {calibration_id}")

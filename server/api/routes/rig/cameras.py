@@ -129,7 +129,7 @@ def get_frame(
 
 @router.get(
     "/cameras/{cam}/stats",
-    summary="What became of a camera's frames, and the newest one's quality",
+    summary="Counters of a camera's frames, and the newest one's quality",
     responses=errors(409, 422, 503),
 )
 def get_stats(service: ServiceDep, cam: Camera) -> CameraStats:

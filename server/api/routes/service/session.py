@@ -23,7 +23,7 @@ class PersonReply(BaseModel):
 
 @router.get("/session", summary="Who am I?", response_model=PersonReply, responses=errors(401))
 def get_session(request: Request) -> object:
-    """Return the name and role that the key or the cookie stands for."""
+    """Return the name and role that the key or the cookie belongs to."""
     person = request.state.person
     if person is None:
         return problem_response(401, "key_missing", "Nobody is logged in.", "Send a key, or POST it to log in.")

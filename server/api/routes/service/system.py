@@ -25,7 +25,7 @@ LastEventId = Annotated[
 
 
 class ReadyReply(BaseModel):
-    """Whether the service can do its work."""
+    """Return True if the service can do its work."""
 
     ready: bool = Field(description="True.")
 
@@ -36,11 +36,11 @@ class HealthReply(BaseModel):
     status: Literal["ok"] = Field(description="The service answers.")
     version: str = Field(description="Version of the program.")
     uptime_s: float = Field(description="For how long it has been running.")
-    rig: Literal["ok", "fault"] = Field(description="Whether cameras and stage are open; GET /rig says why not.")
-    worker: Literal["ready", "starting"] = Field(description="Whether it can compute yet.")
+    rig: Literal["ok", "fault"] = Field(description="`ok`: cameras and stage are open; `fault`: the reason is in GET /rig.")
+    worker: Literal["ready", "starting"] = Field(description="`ready` to compute, or still `starting`.")
 
 
-@router.get("/healthz", summary="Whether the service is up")
+@router.get("/healthz", summary="Liveness")
 def healthz(service: ServiceDep) -> HealthReply:
     """Answer quickly, whatever else is going on; says what is not well."""
     return HealthReply.model_validate(
@@ -55,7 +55,7 @@ def healthz(service: ServiceDep) -> HealthReply:
 
 
 @router.get(
-    "/readyz", summary="Whether it can capture and compute now", response_model=ReadyReply, responses=errors(503)
+    "/readyz", summary="Readiness to capture and compute", response_model=ReadyReply, responses=errors(503)
 )
 def readyz(service: ServiceDep) -> object:
     """Answer 200 when rig, worker and disk are ready; else a problem whose `reasons` hold code and cause each."""

@@ -1,4 +1,4 @@
-"""What only people know about a test: read and replaced as a whole."""
+"""Metadata of a test: read and replaced as a whole."""
 
 from __future__ import annotations
 

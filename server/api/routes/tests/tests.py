@@ -87,10 +87,10 @@ def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestRe
 def patch_test(
     service: ServiceDep, test_id: TestId, body: TestPatch, response: Response, if_match: IfMatch = None
 ) -> TestReply:
-    """Change what is given; If-Match says which state of the test was meant."""
+    """Change what is given; If-Match names which state of the test was meant."""
     service.tests.path(test_id)
     changes = {k: v for k, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    with service.changes:  # nobody else's change comes between the look and ours
+    with service.changes:  # no other change comes between the check and this one
         require_match(if_match, etag_of(_reply(service, test_id)), f"test {test_id}")
         document = service.tests.update(test_id, changes)
         service.catalog.put_entry("test", "", test_id, test_entry(document))
@@ -244,7 +244,7 @@ def get_step(service: ServiceDep, test_id: TestId, n: StepNumber, response: Resp
 def patch_step(
     service: ServiceDep, test_id: TestId, n: StepNumber, body: StepPatch, response: Response, if_match: IfMatch = None
 ) -> StepReply:
-    """Change the label; what was taken stays as it is. If-Match says which state of the step was meant."""
+    """Change the label; what was taken stays as it is. If-Match names which state of the step was meant."""
     service.tests.step(test_id, n)
     with service.changes:
         require_match(if_match, etag_of(step_reply(service, test_id, n)), f"step {n} of test {test_id}")
