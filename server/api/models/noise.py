@@ -15,9 +15,7 @@ from server.base.models import Label, Listing, Reply, Request
 class NoiseRequest(Request):
     """How to measure the cameras' noise."""
 
-    frames: Annotated[Whole, Field(ge=2, le=200)] = Field(
-        16, description="Pairs of frames; the scene must be at rest."
-    )
+    frames: Annotated[Whole, Field(ge=2, le=200)] = Field(16, description="Pairs of frames; the scene must be at rest.")
     label: Label = Field("", description="Free text.")
 
 

@@ -93,9 +93,7 @@ class SeedsReply(Reply):
 
 
 @router.post(
-    "/steps/{n}/texture",
-    summary="Speckle quality of a region for a subset size",
-    responses=errors(404, 409, 422),
+    "/steps/{n}/texture", summary="Speckle quality of a region for a subset size", responses=errors(404, 409, 422)
 )
 def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
     """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""

@@ -36,7 +36,9 @@ class HealthReply(BaseModel):
     status: Literal["ok"] = Field(description="The service answers.")
     version: str = Field(description="Version of the program.")
     uptime_s: float = Field(description="For how long it has been running.")
-    rig: Literal["ok", "fault"] = Field(description="`ok`: cameras and stage are open; `fault`: the reason is in GET /rig.")
+    rig: Literal["ok", "fault"] = Field(
+        description="`ok`: cameras and stage are open; `fault`: the reason is in GET /rig."
+    )
     worker: Literal["ready", "starting"] = Field(description="`ready` to compute, or still `starting`.")
 
 
@@ -54,9 +56,7 @@ def healthz(service: ServiceDep) -> HealthReply:
     )
 
 
-@router.get(
-    "/readyz", summary="Readiness to capture and compute", response_model=ReadyReply, responses=errors(503)
-)
+@router.get("/readyz", summary="Readiness to capture and compute", response_model=ReadyReply, responses=errors(503))
 def readyz(service: ServiceDep) -> object:
     """Answer 200 when rig, worker and disk are ready; else a problem whose `reasons` hold code and cause each."""
     reasons = service.not_ready()
