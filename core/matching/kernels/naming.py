@@ -17,8 +17,23 @@ _INNER: dict[str, Any] = {**_ALL, "no_cpython_wrapper": True}
 
 inner = njit(**_INNER)
 """Compile a function that only kernels call: its wrapper for Python would take longer to compile than itself."""
-entry = njit(cache=True, **_ALL)
-"""Compile a function that Python calls, and keep it on disk."""
+
+
+def entry(function: Callable[..., Any]) -> Any:
+    """Compile a function that Python calls, and keep it on disk.
+
+    What another version of the program left there may name classes of arguments that no longer exist; numba would then
+    fail at every call. Such an entry is emptied here.
+    """
+    made = njit(cache=True, **_ALL)(function)
+    try:
+        made._cache._cache_file._load_index()
+    except (AttributeError, ImportError):
+        try:
+            made._cache.flush()
+        except OSError:  # not ours to write: compile anew in every process
+            made._cache.disable()
+    return made
 
 
 def kernel(made_for: str, **options: Any) -> Callable[[Any], Any]:
