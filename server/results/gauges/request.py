@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
-from pydantic import ConfigDict, Field, StringConstraints, model_validator
+from pydantic import AliasChoices, ConfigDict, Field, StringConstraints, model_validator
 
 from core.settings import Pixel, Whole, disagreement
 from server.base.models import Number, Request, StepNumber, Switch, any_of, given, not_both, one_of
@@ -137,7 +137,8 @@ class ThreeTwoOneAlignment(Request):
 
     kind: Literal["3-2-1"] = Field(description="3-2-1.")
     positions_px: Annotated[list[PositionPx], Field(min_length=6, max_length=6)] = Field(
-        description="Six positions: plane, plane, plane, from, to, origin."
+        validation_alias=AliasChoices("positions_px", "places_px"),  # the second is its earlier name
+        description="Six positions: plane, plane, plane, from, to, origin.",
     )
 
 

@@ -13,6 +13,7 @@ import pytest
 from core.settings import AnalysisSettings
 from server.formats.results.reading import read_field, read_head, read_measured
 from server.formats.results.settings import current_summary, stored_settings
+from server.results.gauges.request import GaugeRequest, ThreeTwoOneAlignment
 from server.results.provenance import calibration_of
 from server.results.steps import read_step
 from tests.support.requirements import ROOT
@@ -83,3 +84,7 @@ def test_earlier_names_of_parameters_are_accepted() -> None:
     assert (settings.spacing_px, settings.patch) == (7, "quadratic")
     assert AnalysisSettings.model_validate({**old, "patch": "stretch"}).patch == "affine"
     assert "step_px" not in settings.model_dump()
+    asked = {"align": {"kind": "3-2-1", "places_px": [[0, 0], [1, 0], [0, 1], [0, 0], [1, 0], [0, 0]]}}
+    frame = GaugeRequest.model_validate(asked).align
+    assert isinstance(frame, ThreeTwoOneAlignment)
+    assert frame.positions_px[1] == (1.0, 0.0)
