@@ -258,7 +258,7 @@ def test_ranges_and_strides_take_what_numpy_takes() -> None:
             slice(*(int(v) if v else None for v in (text or ":").split(":")), stride) for text in (rows, cols)
         )
         np.testing.assert_array_equal(part.values, w.values[index])
-        np.testing.assert_array_equal(part.place("x_px"), x.values[index])
+        np.testing.assert_array_equal(part.position("x_px"), x.values[index])
         np.testing.assert_array_equal(part.rows, np.arange(GRID[0])[index[0]])
 
 
