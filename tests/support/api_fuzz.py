@@ -286,15 +286,19 @@ def fuzz(
         schema = schema.include(operation_id=only)
     report = Report()
     began = time.monotonic()
-    for event in from_schema(schema).execute():
-        if isinstance(event, events.ScenarioFinished):
-            report.note(event, loud)
-        elif isinstance(event, events.NonFatalError):
-            report.errors.append(f"{event.label}: {event.info.format()}")
-        elif isinstance(event, events.FatalError):
-            report.errors.append(repr(event.exception))
-        elif isinstance(event, events.PhaseFinished) and loud:
-            print(f"{event.phase.name.value}: {report.cases} cases, {time.monotonic() - began:.1f} s", flush=True)
+    try:
+        for event in from_schema(schema).execute():
+            if isinstance(event, events.ScenarioFinished):
+                report.note(event, loud)
+            elif isinstance(event, events.NonFatalError):
+                report.errors.append(f"{event.label}: {event.info.format()}")
+            elif isinstance(event, events.FatalError):
+                report.errors.append(repr(event.exception))
+            elif isinstance(event, events.PhaseFinished) and loud:
+                print(f"{event.phase.name.value}: {report.cases} cases, {time.monotonic() - began:.1f} s", flush=True)
+    finally:  # hooks are schemathesis' own, and would go on with this service in the next run
+        schemathesis.hooks.unregister(before_call)
+        schemathesis.hooks.unregister(after_call)
     report.seconds = time.monotonic() - began
     return report
 

@@ -78,7 +78,10 @@ def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response
 
 
 @router.post(
-    ":import", summary="Import a calibration made elsewhere", status_code=201, responses=errors(409, 413, 422, 507)
+    ":import",
+    summary="Import a calibration made elsewhere",
+    status_code=201,
+    responses=errors(404, 409, 413, 422, 507),  # 404: a repeated request, whose calibration was deleted since
 )
 def import_calibration(
     service: ServiceDep,
