@@ -11,8 +11,9 @@ ARAVIS := $(VENV)/.aravis
 PEER := .venv-bench
 PEER_STAMP := $(PEER)/.installed
 ARGS ?=
-# test files side by side, a process each; more than four only compile the same kernels again
-WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 4 ? 4 : n)))
+# test files side by side, a process each: one more than there are cores, since devices make tests wait; more than four
+# only compile the same kernels again
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
 .PHONY: help demo quick test test-deep serve check check-page bench format accuracy fuzz load openapi reference docs torture pagespeed pagepictures clean
 

@@ -30,6 +30,9 @@ pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions say
 
 TESTS = Path(__file__).parent
 
+# What waits longest begins first, and the many short files fill the workers up at the end
+ORDER = ("contract", "crash", "service", "browser", "accuracy", "page", "unit")
+
 # A run that was started in the background ignores Ctrl-C, and what it starts would inherit that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -38,6 +41,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark every test with its tier, which is the folder that it lies in, and what is left to the deep tier."""
+    items.sort(key=lambda item: ORDER.index(item.path.relative_to(TESTS).parts[0]))
     for item in items:
         folders = item.path.relative_to(TESTS).parts
         item.add_marker(folders[0])

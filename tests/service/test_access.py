@@ -38,6 +38,7 @@ def guarded(service: Service, **options: object) -> Iterator[str]:
     """Serve with keys required; yields the URL."""
     listener = socket.socket()
     listener.bind(("127.0.0.1", 0))
+    listener.listen()  # who comes before the server is up waits in the queue
     app = create_app(service, keys_required=True, close_service=False, **options)  # type: ignore[arg-type]
     server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=2))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
@@ -354,6 +355,7 @@ def test_on_loopback_nobody_is_asked_unless_the_rig_file_says_so(tmp_path: Path)
         app = create_app(made, close_service=False)
         listener = socket.socket()
         listener.bind(("127.0.0.1", 0))
+        listener.listen()  # who comes before the server is up waits in the queue
         server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()

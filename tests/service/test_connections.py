@@ -38,6 +38,7 @@ def port(own: Service) -> Iterator[int]:
     # so that an unread answer waits with us, and not in the kernel
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024)
     listener.bind(("127.0.0.1", 0))
+    listener.listen()  # who comes before the server is up waits in the queue
     server = OrderlyServer(create_app(own, close_service=False), own, limits=LIMITS)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()

@@ -47,6 +47,7 @@ def guarded(place: Path) -> Iterator[tuple[Service, int]]:
     service = Service(tiny_config(), place / "data").start()
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.bind(("127.0.0.1", 0))
+    listener.listen()  # who comes before the server is up waits in the queue
     server = OrderlyServer(create_app(service, close_service=False), service)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()

@@ -51,6 +51,7 @@ def served(service: Service, **app: Any) -> Iterator[httpx.Client]:
     """Serve on a free loopback port in a thread of this process; yields a client. ``app`` goes to `create_app`."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.bind(("127.0.0.1", 0))
+    listener.listen()  # who comes before the server is up waits in the queue
     settings = uvicorn.Config(
         create_app(service, close_service=False, **app), log_level="error", timeout_graceful_shutdown=2
     )

@@ -83,9 +83,14 @@ export class FieldMap {
     const now = { result, n, info, image, grid, values, sigma: null, places, statistics: statistics(grid, values), withSigma: Promise.resolve() };
     this.now = now;
     // what the picture does not need may come after it
-    now.withSigma = result.sigma(n, info.key).then((sigma) => { if (now.info === info) now.sigma = sigma; return sigma; }, () => null);
+    now.withSigma = result.sigma(n, info.key).then((sigma) => {
+      if (now.info === info) now.sigma = sigma;
+      if (this.now === now) this.view.reread();
+      return sigma;
+    }, () => null);
     this.raster = null;
     this.view.readout.textContent = ""; // what it said was of another field or step
+    this.view.reread();
     return true;
   }
 

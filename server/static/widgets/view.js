@@ -37,6 +37,7 @@ export class View {
     /** @type {Place | null} */
     this.hover = null;
     this.asking = false;
+    this.outdated = false;
     this.drawing = false;
     /** @type {((aim: Place | null) => void) | null} */
     this.onaim = null;
@@ -356,6 +357,12 @@ export class View {
     this.#say();
   }
 
+  /** What lies under a resting mouse has changed: another field or step, or its uncertainty has come. */
+  reread() {
+    this.outdated = true;
+    this.#say();
+  }
+
   async #say() {
     // one question at a time: what the mouse passed meanwhile is not asked for
     if (this.asking) return;
@@ -363,6 +370,7 @@ export class View {
     try {
       while (this.hover) {
         const { x, y } = this.hover;
+        this.outdated = false;
         const column = Math.round(x);
         const row = Math.round(y);
         const place = `x ${num(x, 5)} px   y ${num(y, 5)} px`;
@@ -371,7 +379,7 @@ export class View {
         if (this.hover) this.readout.textContent = text ? `${place}   ${text}` : place;
         this.readout.dataset.column = String(column);
         this.readout.dataset.row = String(row);
-        if (this.hover && this.hover.x === x && this.hover.y === y) return;
+        if (this.hover && this.hover.x === x && this.hover.y === y && !this.outdated) return;
       }
     } finally {
       this.asking = false;
