@@ -1,4 +1,4 @@
-// Shows the API with Swagger UI, from files of this service alone. Where a key is asked for, the page asks for it first.
+// Shows the API with Swagger UI, from files of this service alone. If the service requires a key, the page asks for it first.
 /** @import { SwaggerUI } from "#swagger" */
 
 const swagger = /** @type {{ SwaggerUIBundle: SwaggerUI }} */ (/** @type {unknown} */ (window)).SwaggerUIBundle;

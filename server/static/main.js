@@ -1,10 +1,10 @@
-// The shell: bar with the stop button, screens by address, what is said about connection and key.
+// The shell: bar with the stop button, screens by address, messages about connection and key.
 import * as api from "./lib/api.js";
 import * as events from "./lib/events.js";
 import { h, replace, notify, badge, num, field, part, problemText, ask, modal } from "./lib/dom.js";
 
 /** @typedef {() => void} Leave */
-/** @typedef {{ screen: string, path: string[], query: URLSearchParams }} Here what the address says */
+/** @typedef {{ screen: string, path: string[], query: URLSearchParams }} Here parts of the address */
 /** @typedef {{ open: (root: HTMLElement, here: Here) => Promise<Leave> }} Screen */
 
 /** @type {Record<string, [text: string, load: () => Promise<Screen>]>} */
@@ -23,14 +23,14 @@ let leave = null;
 let visit = 0;
 
 /** "#/test/t000001-52d4a7?step=3" -> {screen, path, query} */
-function place() {
+function route() {
   const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
   const [screen, ...rest] = path.split("/").filter(Boolean).map(decodeURIComponent);
   return { screen: SCREENS[screen] ? screen : "rig", path: rest, query: new URLSearchParams(query ?? "") };
 }
 
 async function open() {
-  const here = place();
+  const here = route();
   visit += 1;
   const mine = visit;
   for (const link of /** @type {NodeListOf<HTMLElement>} */ (bar.querySelectorAll("nav a"))) {
@@ -62,7 +62,7 @@ async function stop() {
   stopButton.textContent = "STOPPING …";
   try {
     const answer = await api.post("/stage/stop");
-    notify(`Stop is on the wire after ${num(answer.elapsed_ms, 3)} ms.${answer.cancelled_job ? " The job that moved was cancelled." : ""}`, "good");
+    notify(`The stop command was sent after ${num(answer.elapsed_ms, 3)} ms.${answer.cancelled_job ? " The job that moved the axis was cancelled." : ""}`, "good");
   } catch (error) {
     notify(error);
   } finally {
@@ -100,7 +100,7 @@ function drawBar() {
 }
 
 let escaped = -Infinity;
-// before anything else hears of it: the stop works wherever the focus is, in a drawing or a dialog too
+// in the capture phase: the stop works wherever the focus is, in a drawing or a dialog too
 window.addEventListener("keydown", (event) => {
   if (event.key !== "Escape") return;
   if (event.timeStamp - escaped < 1500) stop();
@@ -114,19 +114,19 @@ const KEYS = [
   ["arrow keys", "Move the picture; with Shift farther"],
   ["+, −, 0, 1", "Zoom in, zoom out, fit, one picture pixel on one screen pixel"],
   ["c", "Cross-hair on or off"],
-  ["Enter", "Begin to point: a cross-hair tells what lies under it"],
+  ["Enter", "Begin to point: the values under the cross-hair are shown below the picture"],
   ["While pointing or drawing", ""],
   ["arrow keys", "Move the cross-hair by 1 px; with Shift by 10 px, with Alt by 0.1 px"],
   ["Enter", "Set a point, or read it; at the last point once more ends a polygon, hole or crack"],
   ["Backspace", "Take one point back"],
   ["Escape", "Leave"],
   ["Ctrl+Z, Ctrl+Y", "Undo, redo"],
-  ["Corners and ends that are drawn", ""],
-  ["Tab", "Goes to them"],
+  ["Corners and ends of a drawing", ""],
+  ["Tab", "Moves the focus to them"],
   ["arrow keys", "Move one by 1 px; with Shift by 10 px, with Alt by 0.1 px"],
-  ["Delete", "Removes one"],
-  ["On the surface in space", ""],
-  ["arrow keys, +, −, 0", "Turn it, zoom, put it back"],
+  ["Delete", "Remove one"],
+  ["On the 3-D surface", ""],
+  ["arrow keys, +, −, 0", "Rotate, zoom, reset the view"],
 ];
 function showKeys() {
   const rows = KEYS.map(([keys, what]) => (what ? h("tr", h("td", h("kbd", keys)), h("td", what)) : h("tr", h("th", { colspan: 2, scope: "rowgroup" }, keys))));
@@ -165,7 +165,7 @@ async function showStage() {
       .join("  ");
     stageText.title = stage.fault ? stage.fault.cause ?? String(stage.fault) : "Stage position";
   } catch {
-    stageText.textContent = "stage: not known";
+    stageText.textContent = "stage: unknown";
   }
 }
 
@@ -187,7 +187,7 @@ async function askForKey() {
         replace(problem, problemText(error));
       }
     } },
-    h("h2", "This service asks for a key"),
+    h("h2", "This service requires a key"),
     h("p.quiet", "An administrator makes one with ", h("code", "stereorig keys add NAME --role operator"), "."),
     field("Key", input), problem,
     h("div.row.end", h("button.primary", { type: "submit" }, "Log in"))));
@@ -198,7 +198,7 @@ async function askForKey() {
 api.onConnection((state) => {
   if (state === "login") askForKey();
   lost.hidden = state !== "down";
-  if (state === "down") lost.textContent = "The service does not answer. What is shown may be old; the page goes on by itself once it is back.";
+  if (state === "down") lost.textContent = "The service does not answer. The values shown may be out of date; the page continues by itself once the service answers.";
 });
 
 /** @type {number | undefined} */
@@ -226,12 +226,12 @@ async function begin() {
 const kept = localStorage.getItem("theme");
 if (kept) document.documentElement.dataset.theme = kept;
 drawBar();
-SCREENS[place().screen][1]().catch(() => {}); // its script comes while the service says who is there
+SCREENS[route().screen][1]().catch(() => {}); // its script loads during the session request
 window.addEventListener("hashchange", open);
 document.querySelector(".skip")?.addEventListener("click", (event) => {
   event.preventDefault(); // the address names the screen
   main.focus();
 });
-// what has the focus is not hidden under the bar
+// the bar does not cover the control in focus
 new ResizeObserver(() => document.documentElement.style.setProperty("scroll-padding-top", `${bar.offsetHeight + 8}px`)).observe(bar);
 begin();

@@ -98,7 +98,7 @@ def test_rig(page: Watched, audit: Audit) -> None:
         at.wait_for_function("image => image.naturalWidth === 256", arg=image.element_handle())
     expect(at.locator(".chart canvas")).to_have_count(4)
     unfold(at)
-    at.get_by_label("What is laid over cam1").select_option("texture")
+    at.get_by_label("Overlay of cam1").select_option("texture")
     expect(at.get_by_text("green: error below 0.01 px")).to_be_visible()
     at.get_by_role("button", name="Cross-hair").first.click()
     audit("live views, a map over one")
@@ -132,7 +132,7 @@ def test_tests(page: Watched, bench: Bench, audit: Audit) -> None:
     audit("tests, a new one without a name")
     page.open(f"#/test/{bench.test_id}")
     unfold(at)
-    expect(at.get_by_role("button", name="Save the facts")).to_be_visible()
+    expect(at.get_by_role("button", name="Save the metadata")).to_be_visible()
     at.locator('[data-step="1"] button').click()
     expect(at.locator('[data-role="quality"]')).to_contain_text("Step 1")
     at.get_by_role("button", name="Rectangle in the middle").click()
@@ -188,7 +188,7 @@ def test_results_in_space_and_side_by_side(page: Watched, bench: Bench, audit: A
 def test_jobs(page: Watched, bench: Bench, audit: Audit) -> None:
     at = page.open("#/jobs")
     at.locator("tr.pick button").first.click()
-    expect(at.get_by_role("heading", name="Course")).to_be_visible()
+    expect(at.get_by_role("heading", name="Log")).to_be_visible()
     unfold(at)
     audit("a job and the system")
     page.sound()
@@ -196,12 +196,12 @@ def test_jobs(page: Watched, bench: Bench, audit: Audit) -> None:
 
 def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:
     at = page.open(f"#/test/{bench.test_id}")
-    at.get_by_text("Facts for the report").click()
+    at.get_by_text("Metadata for the report").click()
     at.get_by_label("Laboratory").fill("Room <7> & 8")
     camera = at.get_by_role("group", name="Camera 1 and its lens")
     camera.get_by_label("f-number").fill("5.6")
-    at.get_by_role("button", name="Save the facts").click()
-    expect(at.get_by_text("The facts are kept.")).to_be_visible()
+    at.get_by_role("button", name="Save the metadata").click()
+    expect(at.get_by_text("The metadata are saved.")).to_be_visible()
     shown(page, bench)
     at.get_by_text("Export and report").click()
     with at.context.expect_page(timeout=200_000) as opened:

@@ -79,7 +79,7 @@ def put_before_the_cameras(shown: Page, scene: str, load: float) -> None:
     shown.get_by_label("Scene", exact=True).select_option(scene)
     shown.get_by_label("Load", exact=True).fill(str(load))
     with shown.expect_response(lambda answer: answer.url.endswith("/sim/scene")) as told:
-        shown.get_by_role("button", name="Show it").click()
+        shown.get_by_role("button", name="Show the scene").click()
     assert told.value.status == 200
 
 
@@ -157,10 +157,10 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     shown.keyboard.press("Enter")
     expect(shown.get_by_role("heading", level=1, name="Pressure test")).to_be_visible()
     made.test_id = shown.url.split("/")[-1]
-    shown.get_by_text("Facts for the report").click()
+    shown.get_by_text("Metadata for the report").click()
     shown.get_by_label("Operator").fill("A. Smith")
-    shown.get_by_role("button", name="Save the facts").click()
-    expect(shown.get_by_text("The facts are kept.")).to_be_visible()
+    shown.get_by_role("button", name="Save the metadata").click()
+    expect(shown.get_by_text("The metadata are saved.")).to_be_visible()
 
     # three steps, each with its load
     for n, (pressure, load) in enumerate(STEPS):
@@ -187,7 +187,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
         expect(shown.get_by_text("from its epipolar line")).to_have_count(k + 1)
         shown.wait_for_timeout(350)  # two clicks, not a double one
     shown.get_by_label("Subset", exact=True).fill("25")
-    shown.get_by_label("Step", exact=True).fill("5")
+    shown.get_by_label("Spacing", exact=True).fill("5")
     expect(shown.locator('[data-role="texture"]')).to_contain_text("subsets")
     shown.get_by_role("button", name="Measure", exact=True).click()
     progress = shown.locator('[data-role="progress"]')
@@ -388,7 +388,7 @@ def test_a_job_that_is_cancelled(page: Watched, client: httpx.Client, made: Made
     open_test(shown)
     Editor(shown).drag((40, 40), (210, 200))
     shown.get_by_label("Subset", exact=True).fill("31")
-    shown.get_by_label("Step", exact=True).fill("1")
+    shown.get_by_label("Spacing", exact=True).fill("1")
     shown.get_by_role("textbox", name="Steps", exact=True).fill("0-2")
     shown.get_by_label("Label", exact=True).last.fill("too fine")
     shown.get_by_role("button", name="Measure", exact=True).click()

@@ -50,7 +50,7 @@ def test_tab_reaches_everything_and_the_focus_is_seen(page: Watched, plate: str,
     at = page.open(f"#/test/{plate}" if screen == "test" else f"#/{screen}")
     if screen == "test":
         at.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true })")
-        expect(at.get_by_role("button", name="Save the facts")).to_be_visible()
+        expect(at.get_by_role("button", name="Save the metadata")).to_be_visible()
         at.get_by_role("button", name="Rectangle in the middle").click()
         expect(at.locator('[data-role="texture"]')).to_contain_text("texture")
         at.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
@@ -147,7 +147,7 @@ def test_dialogs_hold_the_focus_and_give_it_back(page: Watched, plate: str) -> N
 
 def test_the_focus_stays_where_something_is_drawn_anew(page: Watched, client: httpx.Client, plate: str) -> None:
     at = page.open("#/rig")
-    forth = at.get_by_role("button", name="Jog axis 2 forth")
+    forth = at.get_by_role("button", name="Jog axis 2 forward")
     forth.press("Enter")
     expect(forth).not_to_have_attribute("aria-busy", "true")
     expect(forth).to_be_focused()

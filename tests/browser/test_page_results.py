@@ -417,7 +417,7 @@ def test_the_difference_of_two_analyses(page: Watched, bench: Bench) -> None:
     assert float(figures.get_attribute("data-rms") or 0) == pytest.approx(1e-3, abs=1e-9)
     s = [bench.field(2, "sigma_w_mm", a) ** 2 for a in (bench.analysis_id, bench.cut_id)]
     told = np.sqrt(np.mean((s[0] + s[1])[both]))
-    assert float(figures.get_attribute("data-told") or 0) == pytest.approx(told, rel=1e-5)
+    assert float(figures.get_attribute("data-reported") or 0) == pytest.approx(told, rel=1e-5)
     page.sound()
 
 

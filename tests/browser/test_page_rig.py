@@ -64,7 +64,7 @@ def test_settings_are_set_and_what_the_camera_took_is_told(page: Watched, client
     box = shown.get_by_role("region", name="cam2", exact=True)
     box.get_by_label("Exposure").fill("12.5")
     box.get_by_role("button", name="Set").click()
-    expect(box.get_by_text("The camera took 12.50 ms")).to_be_visible()
+    expect(box.get_by_text("The camera applied 12.50 ms")).to_be_visible()
     assert client.get("/api/v1/cameras/cam2").json()["settings"]["exposure_ms"] == 12.5
     box.get_by_label("Exposure").fill("5000")
     box.get_by_role("button", name="Set").click()
@@ -78,7 +78,7 @@ def test_settings_are_set_and_what_the_camera_took_is_told(page: Watched, client
 def test_overlays_lie_over_the_image(page: Watched) -> None:
     shown = page.open()
     view = shown.locator(".view").first
-    view.get_by_label("What is laid over cam1").select_option("texture")
+    view.get_by_label("Overlay of cam1").select_option("texture")
     overlay = view.locator(".content > img").nth(1)
     shown.wait_for_function("image => image.naturalWidth > 0", arg=overlay.element_handle())
     picture, map_ = view.locator(".content > img").first.bounding_box(), overlay.bounding_box()
@@ -108,10 +108,10 @@ def test_charts_take_the_colours_of_the_theme(page: Watched) -> None:
 def test_jog_moves_the_axis_and_stop_is_told(page: Watched, client: httpx.Client) -> None:
     shown = page.open()
     axis = shown.locator('[data-axis="1"]')
-    axis.get_by_role("button", name="Jog axis 1 forth").click()
+    axis.get_by_role("button", name="Jog axis 1 forward").click()
     expect(axis.locator('[data-role="position"]')).to_have_text(re.compile(r"^1(\.0+)? ?mm|^1\.0"), timeout=15_000)
     shown.get_by_role("button", name="STOP").click()
-    expect(shown.get_by_text("Stop is on the wire")).to_be_visible()
+    expect(shown.get_by_text("The stop command was sent")).to_be_visible()
     assert client.get("/api/v1/stage").json()["axes"][0]["position_mm"] == pytest.approx(1.0, abs=0.01)
     page.sound()
 
@@ -130,7 +130,7 @@ def test_by_keyboard_alone_and_on_a_tablet(chromium: Browser, client: httpx.Clie
         expect(shown.get_by_role("heading", name="Jobs and system")).to_be_visible()
         shown.keyboard.press("Escape")
         shown.keyboard.press("Escape")
-        expect(shown.get_by_text("Stop is on the wire")).to_be_visible()
+        expect(shown.get_by_text("The stop command was sent")).to_be_visible()
         page.sound()
 
 

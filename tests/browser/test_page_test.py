@@ -69,12 +69,12 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
     expect(shown.get_by_role("heading", name="Plate <b> & more")).to_be_visible()
     test_id = page.page.url.split("/")[-1]
     # facts that the report asks for
-    shown.get_by_text("Facts for the report").click()
+    shown.get_by_text("Metadata for the report").click()
     shown.get_by_label("Operator").fill("A. Smith")
     camera = shown.get_by_role("group", name="Camera 2 and its lens")
     camera.get_by_label("Focal length").fill("50")
-    shown.get_by_role("button", name="Save the facts").click()
-    expect(shown.get_by_text("The facts are kept.")).to_be_visible()
+    shown.get_by_role("button", name="Save the metadata").click()
+    expect(shown.get_by_text("The metadata are saved.")).to_be_visible()
     assert client.get(f"{API}/tests/{test_id}/facts").json() == {
         "operator": "A. Smith",
         "cam2": {"lens": {"focal_length_mm": 50.0}},
@@ -85,7 +85,7 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
     group.get_by_label("Load").fill("1250")
     group.get_by_label("Channels").fill("stroke_mm = 0,42")
     group.get_by_role("button", name="Capture").click()
-    expect(shown.get_by_role("alert").filter(has_text="is no channel")).to_be_visible()
+    expect(shown.get_by_role("alert").filter(has_text="is not a channel")).to_be_visible()
     group.get_by_label("Channels").fill("stroke_mm = 0.42, temperature_c = -21.3")
     group.get_by_role("button", name="Capture").click()
     quality = shown.locator('[data-role="quality"]')
@@ -117,7 +117,7 @@ def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: h
     expect(shown.get_by_text("Camera 1 has 3 images, camera 2 has 2.")).to_be_visible()
     shown.get_by_label("Images of camera 2").set_input_files(files["right"])
     shown.get_by_role("button", name="Import", exact=True).click()
-    expect(shown.get_by_text("3 of 3 pairs are steps now.")).to_be_visible(timeout=SLOW)
+    expect(shown.get_by_text("3 of 3 pairs imported as steps.")).to_be_visible(timeout=SLOW)
     assert [s["label"] for s in client.get(f"{API}/tests/{test_id}").json()["steps"]] == ["left_1", "left_2", "left_10"]
     for n, number in enumerate((1, 2, 10)):
         for cam, side in (("cam1", "left"), ("cam2", "right")):
@@ -225,7 +225,7 @@ def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client:
     assert square.evaluate(ON_SCREEN) == pytest.approx(41 / WIDTH * picture["width"], abs=1)
     shown.get_by_label("texture map").check()
     expect(shown.get_by_text("a subset of 41 px")).to_be_visible()
-    shown.get_by_role("button", name="Look at them").click()
+    shown.get_by_role("button", name="Zoom to the subsets").click()
     assert square.evaluate(ON_SCREEN) == pytest.approx(41 * 6, abs=1)
     page.sound()
 

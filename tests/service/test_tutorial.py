@@ -17,6 +17,7 @@ import pytest
 
 from server.demo.process import running_service
 from tests.support.document_scripts import WRITTEN, blocks, one_block, run
+from tests.support.plate_truth import check_plate_field
 from tests.support.requirements import ROOT
 from tests.support.service_rig import true_cameras, wait_for_rig
 
@@ -25,8 +26,6 @@ API = "/api/v1"
 NO_CURL = "curl not found: apt install curl to run the tutorial's scripts"
 RIG = ROOT / "config" / "sim_paper.toml"
 SCRIPT, FILES, LIBRARY = "docs/tutorial/script.md", "docs/tutorial/files.md", "docs/tutorial/library.md"
-# what the scripts say of the plate: the paper's, in mm and N/mm^2, and the last pressure in kPa
-RADIUS, THICKNESS, MODULUS, POISSON, PRESSURE = 13.385, 0.762, 71.0e3, 0.334, 689.0
 
 
 def script(language: str, like: str) -> str:
@@ -57,24 +56,6 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
         yield made
 
 
-def is_the_plate(client: httpx.Client, w_mm: Any) -> None:
-    """Assert that this is W of the newest analysis, and the textbook's: a clamped plate's deflection."""
-    test_id = client.get(f"{API}/tests").json()["tests"][-1]["id"]
-    test = client.get(f"{API}/tests/{test_id}").json()
-    assert [step["label"] for step in test["steps"]] == ["0 kPa", "344.5 kPa", "689 kPa"]
-    path = f"{API}/tests/{test_id}/analyses/{test['analyses'][-1]['id']}/steps/2/fields"
-    x, y, told = (
-        np.array(client.get(f"{path}/{name}").json()["values"], dtype=float) for name in ("x_mm", "y_mm", "w_mm")
-    )
-    np.testing.assert_allclose(w_mm, told.reshape(np.shape(w_mm)), rtol=1e-6)
-    stiffness = MODULUS * THICKNESS**3 / (12 * (1 - POISSON**2))
-    deflection = PRESSURE * 1e-3 * RADIUS**4 / (64 * stiffness)
-    true = -deflection * np.clip(1 - (np.hypot(x, y) / RADIUS) ** 2, 0, None) ** 2
-    assert np.isfinite(told).mean() > 0.99
-    assert np.abs(told).max() > 0.1
-    assert np.sqrt(np.nanmean((told - true) ** 2)) < 1e-3  # mm
-
-
 def test_ten_lines_of_curl(client: httpx.Client, tmp_path: Path) -> None:
     if shutil.which("curl") is None:
         pytest.skip(NO_CURL)
@@ -82,7 +63,7 @@ def test_ten_lines_of_curl(client: httpx.Client, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     with (tmp_path / "w.csv").open(encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    is_the_plate(client, [float(row["w_mm"] or "nan") for row in rows])
+    check_plate_field(client, [float(row["w_mm"] or "nan") for row in rows])
 
 
 def test_ten_lines_of_python(client: httpx.Client, tmp_path: Path) -> None:
@@ -92,7 +73,7 @@ def test_ten_lines_of_python(client: httpx.Client, tmp_path: Path) -> None:
     )
     done = run([sys.executable, "script.py"], tmp_path)
     assert done.returncode == 0, done.stderr
-    is_the_plate(client, np.array(json.loads((tmp_path / "w.json").read_text(encoding="utf-8")), dtype=float))
+    check_plate_field(client, np.array(json.loads((tmp_path / "w.json").read_text(encoding="utf-8")), dtype=float))
 
 
 def test_the_calibration_by_script(client: httpx.Client, tmp_path: Path) -> None:

@@ -9,40 +9,38 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import Page, Request
 
-WIDTH = 256
-
-
-HEIGHT = 240
+# of the small rig's images, px
+WIDTH, HEIGHT = 256, 240
 
 
 class Editor:
-    """Camera 1's picture, and where its pixels are by the transform that the browser drew it with."""
+    """A camera's picture, and the window positions of its pixels by the transform that the browser drew it with."""
 
-    def __init__(self, shown: Page, camera: int = 1) -> None:
-        self.page = shown
+    def __init__(self, shown: Page, camera: int = 1, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+        self.page, self.size = shown, size
         self.view = shown.locator(".view").nth(camera - 1)
         self.image = self.view.locator(".content > img").first
-        shown.wait_for_function("image => image.naturalWidth === 256", arg=self.image.element_handle())
+        shown.wait_for_function(f"image => image.naturalWidth === {size[0]}", arg=self.image.element_handle())
         self.show()
 
     def show(self) -> None:
         """Bring all of it into the window: what lies outside cannot be clicked."""
         self.view.evaluate("view => view.scrollIntoView({block: 'end', behavior: 'instant'})")
 
-    def place(self, x: float, y: float) -> tuple[float, float]:
+    def position(self, x: float, y: float) -> tuple[float, float]:
         box = self.image.bounding_box()
         assert box is not None
-        return box["x"] + (x + 0.5) / WIDTH * box["width"], box["y"] + (y + 0.5) / HEIGHT * box["height"]
+        return box["x"] + (x + 0.5) / self.size[0] * box["width"], box["y"] + (y + 0.5) / self.size[1] * box["height"]
 
     def click(self, x: float, y: float) -> None:
-        self.page.mouse.click(*self.place(x, y))
+        self.page.mouse.click(*self.position(x, y))
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        self.page.mouse.move(*self.place(*start))
+        self.page.mouse.move(*self.position(*start))
         self.page.mouse.down()
         middle = ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
-        self.page.mouse.move(*self.place(*middle))
-        self.page.mouse.move(*self.place(*end))
+        self.page.mouse.move(*self.position(*middle))
+        self.page.mouse.move(*self.position(*end))
         self.page.mouse.up()
 
     def key(self, name: str, times: int = 1) -> None:
@@ -59,7 +57,7 @@ class Editor:
 def asked(shown: Page, path: str, act: Callable[[], object], key: str = "", *like: Any) -> dict[str, Any]:
     """Return the body that the page sends to an operation once this is done: the one with these numbers under a key.
 
-    What is drawn is judged a little later, so that a body from before may still be under way.
+    A drawing is checked a little later, so that an earlier body may still be under way.
     """
 
     def right(request: Request) -> bool:

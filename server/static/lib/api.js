@@ -1,13 +1,13 @@
-// The public HTTP API as the page uses it: nothing else is ever asked.
+// The public HTTP API as the page uses it: the page sends no other request.
 /** @import { Address, Body, Model, Query, Reply, Trouble } from "#routes" */
-/** @typedef {{ [name: string]: string | number | boolean | readonly (string | number)[] | null | undefined }} Asked what is asked of an address */
+/** @typedef {{ [name: string]: string | number | boolean | readonly (string | number)[] | null | undefined }} Asked query parameters */
 
 export const BASE = "/api/v1";
 
-/** What the API answers when it refuses: code, cause and remedy. */
+/** A refusal by the API: code, cause and remedy. */
 export class Problem extends Error {
   /**
-   * @param {number} status of HTTP; 0 where no answer refused
+   * @param {number} status of HTTP; 0 without an answer
    * @param {Trouble} document_
    * @param {string | null} [requestId]
    */
@@ -26,13 +26,13 @@ export class Problem extends Error {
 }
 
 /**
- * A problem as a document or an event tells it, or one of what was typed in here, to be shown as any other.
+ * A problem stated by a document or an event, or found in the operator's input, to be shown as any other.
  * @param {Trouble} trouble
  */
 export const problemOf = (trouble) => new Problem(0, trouble);
 
 /**
- * Whether something was given up because nobody waits for it any more.
+ * Return true if a request was aborted because its screen was left.
  * @param {unknown} error
  */
 export const aborted = (error) => error instanceof Error && error.name === "AbortError";
@@ -41,7 +41,7 @@ export const aborted = (error) => error instanceof Error && error.name === "Abor
 /** @type {Set<(state: Connection) => void>} */
 const listeners = new Set();
 /**
- * Hear whether the service can be reached ("up", "down") and when a key is needed ("login").
+ * Call a listener when the service answers ("up"), does not ("down") or requires a key ("login").
  * @param {(state: Connection) => void} listener
  */
 export function onConnection(listener) {
@@ -49,7 +49,7 @@ export function onConnection(listener) {
   return () => listeners.delete(listener);
 }
 /** @param {Connection} state */
-function tell(state) {
+function announce(state) {
   for (const listener of listeners) listener(state);
 }
 
@@ -73,7 +73,7 @@ function located(path, query = {}) {
 /**
  * @param {"GET" | "POST" | "PUT" | "PATCH" | "DELETE"} method
  * @param {string} path
- * @param {{ body?: unknown, query?: Asked, headers?: Record<string, string>, signal?: AbortSignal, making?: boolean }} [options] `making`: it makes something
+ * @param {{ body?: unknown, query?: Asked, headers?: Record<string, string>, signal?: AbortSignal, making?: boolean }} [options] `making`: it creates something
  */
 async function send(method, path, { body, query, headers = {}, signal, making = false } = {}) {
   const url = located(path, query);
@@ -85,17 +85,17 @@ async function send(method, path, { body, query, headers = {}, signal, making = 
     sent["Content-Type"] = "application/json";
     content = JSON.stringify(body);
   }
-  // what makes something carries its key, so it may be sent once more when the line broke
+  // a creating request carries its key, so it may be sent again after a broken connection
   for (let attempt = 0; ; attempt += 1) {
     try {
       const response = await fetch(url, { method, headers: sent, body: content, signal, credentials: "same-origin" });
-      tell("up");
+      announce("up");
       return response;
     } catch (error) {
       if (aborted(error)) throw error;
       if (attempt >= 1 || !(method === "GET" || making)) {
-        tell("down");
-        throw new Problem(0, { detail: "The service does not answer.", remedy: "Is it running? The page goes on by itself once it is back.", code: "no_answer" });
+        announce("down");
+        throw new Problem(0, { detail: "The service does not answer.", remedy: "Is it running? The page continues by itself once the service answers.", code: "no_answer" });
       }
       await new Promise((resolve) => setTimeout(resolve, 300));
     }
@@ -113,7 +113,7 @@ async function refuse(response) {
   } catch {
     // not a problem document: the status must do
   }
-  if (response.status === 401) tell("login");
+  if (response.status === 401) announce("login");
   throw new Problem(response.status, document_, response.headers.get("X-Request-Id"));
 }
 
@@ -176,14 +176,14 @@ export const remove = async (path) => json(await send("DELETE", path));
 export const upload = async (path, form) => json(await send("POST", path, { body: form, making: true }));
 
 /**
- * Something else than JSON.
+ * An answer that is not JSON.
  * @param {string} path
  * @param {Asked} [query]
  */
 export const raw = async (path, query) => ok(await send("GET", path, { query }));
 
 /**
- * Read something together with its ETag, for a change that must not overwrite somebody else's.
+ * Read something together with its ETag, for a change that must not overwrite that of another client.
  * @template {string} const P
  * @param {P & Address<"get", P>} path
  * @returns {Promise<{ value: Reply<"get", P>, etag: string | null }>}

@@ -21,7 +21,7 @@ function okLab(lightness, a, b) {
   return linear.map((v) => 255 * Math.min(1, Math.max(0, v <= 0.0031308 ? 12.92 * v : 1.055 * Math.max(v, 0) ** (1 / 2.4) - 0.055)));
 }
 
-/** Blue over light grey to brown: lightness and chroma change evenly from the middle, told apart with any colour sense. */
+/** Blue over light grey to brown: lightness and chroma change evenly from the middle, distinguished with any colour vision. */
 function diverging() {
   const made = [];
   for (let k = 0; k <= 32; k += 1) {
@@ -67,7 +67,7 @@ export function colours(name, levels = 0, reverse = false) {
 }
 
 /**
- * Which of the 256 colours a value has.
+ * Index of a value's colour among the 256.
  * @param {number} value
  * @param {number} low
  * @param {number} high
@@ -92,9 +92,9 @@ export function percentiles(values, low, high) {
   finite = finite.subarray(0, count).sort();
   if (!finite.length) return null;
   const at = (/** @type {number} */ share) => {
-    const place = (share / 100) * (finite.length - 1);
-    const k = Math.min(Math.floor(place), Math.max(finite.length - 2, 0));
-    return finite.length === 1 ? finite[0] : finite[k] + (finite[k + 1] - finite[k]) * (place - k);
+    const index = (share / 100) * (finite.length - 1);
+    const k = Math.min(Math.floor(index), Math.max(finite.length - 2, 0));
+    return finite.length === 1 ? finite[0] : finite[k] + (finite[k + 1] - finite[k]) * (index - k);
   };
   return [at(low), at(high)];
 }
@@ -110,7 +110,7 @@ export function suited(low, high) {
   return low < 0 && high > 0 && less > 0.2 * more ? "diverging" : "viridis";
 }
 
-// what a status means is told by colours of its own: the good ones calm, each failure another
+// a colour for each status: valid ones calm, each failure another
 const STATUS = ["#7fb8a4", "#9aa3a8", "#4b5156", "#6a5acd", "#e0b100", "#d9480f", "#c2255c", "#1c7ed6", "#862e9c", "#000000", "#c0ca33"];
 /** @param {number} value */
 export const statusColour = (value) => STATUS[value] ?? "#ffffff";

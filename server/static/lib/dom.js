@@ -1,4 +1,4 @@
-// Elements, numbers with units, and what the screens share of looks.
+// Elements, numbers with units, and the style that all screens share.
 /** @import { Attributes, Column, Control, Drawn, Made, Part } from "#dom" */
 
 /**
@@ -58,7 +58,7 @@ function attributes(node, values) {
 }
 
 /**
- * What a canvas is drawn with.
+ * The drawing context of a canvas.
  * @param {HTMLCanvasElement} canvas
  */
 export function pen(canvas) {
@@ -68,13 +68,13 @@ export function pen(canvas) {
 }
 
 /**
- * Put other children into a node. Where the focus was in it, it stays at what stands in the same place now.
+ * Put other children into a node. A focus inside it moves to the corresponding new control.
  * @param {Drawn} node
  * @param {Part[]} children
  */
 export function replace(node, ...children) {
   const active = /** @type {Control | null} */ (document.activeElement);
-  const held = active && active !== node && node.contains(active) ? place(node, active) : null;
+  const held = active && active !== node && node.contains(active) ? slotOf(node, active) : null;
   node.replaceChildren();
   fill(node, children);
   if (held && !(held.control.isConnected && document.activeElement === held.control)) refocus(node, held);
@@ -82,7 +82,7 @@ export function replace(node, ...children) {
 }
 
 /**
- * What tells a control from the others of its kind, as far as it survives being drawn again.
+ * Text that distinguishes a control from others of its kind, and that is the same when it is drawn again.
  * @param {Control} control
  */
 function sign(control) {
@@ -104,11 +104,11 @@ function alike(node, control, mine = sign(control)) {
  * @param {Drawn} node
  * @param {Control} control
  */
-const place = (node, control) => ({ control, mine: sign(control), index: alike(node, control).indexOf(control) });
+const slotOf = (node, control) => ({ control, mine: sign(control), index: alike(node, control).indexOf(control) });
 
 /**
  * @param {Drawn} node
- * @param {ReturnType<typeof place>} held
+ * @param {ReturnType<typeof slotOf>} held
  */
 function refocus(node, { control: before, mine, index }) {
   if (before.isConnected) return before.focus({ preventScroll: true }); // it was only moved
@@ -122,7 +122,7 @@ function refocus(node, { control: before, mine, index }) {
 }
 
 /**
- * A number with `digits` significant digits; an unknown one is said to be unknown, never zero.
+ * A number with `digits` significant digits; an unknown one is a dash, never zero.
  * @param {number | null | undefined} value
  */
 export function num(value, digits = 4) {
@@ -172,7 +172,7 @@ export function when(utc) {
 
 let fields = 0;
 /**
- * A labelled control: field("Exposure", input, "ms", "what it means").
+ * A labelled control: field("Exposure", input, "ms", "a hint").
  * @param {string} label
  * @param {HTMLElement} control
  */
@@ -206,7 +206,7 @@ export function select(options, chosen, attributes_ = {}) {
 }
 
 /**
- * A button that cannot be pressed again while what it began is under way.
+ * A button that cannot be pressed again while its action is running.
  * @param {string} text
  * @param {() => unknown} run
  * @param {Attributes & { kind?: string }} [attributes_]
@@ -216,7 +216,7 @@ export function action(text, run, attributes_ = {}) {
   const node = h(kind ? `button.${kind}` : "button", { type: "button", ...others }, text);
   node.addEventListener("click", async () => {
     if (node.getAttribute("aria-disabled") === "true") return;
-    // `disabled` would take the focus away from who pressed it by keyboard
+    // `disabled` would take the focus away from an operator at the keyboard
     node.setAttribute("aria-disabled", "true");
     node.setAttribute("aria-busy", "true");
     try {
@@ -247,7 +247,7 @@ export const numeric = (heading, cell) => [heading, cell, { numeric: true }];
  * @param {readonly Row[]} rows
  * @param {{ caption?: string, onrow?: (row: Row) => unknown, empty?: string }} [options]
  */
-export function table(columns, rows, { caption, onrow, empty = "Nothing here yet." } = {}) {
+export function table(columns, rows, { caption, onrow, empty = "No entries yet." } = {}) {
   if (!rows.length) return h("p.quiet", empty);
   return h(
     "div.scroll",
@@ -271,11 +271,11 @@ export function table(columns, rows, { caption, onrow, empty = "Nothing here yet
 }
 
 /**
- * Facts as a definition list; values that are not known are said to be so.
+ * Names and values as a definition list; an unknown value is a dash.
  * @param {readonly (readonly [string, Part])[]} pairs name and value of each
  */
-export function facts(pairs) {
-  return h("dl.facts", pairs.map(([name, value]) => [h("dt", name), h("dd", value ?? "–")]));
+export function definitions(pairs) {
+  return h("dl.definitions", pairs.map(([name, value]) => [h("dt", name), h("dd", value ?? "–")]));
 }
 
 /** @param {string | undefined} text */
@@ -301,11 +301,11 @@ export function part(id) {
 }
 
 /**
- * Say something at the foot of the page; a problem shows cause and remedy as the API gave them.
+ * Show a message at the foot of the page; a problem shows cause and remedy as the API gave them.
  * @param {unknown} what an error, or a text
  */
 export function notify(what, kind = "") {
-  const place = part("notices");
+  const notices = part("notices");
   const problem = what instanceof Error;
   const box = h(
     `div.notice${problem ? ".bad" : kind ? `.${kind}` : ""}`,
@@ -317,10 +317,10 @@ export function notify(what, kind = "") {
       (next?.querySelector("button") ?? part("main")).focus({ preventScroll: true });
     } }, "×"),
   );
-  const same = [...place.children].find((node) => node.firstChild?.textContent === box.firstChild?.textContent);
+  const same = [...notices.children].find((node) => node.firstChild?.textContent === box.firstChild?.textContent);
   if (same) same.remove();
-  place.append(box);
-  while (place.children.length > 4) place.firstElementChild?.remove();
+  notices.append(box);
+  while (notices.children.length > 4) notices.firstElementChild?.remove();
   /** @returns {unknown} */
   const fade = () => (box.contains(document.activeElement) ? setTimeout(fade, 2000) : box.remove());
   if (!problem) setTimeout(fade, 6000);
@@ -345,7 +345,7 @@ export function problemText(problem) {
 /**
  * Open a dialog: Tab goes round in it, and the focus goes back to where it was once it is closed.
  * @param {HTMLDialogElement} node
- * @param {HTMLElement} [first] what has the focus at first
+ * @param {HTMLElement} [first] control that has the focus first
  */
 export function modal(node, first) {
   const before = /** @type {HTMLElement | null} */ (document.activeElement);
@@ -369,7 +369,7 @@ export function modal(node, first) {
 }
 
 /**
- * A dialog with a heading, a body and buttons; resolves to what was pressed. What moves can be stopped from it.
+ * A dialog with a heading, a body and buttons; resolves to the meaning of the pressed one. It has a stop button of its own.
  * @param {string} heading
  * @param {HTMLElement} body
  * @param {(readonly [string, string | null])[]} buttons text and meaning of each; the last one is the first choice

@@ -3,21 +3,21 @@ import { BASE } from "./api.js";
 /** @import { Events } from "#routes" */
 
 const NAMES = ["job", "step", "result", "stage", "camera", "scene", "test", "calibration", "noise"];
-/** @type {Map<string, Set<(data: any) => void>>} what was said is as its name says: a border */
+/** @type {Map<string, Set<(data: any) => void>>} data by the name of their event; not checked at run time */
 const listeners = new Map();
 /** @type {EventSource | null} */
 let source = null;
 
 /**
- * Hear events of one name; returns the function that ends it.
+ * Call a listener for events of one name; returns the function that ends it.
  * @template {keyof Events} Name
  * @param {Name} name
  * @param {(data: Events[Name]) => void} listener
  */
 export function on(name, listener) {
-  const heard = listeners.get(name) ?? new Set();
-  listeners.set(name, heard.add(listener));
-  return () => heard.delete(listener);
+  const registered = listeners.get(name) ?? new Set();
+  listeners.set(name, registered.add(listener));
+  return () => registered.delete(listener);
 }
 
 /**

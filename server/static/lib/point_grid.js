@@ -1,10 +1,10 @@
 // The grid of points: values between them, never over a missing point or a cut. The rule is that of the gauges:
-// four corners bilinearly; three where the fourth is missing or lies beyond a cut and the place lies in their triangle.
+// four corners bilinearly; three where the fourth is missing or lies beyond a cut and the position lies in their triangle.
 
 const NEAR = 1e-6;
 
 /**
- * Whether the straight lines a-b and c-d meet.
+ * Return true if the straight lines a-b and c-d meet.
  * @param {number} ax
  * @param {number} ay
  * @param {number} bx
@@ -78,7 +78,7 @@ export class Grid {
   }
 
   /**
-   * Nearest point of the grid to a place in the reference image.
+   * Nearest point of the grid to a position in the reference image.
    * @param {number} x
    * @param {number} y
    */
@@ -89,17 +89,17 @@ export class Grid {
   }
 
   /**
-   * Nearest point where the points lie at `places`; -1 where none has a place.
-   * @param {ArrayLike<number>} places
+   * Nearest of points at `positions`; -1 where none has a position.
+   * @param {ArrayLike<number>} positions
    * @param {number} x
    * @param {number} y
    */
-  nearestOf(places, x, y) {
+  nearestOf(positions, x, y) {
     let best = -1;
-    let least = Infinity;
+    let min = Infinity;
     for (let i = 0; i < this.x.length; i += 1) {
-      const d = (places[2 * i] - x) ** 2 + (places[2 * i + 1] - y) ** 2;
-      if (d < least) { least = d; best = i; }
+      const d = (positions[2 * i] - x) ** 2 + (positions[2 * i + 1] - y) ** 2;
+      if (d < min) { min = d; best = i; }
     }
     return best;
   }
@@ -110,7 +110,7 @@ export class Grid {
   }
 
   /**
-   * Which of a cell's corners (bits) have a value.
+   * Bits of a cell's corners that have a value.
    * @param {ArrayLike<number>} values
    * @param {number} cell
    */
@@ -159,7 +159,7 @@ export class Grid {
   }
 
   /**
-   * Value at a place of the reference image; NaN where it has none.
+   * Value at a position in the reference image; NaN where it has none.
    * @param {ArrayLike<number>} values
    * @param {number} x
    * @param {number} y
@@ -179,15 +179,15 @@ export class Grid {
    * @param {ArrayLike<number>} values of the points
    * @param {number} width of the image, px
    * @param {number} height of the image, px
-   * @param {ArrayLike<number> | null} places where the points lie in it (x, y, x, y ...); null: the reference image
+   * @param {ArrayLike<number> | null} positions of the points in it (x, y, x, y ...); null: the reference image
    * @param {boolean} steps each pixel takes its nearest point's value, failed or not (for a status)
    * @returns {Raster} the part of the image where points lie
    */
-  raster(values, width, height, places = null, steps = false) {
+  raster(values, width, height, positions = null, steps = false) {
     let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
     for (let i = 0; i < this.x.length; i += 1) {
-      const x = places ? places[2 * i] : this.x[i];
-      const y = places ? places[2 * i + 1] : this.y[i];
+      const x = positions ? positions[2 * i] : this.x[i];
+      const y = positions ? positions[2 * i + 1] : this.y[i];
       if (x < left) left = x;
       if (x > right) right = x;
       if (y < top) top = y;
@@ -200,8 +200,8 @@ export class Grid {
     bottom = Math.min(Math.ceil(bottom) + margin, height - 1);
     if (!(right >= left && bottom >= top)) return { x: 0, y: 0, width: 0, height: 0, values: new Float32Array(0) };
     const out = { x: left, y: top, width: right - left + 1, height: bottom - top + 1, values: new Float32Array((right - left + 1) * (bottom - top + 1)).fill(NaN) };
-    if (steps && !places) this.#nearestEach(values, out);
-    else this.#cells(values, out, places);
+    if (steps && !positions) this.#nearestEach(values, out);
+    else this.#cells(values, out, positions);
     return out;
   }
 
@@ -225,9 +225,9 @@ export class Grid {
   /**
    * @param {ArrayLike<number>} values
    * @param {Raster} out
-   * @param {ArrayLike<number> | null} places
+   * @param {ArrayLike<number> | null} positions
    */
-  #cells(values, out, places) {
+  #cells(values, out, positions) {
     const used = new Uint8Array(this.x.length);
     for (let r = 0; r < this.rows - 1; r += 1) {
       for (let c = 0; c < this.cols - 1; c += 1) {
@@ -237,18 +237,18 @@ export class Grid {
         const lone = bits !== 15 && ![14, 13, 11, 7].includes(bits);
         if (lone) continue;
         for (const corner of this.corners(cell)) used[corner] = 1;
-        if (!places) this.#rectangle(values, out, cell, bits);
+        if (!positions) this.#rectangle(values, out, cell, bits);
         else if (bits === 15) {
-          this.#triangle(values, out, places, cell, 0, bits);
-          this.#triangle(values, out, places, cell, 3, bits);
-        } else this.#triangle(values, out, places, cell, 3 - Math.log2(15 & ~bits), bits);
+          this.#triangle(values, out, positions, cell, 0, bits);
+          this.#triangle(values, out, positions, cell, 3, bits);
+        } else this.#triangle(values, out, positions, cell, 3 - Math.log2(15 & ~bits), bits);
       }
     }
-    // a point without neighbours shows itself alone
+    // a point without neighbours is drawn as a dot
     for (let i = 0; i < used.length; i += 1) {
       if (used[i] || !this.valid[i] || !Number.isFinite(values[i])) continue;
-      const x = Math.round(places ? places[2 * i] : this.x[i]) - out.x;
-      const y = Math.round(places ? places[2 * i + 1] : this.y[i]) - out.y;
+      const x = Math.round(positions ? positions[2 * i] : this.x[i]) - out.x;
+      const y = Math.round(positions ? positions[2 * i + 1] : this.y[i]) - out.y;
       for (let v = Math.max(y - 1, 0); v <= Math.min(y + 1, out.height - 1); v += 1) {
         for (let u = Math.max(x - 1, 0); u <= Math.min(x + 1, out.width - 1); u += 1) out.values[v * out.width + u] = values[i];
       }
@@ -286,23 +286,23 @@ export class Grid {
   }
 
   /**
-   * The half of a cell at its corner `o`, where its corners lie at `places`.
+   * The half of a cell at its corner `o`, where its corners lie at `positions`.
    * @param {ArrayLike<number>} values
    * @param {Raster} out
-   * @param {ArrayLike<number>} places
+   * @param {ArrayLike<number>} positions
    * @param {number} cell
    * @param {number} o
    * @param {number} bits
    */
-  #triangle(values, out, places, cell, o, bits) {
+  #triangle(values, out, positions, cell, o, bits) {
     const corner = (/** @type {number} */ k) => cell + (k & 1) + (k & 2 ? this.cols : 0);
     const [io, ia, ib, id] = [corner(o), corner(o ^ 1), corner(o ^ 2), corner(o ^ 3)];
-    const px = places[2 * io];
-    const py = places[2 * io + 1];
-    const ax = places[2 * ia];
-    const ay = places[2 * ia + 1];
-    const bx = places[2 * ib];
-    const by = places[2 * ib + 1];
+    const px = positions[2 * io];
+    const py = positions[2 * io + 1];
+    const ax = positions[2 * ia];
+    const ay = positions[2 * ia + 1];
+    const bx = positions[2 * ib];
+    const by = positions[2 * ib + 1];
     const ux = ax - px;
     const uy = ay - py;
     const vx = bx - px;
@@ -337,7 +337,7 @@ export class Grid {
   }
 
   /**
-   * Whether another grid has the same points.
+   * Return true if another grid has the same points.
    * @param {Grid} other
    */
   same(other) {
@@ -346,7 +346,7 @@ export class Grid {
 }
 
 /**
- * Least, largest, mean, sd and number of the values of measured points, and how many there could be.
+ * Min, max, mean, sd and number of the values of valid points, and the number of points inside the region.
  * @param {Grid} grid
  * @param {ArrayLike<number>} values
  */

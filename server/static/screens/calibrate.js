@@ -1,8 +1,8 @@
-// Calibrations: plan with its expected uncertainty, run, look, accept or discard, import, compare.
+// Calibrations: plan with its expected uncertainty, run, review (accept or discard), import, compare.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { calibrationViews } from "./calibrate/views.js";
-import { h, numeric, pen, replace, field, number, select, action, table, facts, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
+import { h, numeric, pen, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends, Part } from "#dom" */
@@ -79,7 +79,7 @@ export async function open(root, { path }) {
   async function show(again = false) {
     const id = chosen ?? entries.find((one) => one.state === "complete")?.id;
     if (!id) {
-      replace(shown, h("section.panel", h("p.quiet", "What a calibration found is shown here.")));
+      replace(shown, h("section.panel", h("p.quiet", "The result of a calibration is shown here.")));
       return;
     }
     try {
@@ -113,10 +113,10 @@ export async function open(root, { path }) {
       else location.hash = "#/calibrate";
     }));
     const { problem } = document_;
-    // one that its verdict refused is shown like any other: what was wrong is in its residuals
+    // one with the verdict failed is shown like any other: its residuals show the cause
     if (document_.state !== "complete" && !document_.verdict) {
       return { nodes: h("section.panel", heading,
-        problem ? problemText(api.problemOf(problem)) : h("p.quiet", "It is not complete yet; the job's course is above, or under Jobs."),
+        problem ? problemText(api.problemOf(problem)) : h("p.quiet", "Not complete yet; the progress is shown above, or under Jobs."),
         document_.state === "unfinished" ? null : decide, viewsOf(document_)), close: () => {} };
     }
     /** @type {Reply<"get", "/calibrations/{calibration_id}/residuals">["views"] | null} */
@@ -159,7 +159,7 @@ export async function open(root, { path }) {
 }
 
 /**
- * The plan, what it may be expected to leave uncertain, and its run.
+ * The plan, its expected uncertainty, and its run.
  * @param {Model<"RigReply">} rig
  * @param {Ends} ends
  * @param {(id: string) => Promise<unknown>} done
@@ -171,7 +171,7 @@ function run(rig, ends, done) {
   const held = h("input", { type: "text", value: list_(usual.held_out_mm), inputmode: "decimal", autocomplete: "off" });
   const frames = number(usual.frames ?? 4, { min: 1, max: 256, step: 1 });
   const localiser = select([["profile", "profile (finest)"], ["paper", "paper (1996)"]], usual.localiser ?? "profile");
-  const label = h("input", { type: "text", maxlength: 300, placeholder: "what it is for" });
+  const label = h("input", { type: "text", maxlength: 300, placeholder: "purpose" });
   const roll = number(0, { min: -180, max: 180 });
   const noise = number(0.005, { min: 0.0001, max: 10 });
   const expected = h("div", { role: "status", "data-role": "expected" });
@@ -185,27 +185,27 @@ function run(rig, ends, done) {
   function numbers(input, name) {
     const parts = input.value.split(/[\s;,]+/).filter(Boolean);
     const values = parts.map(Number);
-    if (values.some((value) => !Number.isFinite(value))) throw api.problemOf({ cause: `${name}: “${input.value}” is no list of numbers.`, remedy: "Write millimetres with a point, between commas: 0, 2.5, 5." });
+    if (values.some((value) => !Number.isFinite(value))) throw api.problemOf({ cause: `${name}: “${input.value}” is not a list of numbers.`, remedy: "Write millimetres with a point, between commas: 0, 2.5, 5." });
     return values;
   }
   const plan = () => ({ positions_mm: numbers(positions, "Fitted positions"), held_out_mm: numbers(held, "Held-out positions"), localiser: /** @type {"profile" | "paper"} */ (localiser.value) });
 
   let asked = 0;
-  async function foresee() {
+  async function estimate() {
     asked += 1;
     const mine = asked;
     try {
-      const told = await api.post("/calibrations:expect", { ...plan(), roll_deg: Number(roll.value), noise_px: Number(noise.value) });
-      if (mine === asked) replace(expected, foreseen(told));
+      const estimated = await api.post("/calibrations:expect", { ...plan(), roll_deg: Number(roll.value), noise_px: Number(noise.value) });
+      if (mine === asked) replace(expected, expectedUncertainty(estimated));
     } catch (error) {
       if (mine === asked) replace(expected, problemText(error));
     }
   }
   /** @type {number | undefined} */
   let timer;
-  for (const input of [positions, held, localiser, roll, noise]) input.addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(foresee, 350); });
+  for (const input of [positions, held, localiser, roll, noise]) input.addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(estimate, 350); });
   ends.push(() => clearTimeout(timer));
-  foresee();
+  estimate();
 
   async function begin() {
     const { job, calibration_id: id } = await api.post("/calibrations", { ...plan(), frames: Number(frames.value), label: label.value });
@@ -231,7 +231,7 @@ function run(rig, ends, done) {
       } });
       replace(progress, ended.state === "succeeded"
         ? h("p", badge("succeeded", "good"), " ", verdictOf(ended))
-        : ended.state === "cancelled" ? h("p", badge("cancelled", "warn"), " The axes were stopped; nothing was made of the views.") : problemText(api.jobProblem(ended)));
+        : ended.state === "cancelled" ? h("p", badge("cancelled", "warn"), " The axes were stopped; no calibration was computed from the views.") : problemText(api.jobProblem(ended)));
       if (id) await done(id);
     } catch (error) {
       if (!api.aborted(error)) throw error;
@@ -239,7 +239,7 @@ function run(rig, ends, done) {
       start.removeAttribute("aria-disabled");
     }
   }
-  // one that runs already is followed, whoever began it
+  // a running one is followed, whichever client began it
   api.get("/jobs", { limit: 20 }).then(({ jobs }) => {
     const job = jobs.find((one) => one.kind === "calibration" && ["queued", "running", "cancelling"].includes(one.state));
     return job && follow(job, /** @type {string | undefined} */ (job.subject.calibration_id));
@@ -247,41 +247,41 @@ function run(rig, ends, done) {
 
   const { target } = rig;
   return h("section.panel", { "aria-label": "New calibration" }, h("h2", "New calibration"),
-    h("p.quiet", `Target of the rig file: ${target.lines?.join(" × ")} lines, ${target.dark_lines ? "dark" : "bright"}, ${quantity(target.pitch_mm, "mm")} apart, ${quantity(target.line_width_mm, "mm")} wide, known to ±${um(target.node_tolerance_mm)}.`),
+    h("p.quiet", `Target of the rig file: ${target.lines?.join(" × ")} lines, ${target.dark_lines ? "dark" : "bright"}, pitch ${quantity(target.pitch_mm, "mm")}, line width ${quantity(target.line_width_mm, "mm")}, positions known to ±${um(target.node_tolerance_mm)}.`),
     h("div.fields",
       field("Fitted positions", positions, "mm", "dZ, away from the target"), field("Held-out positions", held, "mm", "for an independent check"),
       field("Frames averaged", frames), field("Localiser", localiser), field("Label", label)),
     h("details", { open: true }, h("summary", "Expected uncertainty"),
-      h("div.fields", field("Assumed noise of an intersection", noise, "px"), field("Grid turned by", roll, "°", "in the images; 45 if it stands on a corner")), expected),
+      h("div.fields", field("Assumed noise of an intersection", noise, "px"), field("Rotation of the grid", roll, "°", "in the images; 45 for a grid on its corner")), expected),
     h("div.row", start), progress);
 }
 
-/** @param {Expected} told */
-function foreseen(told) {
-  const middle = told.points[0];
-  const corners = told.points.slice(1);
+/** @param {Expected} estimated */
+function expectedUncertainty(estimated) {
+  const middle = estimated.points[0];
+  const corners = estimated.points.slice(1);
   const worst = [0, 1, 2].map((axis) => Math.max(...corners.map((point) => point.sigma_mm[axis])));
-  const sigma = (/** @type {string} */ cam, /** @type {string} */ name) => told.parameters[`${cam}.${name}`].sigma;
+  const sigma = (/** @type {string} */ cam, /** @type {string} */ name) => estimated.parameters[`${cam}.${name}`].sigma;
   return [
-    told.refused ? h("div.problem", h("p", h("strong", "Such views would be refused.")), h("ul", told.reasons.map((text) => h("li", text))), h("p", "Let the positions lie further apart.")) : null,
+    estimated.refused ? h("div.problem", h("p", h("strong", "Such views would be refused.")), h("ul", estimated.reasons.map((text) => h("li", text))), h("p", "Increase the distance between the positions.")) : null,
     table([["Point", (row) => row[0]], ...["X", "Y", "Z"].map((axis, k) => numeric(`σ ${axis}`, (/** @type {[string, number[]]} */ row) => um(row[1][k])))],
-      /** @type {[string, number[]][]} */ ([["middle of the volume", middle.sigma_mm], ["worst corner", worst]]), { caption: `What the parameters' uncertainty does to a point; the corners lie at ±${num(Math.abs(corners[0].xyz_mm[0]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[1]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[2]), 3)} mm` }),
+      /** @type {[string, number[]][]} */ ([["middle of the volume", middle.sigma_mm], ["worst corner", worst]]), { caption: `Standard uncertainty of a point from that of the parameters; the corners are at ±${num(Math.abs(corners[0].xyz_mm[0]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[1]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[2]), 3)} mm` }),
     h("details", h("summary", "Parameters and assumptions"),
-      table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]], ...CAMERAS.map((cam) => numeric(`σ ${cam}`, (/** @type {string} */ name) => num(sigma(cam, name), 3)))], NAMES, { caption: "Expected standard deviations" }),
-      facts([["shape", `${um(told.shape_rms_mm)} rms over the volume`], ["scale", quantity(100 * told.scale, "%", 2)], ["intersections seen", `cam1 ${num(100 * told.seen_share.cam1, 3)} %, cam2 ${num(100 * told.seen_share.cam2, 3)} %`]]),
-      h("p.quiet", String(told.assumed.text))),
+      table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]], ...CAMERAS.map((cam) => numeric(`σ ${cam}`, (/** @type {string} */ name) => num(sigma(cam, name), 3)))], NAMES, { caption: "Expected standard uncertainties" }),
+      definitions([["shape", `${um(estimated.shape_rms_mm)} rms over the volume`], ["scale", quantity(100 * estimated.scale, "%", 2)], ["visible intersections", `cam1 ${num(100 * estimated.seen_share.cam1, 3)} %, cam2 ${num(100 * estimated.seen_share.cam2, 3)} %`]]),
+      h("p.quiet", String(estimated.assumed.text))),
   ];
 }
 
 /** @param {Calibration} document_ */
 function verdict(document_) {
   const { verdict: v, uncertainty: u, checks } = document_;
-  if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it brings no verdict.`);
+  if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it has no verdict.`);
   return [
     h("p", badge(v.level, LEVEL[v.level])), h("ul", (v.reasons ?? []).map((text) => h("li", text))),
     document_.problem ? h("p", document_.problem.remedy, " ", h("code.quiet", document_.problem.code)) : null,
-    u ? facts([["shape", `${um(u.shape_rms_mm)} rms, expected from this calibration alone`], ["Z at the middle, at the corners", `${um(u.centre_z_mm)}, ${um(u.corner_z_mm)}`], ["common scale", quantity(100 * u.scale, "%", 2)]]) : null,
-    checks?.made ? h("details", h("summary", "What was checked, and what was not"), h("ul", checks.made.map((check) => h("li", badge(check.made ? "checked" : "not checked", check.made ? "good" : "warn"), " ", check.text)))) : null,
+    u ? definitions([["shape", `${um(u.shape_rms_mm)} rms, expected from this calibration alone`], ["Z at the middle, at the corners", `${um(u.centre_z_mm)}, ${um(u.corner_z_mm)}`], ["common scale", quantity(100 * u.scale, "%", 2)]]) : null,
+    checks?.made ? h("details", h("summary", "Checks made and not made"), h("ul", checks.made.map((check) => h("li", badge(check.made ? "checked" : "not checked", check.made ? "good" : "warn"), " ", check.text)))) : null,
     document_.review?.note ? h("p.quiet", `${document_.review.decision} by ${document_.review.by}: ${document_.review.note}`) : null,
   ];
 }
@@ -299,11 +299,11 @@ function decisions(document_, changed, gone) {
     state === "complete" && now !== "accepted" ? action("Accept", () => put("accepted"), { kind: "primary", title: "New tests measure with the newest accepted calibration" }) : null,
     now !== "discarded" ? action("Discard", async () => {
       const note = h("input", { type: "text", maxlength: 300 });
-      if (await ask("Discard this calibration?", h("div", h("p", "No new test can be made with it. It stays on disk, and the decision can be taken back."), field("Why", note)), [["Cancel", null], ["Discard", "yes"]])) await put("discarded", note.value);
+      if (await ask("Discard this calibration?", h("div", h("p", "No new test can be made with it. It stays on disk, and the decision can be withdrawn."), field("Reason", note)), [["Cancel", null], ["Discard", "yes"]])) await put("discarded", note.value);
     }, { kind: "danger" }) : null,
-    now ? action("Take the decision back", () => put(null)) : null,
+    now ? action("Withdraw the decision", () => put(null)) : null,
     action("Delete …", async () => {
-      if (await ask("Delete this calibration?", h("p", "It goes to the trash; tests made with it keep their own copy."), [["Cancel", null], ["Delete", "yes"]])) {
+      if (await ask("Delete this calibration?", h("p", "It is moved to the trash; tests made with it keep their own copy."), [["Cancel", null], ["Delete", "yes"]])) {
         await api.remove(`/calibrations/${id}`);
         await gone();
       }
@@ -315,7 +315,7 @@ function decisions(document_, changed, gone) {
 /** @param {Calibration} document_ */
 function measures(document_) {
   const { checks } = document_;
-  if (!checks) return h("p.quiet", "It brings no checks.");
+  if (!checks) return h("p.quiet", "It has no checks.");
   /** @type {[text: string, camera: string, check: import("#routes").PositionsCheck, positions: { [cam: string]: number[] } | null][]} */
   const rows = [];
   for (const [name, text] of /** @type {const} */ ([["fitted", "fitted"], ["held_out", "held out"]])) {
@@ -331,7 +331,7 @@ function measures(document_) {
     table([["Positions", (row) => [row[0], row[3] ? h("small.quiet", ` ${[...new Set(Object.values(row[3]).flat())].map((mm) => num(mm, 3)).join(", ")} mm`) : null]], ["Camera", (row) => row[1]],
       ["RBE", (row) => quantity(row[2].rbe_px, "px", 3), { numeric: true }], ["RAZ", (row) => um(row[2].raz_mm), { numeric: true }], ["NSCE", (row) => num(row[2].nsce, 3), { numeric: true }], ["Points", (row) => count(row[2].points), { numeric: true }]],
     rows, { caption: "Reprojection error (RBE), its size on the target (RAZ), normalised (NSCE)" }),
-    checks.drift_px ? h("p.quiet", `Back at zero the grid lay ${num(checks.drift_px.cam1, 2)} px (cam1) and ${num(checks.drift_px.cam2, 2)} px (cam2) from where it was first seen.`) : null,
+    checks.drift_px ? h("p.quiet", `After the return to zero the grid was ${num(checks.drift_px.cam1, 2)} px (cam1) and ${num(checks.drift_px.cam2, 2)} px (cam2) from its first position.`) : null,
   ];
 }
 
@@ -358,7 +358,7 @@ function parameters(document_) {
   const sigma = document_.sigma ?? {};
   return table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]],
     ...CAMERAS.map((cam) => numeric(`${cam} ± σ`, (/** @type {string} */ name) => withSigma(document_[cam]?.[name], sigma[`${cam}.${name}`]))),
-    ["nominal", (name) => nominal(document_, name), { numeric: true }]], NAMES, { caption: "Ten parameters of each camera, with their standard deviations" });
+    ["nominal", (name) => nominal(document_, name), { numeric: true }]], NAMES, { caption: "Ten parameters of each camera, with their standard uncertainties" });
 }
 
 /**
@@ -395,14 +395,14 @@ function correlations(document_) {
     context.fillStyle = value < 0 ? `rgba(40, 120, 220, ${Math.abs(value)})` : `rgba(230, 120, 0, ${Math.abs(value)})`;
     context.fillRect(k * SIZE, i * SIZE, SIZE - 1, SIZE - 1);
   }));
-  const under = h("p.quiet", { role: "status" }, "Point at a square to read it.");
+  const under = h("p.quiet", { role: "status" }, "Point at a square to read its value.");
   canvas.addEventListener("pointermove", (event) => {
     const box = canvas.getBoundingClientRect();
     const [k, i] = [Math.floor(((event.clientX - box.left) / box.width) * names.length), Math.floor(((event.clientY - box.top) / box.height) * names.length)];
     if (r[i]?.[k] !== undefined) under.textContent = `${names[i]} and ${names[k]}: ${num(r[i][k], 4)}`;
   });
   return h("details", h("summary", "Correlation of the parameters"),
-    h("p.quiet", "Strongly correlated parameters nearly cancel in space; judge by the uncertainty of points."), canvas, under,
+    h("p.quiet", "The effects of strongly correlated parameters nearly cancel; assess a calibration by the uncertainty of points."), canvas, under,
     table([["One", (row) => row[0]], ["Other", (row) => row[1]], ["Correlation", (row) => row[2].toFixed(5).replace("-", "−"), { numeric: true }]], strongest.slice(0, 12), { caption: "Strongest, above 0.9", empty: "None above 0.9." }));
 }
 

@@ -1,7 +1,7 @@
-// What runs and ran, and how the machine is.
+// Running and ended jobs, and the state of the system.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
-import { h, replace, action, badge, facts, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
+import { h, replace, action, badge, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Model } from "#routes" */
 /** @typedef {Model<"JobReply">} Job */
@@ -9,7 +9,7 @@ import { h, replace, action, badge, facts, num, quantity, table, when, problemTe
 /** @param {HTMLElement} root */
 export async function open(root) {
   const list = h("div");
-  const detail = h("section.panel", { "aria-live": "polite" }, h("p.quiet", "Choose a job to see its course."));
+  const detail = h("section.panel", { "aria-live": "polite" }, h("p.quiet", "Choose a job to see its log."));
   const health = h("section.panel");
   /** @type {Map<string, Job>} */
   const jobs = new Map();
@@ -54,13 +54,13 @@ export async function open(root) {
   function show() {
     const job = jobs.get(chosen);
     if (!job) return;
-        replace(detail,
+    replace(detail,
       h("div.spread", h("h2", `${job.kind} `, h("code", job.id)), badge(job.state, STATE_KIND[job.state])),
-      facts([["created", when(job.created_utc)], ["started", when(job.started_utc)], ["finished", when(job.finished_utc)],
+      definitions([["created", when(job.created_utc)], ["started", when(job.started_utc)], ["finished", when(job.finished_utc)],
         ...Object.entries(job.subject ?? {}).map(([name, value]) => /** @type {const} */ ([name, link(name, value, job.subject)]))]),
       job.problem ? problemText(api.problemOf(job.problem)) : null,
-      h("h3", "Course"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Course of the job" }, (log.get(job.id) ?? []).map((one) => `${one.line}\n`)),
-      job.result ? h("details", h("summary", "Result as the API gives it"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Result of the job" }, JSON.stringify(job.result, null, 1))) : null);
+      h("h3", "Log"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Log of the job" }, (log.get(job.id) ?? []).map((one) => `${one.line}\n`)),
+      job.result ? h("details", h("summary", "Result as returned by the API"), h("pre.scroll", { tabindex: 0, role: "region", "aria-label": "Result of the job" }, JSON.stringify(job.result, null, 1))) : null);
   }
 
   /**
@@ -99,10 +99,10 @@ export async function open(root) {
       const free = value("stereorig_disk_free_bytes");
       const ready = value("stereorig_ready") === 1;
       replace(health, h("div.spread", h("h2", "System"), badge(ready ? "ready" : "not ready", ready ? "good" : "warn")),
-        ready ? null : action("Why not?", () => api.get("/readyz")),
-        facts([["version", well.version], ["up for", quantity(well.uptime_s, "s", 6)], ["rig", badge(well.rig, STATE_KIND[well.rig])], ["compute worker", badge(well.worker, STATE_KIND[well.worker])],
-          ["free on the disk", free === null ? "–" : quantity(free / 2 ** 30, "GiB", 4)], ["jobs active", num(value("stereorig_jobs_active"), 4)], ["waiting to compute", num(value("stereorig_compute_queue"), 4)],
-          ["worker started", value("stereorig_worker_starts_total") === null ? "–" : `${value("stereorig_worker_starts_total")} times`]]),
+        ready ? null : action("Show the cause", () => api.get("/readyz")),
+        definitions([["version", well.version], ["uptime", quantity(well.uptime_s, "s", 6)], ["rig", badge(well.rig, STATE_KIND[well.rig])], ["compute worker", badge(well.worker, STATE_KIND[well.worker])],
+          ["free on the disk", free === null ? "–" : quantity(free / 2 ** 30, "GiB", 4)], ["jobs active", num(value("stereorig_jobs_active"), 4)], ["analyses waiting", num(value("stereorig_compute_queue"), 4)],
+          ["starts of the worker", value("stereorig_worker_starts_total") === null ? "–" : `${value("stereorig_worker_starts_total")}`]]),
         h("p", h("a", { href: `${api.BASE}/metrics` }, "All figures"), " · ", h("a", { href: "/docs" }, "HTTP API")));
     } catch (error) {
       replace(health, h("h2", "System"), problemText(error));

@@ -1,4 +1,4 @@
-// Results: which tests and analyses there are, and one analysis' fields over the image and in space.
+// Results: the tests and analyses, and one analysis' fields over the image and in space.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { Result, allTests } from "./results/analysis.js";
@@ -7,7 +7,7 @@ import { Scale } from "../widgets/scale.js";
 import { about, files } from "./results/about.js";
 import { gauges } from "./results/gauges.js";
 import { mark, pinned } from "./results/probe.js";
-import { h, replace, table, badge, when, num, count, quantity, field, select, facts, notify, problemText, STATE_KIND } from "../lib/dom.js";
+import { h, replace, table, badge, when, num, count, quantity, field, select, definitions, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
@@ -16,8 +16,8 @@ import { h, replace, table, badge, when, num, count, quantity, field, select, fa
 /** @typedef {"image" | "surface" | "compare"} Mode */
 /** @typedef {{ step: number | null, field: string | null, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
 /** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
- *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer what the parts of the screen share; `drawn` is told after each change of step, field or scale */
-/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} Stand what stands in the place of the map */
+ *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer shared by the parts of the screen; `drawn` is called after each change of step, field or scale */
+/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
 
 /** @type {[Mode, string][]} */
 const MODES = [["image", "Image"], ["surface", "3-D surface"], ["compare", "Side by side"]];
@@ -45,7 +45,7 @@ async function list(root, testId) {
     try {
       const whole = await api.get(`/tests/${test.id}`);
       replace(detail, h("div.spread", h("h2", whole.name), h("a", { href: `#/test/${whole.id}` }, "the test")),
-        facts([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.steps?.length)], ["calibration", whole.calibration_id ?? "–"]]),
+        definitions([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.steps?.length)], ["calibration", whole.calibration_id ?? "–"]]),
         h("h3", "Analyses"),
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
@@ -94,8 +94,8 @@ async function show(root, testId, analysisId, query) {
   const slider = h("input", { type: "range", min: 0, max: Math.max(result.steps.length - 1, 0), step: 1, "aria-label": "Step" });
   const stepText = h("output", { "data-role": "step" });
   const status = h("div");
-  const statistics = h("dl.facts", { "data-role": "statistics" });
-  const probe = h("div", { "data-role": "probe" }, h("p.quiet", "Click a place to see every number of its point."));
+  const statistics = h("dl.definitions", { "data-role": "statistics" });
+  const probe = h("div", { "data-role": "probe" }, h("p.quiet", "Click a point to see all its values."));
   const message = h("p.quiet", { role: "status" });
   const modes = h("div.row", { role: "group", "aria-label": "View" }, MODES.map(([name, text]) =>
     h("button", { type: "button", "data-mode": name, "aria-pressed": String(name === "image"), onclick: () => setMode(name).catch(notify) }, text)));
@@ -116,7 +116,7 @@ async function show(root, testId, analysisId, query) {
     const { shown } = await result.fields(state.step);
     let key = state.field;
     if (!shown.some((one) => one.key === key)) {
-      // what this step lacks (a shape has no displacement) stays chosen for the others
+      // a field that this step lacks (a shape has no displacement) stays chosen for the others
       key = key ?? (shown.some((one) => one.key === "w_mm") ? "w_mm" : "z_mm");
     }
     state.info = shown.find((one) => one.key === key) ?? null;
@@ -130,7 +130,7 @@ async function show(root, testId, analysisId, query) {
 
   async function refresh() {
     if (state.step === null) {
-      message.textContent = "No step is finished yet. The page goes on by itself.";
+      message.textContent = "No step is finished yet. The page updates by itself.";
       return;
     }
     slider.max = String(Math.max(result.steps.length - 1, 0));
@@ -141,7 +141,7 @@ async function show(root, testId, analysisId, query) {
     const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field ?? "")}`;
     if (location.hash !== address && location.hash.startsWith(`#/results/${testId}/${analysisId}`)) history.replaceState(null, "", address);
     if (!state.info) {
-      message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference, from which displacements are counted." : "choose another field."}`;
+      message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference of the displacements." : "choose another field."}`;
       const z = (await result.fields(state.step)).shown.find((one) => one.key === "z_mm");
       if (!z || !(await map.load(result, state.step, z, state.image))) return;
       const none = String(state.field);
@@ -172,9 +172,9 @@ async function show(root, testId, analysisId, query) {
     scale.lay(values, info.unit, info.flags, Boolean(info.signed));
     map.redraw(scale);
     const s = map.now.statistics;
-    replace(statistics, [...facts([
-      ["smallest", quantity(s.min, info.unit)], ["largest", quantity(s.max, info.unit)], ["mean", quantity(s.mean, info.unit)], ["sd", quantity(s.sd, info.unit, 3)],
-      ["measured", `${count(s.count)} of ${count(s.within)} points (${num(s.within ? (100 * s.count) / s.within : null, 4)} %)`],
+    replace(statistics, [...definitions([
+      ["min", quantity(s.min, info.unit)], ["max", quantity(s.max, info.unit)], ["mean", quantity(s.mean, info.unit)], ["sd", quantity(s.sd, info.unit, 3)],
+      ["valid", `${count(s.count)} of ${count(s.within)} points (${num(s.within ? (100 * s.count) / s.within : null, 4)} %)`],
     ]).children]);
     for (const listener of screen.drawn) await listener();
   }
@@ -218,8 +218,8 @@ async function show(root, testId, analysisId, query) {
     pinned(screen, answer);
   }
 
-  /** @type {Stand | null} */
-  let other = null; // what stands in the place of the map: the surface, or two maps
+  /** @type {OtherView | null} */
+  let other = null; // shown instead of the map: the surface, or two maps
   /** @param {Mode} name */
   async function setMode(name) {
     state.mode = name;
@@ -234,7 +234,7 @@ async function show(root, testId, analysisId, query) {
       map.view.fit();
       return;
     }
-    /** @type {Stand} */
+    /** @type {OtherView} */
     const made = name === "surface" ? await (await import("./results/surface.js")).surface(screen) : await (await import("./results/compare.js")).compare(screen);
     if (state.mode !== name || other || !document.contains(stage)) {
       made.close();
@@ -274,8 +274,8 @@ async function show(root, testId, analysisId, query) {
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
-  const told = about(screen);
-  below.append(gauges(screen), files(screen), told.root);
+  const aboutPanel = about(screen);
+  below.append(gauges(screen), files(screen), aboutPanel.root);
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;
@@ -283,13 +283,13 @@ async function show(root, testId, analysisId, query) {
     await result.refresh();
     drawStatus();
     slider.max = String(Math.max(result.steps.length - 1, 0));
-    told.draw();
+    aboutPanel.draw();
     if (first) await setStep(result.steps.at(-1) ?? null);
   }), events.on("job", async (job) => {
     if (job.id !== result.analysis.job_id || job.state === result.analysis.state) return;
     await result.refresh();
     drawStatus();
-    told.draw();
+    aboutPanel.draw();
   }), () => { state.playing = null; });
   return () => ends.forEach((end) => end());
 }

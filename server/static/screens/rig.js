@@ -3,7 +3,7 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { View } from "../widgets/view.js";
 import { chart } from "../widgets/plots.js";
-import { h, replace, field, number, select, action, facts, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
+import { h, replace, field, number, select, action, definitions, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Model } from "#routes" */
@@ -20,9 +20,9 @@ export async function open(root) {
   /** @type {Ends} */
   const ends = [];
   const cameras = CAMERAS.map((cam) => camera(cam, rig.cameras[cam], ends));
-  const pair = h("dl.facts");
+  const pair = h("dl.definitions");
   const state = h("div");
-  const again = reconnect(); // one button: what is pressed must not be drawn anew meanwhile
+  const again = reconnect(); // one button: it must not be drawn again while it is pressed
   replace(root,
     h("div.spread", h("h1", rig.name || "Rig"), state),
     h("div.grid.two.views", cameras.map((one) => one.root)),
@@ -31,32 +31,32 @@ export async function open(root) {
 
   /** @type {{ at: number, paired: number } | null} */
   let last = null;
-  async function look() {
+  async function update() {
     if (document.hidden) return;
     try {
       const now = await api.get("/rig");
       const gone = CAMERAS.filter((cam) => now.cameras[cam].fault);
       replace(state, now.fault ? badge("fault", "bad") : gone.length ? badge(`without ${gone.join(" and ")}`, "bad") : badge(now.holder ? `in use: ${now.holder}` : "ready", now.holder ? "busy" : "good"),
         now.fault ? [problemText(api.problemOf(now.fault)), again] : gone.length ? again : null);
-      const stats = await Promise.all(cameras.map((one) => one.look(now.cameras[one.cam])));
+      const stats = await Promise.all(cameras.map((one) => one.update(now.cameras[one.cam])));
       const figures = stats.find(Boolean)?.pairs;
       if (figures) {
         const rate = last && figures.paired >= last.paired ? (1000 * (figures.paired - last.paired)) / (performance.now() - last.at) : null;
-        replace(pair, [...facts([
+        replace(pair, [...definitions([
           ["paired", count(figures.paired)],
-          ["pairs a second", num(rate, 3)],
-          ["skew allowed", quantity(now.max_skew_ms, "ms", 3)],
+          ["pairs per second", num(rate, 3)],
+          ["max. skew", quantity(now.max_skew_ms, "ms", 3)],
           ["unpaired", count(figures.unpaired)], ["dropped", count(figures.dropped)], ["incomplete", count(figures.incomplete)], ["refused", count(figures.refused)],
         ]).children]);
         last = { at: performance.now(), paired: figures.paired };
       }
     } catch (error) {
-      replace(state, badge("not known", "warn"));
+      replace(state, badge("unknown", "warn"));
       if (error instanceof api.Problem && error.status >= 500) replace(state, problemText(error), again);
     }
   }
-  look();
-  const timer = setInterval(look, 1000);
+  update();
+  const timer = setInterval(update, 1000);
   ends.push(() => clearInterval(timer));
   return () => ends.forEach((end) => end());
 }
@@ -87,8 +87,8 @@ function camera(cam, first, ends) {
   view.size(size[0], size[1]);
   const overlay = h("img", { alt: "", hidden: true });
   view.content.insertBefore(overlay, view.svg);
-  const overlayChoice = select([["", "no overlay"], ["saturation", "saturated pixels"], ["texture", "texture quality"]], "", { "aria-label": `What is laid over ${cam}` });
-  const legend = h("span.told", { hidden: true }); // over the picture: both cameras' stay at one height
+  const overlayChoice = select([["", "no overlay"], ["saturation", "saturated pixels"], ["texture", "texture quality"]], "", { "aria-label": `Overlay of ${cam}` });
+  const legend = h("span.legend", { hidden: true }); // over the picture: both pictures keep the same height
   let shownOverlay = "";
   async function layOver() {
     const kind = overlayChoice.value;
@@ -108,17 +108,17 @@ function camera(cam, first, ends) {
 
   const start = () => view.show(api.address(`/cameras/${cam}/stream.mjpg`, { rate_hz: 10, t: Date.now() }));
   view.image.addEventListener("error", () => {
-    view.blank("No picture: the stream ended. It is tried again.");
+    view.blank("No picture: the stream ended. Trying again.");
     setTimeout(() => !dark && document.contains(view.root) && start(), 2000);
   });
   start();
-  // a stream that ended leaves its last picture, and the browser does not say so: an old picture is not shown as a live one
+  // the browser keeps the last picture of a stream that ended, without an event: an old picture must not pass for a live one
   let dark = false;
   let severed = false;
-  /** @param {string} why */
-  function lose(why) {
+  /** @param {string} cause */
+  function lose(cause) {
     dark = true;
-    view.blank(`No picture: ${why}`);
+    view.blank(`No picture: ${cause}`);
   }
   function regain(again = false) {
     if (dark || again) start();
@@ -132,11 +132,11 @@ function camera(cam, first, ends) {
     events.on("open", () => { regain(severed); severed = false; }),
   );
 
-  const figures = h("dl.facts");
+  const figures = h("dl.definitions");
   const quality = h("span");
   const trouble = h("div", { role: "alert" });
-  const histogramPlace = h("div");
-  const focusPlace = h("div");
+  const histogramBox = h("div");
+  const focusBox = h("div");
   /** @type {[number, number][]} time and focus */
   const course = [];
   /** @type {Chart | null} */
@@ -157,7 +157,7 @@ function camera(cam, first, ends) {
     const answer = await api.patch(`/cameras/${cam}`, changes);
     exposure.value = String(answer.settings.exposure_ms ?? "");
     gain.value = String(answer.settings.gain_db ?? "");
-    taken.textContent = `The camera took ${quantity(answer.settings.exposure_ms, "ms")} and ${quantity(answer.settings.gain_db, "dB")}.`;
+    taken.textContent = `The camera applied ${quantity(answer.settings.exposure_ms, "ms")} and ${quantity(answer.settings.gain_db, "dB")}.`;
   }, { kind: "primary" });
   for (const input of [exposure, gain]) input.addEventListener("keydown", (event) => event.key === "Enter" && set.click());
 
@@ -167,10 +167,10 @@ function camera(cam, first, ends) {
   let counted = null;
   let rounds = 0;
   /** @param {Rig["cameras"][string]} now */
-  async function look(now) {
-    const told = JSON.stringify(now?.fault ?? null);
-    if (told !== trouble.dataset.told) { // said once, not every second
-      trouble.dataset.told = told;
+  async function update(now) {
+    const fault = JSON.stringify(now?.fault ?? null);
+    if (fault !== trouble.dataset.fault) { // announced once, not every second
+      trouble.dataset.fault = fault;
       replace(trouble, now?.fault ? problemText(api.problemOf(now.fault)) : null);
     }
     if (now?.fault) {
@@ -187,7 +187,7 @@ function camera(cam, first, ends) {
     } catch (error) {
       if (!(error instanceof Error)) throw error;
       if (error instanceof api.Problem && error.status >= 500) lose(error.message);
-      replace(figures, [...facts([["not known", error.message]]).children]);
+      replace(figures, [...definitions([["unknown", error.message]]).children]);
       return null;
     }
     const q = stats.quality;
@@ -196,22 +196,22 @@ function camera(cam, first, ends) {
     course.push([at, q.focus]);
     if (course.length > COURSE) course.shift();
     replace(quality, badge(q.code, STATE_KIND[q.code] ?? "warn"));
-    // a camera that was set anew counts from zero
+    // after a change of settings a camera counts from zero
     const rate = counted && stats.frames.delivered >= counted.delivered ? (stats.frames.delivered - counted.delivered) / ((performance.now() - counted.at) / 1000) : null;
     counted = { delivered: stats.frames.delivered, at: performance.now() };
-    replace(figures, [...facts([
+    replace(figures, [...definitions([
       ["frame rate", quantity(rate, "Hz", 3)], ["mean grey", num(q.mean_grey, 4)], ["saturated", quantity(100 * q.saturated_share, "%", 3)],
       ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", num(q.focus, 3)],
       ["dropped", count(stats.frames.dropped)], ["incomplete", count(stats.frames.incomplete)],
     ]).children]);
     const bins = stats.histogram.map((_, i) => i);
-    if (!histogram && histogramPlace.clientWidth) {
-      histogram = await chart(histogramPlace, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
+    if (!histogram && histogramBox.clientWidth) {
+      histogram = await chart(histogramBox, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
     } else histogram?.set([bins, stats.histogram]);
     /** @type {[number[], number[]]} */
     const courseData = [course.map((p) => p[0]), course.map((p) => p[1])];
-    if (!focus && focusPlace.clientWidth && course.length > 1) {
-      focus = await chart(focusPlace, { x: "time (s)", y: "focus", height: 130, series: [{ label: "focus" }], data: courseData, label: `Recent course of the focus figure of ${cam}` });
+    if (!focus && focusBox.clientWidth && course.length > 1) {
+      focus = await chart(focusBox, { x: "time (s)", y: "focus", height: 130, series: [{ label: "focus" }], data: courseData, label: `Recent history of the focus figure of ${cam}` });
     } else focus?.set(courseData);
     rounds += 1;
     if (overlayChoice.value && rounds % 2 === 0) layOver().catch(() => {});
@@ -227,8 +227,8 @@ function camera(cam, first, ends) {
       field("Exposure", exposure, "ms", range(device.exposure_range_ms, "ms")), field("Gain", gain, "dB", range(device.gain_range_db, "dB")),
       h("div.field", h("span.quiet", "\u00a0"), set)),
     taken,
-    h("div.grid.two", h("div", figures), h("div", histogramPlace, focusPlace)));
-  return { cam, root: box, look };
+    h("div.grid.two", h("div", figures), h("div", histogramBox, focusBox)));
+  return { cam, root: box, update };
 }
 
 /** @typedef {readonly number[] | null | undefined} Span low and high */
@@ -246,7 +246,7 @@ function stage(ends) {
   async function run(asked) {
     const { job } = await asked;
     const ended = await api.finished(job.id);
-    await look();
+    await update();
     if (ended.state !== "succeeded") throw api.jobProblem(ended);
   }
 
@@ -255,7 +255,7 @@ function stage(ends) {
       const target = number(null, { min: axis.limits?.low_mm, max: axis.limits?.high_mm, placeholder: num(axis.position_mm, 5) });
       const go = action("Go", () => run(api.post("/stage/moves", { positions_mm: { [axis.axis]: Number(target.value) } })));
       target.addEventListener("keydown", (event) => event.key === "Enter" && go.click());
-      const jog = (/** @type {1 | -1} */ sign) => action(sign < 0 ? "◂ −" : "+ ▸", () => run(api.post("/stage/moves", { by_mm: { [axis.axis]: sign * Number(step.value) } })), { "aria-label": `Jog axis ${axis.axis} ${sign < 0 ? "back" : "forth"}` });
+      const jog = (/** @type {1 | -1} */ sign) => action(sign < 0 ? "◂ −" : "+ ▸", () => run(api.post("/stage/moves", { by_mm: { [axis.axis]: sign * Number(step.value) } })), { "aria-label": `Jog axis ${axis.axis} ${sign < 0 ? "backward" : "forward"}` });
       return h("fieldset", { "data-axis": axis.axis },
         h("legend", `Axis ${axis.axis}${axis.cameras?.length ? ` · ${axis.cameras.join(", ")}` : ""}`),
         h("div.row", h("strong", { "data-role": "position" }, quantity(axis.position_mm, "mm", 6)), h("span", { "data-role": "state" }, stateBadge(axis)),
@@ -267,7 +267,7 @@ function stage(ends) {
 
   const stateBadge = (/** @type {Axes[number]} */ axis) => badge(axis.moving ? "moving" : axis.homed === false ? "not homed" : axis.state, axis.moving ? "busy" : axis.homed === false ? "warn" : (STATE_KIND[axis.state] ?? ""));
 
-  async function look() {
+  async function update() {
     if (document.hidden) return;
     try {
       const now = await api.get("/stage");
@@ -277,7 +277,7 @@ function stage(ends) {
         draw();
       } else {
         axes = fresh;
-        for (const axis of axes) { // what is being typed stays
+        for (const axis of axes) { // an unfinished input stays
           const shown = (/** @type {string} */ role) => /** @type {HTMLElement} */ (rows.querySelector(`[data-axis="${axis.axis}"] [data-role="${role}"]`));
           shown("position").textContent = quantity(axis.position_mm, "mm", 6);
           replace(shown("state"), stateBadge(axis));
@@ -289,9 +289,9 @@ function stage(ends) {
       axes = [];
     }
   }
-  look();
-  const timer = setInterval(look, 700);
-  ends.push(() => clearInterval(timer), events.on("stage", look));
+  update();
+  const timer = setInterval(update, 700);
+  ends.push(() => clearInterval(timer), events.on("stage", update));
   return h("section.panel", h("h2", "Stage"), h("div.fields", field("Jog step", step, "mm")), rows,
     h("div.row", action("Home all", () => run(api.post("/stage/home", {}))), h("span.quiet", "The red button stops every axis at once; so does Esc, pressed twice.")));
 }
@@ -302,5 +302,5 @@ function scene(rig) {
   const load = number(rig.scene?.load ?? 0);
   return h("details", h("summary", "Simulated scene"),
     field("Scene", which), field("Load", load, "", "kPa for plate, kN for panel, per cent for strip, share of the motion for block"),
-    action("Show it", () => api.put("/sim/scene", { scene: /** @type {Model<"SceneRequest">["scene"]} */ (which.value), load: Number(load.value) })));
+    action("Show the scene", () => api.put("/sim/scene", { scene: /** @type {Model<"SceneRequest">["scene"]} */ (which.value), load: Number(load.value) })));
 }

@@ -1,8 +1,8 @@
-// Tests: make one, take or import its steps, tell what no device knows, choose what is measured and how.
+// Tests: make one, capture or import its steps, state its metadata, draw the region, start an analysis.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { stepsPanel } from "./test/steps.js";
-import { factsPanel } from "./test/facts.js";
+import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
 import { h, replace, field, select, action, table, when, notify } from "../lib/dom.js";
 
@@ -70,11 +70,11 @@ async function one(root, id) {
     const name = h("input", { type: "text", maxlength: 300, value: test.name });
     const specimen = h("input", { type: "text", maxlength: 300, value: test.specimen });
     const notes = h("textarea", { rows: 3, maxlength: 20000, value: test.notes });
-    replace(head, h("p", test.specimen ? `${test.specimen} · ` : "", test.calibration_id ? ["calibration ", h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id)] : "no calibration: its images can be looked at, not measured", ` · made ${when(test.created_utc)} · `, h("code", test.id)),
+    replace(head, h("p", test.specimen ? `${test.specimen} · ` : "", test.calibration_id ? ["calibration ", h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id)] : "no calibration: its images can be viewed, not measured", ` · made ${when(test.created_utc)} · `, h("code", test.id)),
       test.notes ? h("p.quiet", test.notes) : null,
       h("details", h("summary", "Name, specimen and notes"), h("div.fields", field("Name", name), field("Specimen", specimen)), field("Notes", notes),
         action("Save", async () => { test = await api.patch(`/tests/${id}`, { name: name.value, specimen: specimen.value, notes: notes.value }); title.textContent = test.name; drawHead(); notify("Saved.", "good"); })),
-      factsPanel(id));
+      metadataPanel(id));
   }
   function drawAnalyses() {
     replace(analyses, h("h2", "Analyses"), table([

@@ -1,4 +1,4 @@
-// A field over an image: what is under the mouse, and the points' own numbers.
+// A field over an image, with the values under the mouse.
 import * as api from "../lib/api.js";
 import { View } from "./view.js";
 import { num, quantity } from "../lib/dom.js";
@@ -9,10 +9,10 @@ import { statistics } from "../lib/point_grid.js";
 /** @import { Scale } from "./scale.js" */
 /** @typedef {"reference" | "cam1" | "cam2"} Over the image that a field is laid over */
 /** @typedef {{ result: Result, n: number, info: Shown, image: Over, grid: Grid, values: ArrayLike<number>, sigma: ArrayLike<number> | null,
- *   places: ArrayLike<number> | null, statistics: ReturnType<typeof statistics>, withSigma: Promise<unknown> }} Now what is shown */
+ *   positions: ArrayLike<number> | null, statistics: ReturnType<typeof statistics>, withSigma: Promise<unknown> }} Now shown field */
 
 /**
- * Values of the points that were measured.
+ * Values of the valid points.
  * @param {Grid} grid
  * @param {ArrayLike<number>} values
  */
@@ -25,8 +25,8 @@ export function measured(grid, values) {
 
 export class FieldMap {
   /**
-   * @param {string} label for those who do not see it
-   * @param {((x: number, y: number, event: Event) => void) | null} onpick hears clicks and the Enter key, in the pixels of the picture shown
+   * @param {string} label name for screen readers
+   * @param {((x: number, y: number, event: Event) => void) | null} onpick called on clicks and the Enter key, in pixels of the picture shown
    */
   constructor(label, onpick = null) {
     this.view = new View({ label, grey: (x, y) => this.#under(x, y), onpick: (x, y, event) => onpick?.(x, y, event) });
@@ -55,12 +55,12 @@ export class FieldMap {
   }
 
   /**
-   * Read what is to be shown.
+   * Read a field and its image.
    * @param {Result} result
    * @param {number} n step
    * @param {Shown} info entry of `result.fields`
    * @param {Over} image
-   * @returns {Promise<boolean>} false if something newer was asked for meanwhile
+   * @returns {Promise<boolean>} false if a newer one was requested meanwhile
    */
   async load(result, n, info, image) {
     this.asked += 1;
@@ -71,8 +71,8 @@ export class FieldMap {
       this.address = address;
       this.view.show(address);
     }
-    const [grid, values, places] = await Promise.all([
-      result.grid(n), result.values(n, info.key), image === "reference" ? null : result.places(n, image).then((one) => one.data),
+    const [grid, values, positions] = await Promise.all([
+      result.grid(n), result.values(n, info.key), image === "reference" ? null : result.positions(n, image).then((one) => one.data),
     ]);
     if (mine !== this.asked) return false;
     if (this.address !== address) {
@@ -80,16 +80,16 @@ export class FieldMap {
       this.view.show(address);
     }
     /** @type {Now} */
-    const now = { result, n, info, image, grid, values, sigma: null, places, statistics: statistics(grid, values), withSigma: Promise.resolve() };
+    const now = { result, n, info, image, grid, values, sigma: null, positions, statistics: statistics(grid, values), withSigma: Promise.resolve() };
     this.now = now;
-    // what the picture does not need may come after it
+    // not needed for the picture: it may arrive later
     now.withSigma = result.sigma(n, info.key).then((sigma) => {
       if (now.info === info) now.sigma = sigma;
       if (this.now === now) this.view.reread();
       return sigma;
     }, () => null);
     this.raster = null;
-    this.view.readout.textContent = ""; // what it said was of another field or step
+    this.view.readout.textContent = ""; // its text was that of another field or step
     this.view.reread();
     return true;
   }
@@ -117,7 +117,7 @@ export class FieldMap {
     this.scale = scale;
     if (!this.now || !scale) return;
     if (this.noImage && this.now.image === "reference") {
-      // no picture: the points say how large it must have been
+      // no picture: its size follows from the points
       const { grid } = this.now;
       this.view.size(Math.ceil(Math.max(...[0, grid.cols - 1].map((c) => grid.x0 + c * grid.dx)) + grid.x0), Math.ceil(grid.y0 * 2 + (grid.rows - 1) * grid.dy));
     }
@@ -125,8 +125,8 @@ export class FieldMap {
     if (!width) return; // drawn when the picture has come
     const size = `${width} ${height}`;
     if (!this.raster || this.size !== size) {
-      const { grid, values, places, info } = this.now;
-      this.raster = grid.raster(values, width, height, places, Boolean(info.flags));
+      const { grid, values, positions, info } = this.now;
+      this.raster = grid.raster(values, width, height, positions, Boolean(info.flags));
       this.size = size;
     }
     scale.paint(this.view.canvas, width, height, this.raster);
@@ -135,28 +135,28 @@ export class FieldMap {
   }
 
   /**
-   * Number of the point nearest to a place in the picture shown, and how far off it is, px.
+   * Index of the point nearest to a position in the picture shown, and its distance, px.
    * @param {number} x
    * @param {number} y
    */
   nearest(x, y) {
     if (!this.now) return { i: -1, distance: Infinity };
-    const { grid, places } = this.now;
-    const i = places ? grid.nearestOf(places, x, y) : grid.nearest(x, y);
+    const { grid, positions } = this.now;
+    const i = positions ? grid.nearestOf(positions, x, y) : grid.nearest(x, y);
     if (i < 0) return { i, distance: Infinity };
-    const at = this.placeOf(i);
+    const at = this.positionOf(i);
     return { i, distance: Math.hypot(at[0] - x, at[1] - y) };
   }
 
   /**
-   * Where a point lies in the picture shown.
+   * Position of a point in the picture shown.
    * @param {number} i
    * @returns {[number, number]}
    */
-  placeOf(i) {
+  positionOf(i) {
     if (!this.now) return [NaN, NaN];
-    const { grid, places } = this.now;
-    return places ? [places[2 * i], places[2 * i + 1]] : [grid.x[i], grid.y[i]];
+    const { grid, positions } = this.now;
+    return positions ? [positions[2 * i], positions[2 * i + 1]] : [grid.x[i], grid.y[i]];
   }
 
   /**
@@ -168,9 +168,9 @@ export class FieldMap {
     if (!hover || !this.now) return null;
     const { result, n, image } = this.now;
     const [step, cam] = image === "reference" ? [result.reference, "cam1"] : [n, image];
-    const said = this.#value(this.now, hover);
+    const value = this.#value(this.now, hover);
     const grey = await greyOf({ test: result.testId, step, cam }, column, row).catch(() => null); // its image may be gone
-    return [said, grey].filter(Boolean).join("   ") || null;
+    return [value, grey].filter(Boolean).join("   ") || null;
   }
 
   /**
@@ -184,8 +184,8 @@ export class FieldMap {
     this.view.readout.dataset.point = String(i);
     this.view.readout.dataset.value = String(values[i]);
     if (info.flags) return `${info.text}: ${(info.flags[values[i]] ?? values[i]).toString().replace(/_/g, " ")}`;
-    if (!grid.valid[i] || !Number.isFinite(values[i])) return `${info.text}: not measured`;
-    const told = sigma && Number.isFinite(sigma[i]) ? ` ± ${num(sigma[i], 2)}` : "";
-    return `${info.text} ${told ? num(values[i], 5) + told : ""}${told ? `\u00a0${info.unit}` : quantity(values[i], info.unit, 5)}`;
+    if (!grid.valid[i] || !Number.isFinite(values[i])) return `${info.text}: no valid value`;
+    const uncertainty = sigma && Number.isFinite(sigma[i]) ? ` ± ${num(sigma[i], 2)}` : "";
+    return `${info.text} ${uncertainty ? num(values[i], 5) + uncertainty : ""}${uncertainty ? `\u00a0${info.unit}` : quantity(values[i], info.unit, 5)}`;
   }
 }

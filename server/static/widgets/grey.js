@@ -1,9 +1,9 @@
-// Grey levels of recorded images: read in tiles, so that a mouse that wanders asks seldom.
+// Grey levels of recorded images: read in tiles, so that a moving mouse needs few requests.
 import * as api from "../lib/api.js";
 import { num } from "../lib/dom.js";
 
 const TILE = 64;
-const MOST = 256; // tiles that are kept
+const MAX_TILES = 256; // in the cache
 
 /** @import { Reply } from "#routes" */
 /** @typedef {{ test: string, step: number, cam: string }} StepImage */
@@ -22,11 +22,11 @@ function tile(image, column, row) {
   const query = { x_px: column * TILE, y_px: row * TILE, columns: TILE, rows: TILE };
   const key = api.address(path, query);
   const held = tiles.get(key) ?? api.get(path, query);
-  tiles.delete(key); // what was used last is dropped last
+  tiles.delete(key); // dropped least recently used first
   tiles.set(key, held);
   held.catch(() => tiles.delete(key));
   const [oldest] = tiles.keys();
-  if (tiles.size > MOST) tiles.delete(oldest);
+  if (tiles.size > MAX_TILES) tiles.delete(oldest);
   return held;
 }
 

@@ -14,7 +14,7 @@ async function uplot() {
 }
 
 /**
- * As wide as the longest number of an axis needs, so that its name stands beside and not over it.
+ * Width of an axis: that of its longest number, so that its name is beside and not over it.
  * @param {uPlot} plot
  * @param {string[] | null} values
  * @param {number} index
@@ -24,7 +24,7 @@ function wide(plot, values, index, cycle) {
   // what uPlot keeps of an axis beyond its types
   const axis = /** @type {any} */ (plot.axes[index]);
   if (cycle > 1) return axis._size; // it may not go on for ever
-  const longest = (values ?? []).reduce((most, one) => (one.length > most.length ? one : most), "");
+  const longest = (values ?? []).reduce((longer, one) => (one.length > longer.length ? one : longer), "");
   plot.ctx.font = axis.font[0];
   return Math.max(50, Math.ceil(axis.ticks.size + axis.gap + plot.ctx.measureText(longest).width / (window.devicePixelRatio || 1) + 4));
 }
@@ -47,8 +47,8 @@ function axes() {
 }
 
 /**
- * Draw into `place`; returns {set(data), close()}.
- * @param {HTMLElement} place
+ * Draw into `box`; returns {set(data), close()}.
+ * @param {HTMLElement} box
  * @param {object} options
  * @param {string} options.x name and unit of the abscissa
  * @param {string} options.y name and unit of the ordinate
@@ -56,17 +56,17 @@ function axes() {
  * @param {boolean|boolean[]} [options.bars] whether (which of) the series are bars
  * @param {number} [options.height]
  * @param {uPlot.AlignedData} options.data
- * @param {string} [options.label] what the plot shows, for those who do not see it
+ * @param {string} [options.label] name of the plot for screen readers
  * @param {number[][]} [options.bands] pairs of series (counted from 1) between which the ground is shaded
  */
-export async function chart(place, { x, y, series, height = 200, data, bars = false, bands = [], label }) {
+export async function chart(box, { x, y, series, height = 200, data, bars = false, bands = [], label }) {
   const Plot = await uplot();
   const isBar = (/** @type {number} */ index) => (Array.isArray(bars) ? bars[index] : bars);
   /** @returns {uPlot.Options} */
   const options = () => {
     const axis = axes();
     return {
-      width: Math.max(place.clientWidth, 200),
+      width: Math.max(box.clientWidth, 200),
       height,
       scales: { x: { time: false } },
       axes: [{ ...axis(x), size: 34 }, { ...axis(y), size: wide }],
@@ -86,22 +86,22 @@ export async function chart(place, { x, y, series, height = 200, data, bars = fa
       bands: bands.map(([high, low]) => ({ series: [high, low], fill: `${COLOURS[(series[high - 1].colour ?? 0) % COLOURS.length]}40` })),
     };
   };
-  place.replaceChildren();
-  place.classList.add("chart");
-  place.setAttribute("role", "img");
-  place.setAttribute("aria-label", label ?? `${y} over ${x}`);
+  box.replaceChildren();
+  box.classList.add("chart");
+  box.setAttribute("role", "img");
+  box.setAttribute("aria-label", label ?? `${y} over ${x}`);
   let now = data;
-  let plot = new Plot(options(), now, place);
+  let plot = new Plot(options(), now, box);
   // a canvas keeps the colours that it was drawn with
   const recolour = () => {
     plot.destroy();
-    plot = new Plot(options(), now, place);
+    plot = new Plot(options(), now, box);
   };
   const system = matchMedia("(prefers-color-scheme: dark)");
   window.addEventListener("themechange", recolour);
   system.addEventListener("change", recolour);
-  const observer = new ResizeObserver(() => place.clientWidth > 0 && plot.setSize({ width: place.clientWidth, height }));
-  observer.observe(place);
+  const observer = new ResizeObserver(() => box.clientWidth > 0 && plot.setSize({ width: box.clientWidth, height }));
+  observer.observe(box);
   return {
     set: (/** @type {uPlot.AlignedData} */ next) => { now = next; plot.setData(next); },
     close: () => {

@@ -3,13 +3,13 @@
 // Everything is kept in camera 1's pixels, the first pixel's centre at (0, 0), to a tenth of a pixel.
 import { h, svg, replace, num } from "../lib/dom.js";
 import { nudge, onGrab, stroke } from "./view.js";
-/** @import { View, Place } from "./view.js" */
+/** @import { View, Position } from "./view.js" */
 /** @import { Model } from "#routes" */
 /** @typedef {[x: number, y: number]} Spot */
 /** @typedef {{ form: "rectangle" | "polygon", points: Spot[] }} Outline a rectangle by two opposite corners */
 /** @typedef {{ outline: Outline | null, holes: Spot[][], cracks: Spot[][], seeds: { one: Spot, two: Spot | null }[] }} State */
 /** @typedef {"move" | "rectangle" | "polygon" | "hole" | "crack" | "seed"} Tool */
-/** @typedef {{ kind: "rectangle", points: [Spot, Spot] } | { kind: keyof typeof LEAST, points: Spot[] }} Draft what is being drawn */
+/** @typedef {{ kind: "rectangle", points: [Spot, Spot] } | { kind: keyof typeof MIN_POINTS, points: Spot[] }} Draft unfinished shape */
 
 /** @type {[tool: Tool, text: string, title: string][]} */
 const TOOLS = [
@@ -23,7 +23,7 @@ const TOOLS = [
 const KEYS = "By keyboard: arrow keys move the cross-hair (Shift 10 px, Alt 0.1 px), Enter sets a point, Enter there again ends, Escape leaves.";
 const COLOUR = { outline: "#ffd23e", hole: "#ff6a5c", crack: "#ff3df2", seed: "#33e0a0", draft: "#ffffff" };
 const round = (/** @type {number} */ value) => Math.round(value * 10) / 10;
-const LEAST = { outline: 3, hole: 3, crack: 2 };
+const MIN_POINTS = { outline: 3, hole: 3, crack: 2 };
 
 export class RegionEditor {
   /**
@@ -75,7 +75,7 @@ export class RegionEditor {
   }
 
   /**
-   * Take a tool; who took it by keyboard goes on over the picture.
+   * Take a tool; taken by keyboard, the focus moves to the picture.
    * @param {Tool} tool
    */
   use(tool, byKey = false) {
@@ -132,7 +132,7 @@ export class RegionEditor {
     this.onchange();
   }
 
-  // what the API takes
+  // values for the API
 
   /** @returns {Model<"Region"> | null} */
   region() {
@@ -184,14 +184,14 @@ export class RegionEditor {
 
   // mouse, and the cross-hair that keys move
 
-  /** @param {Place | null} aim */
+  /** @param {Position | null} aim */
   #aimed(aim) {
     this.tip = aim && this.#inside([aim.x, aim.y]);
     if (this.draft?.kind === "rectangle" && this.tip) this.draft.points[1] = this.tip;
     if (this.draft) this.draw();
   }
 
-  /** On the epipolar line of the seed that waits for its place in camera 2: next to where it is in camera 1. */
+  /** Point of the epipolar line of a seed without a position in camera 2: the one nearest to its position in camera 1. */
   #onLine() {
     const open = this.state.seeds.findLastIndex((seed) => !seed.two);
     if (open < 0) return null;
@@ -208,24 +208,24 @@ export class RegionEditor {
    * @param {Event} event
    */
   #pick(x, y, event) {
-    const place = this.#inside([x, y]);
+    const spot = this.#inside([x, y]);
     const byKey = event.type === "keydown";
     if (this.tool === "seed") {
-      this.change((state) => state.seeds.push({ one: place, two: null }));
+      this.change((state) => state.seeds.push({ one: spot, two: null }));
       if (byKey) {
-        this.hint.textContent = "Now the same point in camera 2: the focus is there. Arrow keys begin on its line; Escape leaves it to be found.";
+        this.hint.textContent = "Now the same point in camera 2: the focus is there. Arrow keys begin on its line; with Escape its position is found automatically.";
         this.two.setAim(null);
         this.two.frame.focus();
       }
       return;
     }
     if (this.tool === "rectangle" && byKey) {
-      if (!this.draft) this.draft = { kind: "rectangle", points: [place, place] };
+      if (!this.draft) this.draft = { kind: "rectangle", points: [spot, spot] };
       else {
         const [from] = this.draft.points;
-        if (Math.abs(place[0] - from[0]) < 2 || Math.abs(place[1] - from[1]) < 2) return;
+        if (Math.abs(spot[0] - from[0]) < 2 || Math.abs(spot[1] - from[1]) < 2) return;
         this.draft = null;
-        this.change((state) => { state.outline = { form: "rectangle", points: [from, place] }; });
+        this.change((state) => { state.outline = { form: "rectangle", points: [from, spot] }; });
       }
       this.draw();
       return;
@@ -235,12 +235,12 @@ export class RegionEditor {
     const { kind, points } = this.draft;
     if (kind === "rectangle") return;
     const first = points[0];
-    const near = first && Math.hypot(first[0] - place[0], first[1] - place[1]) * this.one.scale < 9;
+    const near = first && Math.hypot(first[0] - spot[0], first[1] - spot[1]) * this.one.scale < 9;
     const last = points.at(-1);
-    const twice = last && Math.hypot(last[0] - place[0], last[1] - place[1]) * this.one.scale < 3;
-    if ((near && kind !== "crack" && points.length >= 3) || (twice && points.length >= LEAST[kind])) this.finish();
+    const twice = last && Math.hypot(last[0] - spot[0], last[1] - spot[1]) * this.one.scale < 3;
+    if ((near && kind !== "crack" && points.length >= 3) || (twice && points.length >= MIN_POINTS[kind])) this.finish();
     else if (!twice) {
-      points.push(place);
+      points.push(spot);
       this.draw();
     }
   }
@@ -252,13 +252,13 @@ export class RegionEditor {
    */
   #pick2(x, y, event) {
     if (this.tool !== "seed") return;
-    const place = this.#inside([x, y], this.two);
+    const spot = this.#inside([x, y], this.two);
     const open = this.state.seeds.findLastIndex((seed) => !seed.two);
     if (open < 0) {
       this.hint.textContent = "Click the point in camera 1 first.";
       return;
     }
-    this.change((state) => { state.seeds[open].two = place; });
+    this.change((state) => { state.seeds[open].two = spot; });
     if (event.type === "keydown") {
       this.two.setAim(null);
       this.one.frame.focus();
@@ -268,8 +268,8 @@ export class RegionEditor {
   finish() {
     if (!this.draft || this.draft.kind === "rectangle") return;
     const { kind, points } = this.draft;
-    if (points.length < LEAST[kind]) {
-      this.hint.textContent = `It needs ${LEAST[kind]} points or more.`;
+    if (points.length < MIN_POINTS[kind]) {
+      this.hint.textContent = `At least ${MIN_POINTS[kind]} points are needed.`;
       return;
     }
     this.draft = null;
@@ -354,7 +354,7 @@ export class RegionEditor {
     } else corners.forEach((p, k) => parts.push(this.#handle(`outline.${k}`, p, COLOUR.outline, `Corner ${k + 1} of the region`, (to, state) => { if (state.outline) state.outline.points[k] = to; }, (state) => { state.outline?.points.splice(k, 1); if (state.outline && state.outline.points.length < 3) state.outline = null; })));
     for (const [kind, name] of /** @type {const} */ ([["holes", "hole"], ["cracks", "crack"]])) {
       this.state[kind].forEach((points, i) => points.forEach((p, k) => parts.push(this.#handle(`${kind}.${i}.${k}`, p, COLOUR[name], `Point ${k + 1} of ${name} ${i + 1}`,
-        (to, state) => { state[kind][i][k] = to; }, (state) => { state[kind][i].splice(k, 1); if (state[kind][i].length < LEAST[name]) state[kind].splice(i, 1); }))));
+        (to, state) => { state[kind][i][k] = to; }, (state) => { state[kind][i].splice(k, 1); if (state[kind][i].length < MIN_POINTS[name]) state[kind].splice(i, 1); }))));
     }
     /** @type {SVGElement[]} */
     const second = [];
@@ -395,7 +395,7 @@ export class RegionEditor {
    * @param {(state: State) => unknown} remove
    */
   #handle(name, [x, y], colour, label, move, remove, view = this.one) {
-    // what is drawn already does not catch the clicks that draw something else
+    // existing shapes do not catch the clicks that draw another one
     const idle = ["polygon", "hole", "crack"].includes(this.tool) || (this.tool === "seed" && !name.startsWith("seed"));
     const node = svg("circle", { class: idle ? "handle" : "grab", "data-handle": name, cx: x, cy: y, r: 6, stroke: colour, fill: `${colour}66`, style: "r: calc(6px * var(--px, 1)); stroke-width: calc(2px * var(--px, 1))", tabindex: 0, role: "button", "aria-label": `${label}, at ${num(x, 5)}, ${num(y, 5)} px` });
     let moving = false;
@@ -442,14 +442,14 @@ export class RegionEditor {
   drawList() {
     const { outline, holes, cracks, seeds } = this.state;
     const text = (/** @type {Spot[]} */ points) => points.map((p) => `${p[0]}, ${p[1]}`).join("; ");
-    /** @type {(label: string, points: Spot[], least: number, put: (state: State, points: Spot[]) => unknown, remove: (state: State) => unknown) => HTMLElement} */
-    const row = (label, points, least, put, remove) => {
+    /** @type {(label: string, points: Spot[], minPoints: number, put: (state: State, points: Spot[]) => unknown, remove: (state: State) => unknown) => HTMLElement} */
+    const row = (label, points, minPoints, put, remove) => {
       const input = h("input", { type: "text", value: text(points), "aria-label": `${label}: x, y of each point, px` });
       const trouble = h("small.hint");
       input.addEventListener("change", () => {
         const read = input.value.split(";").map((one) => one.trim()).filter(Boolean).map((one) => one.split(/[\s,]+/).map(Number));
-        if (read.length < least || read.some((p) => p.length !== 2 || !p.every(Number.isFinite))) {
-          trouble.textContent = `Write x, y between semicolons, ${least} points or more.`;
+        if (read.length < minPoints || read.some((p) => p.length !== 2 || !p.every(Number.isFinite))) {
+          trouble.textContent = `Write x, y between semicolons, at least ${minPoints} points.`;
           return;
         }
         this.change((state) => put(state, read.map((p) => this.#inside(p))));
@@ -463,14 +463,14 @@ export class RegionEditor {
       holes.map((points, i) => row(`Hole ${i + 1}`, points, 3, (state, read) => { state.holes[i] = read; }, (state) => { state.holes.splice(i, 1); })),
       cracks.map((points, i) => row(`Crack ${i + 1}`, points, 2, (state, read) => { state.cracks[i] = read; }, (state) => { state.cracks.splice(i, 1); })),
       seeds.map((seed, i) => row(`Seed ${i + 1}`, seed.two ? [seed.one, seed.two] : [seed.one], 1, (state, read) => { state.seeds[i] = { one: read[0], two: read[1] ?? null }; }, (state) => { state.seeds.splice(i, 1); })),
-      seeds.map((_, i) => { const off = this.lines[i]?.distance_px; return off === null || off === undefined ? null : h(off > 8 ? "p.problem" : "p.quiet", `Seed ${i + 1}: camera 2's place lies ${num(off, 2)} px from its epipolar line${off > 8 ? "; 8 px are allowed: it is another point." : "."}`); }));
+      seeds.map((_, i) => { const off = this.lines[i]?.distance_px; return off === null || off === undefined ? null : h(off > 8 ? "p.problem" : "p.quiet", `Seed ${i + 1}: its position in camera 2 is ${num(off, 2)} px from its epipolar line${off > 8 ? "; the limit is 8 px: it is another point." : "."}`); }));
   }
 
   /**
-   * Epipolar lines as the API gave them.
+   * Show the epipolar lines of the seeds.
    * @param {Model<"SeedsReply">["seeds"]} lines
    */
-  tellLines(lines) {
+  setLines(lines) {
     this.lines = lines;
     this.draw();
     this.drawList();

@@ -8,7 +8,7 @@ import { h, replace, field, number, pen, select, num, tick } from "../lib/dom.js
 export class Scale {
   /**
    * @param {() => void} changed called after each change by the user
-   * @param {boolean} steps whether there are several steps to lay it over
+   * @param {boolean} steps true: it can be laid over several steps
    */
   constructor(changed, steps = true) {
     /** @type {Record<string, string> | null} meanings of a status' values */
@@ -37,7 +37,7 @@ export class Scale {
     this.byPercentiles = h("div.fields", field("From", this.lowest, "%"), field("to", this.highest, "%"), steps ? field("Over", this.span) : null);
     this.byLimits = h("div.fields", { hidden: true }, field("From", this.lowGiven), field("to", this.highGiven));
     this.levels.title = "0: smooth";
-    this.controls = h("div.tight", h("div.fields", field("Colours", this.map), field("Levels", this.levels), h("label.check", this.reverse, "turned round")),
+    this.controls = h("div.tight", h("div.fields", field("Colours", this.map), field("Levels", this.levels), h("label.check", this.reverse, "reversed")),
       field("Limits", this.limits), this.byPercentiles, this.byLimits);
     this.root = h("div", this.legend, this.flagList, this.controls);
     for (const control of [this.map, this.limits, this.span, this.lowest, this.highest, this.lowGiven, this.highGiven, this.levels, this.reverse]) {
@@ -59,7 +59,7 @@ export class Scale {
   }
 
   /**
-   * Which percentiles are asked for.
+   * Percentiles of the limits.
    * @returns {[number, number]}
    */
   get percentiles() {
@@ -67,7 +67,7 @@ export class Scale {
     return [of(this.lowest, 1), of(this.highest, 99)];
   }
 
-  /** Other values are given their own limits: those of another field make no sense. */
+  /** Drop given limits: those of another field do not apply. */
   forget() {
     this.lowGiven.value = "";
     this.highGiven.value = "";
@@ -81,7 +81,7 @@ export class Scale {
    * @param {ArrayLike<number>[]} values of one step, or of all
    * @param {string} unit
    * @param {Record<string, string> | null} flags meanings of a status' values
-   * @param {boolean} signed whether zero is the middle whatever the limits (a difference)
+   * @param {boolean} signed true: zero is the middle whatever the limits (a difference)
    */
   lay(values, unit, flags = null, signed = false) {
     this.unit = unit;
@@ -101,8 +101,8 @@ export class Scale {
     }
     this.name = this.map.value === "auto" ? (signed ? "diverging" : suited(this.low, this.high)) : /** @type {MapName} */ (this.map.value);
     if (this.name === "diverging" && this.limits.value !== "given") {
-      const most = Math.max(Math.abs(this.low), Math.abs(this.high));
-      if (this.low < 0 && this.high > 0) [this.low, this.high] = [-most, most];
+      const max = Math.max(Math.abs(this.low), Math.abs(this.high));
+      if (this.low < 0 && this.high > 0) [this.low, this.high] = [-max, max];
     }
     this.rgb = colours(this.name, Math.round(Number(this.levels.value) || 0), this.reverse.checked);
     this.#draw();
@@ -119,8 +119,8 @@ export class Scale {
     for (let i = 0; i < ENTRIES; i += 1) image.data.set([this.rgb[3 * i], this.rgb[3 * i + 1], this.rgb[3 * i + 2], 255], 4 * i);
     pen(this.bar).putImageData(image, 0, 0);
     const digits = Math.min(7, Math.max(3, 2 + Math.ceil(Math.log10(Math.max(Math.abs(this.low), Math.abs(this.high)) / (this.high - this.low) || 1))));
-    const places = [0, 0.25, 0.5, 0.75, 1];
-    replace(this.marks, places.map((share) => h("span", { style: { left: `${100 * share}%` } }, tick(Number((this.low + share * (this.high - this.low)).toPrecision(digits)) * (Math.abs(this.low + share * (this.high - this.low)) < 1e-9 * (this.high - this.low) ? 0 : 1)))),
+    const shares = [0, 0.25, 0.5, 0.75, 1];
+    replace(this.marks, shares.map((share) => h("span", { style: { left: `${100 * share}%` } }, tick(Number((this.low + share * (this.high - this.low)).toPrecision(digits)) * (Math.abs(this.low + share * (this.high - this.low)) < 1e-9 * (this.high - this.low) ? 0 : 1)))),
       h("span.of", this.unit));
     this.legend.setAttribute("aria-label", `Colour bar from ${num(this.low, 4)} to ${num(this.high, 4)} ${this.unit}`);
     this.legend.dataset.low = String(this.low);
@@ -139,7 +139,7 @@ export class Scale {
   }
 
   /**
-   * Draw a raster into a canvas of the image's size; what has no value stays transparent.
+   * Draw a raster into a canvas of the image's size; pixels without a value stay transparent.
    * @param {HTMLCanvasElement} canvas
    * @param {number} width
    * @param {number} height

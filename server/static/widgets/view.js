@@ -3,23 +3,23 @@
 // Pixel coordinates are those of the API: the first pixel's centre is (0, 0).
 import { h, svg, num } from "../lib/dom.js";
 
-/** @typedef {{ x: number, y: number }} Place in the picture, px */
+/** @typedef {{ x: number, y: number }} Position in the picture, px */
 
 /** By one step where an arrow key points. @type {Record<string, [number, number]>} */
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const STEP = 1.25;
-const MOST = 64;
+const MAX_SCALE = 64;
 
 export class View {
   /**
    * @param {object} options
-   * @param {string} options.label what the picture is, for those who do not see it
+   * @param {string} options.label name of the picture for screen readers
    * @param {((x: number, y: number) => Promise<string | null>) | null} [options.grey] text about the pixel under the mouse
    * @param {((x: number, y: number, event: Event) => void) | null} [options.onpick] a click without dragging
-   * @param {boolean} [options.tools] whether there are buttons
+   * @param {boolean} [options.tools] false: without buttons
    *
-   * By keyboard, Enter shows a cross-hair that arrow keys move and that Enter picks with; Escape leaves it. Who draws over
-   * the picture sets `drawing` (arrow keys begin at once), `onaim` (told where it is), `onleave` and `aimFrom` (where it begins).
+   * By keyboard, Enter shows a cross-hair that arrow keys move and that Enter picks with; Escape leaves it. A drawing
+   * tool sets `drawing` (arrow keys begin at once), `onaim` (called with its position), `onleave` and `aimFrom` (its first position).
    */
   constructor({ label, grey = null, onpick = null, tools = true }) {
     this.width = 0;
@@ -30,20 +30,20 @@ export class View {
     this.grey = grey;
     this.onpick = onpick;
     this.fitted = true;
-    /** @type {Place | null} */
+    /** @type {Position | null} */
     this.cross = null;
-    /** @type {Place | null} */
+    /** @type {Position | null} */
     this.aim = null;
-    /** @type {Place | null} */
+    /** @type {Position | null} */
     this.hover = null;
     this.asking = false;
     this.outdated = false;
     this.drawing = false;
-    /** @type {((aim: Place | null) => void) | null} */
+    /** @type {((aim: Position | null) => void) | null} */
     this.onaim = null;
     /** @type {(() => void) | null} */
     this.onleave = null;
-    /** @type {(() => Place | null) | null} */
+    /** @type {(() => Position | null) | null} */
     this.aimFrom = null;
 
     this.image = h("img", { alt: label, draggable: "false" });
@@ -84,7 +84,7 @@ export class View {
   }
 
   /**
-   * Say why there is no picture.
+   * Show the reason for a missing picture.
    * @param {string} text
    */
   blank(text) {
@@ -132,7 +132,7 @@ export class View {
   }
 
   /**
-   * Where a pixel lies in the page.
+   * Position of a pixel in the page.
    * @param {number} x
    * @param {number} y
    */
@@ -149,7 +149,7 @@ export class View {
     this.left = (box.width - this.width * this.scale) / 2;
     this.top = (box.height - this.height * this.scale) / 2;
     this.fitted = true;
-    this.#place();
+    this.#transform();
   }
 
   one() {
@@ -159,7 +159,7 @@ export class View {
 
   /**
    * @param {number} factor
-   * @param {number} [x] what stays where it is, in the frame
+   * @param {number} [x] fixed position, in the frame
    * @param {number} [y]
    */
   zoom(factor, x, y) {
@@ -172,13 +172,13 @@ export class View {
    * @param {number} x
    * @param {number} y
    */
-  lookAt(x, y, scale = this.scale) {
+  centreOn(x, y, scale = this.scale) {
     const box = this.frame.getBoundingClientRect();
-    this.scale = Math.min(Math.max(scale, 0.01), MOST);
+    this.scale = Math.min(Math.max(scale, 0.01), MAX_SCALE);
     this.left = box.width / 2 - (x + 0.5) * this.scale;
     this.top = box.height / 2 - (y + 0.5) * this.scale;
     this.fitted = false;
-    this.#place();
+    this.#transform();
   }
 
   /**
@@ -187,15 +187,15 @@ export class View {
    * @param {number} y
    */
   #scaleTo(scale, x, y) {
-    const next = Math.min(Math.max(scale, 0.01), MOST);
+    const next = Math.min(Math.max(scale, 0.01), MAX_SCALE);
     this.left = x - ((x - this.left) * next) / this.scale;
     this.top = y - ((y - this.top) * next) / this.scale;
     this.scale = next;
     this.fitted = false;
-    this.#place();
+    this.#transform();
   }
 
-  #place() {
+  #transform() {
     this.content.style.transform = `translate(${this.left}px, ${this.top}px) scale(${this.scale})`;
     this.content.classList.toggle("pixels", this.scale >= 2);
     // lines and handles keep their width on the screen
@@ -227,7 +227,7 @@ export class View {
       this.left -= step * by[0];
       this.top -= step * by[1];
       this.fitted = false;
-      this.#place();
+      this.#transform();
     } else if (event.key === "Enter" && own && (this.onpick || this.grey)) {
       if (this.aim) this.onpick?.(this.aim.x, this.aim.y, event);
       else this.setAim(this.#aimStart());
@@ -246,12 +246,12 @@ export class View {
     event.preventDefault();
   }
 
-  /** @param {Place} place */
+  /** @param {Position} position */
   #onFrame({ x, y }) {
     return [this.left + (x + 0.5) * this.scale, this.top + (y + 0.5) * this.scale];
   }
 
-  /** The middle of what is seen of the picture, or where who draws wants to begin. */
+  /** Middle of the visible part of the picture, or the first position given by `aimFrom`. */
   #aimStart() {
     const from = this.aimFrom?.();
     if (from) return from;
@@ -260,13 +260,13 @@ export class View {
   }
 
   /**
-   * Put the cross-hair that keys move onto a pixel, and into sight; null takes it away.
-   * @param {Place | null} place
+   * Put the cross-hair of the keyboard onto a pixel, and into view; null removes it.
+   * @param {Position | null} position
    */
-  setAim(place) {
-    if (place && !this.width) return;
+  setAim(position) {
+    if (position && !this.width) return;
     const inside = (/** @type {number} */ value, /** @type {number} */ size) => Math.round(10 * Math.min(Math.max(value, 0), size - 1)) / 10;
-    this.aim = place && { x: inside(place.x, this.width), y: inside(place.y, this.height) };
+    this.aim = position && { x: inside(position.x, this.width), y: inside(position.y, this.height) };
     if (this.aim) {
       this.readout.setAttribute("aria-live", "polite");
       const box = this.frame.getBoundingClientRect();
@@ -277,12 +277,12 @@ export class View {
         this.left += right;
         this.top += down;
         this.fitted = false;
-        this.#place();
+        this.#transform();
       }
       this.hover = this.aim;
-      this.#say();
+      this.#updateReadout();
     } else {
-      this.readout.removeAttribute("aria-live"); // the mouse would have it speak all the time
+      this.readout.removeAttribute("aria-live"); // mouse motion would be announced all the time
       this.hover = null;
     }
     this.#drawAim();
@@ -293,7 +293,7 @@ export class View {
     this.svg.querySelector(".aim")?.remove();
     if (!this.aim) return;
     const { x, y } = this.aim;
-    const gap = 5 / this.scale; // the pixel itself stays in sight
+    const gap = 5 / this.scale; // the pixel itself stays visible
     const d = `M${x} -0.5V${y - gap}M${x} ${y + gap}V${this.height - 0.5}M-0.5 ${y}H${x - gap}M${x + gap} ${y}H${this.width - 0.5}`;
     this.svg.append(svg("g", { class: "aim", "data-x": x, "data-y": y },
       svg("path", { ...stroke("#000", 3), d, opacity: 0.55 }), svg("path", { ...stroke("#ff9d1e", 1.5), d })));
@@ -321,7 +321,7 @@ export class View {
       const now = [event.clientX, event.clientY];
       if (start && Math.hypot(now[0] - start[0], now[1] - start[1]) > 4) moved = true;
       if (down.size === 2) {
-        const [other] = [...down].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
+        const [other] = [...down].filter(([id]) => id !== event.pointerId).map(([, position]) => position);
         const span = (/** @type {Spot} */ a) => Math.hypot(a[0] - other[0], a[1] - other[1]);
         const box = this.frame.getBoundingClientRect();
         if (span(before) > 5) this.zoom(span(now) / span(before), (now[0] + other[0]) / 2 - box.left, (now[1] + other[1]) / 2 - box.top);
@@ -329,7 +329,7 @@ export class View {
         this.left += now[0] - before[0];
         this.top += now[1] - before[1];
         this.fitted = false;
-        this.#place();
+        this.#transform();
       }
       down.set(event.pointerId, now);
     });
@@ -354,17 +354,17 @@ export class View {
       this.readout.textContent = "";
       return;
     }
-    this.#say();
+    this.#updateReadout();
   }
 
-  /** What lies under a resting mouse has changed: another field or step, or its uncertainty has come. */
+  /** The values under a resting mouse have changed: another field or step, or the uncertainty has arrived. */
   reread() {
     this.outdated = true;
-    this.#say();
+    this.#updateReadout();
   }
 
-  async #say() {
-    // one question at a time: what the mouse passed meanwhile is not asked for
+  async #updateReadout() {
+    // one request at a time: positions passed meanwhile are not requested
     if (this.asking) return;
     this.asking = true;
     try {
@@ -373,10 +373,10 @@ export class View {
         this.outdated = false;
         const column = Math.round(x);
         const row = Math.round(y);
-        const place = `x ${num(x, 5)} px   y ${num(y, 5)} px`;
-        if (!this.readout.textContent) this.readout.textContent = place;
+        const position = `x ${num(x, 5)} px   y ${num(y, 5)} px`;
+        if (!this.readout.textContent) this.readout.textContent = position;
         const text = this.grey ? await this.grey(column, row).catch(() => null) : null;
-        if (this.hover) this.readout.textContent = text ? `${place}   ${text}` : place;
+        if (this.hover) this.readout.textContent = text ? `${position}   ${text}` : position;
         this.readout.dataset.column = String(column);
         this.readout.dataset.row = String(row);
         if (this.hover && this.hover.x === x && this.hover.y === y && !this.outdated) return;
@@ -392,9 +392,9 @@ export class View {
     this.#drawCross();
   }
 
-  /** @param {Place} place */
-  #putCross(place) {
-    this.cross = place;
+  /** @param {Position} position */
+  #putCross(position) {
+    this.cross = position;
     this.#drawCross();
   }
 
@@ -420,7 +420,7 @@ export function stroke(colour, width, dashes = []) {
 }
 
 /**
- * How far an arrow key moves what is drawn, px: with Shift farther, with Alt finer; nothing for other keys.
+ * Step of an arrow key, px: with Shift farther, with Alt finer; null for other keys.
  * @param {KeyboardEvent} event
  * @returns {[number, number] | null}
  */
@@ -431,7 +431,7 @@ export function nudge(event) {
 }
 
 /**
- * Whether a handle that is drawn over the picture was taken.
+ * Return true if a handle over the picture was grabbed.
  * @param {Event} event
  */
 export const onGrab = (event) => event.target instanceof Element && event.target.closest(".grab") !== null;

@@ -1,12 +1,12 @@
 // Which reply, body and query belong to an address of the API, from its OpenAPI description (openapi.d.ts, which
-// api_types.js writes from docs/openapi.json), and what stored documents say beside what is described there.
+// api_types.js writes from docs/openapi.json), and the further fields of stored documents.
 import type { components, paths } from "./openapi";
 
 type Schemas = components["schemas"];
 type Numbers = { [name: string]: number | null | undefined };
 type Check = { rbe_px?: number; raz_mm?: number; nsce?: number; points?: number };
 
-/** What documents carry that the description lets through without a name. */
+/** Fields of documents that the description allows without naming them. */
 interface Unnamed {
   StepReply: { frames?: number };
   NoiseReply: { plan: { label?: string } };
@@ -37,7 +37,7 @@ export type TakenView = { index: number; camera: string; dz_mm: number; dz_comma
 
 type Gauged = { value: number | null; sigma: number | null };
 
-/** A step's gauge readings; \`missing\` says why there is no value. */
+/** A step's gauge readings; \`missing\` is the reason for a missing value. */
 export type GaugeReadings = Omit<Schemas["GaugeStep"], "lines" | "extensometers" | "areas"> & {
   lines?: { distance_px: number[]; missing: (string | null)[]; values: { [variable: string]: { value: (number | null)[]; sigma: (number | null)[]; units: string } } }[];
   extensometers?: { missing?: string | null; values: { [quantity: string]: Gauged } }[];
@@ -52,7 +52,7 @@ type Whole<T> = T extends unknown ? ([Named<T>] extends [never] ? T : Omit<T, ke
 /** A model of the API by its name. */
 export type Model<Name extends keyof Schemas> = Whole<Schemas[Name]>;
 
-/** What the stream of events says. */
+/** Data of the events, by name. */
 export interface Events {
   job: Schemas["JobReply"];
   step: { test_id: string; n: number };
@@ -83,9 +83,9 @@ type Json<Content> = Content extends { content: { "application/json": infer Valu
 
 /** The path, where the API has such an operation there. */
 export type Address<M extends Method, Path extends string> = Canonical<Path> extends keyof Operations<M> ? Path : never;
-/** What it answers. */
+/** Its reply. */
 export type Reply<M extends Method, Path extends string> = Operation<M, Path> extends { responses: infer Answers } ? Whole<Json<Answers[keyof Answers & (200 | 201 | 202)]>> : never;
-/** What is sent to it. */
+/** Its body. */
 export type Body<M extends Method, Path extends string> = Operation<M, Path> extends { requestBody?: infer Sent } ? Json<NonNullable<Sent>> : undefined;
-/** What it can be asked. */
+/** Its query parameters. */
 export type Query<M extends Method, Path extends string> = Operation<M, Path> extends { parameters: { query?: infer Asked } } ? { [Name in keyof Asked]?: Asked[Name] | null } : undefined;

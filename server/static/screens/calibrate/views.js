@@ -1,13 +1,13 @@
-// The pictures of a calibration with what was found in them: lines, intersections, residual arrows.
+// The views of a calibration with the lines and intersections found in them, and residual arrows.
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
 import { h, replace, svg, field, select, num, quantity } from "../../lib/dom.js";
 
 const COLOUR = { lines: "#33c6ff", node: "#ffd23e", arrow: "#ff4d3d" };
-const LONGEST = 0.15; // of the picture's width
+const MAX_ARROW = 0.15; // of the picture's width
 /** @import { Model, TakenView } from "#routes" */
 /** @typedef {readonly (number | null)[]} Spot */
-/** @typedef {{ name: string, found_px: Spot[][], residual_px?: Spot[][] | null, rbe_px?: number | null, raz_mm?: number | null }} Found what the fit found in a view */
+/** @typedef {{ name: string, found_px: Spot[][], residual_px?: Spot[][] | null, rbe_px?: number | null, raz_mm?: number | null }} Found lines' intersections of a view, with residuals */
 
 /** @type {Record<string, string>} */
 const ROLE = { fitted: "fitted", held_out: "held out", zero: "zero", zero_again: "zero, again" };
@@ -25,7 +25,7 @@ export function calibrationViews(calibration, residuals) {
   const text = (/** @type {number} */ index) => { const view = /** @type {TakenView} */ (at(index, "cam1") ?? at(index, "cam2")); return `${quantity(view.dz_commanded_mm ?? view.dz_mm, "mm", 4)} · ${ROLE[view.role] ?? view.role}`; };
   const position = select(indices.map((index) => [index, text(index)]), indices[0]);
   const magnification = h("input", { type: "range", min: 0, max: 4, step: 0.05, value: Math.log10(exaggeration(residuals, calibration.image_size_px?.cam1?.[0] ?? 640)).toFixed(2) });
-  const told = h("output");
+  const timesText = h("output");
   const lines = h("input", { type: "checkbox", checked: true });
   const arrows = h("input", { type: "checkbox", checked: true });
   const views = ["cam1", "cam2"].map((cam) => {
@@ -38,12 +38,12 @@ export function calibrationViews(calibration, residuals) {
 
   function draw() {
     const times = 10 ** Number(magnification.value);
-    told.textContent = `${num(times, 3)} ×`;
+    timesText.textContent = `${num(times, 3)} ×`;
     for (const { cam, view, caption, layer } of views) {
       const index = Number(position.value);
       const taken_ = at(index, cam);
       const name = taken_?.file.split("/").pop();
-      // a look back at zero is compared, not fitted: it has no residuals of its own
+      // the repeated view at zero is compared, not fitted: it has no residuals
       const found = residuals?.find((one) => one.name === name);
       caption.textContent = taken_ ? `${ROLE[taken_.role] ?? taken_.role}, dZ ${quantity(taken_.dz_mm, "mm", 6)} as read back, ${taken_.frames} frames averaged${found ? `; RBE ${quantity(found.rbe_px, "px", 3)}, RAZ ${quantity(found.raz_mm && 1000 * found.raz_mm, "µm", 3)}` : ""}` : "no view";
       replace(layer, ...(found ? drawing(found, times, lines.checked, arrows.checked) : []));
@@ -60,7 +60,7 @@ export function calibrationViews(calibration, residuals) {
   load();
   const root = h("div",
     h("div.fields", field("Position", position),
-      residuals ? [field("Arrows are longer than residuals by", h("span.control", Object.assign(magnification, { id: "magnification" }), told)),
+      residuals ? [field("Magnification of arrows", h("span.control", Object.assign(magnification, { id: "magnification" }), timesText)),
         h("label.check", { style: { alignSelf: "center" } }, lines, "lines and intersections"), h("label.check", { style: { alignSelf: "center" } }, arrows, "residual arrows")] : null),
     h("div.grid.two.views", views.map((one) => one.root)));
   magnification.setAttribute("aria-label", "Magnification of the residual arrows");
@@ -68,22 +68,22 @@ export function calibrationViews(calibration, residuals) {
 }
 
 /**
- * By how much arrows are longer at first: a thousand times, less where the longest would leave the picture.
+ * Initial magnification of the arrows: 1000, or less if the longest would leave the picture.
  * @param {Found[] | null} residuals
  * @param {number} width
  */
 function exaggeration(residuals, width) {
-  let longest = 1e-9;
-  for (const view of residuals ?? []) for (const r of view.residual_px?.flat() ?? []) if (there(r)) longest = Math.max(longest, Math.hypot(...r));
-  return Math.min(1000, Math.max(1, LONGEST * width / longest));
+  let largest = 1e-9;
+  for (const view of residuals ?? []) for (const r of view.residual_px?.flat() ?? []) if (isFound(r)) largest = Math.max(largest, Math.hypot(...r));
+  return Math.min(1000, Math.max(1, MAX_ARROW * width / largest));
 }
 
 /**
- * Whether a point was found.
+ * Return true if a point was found.
  * @param {Spot | undefined} xy
  * @returns {xy is [number, number]}
  */
-const there = (xy) => xy !== undefined && xy[0] !== null && xy[1] !== null && Number.isFinite(xy[0]);
+const isFound = (xy) => xy !== undefined && xy[0] !== null && xy[1] !== null && Number.isFinite(xy[0]);
 
 /**
  * @param {Found} view
@@ -99,21 +99,21 @@ function drawing({ found_px: found, residual_px: residual }, times, lines, arrow
     const course = (/** @type {Spot[]} */ points) => {
       let open = false;
       for (const xy of points) {
-        if (there(xy)) { path.push(`${open ? "L" : "M"}${xy[0]} ${xy[1]}`); open = true; } else open = false;
+        if (isFound(xy)) { path.push(`${open ? "L" : "M"}${xy[0]} ${xy[1]}`); open = true; } else open = false;
       }
     };
     found.forEach(course);
     found[0]?.forEach((_, k) => course(found.map((row) => row[k])));
     parts.push(svg("path", { ...stroke(COLOUR.lines, 1), d: path.join(""), "data-role": "lines" }));
-    // a cross of a point of no length keeps its size on the screen at any zoom
-    parts.push(svg("path", { ...stroke(COLOUR.node, 5), "stroke-linecap": "round", "data-role": "nodes", d: found.flat().filter(there).map(([x, y]) => `M${x} ${y}h0.001`).join("") }));
+    // a line of no length is a dot that keeps its size on the screen at any zoom
+    parts.push(svg("path", { ...stroke(COLOUR.node, 5), "stroke-linecap": "round", "data-role": "nodes", d: found.flat().filter(isFound).map(([x, y]) => `M${x} ${y}h0.001`).join("") }));
   }
   if (arrows && residual) {
     /** @type {string[]} */
     const path = [];
     found.forEach((row, i) => row.forEach((xy, k) => {
       const r = residual[i]?.[k];
-      if (!there(xy) || !there(r)) return;
+      if (!isFound(xy) || !isFound(r)) return;
       const [dx, dy] = [r[0] * times, r[1] * times];
       const head = 0.25;
       path.push(`M${xy[0]} ${xy[1]}l${dx} ${dy}`, `m${-head * (dx - 0.5 * dy)} ${-head * (dy + 0.5 * dx)}L${xy[0] + dx} ${xy[1] + dy}l${-head * (dx + 0.5 * dy)} ${-head * (dy - 0.5 * dx)}`);

@@ -1,6 +1,6 @@
-// What an analysis was made with, how its steps came out, and its files to take away.
+// Settings, step summaries and files of an analysis.
 import * as api from "../../lib/api.js";
-import { h, replace, table, badge, facts, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "../../lib/dom.js";
+import { h, replace, table, badge, definitions, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "../../lib/dom.js";
 
 /** @import { Viewer } from "../results.js" */
 /** @import { StepSummary } from "#routes" */
@@ -37,39 +37,39 @@ export function about(screen) {
       warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", one)))) : null,
       failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.cause ?? one.detail ?? one.code} ${one.remedy ?? ""}`)))) : null,
       h("h3", "Settings"),
-      facts([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
+      definitions([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
         ["software", analysis.software ?? "–"], ["begun", when(analysis.created_utc)], ["calibration", analysis.inputs?.calibration_sha256 ? h("code", analysis.inputs.calibration_sha256.slice(0, 16)) : "–"]]),
       h("h3", "Steps"),
       table([
         ["Step", (one) => one.n, { numeric: true }],
-        ["Measured", (one) => `${count(one.valid)} of ${count(one.points)}`, { numeric: true }],
-        ["Epipolar", (one) => verdict(one.epipolar_check)],
-        ["Off the line", (one) => quantity(one.epipolar_offset_rms_px, "px", 3), { numeric: true }],
+        ["Valid", (one) => `${count(one.valid)} of ${count(one.points)}`, { numeric: true }],
+        ["Epipolar check", (one) => verdict(one.epipolar_check)],
+        ["Epipolar offset", (one) => quantity(one.epipolar_offset_rms_px, "px", 3), { numeric: true }],
         ["Correlation", (one) => num(Math.min(...Object.values(one.zncc_median ?? { none: NaN })), 4), { numeric: true }],
         ["σ Z", (one) => quantity(one.sigma_median_mm?.z_mm, "mm", 2), { numeric: true }],
         ["σ W", (one) => quantity(one.sigma_median_mm?.w_mm, "mm", 2), { numeric: true }],
-        ["Strain noise", (one) => quantity(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
+        ["Strain noise floor", (one) => quantity(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
-        ["Took", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
-      ], steps, { caption: "How each step came out; σ are medians over the points", empty: "No step is finished yet." }),
-      facts(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
+        ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
+      ], steps, { caption: "Summary of each step; σ are medians of the reported standard uncertainties", empty: "No step is finished yet." }),
+      definitions(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
   }
   draw();
   return { root, draw };
 }
 
-/** @typedef {any} Schema of a parameter, as JSON Schema has it: a border */
+/** @typedef {any} Schema of a parameter, in JSON Schema; not checked at run time */
 /** @typedef {{ name: string, in: string, required?: boolean, description?: string, schema: Schema }} Parameter */
 /** @type {any} */
 let description = null;
-/** The API's own description: which forms a result can be had in. */
+/** The API's own description: it lists the formats of a result. */
 async function operations() {
   description ??= await (await api.raw("/openapi.json")).json();
   return description;
 }
 
 /**
- * Files in every form that the service offers, and the report.
+ * Files in every format of the service, and the report.
  * @param {Viewer} screen
  */
 export function files(screen) {
@@ -104,9 +104,9 @@ export function files(screen) {
       if (v !== null) for (const one of input.dataset.many ? v.split(/[\s,]+/) : [v]) address.searchParams.append(name, one);
     }
     const answer = await api.raw(address.href);
-    const told = /filename\*?=(?:UTF-8'')?"?([^";]+)"?/.exec(answer.headers.get("Content-Disposition") ?? "");
+    const named = /filename\*?=(?:UTF-8'')?"?([^";]+)"?/.exec(answer.headers.get("Content-Disposition") ?? "");
     const stale = answer.headers.get("X-Stale");
-    const link = h("a", { href: URL.createObjectURL(await answer.blob()), download: told ? decodeURIComponent(told[1]) : `${result.testId}_${result.analysisId}.${address.searchParams.get("format") ?? "nc"}` });
+    const link = h("a", { href: URL.createObjectURL(await answer.blob()), download: named ? decodeURIComponent(named[1]) : `${result.testId}_${result.analysisId}.${address.searchParams.get("format") ?? "nc"}` });
     document.body.append(link);
     link.click();
     link.remove();
@@ -114,7 +114,7 @@ export function files(screen) {
     if (stale) notify(`The file is saved, but out of date: ${stale}`, "warn");
   }
 
-  /** What is on the screen, as far as it suits the form: figures show one variable, films all steps. */
+  /** Take step and variable from the screen where the format allows: figures show one variable, films all steps. */
   function propose() {
     const form_ = inputs.get("format")?.value;
     const film = ["gif", "mp4"].includes(form_ ?? "");
@@ -124,13 +124,13 @@ export function files(screen) {
     if (variables) variables.value = (film || ["png", "svg"].includes(form_ ?? "")) && screen.info ? screen.info.name : "";
   }
 
-  /** The report in a tab of its own. It is made when it is asked for, which takes a while: that is said. */
+  /** The report in a tab of its own. It is computed on request, which takes a while: a message states so. */
   function report() {
     const address = api.address(`${result.path}/report`);
-    const told = h("p.quiet", { role: "status" }, "One page with everything, to file or print.");
-    const say = () => { told.textContent = "The report is being made from the steps' files: some seconds, longer for many steps. It is shown once it is there."; };
-    return h("div", h("div.row", h("a.button", { href: address, target: "_blank", rel: "noopener", onclick: say }, "Open the report"),
-      h("a.button", { href: address, download: `${result.testId}_${result.analysisId}_report.html`, onclick: say }, "Save the report")), told);
+    const note = h("p.quiet", { role: "status" }, "One HTML page with all results, to file or print.");
+    const announce = () => { note.textContent = "The report is computed from the steps' files: some seconds, longer for many steps. It is shown when it is complete."; };
+    return h("div", h("div.row", h("a.button", { href: address, target: "_blank", rel: "noopener", onclick: announce }, "Open the report"),
+      h("a.button", { href: address, download: `${result.testId}_${result.analysisId}_report.html`, onclick: announce }, "Save the report")), note);
   }
 
   async function draw() {

@@ -1,17 +1,17 @@
-// One analysis' results: what is read is kept, so that stepping and playing ask once.
+// One analysis' results: answers are cached, so that stepping and playing request each once.
 import * as api from "../../lib/api.js";
 import { Grid } from "../../lib/point_grid.js";
 
 /** @import { Model, Reply } from "#routes" */
 /** @typedef {{ key: string, name: string, component: number | null, group: string, text: string, unit: string, about: string,
- *   flags: Record<string, string> | null, signed?: boolean }} Shown what can be shown of a step */
+ *   flags: Record<string, string> | null, signed?: boolean }} Shown a field of a step */
 
-const MOST_BYTES = 300e6;
+const MAX_BYTES = 300e6;
 const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;
 /** @type {Record<string, string>} */
 const NAMES = {
   x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
-  max_shear: "largest shear", von_mises: "von Mises strain", strain_angle_rad: "direction of e1", epipolar_px: "epipolar residual", noise_grey: "image noise",
+  max_shear: "max. shear", von_mises: "von Mises strain", strain_angle_rad: "direction of e1", epipolar_px: "epipolar offset", noise_grey: "image noise",
   status: "status", strain_status: "status of the strain", iterations: "iterations", theta_rad: "theta", phi_rad: "phi", zp_mm: "zp",
 };
 /** @type {[name: string, variables: RegExp][]} */
@@ -21,7 +21,7 @@ const GROUPS = [
 ];
 
 /**
- * Unit that a variable is shown in, and what its stored numbers are multiplied by.
+ * Display unit of a variable, and the factor from its stored numbers.
  * @param {string} name
  * @param {string} units
  */
@@ -43,7 +43,7 @@ export class Result {
     this.analysisId = analysis.id;
     this.test = test;
     this.analysis = analysis;
-    /** @type {Map<string, { bytes: number, promise: Promise<any> }>} each of what its key says */
+    /** @type {Map<string, { bytes: number, promise: Promise<any> }>} by key */
     this.kept = new Map();
     this.bytes = 0;
   }
@@ -99,7 +99,7 @@ export class Result {
   #keep(key, make) {
     const held = this.kept.get(key);
     if (held) {
-      this.kept.delete(key); // what was used last is dropped last
+      this.kept.delete(key); // dropped least recently used first
       this.kept.set(key, held);
       return held.promise;
     }
@@ -108,7 +108,7 @@ export class Result {
       entry.bytes = "bytes" in value ? Number(value.bytes) : 0;
       this.bytes += entry.bytes;
       for (const [old, one] of this.kept) {
-        if (this.bytes <= MOST_BYTES || old === key) break;
+        if (this.bytes <= MAX_BYTES || old === key) break;
         this.kept.delete(old);
         this.bytes -= one.bytes;
       }
@@ -120,7 +120,7 @@ export class Result {
   }
 
   /**
-   * What can be shown of a step.
+   * The fields of a step.
    * @param {number} n
    */
   fields(n) {
@@ -158,11 +158,11 @@ export class Result {
   }
 
   /**
-   * Where the points lie in a step's image of a camera.
+   * Positions of the points in a step's image of a camera.
    * @param {number} n
    * @param {string} cam
    */
-  places(n, cam) {
+  positions(n, cam) {
     return this.#keep(`${n}/${cam}`, async () => {
       const got = await api.npy(`${this.path}/steps/${n}/places/${cam}`, { format: "npy" });
       return { ...got, bytes: got.data.byteLength };
@@ -199,7 +199,7 @@ export class Result {
   }
 
   /**
-   * Standard uncertainties beside them, null where the file has none.
+   * Standard uncertainties of an entry of `fields`, null where the file has none.
    * @param {number} n
    * @param {string} key
    */

@@ -4,7 +4,7 @@ import { FieldMap } from "../../widgets/field_map.js";
 import { Result, allTests } from "./analysis.js";
 import { Scale } from "../../widgets/scale.js";
 import { chart } from "../../widgets/plots.js";
-import { h, replace, select, field, facts, count, quantity, notify } from "../../lib/dom.js";
+import { h, replace, select, field, definitions, count, quantity, notify } from "../../lib/dom.js";
 
 /** @import { Grid } from "../../lib/point_grid.js" */
 /** @import { Model } from "#routes" */
@@ -53,8 +53,8 @@ export async function compare(screen) {
   const stepChoice = h("select", {});
   const show = select([["side", "the field of each"], ["difference", "the difference"]], "side");
   const note = h("p.quiet", { role: "status" });
-  const figures = h("dl.facts", { "data-role": "difference" });
-  const histogramPlace = h("div", { "data-role": "difference-histogram" });
+  const figures = h("dl.definitions", { "data-role": "difference" });
+  const histogramBox = h("div", { "data-role": "difference-histogram" });
   const bar = h("div", scale.root);
   /** @type {Result | null} */
   let other = null;
@@ -64,7 +64,7 @@ export async function compare(screen) {
 
   const tests = await allTests();
   tests.sort((a, b) => Number(b.id === result.testId) - Number(a.id === result.testId)); // its own first
-  // analyses of other tests are asked for when their test is chosen
+  // analyses of other tests are requested when their test is chosen
   /** @type {Map<string, Analyses>} */
   const analyses = new Map([[result.testId, result.test.analyses]]);
   const testChoice = select(tests.map((one) => [one.id, one.name || one.id]), result.testId);
@@ -86,13 +86,13 @@ export async function compare(screen) {
   stepChoice.addEventListener("change", () => update().catch(notify));
   show.addEventListener("change", () => update().catch(notify));
 
-  // what one view shows, the other shows too
+  // both views show the same part
   let following = false;
   const follow = (/** @type {FieldMap} */ from, /** @type {FieldMap} */ to) => () => {
     if (following || !from.view.width || !to.view.width) return;
     following = true;
     const box = from.view.frame.getBoundingClientRect();
-    to.view.lookAt((box.width / 2 - from.view.left) / from.view.scale - 0.5, (box.height / 2 - from.view.top) / from.view.scale - 0.5, from.view.scale);
+    to.view.centreOn((box.width / 2 - from.view.left) / from.view.scale - 0.5, (box.height / 2 - from.view.top) / from.view.scale - 0.5, from.view.scale);
     following = false;
   };
   const [there, back] = [follow(map, right), follow(right, map)];
@@ -102,7 +102,7 @@ export async function compare(screen) {
 
   const left = h("div", h("h2", "This analysis"));
   const rightName = h("h2", "The other");
-  const panel = h("div.grid.two", { hidden: true, "data-role": "difference-panel" }, h("div.panel", bar, figures), h("div.panel", histogramPlace));
+  const panel = h("div.grid.two", { hidden: true, "data-role": "difference-panel" }, h("div.panel", bar, figures), h("div.panel", histogramBox));
   const root = h("div", { "data-role": "compare" },
     h("div.row", field("Test", testChoice), field("Compared with", choice), field("At", stepChoice), field("Right view", show)),
     h("div.grid.two.views", left, h("div", rightName, right.view.root)), note,
@@ -136,7 +136,7 @@ export async function compare(screen) {
     panel.hidden = !differ;
     if (!differ) {
       right.redraw(screen.scale); // one scale for both
-      note.textContent = "Both have the colours of the scale on the left view's analysis.";
+      note.textContent = "Both use the colour scale of the left view.";
       there();
       return;
     }
@@ -147,22 +147,22 @@ export async function compare(screen) {
     if (mine !== asked) return;
     const d = difference(a, b);
     const info = { ...found, key: `${key} difference`, text: `difference of ${found.text}`, flags: null, signed: true };
-    Object.assign(b, { grid: a.grid, places: a.places });
+    Object.assign(b, { grid: a.grid, positions: a.positions });
     right.put(d.values, info, d.sigma);
     scale.lay([right.measured], found.unit, null, true);
     right.redraw(scale);
     const s = b.statistics;
     let squares = 0;
-    let told = 0;
-    d.sigma?.forEach((sigma, i) => { if (Number.isFinite(d.values[i]) && Number.isFinite(sigma)) { squares += sigma ** 2; told += 1; } });
-    const rmsTold = told ? Math.sqrt(squares / told) : null;
-    replace(figures, [...facts([
-      ["mean difference", quantity(s.mean, found.unit)], ["rms", quantity(s.rms, found.unit)], ["sd", quantity(s.sd, found.unit)], ["told σ of a difference, rms", quantity(rmsTold, found.unit)],
-      ["smallest", quantity(s.min, found.unit)], ["largest", quantity(s.max, found.unit)], ["points compared", `${count(s.count)} of ${count(a.values.length)}`],
+    let reported = 0;
+    d.sigma?.forEach((sigma, i) => { if (Number.isFinite(d.values[i]) && Number.isFinite(sigma)) { squares += sigma ** 2; reported += 1; } });
+    const rmsReported = reported ? Math.sqrt(squares / reported) : null;
+    replace(figures, [...definitions([
+      ["mean difference", quantity(s.mean, found.unit)], ["rms", quantity(s.rms, found.unit)], ["sd", quantity(s.sd, found.unit)], ["reported σ of a difference, rms", quantity(rmsReported, found.unit)],
+      ["min", quantity(s.min, found.unit)], ["max", quantity(s.max, found.unit)], ["points compared", `${count(s.count)} of ${count(a.values.length)}`],
     ]).children]);
-    Object.assign(figures.dataset, { rms: String(s.rms), mean: String(s.mean), count: String(s.count), told: String(rmsTold) });
-    note.textContent = `This analysis less the other${d.interpolated ? "; the points differ, so the other's values are taken between its points" : ", point by point"}${found.unit ? `, in ${found.unit}` : ""}. The told σ takes both as independent; analyses of the same images are not.`;
-    await histogram(right.measured, s, found, rmsTold);
+    Object.assign(figures.dataset, { rms: String(s.rms), mean: String(s.mean), count: String(s.count), reported: String(rmsReported) });
+    note.textContent = `This analysis less the other${d.interpolated ? "; the points differ, so the other's values are taken between its points" : ", point by point"}${found.unit ? `, in ${found.unit}` : ""}. The reported σ assumes that both are independent; analyses of the same images are not.`;
+    await histogram(right.measured, s, found, rmsReported);
     there();
   }
 
@@ -177,7 +177,7 @@ export async function compare(screen) {
     plot = null;
     const { min, max, mean } = s;
     if (min === null || max === null || mean === null || !(max > min)) {
-      replace(histogramPlace, h("p.quiet", s.count ? `Every difference is ${quantity(min, info.unit)}.` : "No point has a value in both."));
+      replace(histogramBox, h("p.quiet", s.count ? `Every difference is ${quantity(min, info.unit)}.` : "No point has a value in both."));
       return;
     }
     const width = (max - min) / BINS;
@@ -185,7 +185,7 @@ export async function compare(screen) {
     for (const v of values) bins[Math.min(Math.floor((v - min) / width), BINS - 1)] += 1;
     const x = bins.map((_, k) => min + (k + 0.5) * width);
     const normal = sigma ? x.map((v) => (s.count * width * Math.exp(-0.5 * ((v - mean) / sigma) ** 2)) / (sigma * Math.sqrt(2 * Math.PI))) : null;
-    plot = await chart(histogramPlace, { x: `difference${info.unit ? ` (${info.unit})` : ""}`, y: "points", height: 220, bars: [true, false], series: [{ label: "points" }, ...(normal ? [{ label: "by the told σ, about the mean" }] : [])],
+    plot = await chart(histogramBox, { x: `difference${info.unit ? ` (${info.unit})` : ""}`, y: "points", height: 220, bars: [true, false], series: [{ label: "points" }, ...(normal ? [{ label: "normal distribution of the reported σ" }] : [])],
       data: [x, bins, ...(normal ? [normal] : [])], label: "Histogram of the difference" });
   }
 

@@ -15,7 +15,7 @@ import { shownUnit } from "./analysis.js";
 /** @typedef {Body<"post", "/tests/{test_id}/analyses/{analysis_id}/gauges">} Request */
 
 /** @type {[tool: Tool, text: string, title: string][]} */
-const TOOLS = [["probe", "Probe", "A click shows every number of a point; dragging moves the picture"], ["line", "Line", "Drag a line: values along it"],
+const TOOLS = [["probe", "Probe", "Click a point for all its values; drag to move the picture"], ["line", "Line", "Drag a line: values along it"],
   ["extensometer", "Extensometer", "Two clicks or a drag: elongation over the steps"], ["area", "Area", "Drag a rectangle: statistics of it"]];
 /** @type {Record<Tool, string>} */
 const INK = { probe: "#fff", line: "#ff9d1e", extensometer: "#ff5fa2", area: "#5ad1ff" };
@@ -244,13 +244,13 @@ export function gauges(screen) {
   const plots = {};
   /**
    * @param {Kind} name
-   * @param {HTMLElement} place
+   * @param {HTMLElement} box
    * @param {Parameters<typeof chart>[1]} options
    */
-  async function plot(name, place, options) {
+  async function plot(name, box, options) {
     plots[name]?.close();
     plots[name] = null;
-    plots[name] = await chart(place, options);
+    plots[name] = await chart(box, options);
   }
 
   const lineChart = h("div", { "data-role": "line-chart" });
@@ -260,7 +260,7 @@ export function gauges(screen) {
   async function readLine() {
     if (!state.line || !screen.info || screen.step === null) return;
     const from = state.line;
-    if (screen.info.component !== null) return void replace(lineText, h("p.quiet", "A line reads variables of one number a point; choose another field."));
+    if (screen.info.component !== null) return void replace(lineText, h("p.quiet", "A line needs a scalar field; choose another field."));
     const name = screen.info.name;
     replace(lineText, h("p.quiet", "Reading …"));
     const answer = await api.post(`${result.path}/gauges`, body({ lines: [{ vertices_px: from }], variables: [name, "x_mm", "y_mm", "z_mm"].filter((v, k, each) => each.indexOf(v) === k), steps: [screen.step] }));
@@ -280,21 +280,21 @@ export function gauges(screen) {
     const scaled = (/** @type {(number | null)[]} */ list) => list.map((v) => (v === null ? null : v * factor));
     const values = scaled(value);
     const errors = scaled(sigma);
-    const places = values.map((_, k) => ["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value[k] ?? NaN));
+    const positions = values.map((_, k) => ["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value[k] ?? NaN));
     let length = 0;
     const mm = values.map((_, k) => {
-      const way = k ? Math.hypot(...places[k].map((to, axis) => to - places[k - 1][axis])) : 0;
-      if (Number.isFinite(way)) length += way;
+      const piece = k ? Math.hypot(...positions[k].map((to, axis) => to - positions[k - 1][axis])) : 0;
+      if (Number.isFinite(piece)) length += piece;
       return length;
     });
-    const whole = places.every(([x]) => Number.isFinite(x));
+    const whole = positions.every(([x]) => Number.isFinite(x));
     const inMm = along.value === "mm" && whole;
     const x = inMm ? mm : line.distance_px;
     const band = (/** @type {1 | -1} */ sign) => beside(values, errors, sign);
     const missing = value.filter((v) => v === null).length;
-    replace(lineText, h("p.quiet", `${count(value.length)} places from (${from[0].join(", ")}) to (${from[1].join(", ")}) px`,
+    replace(lineText, h("p.quiet", `${count(value.length)} positions from (${from[0].join(", ")}) to (${from[1].join(", ")}) px`,
       missing ? `; ${missing} without a value: ${[...new Set(line.missing.filter(Boolean))].join(", ").replace(/_/g, " ")}` : "",
-      along.value === "mm" && !whole ? "; the way in mm is not known where points are missing, so it is in pixels" : "", errors.some((v) => v !== null) ? "; the band is one standard uncertainty" : "; its uncertainty is not known"));
+      along.value === "mm" && !whole ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? "; the band is one standard uncertainty" : "; no standard uncertainty is known"));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
     await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 230,
       series: [{ label: name }, { label: "+ σ", edge: true }, { label: "− σ", edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
@@ -328,7 +328,7 @@ export function gauges(screen) {
     if (listed.some((one) => one.captured_utc)) found.push(["time", "time (s)"]);
     if (listed.some((one) => one.load_n !== null && one.load_n !== undefined)) found.push(["load", "load (N)"]);
     const wanted = result.steps.filter((n) => !channels.has(n));
-    // what steps carry is in their own documents; a few at a time
+    // channels are in the steps' own documents; a few at a time
     for (let k = 0; k < wanted.length; k += 8) {
       await Promise.all(wanted.slice(k, k + 8).map(async (n) => channels.set(n, await api.get(`/tests/${result.testId}/steps/${n}`).catch(() => ({})))));
     }
@@ -378,10 +378,10 @@ export function gauges(screen) {
     extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
     const unit = strain ? "µm/m" : "mm";
     await plot("extensometer", extChart, { x: over.selectedOptions[0].text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
-    const told = (/** @type {Row} */ one, /** @type {number} */ k) => { const v = of(one, k, "value"); const s = of(one, k, "sigma"); return v === null ? one.each[k]?.missing?.replace(/_/g, " ") || "–" : `${num(v * factor, 5)}${s === null ? "" : ` ± ${num(s * factor, 2)}`}`; };
+    const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => { const v = of(one, k, "value"); const s = of(one, k, "sigma"); return v === null ? one.each[k]?.missing?.replace(/_/g, " ") || "–" : `${num(v * factor, 5)}${s === null ? "" : ` ± ${num(s * factor, 2)}`}`; };
     replace(extTable, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(over.selectedOptions[0].text, (/** @type {Row} */ one) => num(one.x, 6))]),
-      ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => told(one, k))),
+      ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => valueText(one, k))),
     ], rows, { caption: "With one standard uncertainty" }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
   }
@@ -389,7 +389,7 @@ export function gauges(screen) {
   const areaBox = h("div", { "data-role": "area" });
   async function readArea() {
     if (!state.area || !screen.info) return;
-    if (screen.info.component !== null) return void replace(areaBox, h("p.quiet", "An area reads variables of one number a point; choose another field."));
+    if (screen.info.component !== null) return void replace(areaBox, h("p.quiet", "An area needs a scalar field; choose another field."));
     const { name } = screen.info;
     if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
     const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }));
@@ -399,7 +399,7 @@ export function gauges(screen) {
     areaBox.dataset.answer = JSON.stringify(answer.steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], ["± σ", (one) => cell(one, "mean_sigma", 2), { numeric: true }],
-      ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Smallest", (one) => cell(one, "min"), { numeric: true }], ["Largest", (one) => cell(one, "max"), { numeric: true }],
+      ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Min", (one) => cell(one, "min"), { numeric: true }], ["Max", (one) => cell(one, "max"), { numeric: true }],
       ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas?.[0].valid} of ${one.areas?.[0].points}`), { numeric: true }],
     ], answer.steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle` }));
   }

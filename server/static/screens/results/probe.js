@@ -1,4 +1,4 @@
-// The pinned point: every number that the service has of it.
+// The pinned point: all its values.
 import { h, svg, replace, table, num, badge, STATE_KIND } from "../../lib/dom.js";
 import { shownUnit } from "./analysis.js";
 
@@ -29,19 +29,19 @@ export function pinned(screen, answer) {
     h("div.spread", h("span", `row ${answer.row}, column ${answer.col}, step ${answer.step}`), badge(answer.status.replace(/_/g, " "), STATE_KIND[answer.status] ?? "warn")),
     table([
       ["Number", (row) => row.name], ["Value ± σ", (row) => `${num(row.value, 5)}${row.sigma === null ? "" : ` ± ${num(row.sigma, 2)}`}${row.unit ? `\u00a0${row.unit}` : ""}`, { numeric: true }],
-    ], rows, { caption: "Every number of the point" }));
+    ], rows, { caption: "All values of the point" }));
   mark(screen);
 }
 
 /**
- * Mark the pinned point where it lies in the picture that is shown now.
+ * Mark the pinned point in the picture.
  * @param {Viewer} screen
  */
 export function mark(screen) {
   const { view, now } = screen.map;
   view.svg.querySelector(".pin")?.remove();
   if (screen.state.pinned === undefined || !now) return;
-  const [x, y] = screen.map.placeOf(screen.state.pinned);
+  const [x, y] = screen.map.positionOf(screen.state.pinned);
   if (!Number.isFinite(x)) return;
   view.svg.append(svg("g", { class: "pin" },
     ...[["#000", 4], ["#fff", 1.5]].map(([stroke, width]) => svg("path", { d: `M${x - 6} ${y}H${x + 6}M${x} ${y - 6}V${y + 6}`, stroke, "stroke-width": width, "vector-effect": "non-scaling-stroke", fill: "none" }))));

@@ -1,4 +1,4 @@
-// The measured surface in space with the field on it: turned by mouse, finger or keys; its displacement magnified.
+// The measured surface in space with the field on it: rotated by mouse, finger or keys; its displacement magnified.
 import { h, replace, field, number, action, tick } from "../../lib/dom.js";
 import { ENTRIES } from "../../lib/colour.js";
 
@@ -33,8 +33,8 @@ function round125(value) {
  * @param {number} low
  * @param {number} high
  */
-function marks(low, high, most = 5) {
-  const rough = (high - low) / most;
+function marks(low, high, max = 5) {
+  const rough = (high - low) / max;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = ([1, 2, 5, 10].find((one) => one * power >= rough) ?? 10) * power;
   const out = [];
@@ -46,26 +46,26 @@ function marks(low, high, most = 5) {
 export async function surface(screen) {
   const { THREE, OrbitControls } = await three();
   const { result, map, scale } = screen;
-  const place = h("div.space", { tabindex: 0, role: "application", "aria-label": "Surface in space: arrow keys turn it, + and − zoom, 0 puts it back" });
+  const space = h("div.space", { tabindex: 0, role: "application", "aria-label": "Surface in space: arrow keys rotate, + and − zoom, 0 resets the view" });
   const labels = h("div.labels", { "aria-hidden": "true" });
   const magnification = number(null, { min: 0, "data-role": "magnification" });
   const depth = number(1, { min: 0 });
   const grid = h("input", { type: "checkbox" });
   const note = h("span.quiet", { role: "status" });
-  const reset = h("button", { type: "button", onclick: () => look() }, "Reset view");
+  const reset = h("button", { type: "button", onclick: () => resetView() }, "Reset view");
   const root = h("div.panel", { "data-role": "surface" },
-    h("div.row", field("Displacement ×", magnification), field("Depth ×", depth), h("label.check", grid, "grid lines"), reset, action("Save picture", save), note), place);
+    h("div.row", field("Displacement ×", magnification), field("Depth ×", depth), h("label.check", grid, "grid lines"), reset, action("Save picture", save), note), space);
 
   /** @type {import("three").WebGLRenderer} */
   let renderer;
   try {
     renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
   } catch {
-    replace(place, h("p", "This browser cannot draw in space (no WebGL). The map over the image shows the same field."));
+    replace(space, h("p", "This browser cannot draw in space (no WebGL). The map over the image shows the same field."));
     return { root, close: () => {}, update: async () => {} };
   }
   renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-  place.append(renderer.domElement, labels);
+  space.append(renderer.domElement, labels);
   const scene = new THREE.Scene();
   const camera = new THREE.PerspectiveCamera(30, 1, 0.01, 1e6);
   const controls = new OrbitControls(camera, renderer.domElement);
@@ -106,12 +106,12 @@ export async function surface(screen) {
 
   const factor = (/** @type {HTMLInputElement} */ input, /** @type {number} */ usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Number(input.value));
 
-  /** Triangles over cells whose corners all have a place: never over a missing point or a cut. */
+  /** Triangles over cells whose corners all have a position: never over a missing point or a cut. */
   function build() {
     if (!held) return false;
     const { grid: g, position, motion } = held;
     const count = g.x.length;
-    let most = 0;
+    let largest = 0;
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
     for (let i = 0; i < count; i += 1) {
@@ -120,11 +120,11 @@ export async function surface(screen) {
         if (position[k][i] < low[k]) low[k] = position[k][i];
         if (position[k][i] > high[k]) high[k] = position[k][i];
       }
-      if (motion) most = Math.max(most, Math.hypot(motion[0][i], motion[1][i], motion[2][i]));
+      if (motion) largest = Math.max(largest, Math.hypot(motion[0][i], motion[1][i], motion[2][i]));
     }
     if (!(high[0] >= low[0])) return false;
     const size = Math.hypot(...[0, 1, 2].map((k) => high[k] - low[k])) || 1;
-    const usual = most > 0 ? Math.max(round125((0.12 * size) / most), 1) : 1;
+    const usual = largest > 0 ? Math.max(round125((0.12 * size) / largest), 1) : 1;
     magnification.placeholder = String(usual);
     magnification.disabled = !motion;
     const times = motion ? factor(magnification, usual) : 0;
@@ -175,12 +175,12 @@ export async function surface(screen) {
     wire.geometry.setAttribute("position", attribute);
     wire.geometry.setIndex(lines);
     wire.visible = grid.checked;
-    // a flat surface still needs a box to stand in
+    // a flat surface needs a box of some depth
     for (const one of span) if (one[1] - one[0] < 0.02 * size) { const m = (one[0] + one[1]) / 2; one[0] = m - 0.01 * size; one[1] = m + 0.01 * size; }
     bounds = { span, origin, size, times, deep };
     axes(bounds);
-    place.dataset.triangles = String(triangles.length / 3);
-    place.dataset.magnification = String(times);
+    space.dataset.triangles = String(triangles.length / 3);
+    space.dataset.magnification = String(times);
     note.textContent = `${motion ? `displacement × ${tick(times)}${times === 1 ? " (as it is)" : ""}` : "shape; this step has no displacement"}${deep === 1 ? "" : `, depth × ${tick(deep)}`}; axes in mm`;
     return true;
   }
@@ -206,11 +206,11 @@ export async function surface(screen) {
       edge(a, b);
       return a.map((x, k) => x + 3 * out[k] * long);
     };
-    const most = (/** @type {number} */ axis) => Math.max(2, Math.min(5, Math.round((6 * (span[axis][1] - span[axis][0])) / size)));
+    const maxMarks = (/** @type {number} */ axis) => Math.max(2, Math.min(5, Math.round((6 * (span[axis][1] - span[axis][0])) / size)));
     // X along the lower edge of the picture, Y along the left one, Z along the far left corner; Y_sys points down in it
-    for (const value of marks(...span[0], most(0))) ticks.push({ at: put(0, value, corner(0, 1, 0), [0, 1, 0]), text: tick(value) });
-    for (const value of marks(...span[1], most(1))) ticks.push({ at: put(1, value, corner(0, 0, 0), [-1, 0, 0]), text: tick(value) });
-    for (const value of times > 1 || deep !== 1 ? [] : marks(...span[2], most(2))) ticks.push({ at: put(2, value, corner(1, 1, 0), [1, 0, 0]), text: tick(value) });
+    for (const value of marks(...span[0], maxMarks(0))) ticks.push({ at: put(0, value, corner(0, 1, 0), [0, 1, 0]), text: tick(value) });
+    for (const value of marks(...span[1], maxMarks(1))) ticks.push({ at: put(1, value, corner(0, 0, 0), [-1, 0, 0]), text: tick(value) });
+    for (const value of times > 1 || deep !== 1 ? [] : marks(...span[2], maxMarks(2))) ticks.push({ at: put(2, value, corner(1, 1, 0), [1, 0, 0]), text: tick(value) });
     /** @type {(axis: number, from: number[], out: Triple) => number[]} */
     const mid = (axis, from, out) => { const a = [...from]; a[axis] = (span[axis][0] + span[axis][1]) / 2 - origin[axis]; return a.map((x, k) => x + 7 * out[k] * long); };
     ticks.push({ at: mid(0, corner(0, 1, 0), [0, 1, 0]), text: "X (mm)" }, { at: mid(1, corner(0, 0, 0), [-1, 0, 0]), text: "Y (mm)" },
@@ -240,8 +240,8 @@ export async function surface(screen) {
     for (let k = 0; k < triangles.length; k += 3) {
       const three_ = [triangles[k], triangles[k + 1], triangles[k + 2]];
       const each = three_.map((i) => values[i]);
-      const told = each.every(Number.isFinite) && (!flags || (each[0] === each[1] && each[1] === each[2]));
-      (told ? coloured : others).push(...three_);
+      const complete = each.every(Number.isFinite) && (!flags || (each[0] === each[1] && each[1] === each[2]));
+      (complete ? coloured : others).push(...three_);
     }
     mesh.geometry.setIndex(coloured.concat(others));
     mesh.geometry.clearGroups();
@@ -255,8 +255,8 @@ export async function surface(screen) {
     texture.needsUpdate = true;
   }
 
-  /** From where camera 1 stands: X to the right, Y down, a little from above. */
-  function look() {
+  /** View from the side of camera 1: X to the right, Y down, a little from above. */
+  function resetView() {
     if (!bounds) return;
     const far = bounds.size * 1.75;
     camera.up.set(0, -1, 0);
@@ -276,8 +276,8 @@ export async function surface(screen) {
     waiting = true;
     requestAnimationFrame(() => {
       waiting = false;
-      const width = place.clientWidth;
-      const height = place.clientHeight;
+      const width = space.clientWidth;
+      const height = space.clientHeight;
       if (!width || !height) return;
       const size = renderer.getSize(new THREE.Vector2());
       if (size.x !== width || size.y !== height) {
@@ -294,7 +294,7 @@ export async function surface(screen) {
         span.style.transform = `translate(${((v.x + 1) / 2) * width}px, ${((1 - v.y) / 2) * height}px) translate(-50%, -50%)`;
         span.hidden = v.z > 1;
       });
-      place.dataset.drawn = `${map.now?.n} ${map.now?.info.key}`;
+      space.dataset.drawn = `${map.now?.n} ${map.now?.info.key}`;
     });
   }
 
@@ -319,18 +319,18 @@ export async function surface(screen) {
       const first = !bounds;
       held = got;
       if (!build()) {
-        note.textContent = "No point of this step was measured.";
+        note.textContent = "No point of this step is valid.";
         return;
       }
       paint();
-      if (first) look();
+      if (first) resetView();
     } else paint();
     draw();
   }
 
   for (const input of [magnification, depth]) input.addEventListener("change", () => { if (held && build()) { paint(); draw(); } });
   grid.addEventListener("change", () => { wire.visible = grid.checked; draw(); });
-  place.addEventListener("keydown", (event) => {
+  space.addEventListener("keydown", (event) => {
     const turn = TURNS[event.key];
     const off = camera.position.clone().sub(controls.target);
     if (turn) {
@@ -340,7 +340,7 @@ export async function surface(screen) {
       off.setFromSpherical(polar).applyQuaternion(new THREE.Quaternion().setFromUnitVectors(camera.up, new THREE.Vector3(0, 1, 0)).invert());
     } else if (event.key === "+" || event.key === "=") off.multiplyScalar(1 / 1.2);
     else if (event.key === "-") off.multiplyScalar(1.2);
-    else if (event.key === "0") { look(); event.preventDefault(); return; }
+    else if (event.key === "0") { resetView(); event.preventDefault(); return; }
     else return;
     event.preventDefault();
     camera.position.copy(controls.target).add(off);
@@ -348,7 +348,7 @@ export async function surface(screen) {
     draw();
   });
   const observer = new ResizeObserver(() => draw());
-  observer.observe(place);
+  observer.observe(space);
   const close = () => {
     asked += 1;
     observer.disconnect();

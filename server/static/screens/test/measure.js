@@ -1,4 +1,4 @@
-// Where and how a test is measured: region, seeds, subset over the speckle, texture, settings, start.
+// Region, seeds, subset, texture, settings and start of an analysis.
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
 import { greyOf } from "../../widgets/grey.js";
@@ -47,7 +47,7 @@ export async function measurePanel(id, test, ends, done) {
 
     const reference = select([], 0, { "aria-label": "Reference step" });
     const subset = number(33, { min: 9, max: 255, step: 2 });
-    const step = number(10, { min: 1, max: 1000, step: 1 });
+    const spacing = number(10, { min: 1, max: 1000, step: 1 });
     const showSample = h("input", { type: "checkbox", checked: true });
     const showTexture = h("input", { type: "checkbox" });
     const legend = h("span.quiet");
@@ -70,36 +70,36 @@ export async function measurePanel(id, test, ends, done) {
       const parts = [];
       const [cx, cy] = editor.middle().map(Math.round);
       const half = Number(subset.value) / 2;
-      const apart = Number(step.value);
+      const spacingPx = Number(spacing.value);
       /** @type {(d: string, colour: string, width: number, more?: import("#dom").Attributes, dashes?: number[]) => SVGElement} */
       const path = (d, colour, width, more = {}, dashes = []) => svg("path", { d, ...stroke(colour, width, dashes), ...more });
-      if (showSample.checked && half > 0 && apart > 0) {
+      if (showSample.checked && half > 0 && spacingPx > 0) {
         const square = (/** @type {number} */ x, /** @type {number} */ y) => `M${x - half} ${y - half}h${2 * half}v${2 * half}h${-2 * half}z`;
-        parts.push(path(square(cx + apart, cy) + square(cx, cy + apart), "#33c6ff", 1, {}, [4, 3]), path(square(cx, cy), "#33c6ff", 2, { "data-role": "subset" }));
+        parts.push(path(square(cx + spacingPx, cy) + square(cx, cy + spacingPx), "#33c6ff", 1, {}, [4, 3]), path(square(cx, cy), "#33c6ff", 2, { "data-role": "subset" }));
         const dots = [];
-        for (let i = -3; i <= 3; i += 1) for (let k = -3; k <= 3; k += 1) dots.push(`M${cx + i * apart} ${cy + k * apart}h0.001`);
+        for (let i = -3; i <= 3; i += 1) for (let k = -3; k <= 3; k += 1) dots.push(`M${cx + i * spacingPx} ${cy + k * spacingPx}h0.001`);
         parts.push(path(dots.join(""), "#33c6ff", 4, { "stroke-linecap": "round", "data-role": "points" }));
       }
       replace(sample, parts);
     }
 
     let asked = 0;
-    async function judge() {
+    async function rateTexture() {
       asked += 1;
       const mine = asked;
       const region = editor.region();
       if (!region) {
-        replace(texture, h("p.quiet", "Draw a region to see whether its texture carries such subsets."));
+        replace(texture, h("p.quiet", "Draw a region to rate its speckle quality for such subsets."));
         return;
       }
       try {
-        const told = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), spacing_px: Number(step.value), noise_id: noiseChoice.value || null });
+        const rated = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), noise_id: noiseChoice.value || null });
         if (mine !== asked) return;
         replace(texture,
-          h("p", badge(`${told.level} texture`, LEVEL[told.level] ?? ""), ` ${num(100 * told.good_share, 3)} % of ${count(told.subsets)} subsets below ${told.good_px} px, ${num(100 * told.usable_share, 3)} % below ${told.usable_px} px; median ${quantity(told.median_error_px, "px", 2)} at a noise of ${num(told.noise_grey, 3)} grey levels.`),
-          told.proposed_subset_px && told.proposed_subset_px !== told.subset_px ? h("p.row", `The smallest subset that would do: ${told.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = String(told.proposed_subset_px); changed(); } }, "Take it")) : null,
-          told.proposed_subset_px ? null : h("p", "No subset up to 91 px would do: the pattern is too faint, or too coarse."),
-          h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${told.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${told.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], told.sizes, { caption: "Share of the region's subsets with an expected random error" })));
+          h("p", badge(`${rated.level} speckle quality`, LEVEL[rated.level] ?? ""), ` ${num(100 * rated.good_share, 3)} % of ${count(rated.subsets)} subsets with an expected error below ${rated.good_px} px, ${num(100 * rated.usable_share, 3)} % below ${rated.usable_px} px; median ${quantity(rated.median_error_px, "px", 2)} at a noise of ${num(rated.noise_grey, 3)} grey levels.`),
+          rated.proposed_subset_px && rated.proposed_subset_px !== rated.subset_px ? h("p.row", `Min. subset for this texture: ${rated.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = String(rated.proposed_subset_px); changed(); } }, `Use ${rated.proposed_subset_px} px`)) : null,
+          rated.proposed_subset_px ? null : h("p", "No subset up to 91 px is sufficient: the contrast is too low, or the speckles are too coarse."),
+          h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${rated.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${rated.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], rated.sizes, { caption: "Share of the region's subsets with an expected random error" })));
       } catch (error) {
         if (mine === asked) replace(texture, problemText(error));
       }
@@ -128,12 +128,12 @@ export async function measurePanel(id, test, ends, done) {
       if (question === seedsAsked) return;
       seedsAsked = question;
       if (!seeds) {
-        editor.tellLines([]);
+        editor.setLines([]);
         return;
       }
       try {
         const answer = await api.post(`/tests/${id}/seeds:check`, { seeds, seeds_cam2, reference: Number(reference.value) });
-        if (question === seedsAsked) editor.tellLines(answer.seeds);
+        if (question === seedsAsked) editor.setLines(answer.seeds);
       } catch (error) {
         notify(error);
       }
@@ -147,9 +147,9 @@ export async function measurePanel(id, test, ends, done) {
       drawGauge();
       checkSeeds();
       clearTimeout(timer);
-      timer = setTimeout(() => { judge(); if (showTexture.checked) layTexture().catch(notify); }, 300);
+      timer = setTimeout(() => { rateTexture(); if (showTexture.checked) layTexture().catch(notify); }, 300);
     }
-    for (const input of [subset, step]) input.addEventListener("input", () => Number(input.value) > 0 && changed());
+    for (const input of [subset, spacing]) input.addEventListener("input", () => Number(input.value) > 0 && changed());
     showSample.addEventListener("change", drawSample);
     showTexture.addEventListener("change", () => layTexture().catch(notify));
     views[0].image.addEventListener("load", drawSample);
@@ -172,7 +172,7 @@ export async function measurePanel(id, test, ends, done) {
     const label = h("input", { type: "text", maxlength: 300 });
     const gauge = h("small.hint");
     function drawGauge() {
-      gauge.textContent = strain.checked ? `Virtual gauge: ${num((Number(window_.value) - 1) * Number(step.value) + Number(subset.value), 4)} px wide.` : "";
+      gauge.textContent = strain.checked ? `Virtual strain gauge: ${num((Number(window_.value) - 1) * Number(spacing.value) + Number(subset.value), 4)} px wide.` : "";
     }
     for (const input of [window_, strain]) input.addEventListener("input", drawGauge);
 
@@ -184,7 +184,7 @@ export async function measurePanel(id, test, ends, done) {
       if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
       /** @type {Request} */
       const body_ = {
-        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(step.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
+        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
         reference: Number(reference.value), reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
         smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: Number(order.value), tensor: tensor.value }) : null,
       };
@@ -221,16 +221,16 @@ export async function measurePanel(id, test, ends, done) {
       h("div.grid.two", { style: { marginTop: "var(--gap)" } },
         h("div",
           h("fieldset", h("legend", "Region and seeds"), editor.list,
-            h("p.hint", "Seeds are found by themselves where none are given. Where the texture repeats itself, click three points that are no line, each in both views.")),
+            h("p.hint", "Seeds are searched for automatically if none are given. On a periodic texture, click three points that are not on one line, each in both views.")),
           h("fieldset", h("legend", "Subsets and texture"),
-            h("div.fields", field("Subset", subset, "px", "odd"), field("Step", step, "px", "from point to point")),
-            h("div.row", h("label.check", showSample, "draw them to scale"), h("button", { type: "button", onclick: () => views[0].lookAt(...editor.middle(), 6) }, "Look at them"), h("label.check", showTexture, "texture map"), legend), texture)),
+            h("div.fields", field("Subset", subset, "px", "odd"), field("Spacing", spacing, "px", "distance of neighbouring points")),
+            h("div.row", h("label.check", showSample, "draw them to scale"), h("button", { type: "button", onclick: () => views[0].centreOn(...editor.middle(), 6) }, "Zoom to the subsets"), h("label.check", showTexture, "texture map"), legend), texture)),
         h("div",
-          h("fieldset", h("legend", "How it is measured"),
-            h("div.fields", field("Measure", kind), field("Patch", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Noise", noiseChoice),
+          h("fieldset", h("legend", "Correlation"),
+            h("div.fields", field("Measure", kind), field("Shape function", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Noise", noiseChoice),
               field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
           h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge),
-          h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "go on with each step that lands"),
+          h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
           h("div.row", { style: { marginTop: "0.5rem" } }, start), progress)));
     editor.use("rectangle");
     editor.drawList();
@@ -251,7 +251,7 @@ export async function measurePanel(id, test, ends, done) {
 }
 
 /**
- * "1-5, 8" -> [1, 2, 3, 4, 5, 8]; nothing where all are meant.
+ * "1-5, 8" -> [1, 2, 3, 4, 5, 8]; null for all.
  * @param {string} text
  */
 export function stepList(text) {
@@ -259,7 +259,7 @@ export function stepList(text) {
   const out = [];
   for (const part of text.split(/[\s,;]+/).filter(Boolean)) {
     const found = /^(\d+)(?:[-–](\d+))?$/.exec(part);
-    if (!found) throw api.problemOf({ cause: `“${part}” is no step.`, remedy: "Write numbers and spans between commas: 1-5, 8." });
+    if (!found) throw api.problemOf({ cause: `“${part}” is not a step.`, remedy: "Write numbers and spans between commas: 1-5, 8." });
     const last = Number(found[2] ?? found[1]);
     for (let n = Number(found[1]); n <= last && out.length <= 10000; n += 1) out.push(n);
   }

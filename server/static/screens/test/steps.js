@@ -1,4 +1,4 @@
-// A test's steps: capture with load and channels, what the pair is worth, thumbnails, import of existing pairs.
+// A test's steps: capture with load and channels, quality of the pair, thumbnails, import of existing pairs.
 import * as api from "../../lib/api.js";
 import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "../../lib/dom.js";
 
@@ -10,7 +10,7 @@ import { h, replace, field, number, action, table, badge, num, quantity, when, n
 /** @type {Record<string, string>} */
 const KIND = { ok: "good", dark: "warn", blurred: "warn", low_texture: "warn", saturated: "warn", blank: "bad", cameras_off_zero: "bad" };
 /** @type {Record<string, string>} */
-const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "little texture", saturated: "saturated", blank: "nothing to see", cameras_off_zero: "cameras are off their calibrated place" };
+const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "little texture", saturated: "saturated", blank: "blank", cameras_off_zero: "cameras off their calibrated position" };
 
 /**
  * @param {string} id
@@ -48,35 +48,35 @@ export function stepsPanel(id, test, ends, reread) {
   /** @param {number} n */
   async function show(n) {
     chosen = n;
-    tell(await api.get(`/tests/${id}/steps/${n}`));
+    drawDetail(await api.get(`/tests/${id}/steps/${n}`));
     for (const button of thumbs.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.closest(`[data-step="${n}"]`) !== null));
   }
 
   /** @param {Step} step */
-  function tell(step) {
+  function drawDetail(step) {
     const quality = /** @type {Partial<NonNullable<Step["quality"]>>} */ (step.quality ?? {});
     /** @type {(readonly [string, (q: Exclude<NonNullable<Step["quality"]>["cam1"], undefined | null>) => import("#dom").Part])[]} */
     const rows = [
-      ["verdict", (q) => badge(WORDS[q.code] ?? q.code, KIND[q.code] ?? "warn")], ["mean grey", (q) => `${num(q.mean_grey, 4)}${q.mean_share ? ` (${num(100 * q.mean_share, 3)} %)` : ""}`],
+      ["quality", (q) => badge(WORDS[q.code] ?? q.code, KIND[q.code] ?? "warn")], ["mean grey", (q) => `${num(q.mean_grey, 4)}${q.mean_share ? ` (${num(100 * q.mean_share, 3)} %)` : ""}`],
       ["saturated", (q) => quantity(100 * q.saturated_share, "%", 3)], ["contrast", (q) => quantity(q.contrast_grey, "grey", 3)],
       ["texture", (q) => quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", (q) => num(q.focus, 3)], ["exposure", (q) => quantity(q.exposure_ms, "ms")], ["gain", (q) => quantity(q.gain_db, "dB")],
     ];
     const channels = Object.entries(step.channels ?? {}).map(([name, value]) => `${name} ${num(value, 6)}`).join(", ");
     replace(detail,
-      h("div.spread", h("h3", `Step ${step.n}${step.label ? `: ${step.label}` : ""}`), h("span.row", badge(WORDS[quality.code ?? ""] ?? quality.code ?? "not judged", KIND[quality.code ?? ""] ?? ""),
+      h("div.spread", h("h3", `Step ${step.n}${step.label ? `: ${step.label}` : ""}`), h("span.row", badge(WORDS[quality.code ?? ""] ?? quality.code ?? "not rated", KIND[quality.code ?? ""] ?? ""),
         action("Delete …", async () => {
-          if (await ask(`Delete step ${step.n}?`, h("p", "It goes to the trash; its number is not given again, and analyses that used it are stale."), [["Cancel", null], ["Delete", "yes"]])) {
+          if (await ask(`Delete step ${step.n}?`, h("p", "It is moved to the trash; its number is not used again, and analyses that used it become out of date."), [["Cancel", null], ["Delete", "yes"]])) {
             await api.remove(`/tests/${id}/steps/${step.n}`);
             replace(detail);
             await refresh();
           }
         }))),
       h("p.quiet", [when(step.captured_utc), step.load_n !== null && step.load_n !== undefined ? `load ${quantity(step.load_n, "N", 6)}` : null, channels || null, step.skew_ms !== null && step.skew_ms !== undefined ? `skew ${quantity(step.skew_ms, "ms", 3)}${quality.max_skew_ms ? ` of ${quantity(quality.max_skew_ms, "ms", 3)} allowed` : ""}` : null, (step.frames ?? 1) > 1 ? `${step.frames} frames averaged` : null].filter(Boolean).join(" · ")),
-      table([["Figure", (row) => row[0], { unseen: true }], ["cam1", (row) => (quality.cam1 ? row[1](quality.cam1) : "–"), { numeric: true }], ["cam2", (row) => (quality.cam2 ? row[1](quality.cam2) : "–"), { numeric: true }]], rows, { caption: "What the pair is worth" }));
+      table([["Figure", (row) => row[0], { unseen: true }], ["cam1", (row) => (quality.cam1 ? row[1](quality.cam1) : "–"), { numeric: true }], ["cam2", (row) => (quality.cam2 ? row[1](quality.cam2) : "–"), { numeric: true }]], rows, { caption: "Quality of the pair" }));
   }
 
   const root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
-    h("div.grid.side", h("div", thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; tell(step); await refresh(); }, ends, refresh)));
+    h("div.grid.side", h("div", thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
   draw();
   return { root, refresh, onchange: (/** @type {typeof changed} */ listener) => { changed = listener; } };
 }
@@ -108,13 +108,13 @@ function capture(id, done, ends, refresh) {
     const bar = h("progress", { max: 1, "aria-label": "Progress of the burst" });
     replace(progress, bar, action("Cancel", () => api.post(`/jobs/${made.job.id}/cancel`), { kind: "danger" }));
     const ended = await api.finished(made.job.id, { signal: stopped.signal, onprogress: (job) => { if (job.progress?.total) bar.value = job.progress.done / job.progress.total; } });
-    replace(progress, ["succeeded", "cancelled"].includes(ended.state) ? h("p", `${count.value} steps were asked for; see above.`) : problemText(api.jobProblem(ended)));
+    replace(progress, ["succeeded", "cancelled"].includes(ended.state) ? h("p", `${count.value} steps were requested; see above.`) : problemText(api.jobProblem(ended)));
     return refresh();
   }, { kind: "primary" });
   for (const input of [label, load, channels]) input.addEventListener("keydown", (event) => event.key === "Enter" && take.click());
   return h("div", { role: "group", "aria-label": "Capture" }, h("h3", "Capture a step"),
     h("div.fields", field("Label", label), field("Load", load, "N"), field("Frames averaged", frames)), field("Channels", channels, "", "name = number, between commas"),
-    h("details", h("summary", "A burst"), h("div.fields", field("Steps", count), field("One every", interval, "ms"))), h("div.row", take), progress);
+    h("details", h("summary", "A burst"), h("div.fields", field("Steps", count), field("Interval", interval, "ms"))), h("div.row", take), progress);
 }
 
 /**
@@ -126,7 +126,7 @@ export function parseChannels(text) {
   const out = {};
   for (const part of text.split(/[,;\n]+/).map((one) => one.trim()).filter(Boolean)) {
     const [name, value, ...more] = part.split("=").map((one) => one.trim());
-    if (!name || more.length || !value || !Number.isFinite(Number(value))) throw api.problemOf({ cause: `“${part}” is no channel.`, remedy: "Write name = number, with a point, between commas." });
+    if (!name || more.length || !value || !Number.isFinite(Number(value))) throw api.problemOf({ cause: `“${part}” is not a channel.`, remedy: "Write name = number, with a point, between commas." });
     out[name] = Number(value);
   }
   return out;
@@ -200,7 +200,7 @@ function importPairs(id, refresh, ends) {
         bar.value = ready;
       }
     } finally {
-      replace(progress, h("p", badge(ready === pairs.length ? "imported" : "stopped", ready === pairs.length ? "good" : "warn"), ` ${ready} of ${pairs.length} pairs are steps now.`));
+      replace(progress, h("p", badge(ready === pairs.length ? "imported" : "stopped", ready === pairs.length ? "good" : "warn"), ` ${ready} of ${pairs.length} pairs imported as steps.`));
       await refresh();
     }
   }, { kind: "primary" });
