@@ -65,7 +65,7 @@ def lattice(scene_name, load):
     return replace(bench.scene(scene_name, load, MOTION), texture=dots(pitch_mm=0.5, diameter_mm=0.25, rim_mm=0.03))
 
 
-def shoot(scene):
+def capture(scene):
     rng = np.random.default_rng(3)
     out = []
     for camera in (bench.pair().cam1, bench.pair().cam2):
@@ -76,20 +76,20 @@ def shoot(scene):
 
 @pytest.mark.fault(36)
 def test_a_texture_that_repeats_gives_no_start():
-    reference = ReferencePair(bench.pair(), *shoot(lattice("block", 0.0)))
+    reference = ReferencePair(bench.pair(), *capture(lattice("block", 0.0)))
     grid = bench.grid(spacing_px=12.0)
     with pytest.raises(SeedError):
         reference.shape(grid, OPTIONS)
     # a user who says which dot is which gets the shape, but no guess at how many dots it moved
     xy = np.array([[130.0, 110.0]])
-    place = bench.truth(grid, lattice("block", 0.0)).xyz_mm.reshape(-1, 3)
+    position = bench.truth(grid, lattice("block", 0.0)).xyz_mm.reshape(-1, 3)
     nearest = np.argmin(np.linalg.norm(grid.xy_px.reshape(-1, 2) - xy, axis=1))
-    seed = Seed(tuple(grid.xy_px.reshape(-1, 2)[nearest]), tuple(bench.pair().cam2.project(place[nearest]).xy))
+    seed = Seed(tuple(grid.xy_px.reshape(-1, 2)[nearest]), tuple(bench.pair().cam2.project(position[nearest]).xy))
     shape = reference.shape(grid, OPTIONS, seeds=[seed])
     assert shape.valid.mean() > 0.9
-    assert np.nanmax(np.abs(shape.xyz_mm.reshape(-1, 3) - place)) < 0.02
+    assert np.nanmax(np.abs(shape.xyz_mm.reshape(-1, 3) - position)) < 0.02
     with pytest.raises(SeedError):
-        reference.motion(*shoot(lattice("block", 1.0)), grid, OPTIONS, shape=shape)
+        reference.motion(*capture(lattice("block", 1.0)), grid, OPTIONS, shape=shape)
 
 
 @pytest.mark.parametrize("subset_px", [9, 15, 21, 33])
@@ -97,5 +97,5 @@ def test_speckles_do_not_repeat_and_dots_do(subset_px):
     xy = np.stack(np.meshgrid(np.arange(60, 200, 20), np.arange(60, 170, 20)), -1).reshape(-1, 2).astype(float)
     for seed in range(3):
         painted = replace(bench.scene("block"), texture=speckle(diameter_mm=0.15, seed=seed))
-        assert not repeats(shoot(painted)[0], xy, subset_px=subset_px).any()
-    assert repeats(shoot(lattice("block", 0.0))[0], xy, subset_px=subset_px).all()
+        assert not repeats(capture(painted)[0], xy, subset_px=subset_px).any()
+    assert repeats(capture(lattice("block", 0.0))[0], xy, subset_px=subset_px).all()

@@ -15,7 +15,7 @@ from tests.bench.speed.assembly import HERE, count_loop, innermost_loops
 from tests.bench.speed.ceilings import Ceilings, CompiledLoop, fma_ir, gather_ir, load_ir, rows_ir, vector_width
 from tests.bench.speed.kernel import KINDS, Costs, Rate, make_kernel_scene
 from tests.bench.speed.page import Report
-from tests.bench.speed.pairs import BenchScene, Errors, Request, judge, make_scene
+from tests.bench.speed.pairs import BenchScene, Errors, Request, compare, make_scene
 from tests.bench.speed.parts import Parts, measure_parts
 from tests.bench.speed.peer import Outcome, Run, peer_python, run_peer
 
@@ -46,7 +46,7 @@ def test_worker_measures_the_scene(scene: BenchScene, tmp_path: Path) -> None:
     out = tmp_path / "out"
     worker.measure(job, run, out)
     fields = worker.read_fields(out, 1)
-    errors = judge(scene, 33, fields["xyz"], fields["uvw"])
+    errors = compare(scene, 33, fields["xyz"], fields["uvw"])
     assert errors.lost == 0
     # 33 um a pixel, 1089 px a subset, noise 2: a hundredth of a pixel would be a blunder
     assert (errors.sd_um > 0.0).all()
@@ -59,7 +59,7 @@ def test_judge_counts_lost_points_and_sees_offsets(scene: BenchScene) -> None:
     pose = scene.pair.cam1.cam_from_sys
     uvw_cam, xyz_cam = uvw @ pose.rotation.T, pose.apply(xyz + np.array([0.0, 0.0, 0.002]))
     uvw_cam[0, 3] = np.nan
-    errors = judge(scene, 33, xyz_cam, uvw_cam)
+    errors = compare(scene, 33, xyz_cam, uvw_cam)
     assert errors.lost == 1
     np.testing.assert_allclose(errors.mean_um, [0.0, 0.0, 0.0, 2.0], atol=1e-9)
 

@@ -91,8 +91,8 @@ def test_the_command_line_says_it_once(tmp_path: Path, capsys: pytest.CaptureFix
         str(tmp_path / "out"),
     ]
     assert main(arguments) == 0
-    told = capsys.readouterr()
-    assert (told.out + told.err).count("calibrate again") == 1
+    printed = capsys.readouterr()
+    assert (printed.out + printed.err).count("calibrate again") == 1
     steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
     assert [step["epipolar_check"]["level"] for step in steps] == ["failed"] * 3
     assert steps[0]["epipolar_check"]["own_px"] == pytest.approx(0.01)

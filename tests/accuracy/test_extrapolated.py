@@ -72,7 +72,7 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
         ]
         drawn_pair = StereoPair(*cameras)
         # least squares in the images, as the prediction has it: one step from the true place
-        places = []
+        positions = []
         for points, (xy1, xy2) in zip((before, now), seen, strict=True):
             A = np.concatenate([c.point_jacobian(points) for c in cameras], axis=-2)
             r = np.concatenate(
@@ -82,8 +82,10 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
                 ],
                 axis=-1,
             )
-            places.append(points + np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(A, r, strict=True)]))
-        found.append(np.concatenate([places[0], places[1] - places[0]], axis=-1))
+            positions.append(
+                points + np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(A, r, strict=True)])
+            )
+        found.append(np.concatenate([positions[0], positions[1] - positions[0]], axis=-1))
     scatter = np.asarray(found).std(axis=0)
     np.testing.assert_allclose(np.sqrt(np.diagonal(predicted, axis1=1, axis2=2)), scatter, rtol=0.06)
 
@@ -116,9 +118,9 @@ def test_the_command_line_flags_them(tmp_path: Path) -> None:
     for n, load in enumerate((0.0, 1.0)):
         for name, image in zip(("cam1", "cam2"), take("block", load), strict=True):
             write_image(tmp_path / f"{name}_{n}.tif", image)
-    told = content()
-    told["target"] |= {"pitch_mm": 0.25}
-    (tmp_path / "calibration.json").write_text(json.dumps(told))
+    document = content()
+    document["target"] |= {"pitch_mm": 0.25}
+    (tmp_path / "calibration.json").write_text(json.dumps(document))
     arguments = [
         "measure",
         "--cam1",

@@ -84,10 +84,10 @@ def test_a_grid_rotated_too_far_is_refused_with_its_angle(alpha_deg: float) -> N
 
 def test_a_grid_of_unequal_counts_shows_a_turn_by_90_degrees() -> None:
     lying = GridTarget(pitch_mm=1.0, lines=(11, 9), line_width_mm=0.03)
-    standing = GridTarget(pitch_mm=1.0, lines=(9, 11), line_width_mm=0.03)
+    upright = GridTarget(pitch_mm=1.0, lines=(9, 11), line_width_mm=0.03)
     grey = _grey(CAMERA, lying)
     _accepted(grey, CAMERA, lying)
-    error = _refusal(grey, standing)
+    error = _refusal(grey, upright)
     assert error.code == "target_rotated"
     assert error.context["found"] == [11, 9]
 

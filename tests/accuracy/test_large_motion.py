@@ -27,7 +27,7 @@ def rig() -> Rig:
 
 @cache
 def reference() -> ReferencePair:
-    return ReferencePair(rig().pair, *rig().shoot(plane_scene(rig().texture(3)), seed=1, noise=2.0))
+    return ReferencePair(rig().pair, *rig().capture(plane_scene(rig().texture(3)), seed=1, noise=2.0))
 
 
 @pytest.mark.fault(39)
@@ -46,7 +46,7 @@ def test_it_is_found_again(in_plane: np.ndarray | None, motion: RigidTransform |
     still = plane_scene(rig().texture(3))
     moved = plane_scene(rig().texture(3), in_plane=in_plane, motion=motion)
     grid = PointGrid.rectangle(*REGION, spacing_px=15)
-    field = reference().motion(*rig().shoot(moved, seed=2, noise=2.0), grid, MeasureOptions(subset_px=33))
+    field = reference().motion(*rig().capture(moved, seed=2, noise=2.0), grid, MeasureOptions(subset_px=33))
     _, truth = true_points(still, moved, rig().pair.cam1, grid.xy_px)
     assert field.valid.mean() > 0.99
     error = np.linalg.norm(field.uvw_mm[field.valid] - truth[field.valid], axis=-1)
@@ -68,7 +68,7 @@ def test_stretched_copies_keep_their_places() -> None:
 
 def test_the_copies_are_what_finds_a_large_strain() -> None:
     moved = plane_scene(rig().texture(3), in_plane=np.diag([1.5, 0.8]))
-    now = detect(np.asarray(rig().shoot(moved, seed=2, noise=2.0)[0]))
+    now = detect(np.asarray(rig().capture(moved, seed=2, noise=2.0)[0]))
     image = np.asarray(reference().image1.pixels)
     box = (REGION[0], REGION[1], REGION[2], REGION[3])
     plain = len(scattered_motion(detect(image, box=box), now).xy_px)

@@ -23,7 +23,7 @@ from sim.rig import SimRig
 from sim.truth import truth_at
 from tests.accuracy import test_measure_crack as panel
 from tests.support import field_bench as bench
-from tests.support.cut_scenes import STILL, below, parted, reference, true_uvw
+from tests.support.cut_scenes import STILL, below, opened, reference, true_uvw
 from tests.support.requirements import ROOT
 
 OPTIONS = MeasureOptions(subset_px=21, patch="affine")
@@ -48,7 +48,7 @@ def test_both_lips_stand_up_to_the_line(kind: str) -> None:
     plain = bench.grid(spacing_px=5.0, margin_px=36.0)
     grid = plain.with_cracks([line])
     pair = ReferencePair(bench.pair(), *reference())
-    now = parted(side)
+    now = opened(side)
     field = pair.motion(*now, grid, OPTIONS)
     away = distance_px(grid.xy_px, Cuts([line]))
     lips, true = away < 10.0, true_uvw(grid.xy_px, side)
@@ -113,11 +113,11 @@ def test_what_shows_through_a_hole_counts_for_nothing() -> None:
     behind = bench.take("sphere", 0.0, seed=9)
     images = [
         [i.copy() for i in bench.take("block", 1.0, STILL, seed=1)],
-        [i.copy() for i in parted(lambda xy: xy[..., 0] < -1e9)],
+        [i.copy() for i in opened(lambda xy: xy[..., 0] < -1e9)],
     ]
-    places = bench.pair().cam2.project(truth_of(hole)).xy
+    positions = bench.pair().cam2.project(truth_of(hole)).xy
     for state in images:
-        for image, other, corners in zip(state, behind, (hole, places), strict=True):
+        for image, other, corners in zip(state, behind, (hole, positions), strict=True):
             # well inside: the rim of the body moves by a pixel or two
             (x0, y0), (x1, y1) = np.sort(corners, axis=0)[1:3].round().astype(int) + np.array([[4, 4], [-4, -4]])
             image[y0 : y1 + 1, x0 : x1 + 1] = other[y0 : y1 + 1, x0 : x1 + 1]
@@ -136,9 +136,9 @@ def test_what_shows_through_a_hole_counts_for_nothing() -> None:
     assert np.sqrt(np.mean(share**2)) < 1.3
 
 
-def truth_of(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def truth_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Where camera 1's places lie on the still block, system frame."""
-    return truth_at(bench.scene("block", 1.0, STILL), bench.pair().cam1, places).xyz_mm
+    return truth_at(bench.scene("block", 1.0, STILL), bench.pair().cam1, positions).xyz_mm
 
 
 def fields_equal(a: Field, b: Field) -> None:
@@ -149,7 +149,7 @@ def fields_equal(a: Field, b: Field) -> None:
 @pytest.mark.skipif(available_threads() < 2, reason="one processor")
 def test_threads_change_no_digit() -> None:
     side = below(LINES["kinked"])
-    now, before = parted(side), threads()
+    now, before = opened(side), threads()
     fields = []
     try:
         for n in (1, 2):

@@ -237,9 +237,9 @@ def test_images_that_are_noisier_than_the_reference_are_told(noise: float) -> No
     dense = grid(spacing_px=6.0)
     field = measure_motion(pair(), first, second, *now, dense, replace(OPTIONS, patch="affine"))
     error = (field.uvw_mm - truth(dense, scene("block"), scene("block", 1.0)).uvw_mm)[field.valid]
-    told = np.sqrt((field.sigma_mm[field.valid][:, 3:] ** 2).mean(axis=0))
+    reported = np.sqrt((field.sigma_mm[field.valid][:, 3:] ** 2).mean(axis=0))
     assert field.valid.mean() > 0.97
-    ratio = told / error.std(axis=0)
+    ratio = reported / error.std(axis=0)
     assert (ratio > 0.8).all()
     assert (ratio < 1.25).all()
 

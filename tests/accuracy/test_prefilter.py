@@ -43,15 +43,15 @@ def test_told_is_the_scatter(sd, noise, known):
     pair, clean, xy, w, G = scene()
     model = NoiseModel(coefficients=(noise**2 + 1.0 / 12.0, 0.0, 0.0)) if known else None
     rng = np.random.default_rng(11)
-    errors, told, levels = [], [], []
+    errors, reported, levels = [], [], []
     for _ in range(60):
         images = [prepare(digitise(c, noise=noise, rng=rng), noise=model, blur=Blur(sd)) for c in clean]
         fit = fit_motion(pair, *images, xy, w, G, MatchOptions(subset_px=SUBSET))
         assert (fit.status == PointStatus.OK).all()
         errors.append(np.concatenate([fit.w[:, :1], fit.G[:, :, 0]], axis=1))
-        told.append(np.diagonal(fit.covariance, axis1=1, axis2=2)[:, :4])
+        reported.append(np.diagonal(fit.covariance, axis1=1, axis2=2)[:, :4])
         levels.append(fit.noise)
-    ratio = np.sqrt(np.mean(told, axis=(0, 1)) / np.mean(np.var(errors, axis=0, ddof=1), axis=0))
+    ratio = np.sqrt(np.mean(reported, axis=(0, 1)) / np.mean(np.var(errors, axis=0, ddof=1), axis=0))
     # 36 points, 60 pictures: each ratio to 1.5 %
     assert (ratio > 0.94).all(), ratio
     assert (ratio < 1.06).all(), ratio
@@ -132,8 +132,8 @@ def test_a_field_with_a_prefilter():
     assert moved.valid[inner].mean() > 0.97
     ok = moved.valid
     error = (moved.uvw_mm - truth.uvw_mm)[ok]
-    told = np.sqrt(np.mean(moved.sigma_mm[ok][:, 3:] ** 2, axis=0))
-    ratio = told / np.sqrt(np.mean(error**2, axis=0))
+    reported = np.sqrt(np.mean(moved.sigma_mm[ok][:, 3:] ** 2, axis=0))
+    ratio = reported / np.sqrt(np.mean(error**2, axis=0))
     assert (ratio > 0.8).all(), ratio
     assert (ratio < 1.25).all(), ratio
 

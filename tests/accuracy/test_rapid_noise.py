@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from core.field.points.shared_pixels import SharedPixels
-from tests.bench.accuracy.rapid_noise import seen_over_told, window_slope
+from tests.bench.accuracy.rapid_noise import observed_over_reported, window_slope
 
 SUBSET, STEP = 33, 11  # a subset of 3 x 3 steps, drawn as sums of white cells
 SHARED = SharedPixels(SUBSET)
@@ -28,6 +28,6 @@ def test_noise_is_seen_as_drawn_under_a_deformation(window: int, axis: int) -> N
         weights[::-1, ::-1],
         mode="valid",
     )
-    told = np.full(values.shape, copies.std())
+    reported = np.full(values.shape, copies.std())
     for lag in (1, 2, 4):
-        assert seen_over_told(values, told, weights, SHARED, STEP, lag) == pytest.approx(2.0, rel=0.06)
+        assert observed_over_reported(values, reported, weights, SHARED, STEP, lag) == pytest.approx(2.0, rel=0.06)

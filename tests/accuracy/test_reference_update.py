@@ -21,7 +21,7 @@ from core.status import PointStatus
 from tests.bench.accuracy.paper_rig import turn
 from tests.support import field_bench
 from tests.support import sequence_bench as bench
-from tests.support.cut_scenes import below, parted, true_uvw
+from tests.support.cut_scenes import below, opened, true_uvw
 from tests.support.cut_scenes import reference as crack_reference
 
 PX_UM = 39.0
@@ -59,11 +59,11 @@ def test_motions_of_planes_compose_exactly() -> None:
     rays, w, (R1, t1), (R2, t2) = random_plane_motions(40)
     start = Totals(rays, w, matrix(rays, w, R1, t1))
     rays_k, w_k = plane_seen_later(start)
-    leg = matrix(rays_k, w_k, R2, t2)
+    segment = matrix(rays_k, w_k, R2, t2)
     both = matrix(rays, w, R2 @ R1, R2 @ t1 + t2)
-    after = follow(start, w_k, leg)
+    after = follow(start, w_k, segment)
     assert np.abs(after.G - both).max() < 1e-11
-    assert np.abs(since(start, Totals(rays, w, both), w_k) - leg).max() < 1e-11
+    assert np.abs(since(start, Totals(rays, w, both), w_k) - segment).max() < 1e-11
 
 
 def test_a_field_tells_its_unknowns_to_the_last_digits() -> None:
@@ -99,9 +99,9 @@ def test_pixels_in_common_are_counted_right() -> None:
     )
     offset = rng.uniform(-4.0, 4.0, (5, 2))
     common, own = common_share(slopes, offset, size)
-    places = rng.uniform(-0.5 * size, 0.5 * size, (400_000, 2))  # of the square, from its middle
+    positions = rng.uniform(-0.5 * size, 0.5 * size, (400_000, 2))  # of the square, from its middle
     for k in range(5):
-        back = np.linalg.solve(slopes[k], (places + offset[k]).T)
+        back = np.linalg.solve(slopes[k], (positions + offset[k]).T)
         inside = (np.abs(back) <= 0.5 * size).all(axis=0).mean()
         assert common[k] == pytest.approx(inside / np.linalg.det(slopes[k]), abs=0.004)
     assert own == pytest.approx(np.maximum(1.0, 1.0 / np.linalg.det(slopes)))
@@ -114,7 +114,7 @@ def moving() -> tuple[list[bench.Images], list[np.ndarray]]:
         bench.plate(2.0 * n, np.array([0.021, -0.013, 0.02]) * n, np.diag([1 + 0.01 * n, 1 - 0.004 * n]))
         for n in range(5)
     ]
-    return [bench.shoot(s, seed=k) for k, s in enumerate(scenes)], [bench.truth(s) for s in scenes]
+    return [bench.capture(s, seed=k) for k, s in enumerate(scenes)], [bench.truth(s) for s in scenes]
 
 
 @cache
@@ -172,7 +172,7 @@ def test_a_fresh_worker_goes_on_from_the_files(n: int, tmp_path: Path) -> None:
 def test_told_errors_after_updates_are_the_empirical_ones() -> None:
     """Monte Carlo over the noise: five updates, each leaving the same scatter about the truth as told."""
     scenes = [bench.plate(0.4 * n, np.array([0.021, -0.013, 0.02]) * n) for n in range(7)]
-    clean = [bench.rig().shoot(s, noise=0.0) for s in scenes]
+    clean = [bench.rig().capture(s, noise=0.0) for s in scenes]
     grid = PointGrid.rectangle(90, 90, 430, 390, spacing_px=28)
     errors, sigmas = [], []
     for seed in range(5):
@@ -187,15 +187,15 @@ def test_told_errors_after_updates_are_the_empirical_ones() -> None:
     known = np.isfinite(np.array(errors)).all(axis=(0, 3))
     assert known.mean() > 0.9
     empirical = np.sqrt(np.mean(np.var(np.array(errors)[:, known], axis=0, ddof=1), axis=0))
-    told = np.sqrt(np.mean(np.array(sigmas)[:, known] ** 2, axis=(0, 1)))
-    assert told / empirical == pytest.approx(np.ones(3), abs=0.12)  # 4 x 160 degrees of freedom: 3 % of scatter
+    reported = np.sqrt(np.mean(np.array(sigmas)[:, known] ** 2, axis=(0, 1)))
+    assert reported / empirical == pytest.approx(np.ones(3), abs=0.12)  # 4 x 160 degrees of freedom: 3 % of scatter
 
 
 @cache
 def fading() -> tuple[list[bench.Images], list[np.ndarray]]:
     """Nine steps in which the pattern goes over to another one, 10 degrees of 90 a step."""
     scenes = [bench.plate(0.5 * n, np.array([0.03, 0.01, 0.01]) * n) for n in range(10)]
-    return [bench.shoot_fading(s, 10.0 * n, n) for n, s in enumerate(scenes)], [bench.truth(s) for s in scenes]
+    return [bench.capture_fading(s, 10.0 * n, n) for n, s in enumerate(scenes)], [bench.truth(s) for s in scenes]
 
 
 def test_a_pattern_that_changes_ends_total_correlation_and_not_auto() -> None:
@@ -210,14 +210,14 @@ def test_a_pattern_that_changes_ends_total_correlation_and_not_auto() -> None:
         assert field.valid.mean() > 0.95
         # the other pattern draws the points along: so is told, before an update and after
         error = field.uvw_mm - truth[n]  # type: ignore[operator]
-        told, true = (np.sqrt(np.nanmean(a[..., :2] ** 2)) for a in (field.sigma_mm[..., 3:], error))
-        assert 0.75 < told / true < 1.35
+        reported, true = (np.sqrt(np.nanmean(a[..., :2] ** 2)) for a in (field.sigma_mm[..., 3:], error))
+        assert 0.75 < reported / true < 1.35
 
 
 @pytest.mark.fault(38)
 def test_points_that_were_hidden_come_back_and_never_in_the_step_that_lost_them() -> None:
     scenes = [bench.plate(0.0, np.array([0.03, 0.01, 0.01]) * n) for n in range(6)]
-    images = [bench.shoot(s, seed=k) for k, s in enumerate(scenes)]
+    images = [bench.capture(s, seed=k) for k, s in enumerate(scenes)]
     for k in (2, 3):
         images[k][0][190:260, 200:270] = 30  # before camera 1 alone
     fields = bench.measure(images, "always")
@@ -242,7 +242,7 @@ def test_points_that_were_hidden_come_back_and_never_in_the_step_that_lost_them(
 @pytest.mark.fault(38)
 def test_auto_leaves_a_reference_alone_that_only_an_obstacle_hides() -> None:
     scenes = [bench.plate(0.0, np.array([0.03, 0.01, 0.01]) * n) for n in range(5)]
-    images = [bench.shoot(s, seed=k) for k, s in enumerate(scenes)]
+    images = [bench.capture(s, seed=k) for k, s in enumerate(scenes)]
     for k in (2, 3):
         images[k][0][190:260, 200:270] = 30
     fields = bench.measure(images, "auto")
@@ -261,7 +261,7 @@ def test_a_jump_in_mid_sequence_is_found_by_new_seeds(mode: str) -> None:
         bench.plate(42.0, (4.0, -2.5, 1.0), np.diag([1.2, 1.1])),
         bench.plate(43.0, (4.0, -2.5, 1.0), np.diag([1.2, 1.1])),
     ]
-    images = [bench.shoot(s, seed=k) for k, s in enumerate(scenes)]
+    images = [bench.capture(s, seed=k) for k, s in enumerate(scenes)]
     grid = PointGrid.rectangle(190, 200, 290, 290, spacing_px=14)
     fields = bench.measure(images, mode, grid=grid)  # type: ignore[arg-type]
     for n in (3, 4):
@@ -308,7 +308,7 @@ def test_curved_patches_are_followed_too() -> None:
 def test_rest_is_rest() -> None:
     """A plate that does not move: forty pixels off its place would show in a turned frame, nothing shows here."""
     still = bench.plate(0.0, RigidTransform.identity().translation_mm)
-    images = [bench.shoot(still, seed=k) for k in range(4)]
+    images = [bench.capture(still, seed=k) for k in range(4)]
     for field in bench.measure(images, "always").values():
         assert np.abs(field.uvw_mm).max() < 2e-3
 
@@ -321,7 +321,7 @@ def test_a_leg_that_begins_with_an_open_crack_reaches_over_neither_lip() -> None
     side = below(line)
     grid = field_bench.grid(spacing_px=5.0, margin_px=36.0).with_cracks([line])
     options = MeasureOptions(subset_px=21, patch="affine")
-    pairs = [crack_reference(), parted(side, seed=2), parted(side, seed=12)]
+    pairs = [crack_reference(), opened(side, seed=2), opened(side, seed=12)]
     images = [(MeasureImage(one), MeasureImage(two)) for one, two in pairs]
     reference = ReferencePair(field_bench.pair(), *images[0])
     fields: dict[int, Field] = {}

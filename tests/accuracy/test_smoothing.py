@@ -62,13 +62,13 @@ def test_a_quadratic_stays_and_a_fit_is_numpys():
     window = np.zeros(failed.shape, bool)
     window[0:3, 6:11] = True  # an edge
     np.testing.assert_allclose(got.uvw_mm[0, 8], by_hand(noisy, 0, 8, window), atol=1e-12)
-    told = got.smoothing
-    assert told is not None
-    assert (told.window, told.resolution_px) == (5, 4 * STEP + SUBSET)
-    assert told.resolution_mm == pytest.approx(0.02 * told.resolution_px, rel=1e-6)
-    assert told.whole + told.reduced + told.raw == field.valid.sum()
-    assert told.whole > 0
-    assert told.reduced > 0
+    summary = got.smoothing
+    assert summary is not None
+    assert (summary.window, summary.resolution_px) == (5, 4 * STEP + SUBSET)
+    assert summary.resolution_mm == pytest.approx(0.02 * summary.resolution_px, rel=1e-6)
+    assert summary.whole + summary.reduced + summary.raw == field.valid.sum()
+    assert summary.whole > 0
+    assert summary.reduced > 0
 
 
 def test_nothing_reaches_over_a_cut_or_a_lost_line():
@@ -79,9 +79,9 @@ def test_nothing_reaches_over_a_cut_or_a_lost_line():
     line = np.array([[40.0 + 8.5 * STEP, 0.0], [40.0 + 8.5 * STEP, 400.0]])
     for more in ({"failed": lost}, {"cuts": Cuts((line,))}):
         field = make_field(step, shape=flat, **more)
-        parted = (field.x_px > 40 + 8 * STEP).astype(float)
+        right_half = (field.x_px > 40 + 8 * STEP).astype(float)
         uvw = field.uvw_mm.copy()
-        uvw[..., 0] = np.where(field.valid, parted, np.nan)
+        uvw[..., 0] = np.where(field.valid, right_half, np.nan)
         got = smoothed_displacement(replace(field, uvw_mm=uvw), 7, subset_px=SUBSET)
         np.testing.assert_allclose(got.uvw_mm[..., 0], uvw[..., 0], atol=1e-9)
 
@@ -117,19 +117,19 @@ def test_told_is_the_scatter(window, order):
         means.append(area_statistics(got, got.uvw_mm[..., 2], None, inside, shared=shared).mean)
         stretches.append(extensometer(got, *ends, shared=shared).elongation_mm.value)
         strains.append(surface_strain(got, options, subset_px=SUBSET).strain)
-    told = smoothed_displacement(field, window, subset_px=SUBSET, order=order)
-    shared = SharedPixels.of(told, SUBSET)
+    smoothed = smoothed_displacement(field, window, subset_px=SUBSET, order=order)
+    shared = SharedPixels.of(smoothed, SUBSET)
     ok = field.valid
     scatter = np.var(np.array(uvw)[:, ok], axis=0, ddof=1)
-    ratio = np.sqrt(np.diagonal(told.covariance[ok], axis1=1, axis2=2)[:, 3:] / scatter)
+    ratio = np.sqrt(np.diagonal(smoothed.covariance[ok], axis1=1, axis2=2)[:, 3:] / scatter)
     assert ratio.mean() == pytest.approx(1.0, abs=0.02)
     assert np.abs(ratio - 1.0).max() < 0.15  # sd of one: 3 %
-    mean = area_statistics(told, told.uvw_mm[..., 2], told.sigma_mm[..., 5], inside, shared=shared)
+    mean = area_statistics(smoothed, smoothed.uvw_mm[..., 2], smoothed.sigma_mm[..., 5], inside, shared=shared)
     # sd 3 %; points at edges are taken for ones with whole windows, and they are a good part of this small field
     assert mean.mean_sigma / np.std(means, ddof=1) == pytest.approx(1.03, abs=0.1)
-    reading = extensometer(told, *ends, shared=shared).elongation_mm
+    reading = extensometer(smoothed, *ends, shared=shared).elongation_mm
     assert reading.sigma / np.std(stretches, ddof=1) == pytest.approx(1.0, abs=0.09)
-    strain = surface_strain(told, options, subset_px=SUBSET)
+    strain = surface_strain(smoothed, options, subset_px=SUBSET)
     assert strain.gauge_px == 4 * STEP + SUBSET + (window - 1) * STEP
     whole = np.zeros(field.shape, bool)
     whole[4 : 14 - 4, 4:6] = True
@@ -141,8 +141,8 @@ def test_told_is_the_scatter(window, order):
 def test_neighbours_go_together_as_their_weights_say():
     """The correlation of two smoothed values against a plain sum over both windows and all pixels."""
     field = make_field(lambda X: X, shape=flat)
-    told = smoothed_displacement(field, 5, subset_px=SUBSET)
-    shared = SharedPixels.of(told, SUBSET)
+    smoothed = smoothed_displacement(field, 5, subset_px=SUBSET)
+    shared = SharedPixels.of(smoothed, SUBSET)
     noise = pixel_noise(np.random.default_rng(4), field, 1500)[..., 3:4]
     c = np.linalg.lstsq(np.vander(np.arange(-2, 3), 3), np.eye(5), rcond=None)[0]
     assert c.shape == (3, 5)

@@ -24,7 +24,7 @@ SUBSET = 21
 FALSE_LIMIT = 20e-6  # what the project asks of itself
 
 
-def _shoot(motion: RigidTransform, in_plane: np.ndarray | None = None) -> list[np.ndarray]:
+def _capture(motion: RigidTransform, in_plane: np.ndarray | None = None) -> list[np.ndarray]:
     """Grey levels, 0 to 255 unrounded, of a speckled plane."""
     scene = Scene(
         name="plane",
@@ -64,7 +64,7 @@ STILL = RigidTransform(np.eye(3), np.zeros(3))
 def test_false_strain_of_rigid_motions(axis, angle_deg, shift_mm) -> None:
     """5 mm out of plane and 10 degrees with the true calibration: at most 20 microstrain in the mean."""
     motion = RigidTransform(turned(axis, angle_deg), np.array(shift_mm))
-    found = _strain(_shoot(STILL), _shoot(motion))
+    found = _strain(_capture(STILL), _capture(motion))
     e = found.strain[found.valid]
     assert len(e) > 150
     assert np.abs(e.mean(axis=0)).max() < FALSE_LIMIT
@@ -79,7 +79,7 @@ def test_even_strain_under_rotation() -> None:
     to_sys = UPRIGHT.rotation[:2, :2]
     e = to_sys @ (0.5 * (F.T @ F - np.eye(2))) @ to_sys.T
     motion = RigidTransform(turned((1.0, -1.0, 2.0), 5.0), np.array([0.1, 0.05, 0.3]))
-    found = _strain(_shoot(STILL), _shoot(motion, F))
+    found = _strain(_capture(STILL), _capture(motion, F))
     exact = np.array([e[0, 0], e[1, 1], e[0, 1]])
     assert np.abs(found.strain[found.valid].mean(axis=0) - exact).max() < FALSE_LIMIT
     assert found.patch is not None
@@ -88,13 +88,13 @@ def test_even_strain_under_rotation() -> None:
 
 def test_uncertainty_of_repeated_pictures() -> None:
     """What is told against the scatter of eight pairs of noisy pictures, window by window."""
-    before, after = _shoot(STILL), _shoot(RigidTransform(np.eye(3), np.array([0.013, -0.02, 0.03])))
+    before, after = _capture(STILL), _capture(RigidTransform(np.eye(3), np.array([0.013, -0.02, 0.03])))
     found = [_strain(_noisy(before, k), _noisy(after, 100 + k), window=5) for k in range(8)]
     kept = np.logical_and.reduce([s.valid for s in found])
     scatter = np.sqrt(np.mean(np.var([s.strain[kept] for s in found], axis=0, ddof=1), axis=0))
-    told = np.sqrt(np.mean([s.sigma[kept] ** 2 for s in found], axis=(0, 1)))
+    reported = np.sqrt(np.mean([s.sigma[kept] ** 2 for s in found], axis=(0, 1)))
     # eight pictures of some 60 independent windows: 5 % at two sigma
-    np.testing.assert_allclose(told / scatter, 1.0, atol=0.12)
+    np.testing.assert_allclose(reported / scatter, 1.0, atol=0.12)
 
 
 @pytest.mark.fault(37)
@@ -103,7 +103,7 @@ def test_lips_of_an_open_crack_have_no_false_strain() -> None:
     line = np.array([(0.0, 107.3), (263.0, 118.1)])
     marked = bench.grid(spacing_px=5.0, margin_px=36.0).with_cracks([line])
     reference = ReferencePair(bench.pair(), *cut_scenes.reference())
-    now = cut_scenes.parted(cut_scenes.below(line))
+    now = cut_scenes.opened(cut_scenes.below(line))
     field = reference.motion(*now, marked, MeasureOptions(subset_px=SUBSET, patch="affine"))
     found = surface_strain(field, StrainOptions(window=7), subset_px=SUBSET)
     beside = np.abs(field.y_px - np.interp(field.x_px, line[:, 0], line[:, 1])) < 15.0

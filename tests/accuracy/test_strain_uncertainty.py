@@ -46,7 +46,7 @@ def test_reported_over_empirical(motion, tensor, order):
     status = clean.status.copy()
     status[12, 6:9] = 5
     options = StrainOptions(window=7, tensor=tensor, order=order)
-    found, told = [], None
+    found, last = [], None
     for _ in range(200):
         e = _subset_means(rng, 6) @ root.T
         noisy = replace(
@@ -58,12 +58,12 @@ def test_reported_over_empirical(motion, tensor, order):
         )
         strain = surface_strain(noisy, options, subset_px=SUBSET)
         found.append(strain.strain)
-        told = strain
+        last = strain
     empirical = np.std(found, axis=0)
-    both = told.sigma / empirical
+    both = last.sigma / empirical
     whole = np.zeros(SHAPE, bool)
     whole[3:8, 3:-3] = True
-    cut = told.valid & ~whole
+    cut = last.valid & ~whole
     for where in (whole, cut):
         for k in range(3):
             ratio = np.sqrt(np.mean(both[where][:, k] ** 2))
@@ -75,15 +75,15 @@ def test_principal_scatter():
     rng = np.random.default_rng(6)
     clean = make_field(plane, lambda p: p @ MOTIONS["large"].T, shape=SHAPE, spacing_px=STEP)
     covariance = np.broadcast_to(np.diag(SIGMA**2), (*SHAPE, 6, 6))
-    found, told = [], None
+    found, last = [], None
     for _ in range(200):
         e = _subset_means(rng, 6) * SIGMA
         noisy = replace(
             clean, xyz_mm=clean.xyz_mm + e[..., :3], uvw_mm=clean.uvw_mm + e[..., 3:], covariance=covariance
         )
-        told = surface_strain(noisy, StrainOptions(window=7), subset_px=SUBSET)
-        found.append(told.principal)
-    ratio = (told.sigma_principal / np.std(found, axis=0))[3:-3, 3:-3]
+        last = surface_strain(noisy, StrainOptions(window=7), subset_px=SUBSET)
+        found.append(last.principal)
+    ratio = (last.sigma_principal / np.std(found, axis=0))[3:-3, 3:-3]
     assert np.sqrt(np.mean(ratio**2, axis=(0, 1))) == pytest.approx([1.0, 1.0], abs=0.06)
 
 
@@ -100,8 +100,8 @@ def test_correlation_of_curved_patches():
         expected = 0.0
         if max(dx, dy) < SUBSET:
             expected = all_lags[middle[0] + dy, middle[1] + dx] / all_lags[middle[0], middle[1]]
-        told = SharedPixels(SUBSET, curved=True).correlation(np.array([float(dx)]), np.array([-float(dy)]))[0]
-        assert told == pytest.approx(expected, abs=0.01)
+        correlation = SharedPixels(SUBSET, curved=True).correlation(np.array([float(dx)]), np.array([-float(dy)]))[0]
+        assert correlation == pytest.approx(expected, abs=0.01)
 
 
 def test_curved_patches_scatter_less_over_a_gauge():

@@ -41,15 +41,15 @@ def test_the_expected_error_is_the_scatter_that_noise_gives(size: int) -> None:
     )
     worst = np.sqrt(np.linalg.eigvalsh(np.cov(shifts.T))[-1])
     noisy = texture + rng.normal(0, noise, texture.shape)
-    told = errors_at(noisy, np.array([[x, y]], dtype=float), noise, (size,))[size][0]
-    assert told == pytest.approx(worst, rel=0.15)
+    estimated = errors_at(noisy, np.array([[x, y]], dtype=float), noise, (size,))[size][0]
+    assert estimated == pytest.approx(worst, rel=0.15)
 
 
 def test_no_texture_is_no_texture_and_lines_are_not_enough() -> None:
     points = np.array([[x, y] for x in range(60, 200, 10) for y in range(60, 180, 10)], dtype=float)
     flat = 128.0 + np.random.default_rng(3).normal(0, 2.0, (HEIGHT, WIDTH))
-    told = speckle_quality(flat, 255.0, points, 33)
-    assert (told.level, told.proposed_subset_px, told.good_share) == ("poor", None, 0.0)
+    rated = speckle_quality(flat, 255.0, points, 33)
+    assert (rated.level, rated.proposed_subset_px, rated.good_share) == ("poor", None, 0.0)
     lines = np.tile(128.0 + 60.0 * np.sin(np.arange(WIDTH) / 2.0), (HEIGHT, 1))
     assert speckle_quality(lines, 255.0, points, 33).level == "poor"
     good = speckle_quality(speckle(4), 255.0, points, 33)
@@ -66,9 +66,9 @@ def test_no_texture_is_no_texture_and_lines_are_not_enough() -> None:
 
 
 def test_seeds_of_settings_old_and_new() -> None:
-    def seeds(**said: Any) -> Any:
+    def seeds(**given: Any) -> Any:
         region = {"rectangle": [0, 0, 9, 9]}
-        return seeds_of(stored_settings({"region": region, **said}))
+        return seeds_of(stored_settings({"region": region, **given}))
 
     assert seeds(seeds=None) is None
     assert seeds(seeds=[[1.0, 2.0]]) == [Seed((1.0, 2.0))]  # an analysis from before
@@ -104,12 +104,12 @@ def problem(answer: httpx.Response) -> tuple[int, str]:
 def test_texture_over_http(client: httpx.Client, test_id: str) -> None:
     where = f"{API}/tests/{test_id}/steps/0/texture"
     region = {"rectangle": [60, 60, 180, 170], "holes": [[[100, 100], [140, 100], [140, 140], [100, 140]]]}
-    told = client.post(where, json={"region": region, "subset_px": 33, "spacing_px": 10})
-    assert told.status_code == 200, told.text
-    assert told.json()["subsets"] < 13 * 12  # none in the hole
-    assert told.json()["level"] == "good"
+    rated = client.post(where, json={"region": region, "subset_px": 33, "spacing_px": 10})
+    assert rated.status_code == 200, rated.text
+    assert rated.json()["subsets"] < 13 * 12  # none in the hole
+    assert rated.json()["level"] == "good"
     quiet = client.post(where, json={"region": region, "noise_grey": 0.255}).json()
-    assert quiet["median_error_px"] < 0.2 * told.json()["median_error_px"]
+    assert quiet["median_error_px"] < 0.2 * rated.json()["median_error_px"]
     assert problem(client.post(where, json={"region": region, "subset_px": 34})) == (422, "subset_invalid")
     outside = {"rectangle": [600, 60, 700, 170]}
     assert problem(client.post(where, json={"region": outside})) == (422, "region_outside_image")
@@ -123,8 +123,10 @@ def test_where_camera_2_may_see_a_seed(
     point = np.array([[0.4, -0.7, 0.3]])
     one, two = (camera.project(point).xy[0].tolist() for camera in (pair.cam1, pair.cam2))
     where = f"{API}/tests/{test_id}/seeds:check"
-    told = client.post(where, json={"seeds": [one, one, one], "seeds_cam2": [two, None, [two[0], two[1] + 30]]}).json()
-    right, unknown, wrong = told["seeds"]
+    checked = client.post(
+        where, json={"seeds": [one, one, one], "seeds_cam2": [two, None, [two[0], two[1] + 30]]}
+    ).json()
+    right, unknown, wrong = checked["seeds"]
     assert right["distance_px"] < 1e-3
     assert unknown["distance_px"] is None
     assert 5 < wrong["distance_px"] <= 30

@@ -27,7 +27,7 @@ expect.set_options(timeout=30_000)  # the machine may be busy
 API = "/api/v1"
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]
 DESK, ACROSS, UPRIGHT = (1280, 800), (1024, 768), (768, 1024)
-LOOKS = [("light", DESK), ("dark", DESK), ("light", ACROSS), ("dark", UPRIGHT)]
+STYLES = [("light", DESK), ("dark", DESK), ("light", ACROSS), ("dark", UPRIGHT)]
 RUN = """async rules => {
     const told = await axe.run(document, {runOnly: {type: 'tag', values: rules}, resultTypes: ['violations']});
     const found = told.violations.map(one => `${one.id} (${one.help}): `
@@ -50,7 +50,7 @@ def auditor(at: Page) -> Audit:
         if at.evaluate("typeof axe") == "undefined":
             at.evaluate(AXE_SCRIPT)
         found: list[str] = []
-        for scheme, (width, height) in LOOKS:
+        for scheme, (width, height) in STYLES:
             at.set_viewport_size({"width": width, "height": height})
             at.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
             at.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")

@@ -42,11 +42,11 @@ def begin(shown: Page) -> None:
 def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
     client.put(f"{API}/sim/scene", json={"scene": "grid"}).raise_for_status()
     shown = page.open("#/calibrate")
-    told = client.post(f"{API}/calibrations:expect", json={}).json()
+    reply = client.post(f"{API}/calibrations:expect", json={}).json()
     expected = shown.locator('[data-role="expected"]')
     # the same figures as the API's, before anything is begun
     expect(expected).to_contain_text("middle of the volume")
-    z_um = 1000 * told["points"][0]["sigma_mm"][2]
+    z_um = 1000 * reply["points"][0]["sigma_mm"][2]
     cell = expected.locator("tbody tr").first.locator("td").last
     assert float(cell.inner_text().split()[0]) == pytest.approx(z_um, rel=0.01)
     shown.get_by_label("Fitted positions").fill("0, 0.05")
@@ -68,12 +68,12 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
     expect(shown.get_by_role("region", name="Ten parameters")).to_contain_text(f"{document['cam1']['z0_mm']:.2f}")
     # what was foreseen came to be: the simulated grid stands on its corner
     noise = sum(document["noise_px"].values()) / 2
-    told = client.post(
+    reply = client.post(
         f"{API}/calibrations:expect", json={"positions_mm": [0, 5], "noise_px": noise, "roll_deg": 45.0}
     ).json()
     for name, sigma in document["sigma"].items():
-        assert 0.5 < told["parameters"][name]["sigma"] / sigma < 2.0, name
-    assert told["shape_rms_mm"] == pytest.approx(document["uncertainty"]["shape_rms_mm"], rel=0.5)
+        assert 0.5 < reply["parameters"][name]["sigma"] / sigma < 2.0, name
+    assert reply["shape_rms_mm"] == pytest.approx(document["uncertainty"]["shape_rms_mm"], rel=0.5)
     # the crosses lie where the intersections were found, in the pixels of the picture that is shown
     residuals = client.get(f"{API}/calibrations/{document['id']}/residuals").json()["views"]
     image = shown.get_by_alt_text("Calibration view of cam2")
@@ -101,9 +101,9 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
     slider = shown.get_by_label("Magnification of the residual arrows")
 
     def first_arrow() -> float:
-        told_ = re.search(r"l([-\d.e]+) ([-\d.e]+)", arrows.get_attribute("d") or "")
-        assert told_ is not None
-        return float(told_[1])
+        arrow = re.search(r"l([-\d.e]+) ([-\d.e]+)", arrows.get_attribute("d") or "")
+        assert arrow is not None
+        return float(arrow[1])
 
     slider.fill("2")
     before = first_arrow()

@@ -78,9 +78,9 @@ def put_before_the_cameras(shown: Page, scene: str, load: float) -> None:
     shown.get_by_text("Simulated scene").click()
     shown.get_by_label("Scene", exact=True).select_option(scene)
     shown.get_by_label("Load", exact=True).fill(str(load))
-    with shown.expect_response(lambda answer: answer.url.endswith("/sim/scene")) as told:
+    with shown.expect_response(lambda answer: answer.url.endswith("/sim/scene")) as response:
         shown.get_by_role("button", name="Show the scene").click()
-    assert told.value.status == 200
+    assert response.value.status == 200
 
 
 def live_pictures_move(shown: Page) -> None:
@@ -121,8 +121,8 @@ def deflection_mm(x: Any, y: Any, pressure_kpa: float) -> Any:
     return -pressure_kpa * 1e-3 * RADIUS**4 / (64 * stiffness) * share**2
 
 
-def grey_of(shot: bytes) -> int:
-    return int(np.asarray(Image.open(io.BytesIO(shot)).convert("L"))[0, 0])
+def grey_of(picture: bytes) -> int:
+    return int(np.asarray(Image.open(io.BytesIO(picture)).convert("L"))[0, 0])
 
 
 def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: Made) -> None:
@@ -170,17 +170,17 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
         quality = capture(shown, f"{pressure:g} kPa", load)
         expect(quality).to_contain_text(f"Step {n}")
         expect(shown.locator(f'[data-step="{n}"]')).to_contain_text(f"{pressure:g} kPa")
-    told = client.get(f"{API}/tests/{made.test_id}").json()["steps"]
-    assert [(one["label"], one["load_n"]) for one in told] == [(f"{p:g} kPa", load) for p, load in STEPS]
+    steps = client.get(f"{API}/tests/{made.test_id}").json()["steps"]
+    assert [(one["label"], one["load_n"]) for one in steps] == [(f"{p:g} kPa", load) for p, load in STEPS]
 
     # a region, and three points in both views
     first, second = Editor(shown), Editor(shown, 2)
     true = true_cameras(SMALL)
     one, two = (Camera.from_paper(**true[cam]) for cam in ("cam1", "cam2"))
-    places = np.array([[-2.4, -1.8, 0.0], [2.1, -1.5, 0.0], [0.3, 2.2, 0.0]])
+    positions = np.array([[-2.4, -1.8, 0.0], [2.1, -1.5, 0.0], [0.3, 2.2, 0.0]])
     first.drag((60, 60), (180, 170))
     first.tool("Seed")
-    for k, (a, b) in enumerate(zip(one.project(places).xy, two.project(places).xy, strict=True)):
+    for k, (a, b) in enumerate(zip(one.project(positions).xy, two.project(positions).xy, strict=True)):
         first.click(*a)
         expect(shown.locator('[data-role="epipolar"]')).to_have_count(k + 1)
         second.click(*b)
@@ -196,9 +196,9 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     expect(progress.locator(".badge")).to_have_text("succeeded", timeout=SLOW)
     progress.get_by_role("link", name="Show results").click()
 
-    look_at_the_field(shown, client, made.test_id)
+    check_field(shown, client, made.test_id)
     export_opens(shown, client, made.test_id)
-    report_says(shown)
+    check_report(shown)
 
     go(shown, "Jobs & system", "Jobs and system")
     for kind in ("calibration", "analysis"):
@@ -206,7 +206,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     sound(page)
 
 
-def look_at_the_field(shown: Page, client: httpx.Client, test_id: str) -> None:
+def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
     """Under the mouse, at zoom, are the right pixel, the field's value there, and the image's grey level."""
     analysis = client.get(f"{API}/tests/{test_id}").json()["analyses"][-1]["id"]
     canvas = shown.locator('canvas[data-role="map"][data-shown="2 w_mm reference"]')
@@ -279,14 +279,14 @@ def export_opens(shown: Page, client: httpx.Client, test_id: str) -> None:
     np.testing.assert_allclose([float(row[column]) for row in rows], w.ravel(), rtol=1e-6)
 
 
-def report_says(shown: Page) -> None:
+def check_report(shown: Page) -> None:
     """The report opens in a window of its own, whole, and says what was measured, how, and what is missing."""
     with shown.context.expect_page(timeout=SLOW) as opened:
         shown.get_by_role("link", name="Open the report").click()
     report = opened.value
     report.wait_for_load_state()
-    said = report.locator("body")
-    words = " ".join(said.inner_text().split())
+    body = report.locator("body")
+    words = " ".join(body.inner_text().split())
     wanted = (
         "Pressure test Report of a displacement measurement",
         "aluminium plate 7",

@@ -41,8 +41,8 @@ def plate(client: httpx.Client) -> str:
 
 
 def focused(at: Page) -> str:
-    told = at.evaluate(FOCUS)
-    return "" if told is None else str(told["name"])
+    focus = at.evaluate(FOCUS)
+    return "" if focus is None else str(focus["name"])
 
 
 @pytest.mark.parametrize("screen", ["rig", "calibrate", "test", "jobs"])
@@ -198,11 +198,11 @@ def test_a_region_is_drawn_by_keyboard(page: Watched, plate: str) -> None:
         here = aim(at)
         if shows:  # in the middle of what is seen
             assert here == pytest.approx((127.5, 119.5), abs=1)
-        for place in points:
-            walk(at, here, place)
-            assert aim(at) == pytest.approx(place, abs=0.05)
+        for position in points:
+            walk(at, here, position)
+            assert aim(at) == pytest.approx(position, abs=0.05)
             at.keyboard.press("Enter")
-            here = place
+            here = position
         if close:
             at.keyboard.press("Enter")
 
@@ -254,16 +254,16 @@ def test_seeds_in_both_views_by_keyboard(page: Watched, client: httpx.Client, pl
     at.keyboard.press("ArrowUp")
     start = aim(at, 2)
     # it begins on the line that the service gives
-    told = client.post(f"{API}/tests/{plate}/seeds:check", json={"seeds": [[140, 100]], "reference": 0}).json()
-    course = np.array(told["seeds"][0]["line_px"])
+    checked = client.post(f"{API}/tests/{plate}/seeds:check", json={"seeds": [[140, 100]], "reference": 0}).json()
+    course = np.array(checked["seeds"][0]["line_px"])
     assert np.hypot(*(course - start).T).min() < 0.1
-    place = (start[0] + 12, start[1] - 1)
-    walk(at, start, place)
+    position = (start[0] + 12, start[1] - 1)
+    walk(at, start, position)
     with at.expect_request(lambda request: "/seeds:check" in request.url) as info:
         at.keyboard.press("Enter")
     sent = json.loads(info.value.post_data or "{}")
     assert sent["seeds"] == [[140, 100]]
-    assert np.array(sent["seeds_cam2"]) == pytest.approx(np.array([place]), abs=0.05)
+    assert np.array(sent["seeds_cam2"]) == pytest.approx(np.array([position]), abs=0.05)
     expect(frames.first).to_be_focused()
     page.sound()
 

@@ -115,19 +115,19 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
     at = shown(page, bench)
     readout = at.locator(".view .readout").first
     for spot in ((103.4, 98.2), (141.0, 131.0)):
-        told = bench.client.get(f"{bench.path()}/probe", params={"x_px": spot[0], "y_px": spot[1], "step": 2}).json()
+        reply = bench.client.get(f"{bench.path()}/probe", params={"x_px": spot[0], "y_px": spot[1], "step": 2}).json()
         at.mouse.move(*point_on_screen(at, *spot))
-        w = told["values"]["w_mm"]["value"]
+        w = reply["values"]["w_mm"]["value"]
         expect(readout).to_have_attribute("data-value", repr(w))
         text = f"{w:.5g}".replace("-", "\N{MINUS SIGN}")[:7]
         expect(readout).to_contain_text(text)
         expect(readout).to_contain_text("±")
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
-    told = bench.client.get(f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2}).json()
+    reply = bench.client.get(f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2}).json()
     pinned = at.locator('[data-role="probe"]')
-    expect(pinned).to_contain_text(f"row {told['row']}, column {told['col']}, step 2")
+    expect(pinned).to_contain_text(f"row {reply['row']}, column {reply['col']}, step 2")
     row = pinned.locator("tr", has=at.get_by_role("cell", name="w_mm", exact=True))
-    expect(row).to_contain_text(f"{told['values']['w_mm']['value']:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
+    expect(row).to_contain_text(f"{reply['values']['w_mm']['value']:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
     page.sound()
 
 
@@ -153,8 +153,8 @@ def test_steps_scales_and_images_are_chosen(page: Watched, bench: Bench) -> None
     for cam in ("cam1", "cam2"):
         at.get_by_label("Image", exact=True).select_option(cam)
         drawn(at, f"1 w_mm {cam}")
-        places = np.array(bench.client.get(f"{bench.path()}/steps/1/places/{cam}").json()["values"], dtype=float)
-        x, y = places[5, 6]
+        positions = np.array(bench.client.get(f"{bench.path()}/steps/1/places/{cam}").json()["values"], dtype=float)
+        x, y = positions[5, 6]
         assert pixel(at, round(x), round(y))[3] == 255
     at.get_by_label("Image", exact=True).select_option("reference")
     # a reference has no displacement, and says so
@@ -171,23 +171,26 @@ def test_steps_scales_and_images_are_chosen(page: Watched, bench: Bench) -> None
 def test_places_are_those_of_the_images(bench: Bench) -> None:
     """Camera 1 sees the reference's points where they were put, and camera 2 by its own pinhole formula."""
     calibration = load_calibration(bench.service.tests.calibration_file(bench.test_id))
-    told = {
+    expected = {
         cam: np.array(bench.client.get(f"{bench.path()}/steps/0/places/{cam}").json()["values"], dtype=float)
         for cam in ("cam1", "cam2")
     }
     x, y = bench.field(0, "x_px"), bench.field(0, "y_px")
-    assert np.abs(told["cam1"] - np.stack([x, y], axis=-1)).max() < 0.1
+    assert np.abs(expected["cam1"] - np.stack([x, y], axis=-1)).max() < 0.1
     xyz = np.stack([bench.field(0, f"{a}_mm") for a in "xyz"], axis=-1)
     camera: Camera = calibration.pair.cam2
     p = xyz @ camera.cam_from_sys.rotation.T + camera.cam_from_sys.translation_mm
     content = json.loads(bench.service.tests.calibration_file(bench.test_id).read_text())["cam2"]
     # Eqs. (5) to (8): the ideal image point, then Seidel's radial distortion
     ideal = content["phd_px"] * p[..., :2] / p[..., 2:]
-    r2 = (told["cam2"][..., 0] - content["cx_px"]) ** 2 + (
-        (told["cam2"][..., 1] - content["cy_px"]) / content["aspect"]
+    r2 = (expected["cam2"][..., 0] - content["cx_px"]) ** 2 + (
+        (expected["cam2"][..., 1] - content["cy_px"]) / content["aspect"]
     ) ** 2
     seen = np.stack(
-        [(told["cam2"][..., 0] - content["cx_px"]), (told["cam2"][..., 1] - content["cy_px"]) / content["aspect"]],
+        [
+            (expected["cam2"][..., 0] - content["cx_px"]),
+            (expected["cam2"][..., 1] - content["cy_px"]) / content["aspect"],
+        ],
         axis=-1,
     )
     assert np.abs(seen - ideal).max() < 0.2 + np.abs(content["kappa_per_px2"] * r2[..., None] * ideal).max()
@@ -206,12 +209,12 @@ def drag(at: Page, a: tuple[float, float], b: tuple[float, float]) -> None:
 
 
 def answer_of(at: Page, role: str) -> Any:
-    place = at.locator(f'[data-role="{role}"]')
-    expect(place).to_have_attribute("data-answer", re.compile(".+"))
-    return json.loads(place.get_attribute("data-answer") or "")
+    chart = at.locator(f'[data-role="{role}"]')
+    expect(chart).to_have_attribute("data-answer", re.compile(".+"))
+    return json.loads(chart.get_attribute("data-answer") or "")
 
 
-def told_by(at: Page, role: str, condition: str, arg: Any = None) -> None:
+def wait_for_chart(at: Page, role: str, condition: str, arg: Any = None) -> None:
     """Wait until what a chart shows fulfils a condition on ``a``, its answer, and ``arg``."""
     answer = f"const a = JSON.parse(document.querySelector('[data-role={role}]').dataset.answer)"
     at.wait_for_function(f"arg => {{ {answer}; return {condition} }}", arg=arg)
@@ -229,19 +232,19 @@ def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:
         "variables": ["w_mm", "x_mm", "y_mm", "z_mm"],
         "steps": [2],
     }
-    told = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][0]["lines"][0]["values"]
-    assert got["value"] == told["w_mm"]["value"]
-    assert got["sigma"] == told["w_mm"]["sigma"]
-    xyz = np.array([told[f"{a}_mm"]["value"] for a in "xyz"], dtype=float)
+    reply = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][0]["lines"][0]["values"]
+    assert got["value"] == reply["w_mm"]["value"]
+    assert got["sigma"] == reply["w_mm"]["sigma"]
+    xyz = np.array([reply[f"{a}_mm"]["value"] for a in "xyz"], dtype=float)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xyz, axis=1), axis=0))])
     assert got["x"] == pytest.approx(length, abs=1e-9)
     expect(at.locator('[data-role="line-chart"] canvas')).to_be_visible()
     # another step: the same line
     at.get_by_role("button", name="Step before").click()
     drawn(at, "1 w_mm reference")
-    told = bench.client.post(f"{bench.path()}/gauges", json=body | {"steps": [1]}).json()["steps"][0]["lines"][0]
-    first = told["values"]["w_mm"]["value"][0]
-    told_by(at, "line-chart", "a.value[0] === arg", first)
+    reply = bench.client.post(f"{bench.path()}/gauges", json=body | {"steps": [1]}).json()["steps"][0]["lines"][0]
+    first = reply["values"]["w_mm"]["value"][0]
+    wait_for_chart(at, "line-chart", "a.value[0] === arg", first)
     page.sound()
 
 
@@ -256,16 +259,16 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     expect(at.get_by_role("button", name="Remove e2")).to_be_visible()
     at.get_by_label("Against", exact=True).select_option("load")
     at.get_by_label("Show", exact=True).select_option("elongation_mm")
-    told_by(at, "extensometer-chart", "a.x[1] === 689 && a.value[1].length === 2")
+    wait_for_chart(at, "extensometer-chart", "a.x[1] === 689 && a.value[1].length === 2")
     got = answer_of(at, "extensometer-chart")
     body = {"extensometers": [{"a_px": [120, 70], "b_px": [120, 160]}]}
     steps = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"]
-    told = [one["extensometers"][0]["values"]["elongation_mm"] for one in steps]
-    assert [v[1] for v in got["value"]] == [one["value"] for one in told]
-    assert [v[1] for v in got["sigma"]] == [one["sigma"] for one in told]
+    listed = [one["extensometers"][0]["values"]["elongation_mm"] for one in steps]
+    assert [v[1] for v in got["value"]] == [one["value"] for one in listed]
+    assert [v[1] for v in got["sigma"]] == [one["sigma"] for one in listed]
     assert got["x"] == [0.0, 689.0, 1378.0]
     at.get_by_label("Against", exact=True).select_option("channel:stroke_mm")
-    told_by(at, "extensometer-chart", "a.x[2] === 6.89")
+    wait_for_chart(at, "extensometer-chart", "a.x[2] === 6.89")
     at.get_by_role("button", name="Remove e1").click()
     expect(at.get_by_role("button", name="Remove e1")).to_have_count(0)
     # ends outside the field are refused with cause and remedy
@@ -282,8 +285,8 @@ def test_the_grey_level_under_the_mouse_is_that_of_the_picture_shown(page: Watch
     for image, of in (("reference", (0, "cam1")), ("cam1", (2, "cam1")), ("cam2", (2, "cam2"))):
         at.get_by_label("Image", exact=True).select_option(image)
         drawn(at, f"2 w_mm {image}")
-        told = bench.client.get(f"{API}/tests/{bench.test_id}/steps/{of[0]}/{of[1]}", params={"format": "png"})
-        stored = np.asarray(Image.open(io.BytesIO(told.content)))
+        stored_answer = bench.client.get(f"{API}/tests/{bench.test_id}/steps/{of[0]}/{of[1]}", params={"format": "png"})
+        stored = np.asarray(Image.open(io.BytesIO(stored_answer.content)))
         # inside the field, and beside it, where there is no value to tell
         for presses, spots in ((0, ((130, 120), (20, 30))), (6, ((126, 119),))):
             frame.focus()
@@ -346,8 +349,8 @@ def test_gauges_and_the_probe_are_set_by_keyboard(page: Watched, bench: Bench) -
     at.keyboard.press("Enter")
     x, y = bench.field(2, "x_px"), bench.field(2, "y_px")
     nearest = np.unravel_index(np.argmin(np.hypot(x - start[0], y - start[1])), x.shape)
-    told = re.compile(rf"row {nearest[0]}, column {nearest[1]}, step 2")
-    expect(at.locator('[data-role="probe"]')).to_contain_text(told)
+    wanted = re.compile(rf"row {nearest[0]}, column {nearest[1]}, step 2")
+    expect(at.locator('[data-role="probe"]')).to_contain_text(wanted)
     page.sound()
 
 
@@ -358,8 +361,8 @@ def test_an_areas_statistics_are_the_gauges(page: Watched, bench: Bench) -> None
     got = answer_of(at, "area")[2]
     corners = [float(at.get_by_label(f"Area {side}").input_value()) for side in ("left", "top", "right", "bottom")]
     body = {"areas": [{"rectangle_px": corners}], "variables": ["w_mm"]}
-    told = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][2]["areas"][0]["values"]["w_mm"]
-    assert got == told
+    expected = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][2]["areas"][0]["values"]["w_mm"]
+    assert got == expected
     w, x, y = (bench.field(2, name) for name in ("w_mm", "x_px", "y_px"))
     inside = (x >= corners[0]) & (x <= corners[2]) & (y >= corners[1]) & (y <= corners[3])
     assert got["mean"] == pytest.approx(float(w[inside].mean()), abs=1e-12)
@@ -416,8 +419,8 @@ def test_the_difference_of_two_analyses(page: Watched, bench: Bench) -> None:
     assert float(figures.get_attribute("data-mean") or 0) == pytest.approx(float((w - v)[both].mean()), abs=1e-9)
     assert float(figures.get_attribute("data-rms") or 0) == pytest.approx(1e-3, abs=1e-9)
     s = [bench.field(2, "sigma_w_mm", a) ** 2 for a in (bench.analysis_id, bench.cut_id)]
-    told = np.sqrt(np.mean((s[0] + s[1])[both]))
-    assert float(figures.get_attribute("data-reported") or 0) == pytest.approx(told, rel=1e-5)
+    reported = np.sqrt(np.mean((s[0] + s[1])[both]))
+    assert float(figures.get_attribute("data-reported") or 0) == pytest.approx(reported, rel=1e-5)
     page.sound()
 
 
@@ -434,9 +437,9 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     at.get_by_text("Export and report").click()
     with at.expect_download() as saved:
         at.get_by_role("button", name="Save the file").click()
-    told = bench.service.tests.result_file(bench.test_id, bench.analysis_id, 2).read_bytes()
+    content = bench.service.tests.result_file(bench.test_id, bench.analysis_id, 2).read_bytes()
     assert saved.value.suggested_filename.endswith(".nc")
-    assert Path(saved.value.path()).read_bytes() == told
+    assert Path(saved.value.path()).read_bytes() == content
     # an analysis that is not there
     at.goto(f"{page.origin}/#/results/{bench.test_id}/a000099-ffffff")
     expect(at.locator(".problem")).to_contain_text("a000099-ffffff")
@@ -465,13 +468,13 @@ PLAY = """async address => {
 def test_the_browser_plays_the_films(page: Watched, bench: Bench) -> None:
     page.open("#/jobs")
     query = "variables=w_mm&fps=4&width_px=400"
-    told = page.page.evaluate(PLAY, f"{bench.path()}/export?format=mp4&{query}")
+    film = page.page.evaluate(PLAY, f"{bench.path()}/export?format=mp4&{query}")
     gif = Image.open(io.BytesIO(bench.client.get(f"{bench.path()}/export?format=gif&{query}").content))
-    assert (told["width"], told["height"]) == (gif.width & ~1, gif.height & ~1)
-    assert told["seconds"] == pytest.approx(2 / 4, abs=0.05)  # the reference has no displacement
+    assert (film["width"], film["height"]) == (gif.width & ~1, gif.height & ~1)
+    assert film["seconds"] == pytest.approx(2 / 4, abs=0.05)  # the reference has no displacement
     gif.seek(1)
-    seen = np.array(told["rgba"], dtype=int).reshape(told["height"], told["width"], 4)[..., :3]
-    wanted = np.asarray(gif.convert("RGB"), dtype=int)[: told["height"], : told["width"]]
+    seen = np.array(film["rgba"], dtype=int).reshape(film["height"], film["width"], 4)[..., :3]
+    wanted = np.asarray(gif.convert("RGB"), dtype=int)[: film["height"], : film["width"]]
     # the last frame, as near as a film keeps its colours
     assert np.abs(seen - wanted).mean() < 8
     page.sound()

@@ -54,8 +54,8 @@ def test_the_grey_level_under_the_mouse_is_the_cameras_at_any_zoom(page: Watched
         assert (column, row) == (int(corner[0]), int(corner[1]))
         grey = re.search(r"grey (\d+) of 255", readout.inner_text())
         assert grey is not None
-        told = client.get("/api/v1/cameras/cam1/pixel", params={"x_px": column, "y_px": row}).json()["value"]
-        assert abs(int(grey[1]) - told) <= 15  # two frames, each with its noise of 2 grey levels
+        grey_level = client.get("/api/v1/cameras/cam1/pixel", params={"x_px": column, "y_px": row}).json()["value"]
+        assert abs(int(grey[1]) - grey_level) <= 15  # two frames, each with its noise of 2 grey levels
     page.sound()
 
 

@@ -217,8 +217,8 @@ def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client:
     expect(texture).to_contain_text("texture")
     shown.get_by_label("Subset", exact=True).fill("41")
     body = {"region": {"rectangle": [90, 80, 170, 160]}, "subset_px": 41, "spacing_px": 10}
-    told = client.post(f"{API}/tests/{plate}/steps/0/texture", json=body).json()
-    expect(texture).to_contain_text(f"of {told['subsets']} subsets")
+    rated = client.post(f"{API}/tests/{plate}/steps/0/texture", json=body).json()
+    expect(texture).to_contain_text(f"of {rated['subsets']} subsets")
     square = shown.locator('[data-role="subset"]')
     picture = editor.image.bounding_box()
     assert picture is not None
@@ -235,8 +235,8 @@ def test_seeds_in_both_views_and_a_measurement(
 ) -> None:
     pair = StereoPair(*(Camera.from_paper(**cameras[cam]) for cam in ("cam1", "cam2")))
     # places on the plate, by the rig's own cameras
-    places = np.array([[-0.8, -0.5, 0.0], [0.9, -0.4, 0.0], [0.1, 0.9, 0.0]])
-    one, two = (camera.project(places).xy for camera in (pair.cam1, pair.cam2))
+    positions = np.array([[-0.8, -0.5, 0.0], [0.9, -0.4, 0.0], [0.1, 0.9, 0.0]])
+    one, two = (camera.project(positions).xy for camera in (pair.cam1, pair.cam2))
     shown = page.open(f"#/test/{plate}")
     first, second = Editor(shown), Editor(shown, 2)
     x, y = one.mean(axis=0)

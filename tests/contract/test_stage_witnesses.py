@@ -153,8 +153,8 @@ def test_every_error_text_of_the_simulator_is_pymeasures(esp: tuple[Any, SimESP3
     slips = {"EMERGENCY SOP ACTIVATED": "EMERGENCY STOP ACTIVATED"}  # the witness' spelling, the manual's
     for code, text in _TEXTS.items():
         if code:
-            said = GeneralError(code).message
-            assert slips.get(said, said) == text
+            ours = GeneralError(code).message
+            assert slips.get(ours, ours) == text
     for code, text in _AXIS_TEXTS.items():
         assert AxisError(f"1{code:02d}").message == text
 
@@ -343,6 +343,6 @@ def test_the_drivers_states_and_bits_are_hvl_ccbs() -> None:
         else:
             assert int(message.value, 16) not in _STATES
     for error in newport.NewportSMC100PP.MotorErrors:
-        said = error.message.lower().replace("end of turn", "end of run").replace("timeout", "time out")
-        said = said.removesuffix(" detection").replace("80w", "80 w")
-        assert _POSITIONER_ERRORS[11 - error.value].lower() == said
+        ours = error.message.lower().replace("end of turn", "end of run").replace("timeout", "time out")
+        ours = ours.removesuffix(" detection").replace("80w", "80 w")
+        assert _POSITIONER_ERRORS[11 - error.value].lower() == ours

@@ -36,9 +36,9 @@ def test_a_kill_for_want_of_memory_is_told_from_any_other() -> None:
     assert "somebody killed it" in cause_of_death(-9, out_of_memory=False, memory_mib=None)
 
 
-@pytest.mark.parametrize("place", ["vmstat", "own group", "group above", "none"])
+@pytest.mark.parametrize("counter", ["vmstat", "own group", "group above", "none"])
 def test_the_kernels_counts_tell_whether_memory_ran_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counter: str
 ) -> None:
     proc, groups = tmp_path / "proc", tmp_path / "cgroup"
     (proc / "self").mkdir(parents=True)
@@ -57,9 +57,9 @@ def test_the_kernels_counts_tell_whether_memory_ran_out(
     assert len(watch.kills) == 3
     for file in files.values():
         file.write_text("oom 8\noom_kill 2\noom_group_kill 10\n")
-    if place != "none":
-        files[place].write_text("oom 8\noom_kill 3\n")
-    assert watch.killed_since() is (place != "none")
+    if counter != "none":
+        files[counter].write_text("oom 8\noom_kill 3\n")
+    assert watch.killed_since() is (counter != "none")
 
 
 def test_a_process_memory_is_that_of_the_kernel() -> None:

@@ -23,7 +23,7 @@ from server.store.tests import TestStore
 from server.store.verify import verify
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
 
-MOST_CALLS = 400
+MAX_CALLS = 400
 
 
 def image(seed: int) -> np.ndarray:
@@ -91,7 +91,7 @@ class Session:
 @pytest.mark.fault(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_every_call_that_can_fail_fails_once(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for n in range(1, MOST_CALLS):
+    for n in range(1, MAX_CALLS):
         root = tmp_path / f"{n}"
         session = Session(root)
         faulty = FaultyDisk(way, n)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.fuzz_verdict import judge
+from tests.support.fuzz_verdict import check_fuzz
 
 
 @pytest.mark.deep
@@ -19,4 +19,4 @@ from tests.support.fuzz_verdict import judge
 @pytest.mark.fault(52)
 @pytest.mark.fault(48)
 def test_every_value_at_and_beyond_the_bounds(tmp_path: Path) -> None:
-    judge(tmp_path, phases=("examples", "coverage", "stateful"), each=40, seed=20261122, least=7000)
+    check_fuzz(tmp_path, phases=("examples", "coverage", "stateful"), each=40, seed=20261122, min_cases=7000)

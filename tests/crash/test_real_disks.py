@@ -29,8 +29,8 @@ from tests.support.service_rig import TINY
 
 def record(job_id: str, **more: Any) -> JobRecord:
     progress = Progress(stage="", done=0, total=0, eta_s=None)
-    said = {"id": job_id, "kind": "analysis", "state": "running", "subject": {}, "progress": progress}
-    return JobRecord.model_validate({**said, "created_utc": "2026-03-01T12:00:00Z", **more})
+    fields = {"id": job_id, "kind": "analysis", "state": "running", "subject": {}, "progress": progress}
+    return JobRecord.model_validate({**fields, "created_utc": "2026-03-01T12:00:00Z", **more})
 
 
 def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:

@@ -282,8 +282,8 @@ def test_keys_on_a_network_without_tls_are_warned_about(tmp_path: Path) -> None:
         assert "stereorig serves" in process.stdout.readline()
     finally:
         process.terminate()
-        _, said = process.communicate(timeout=60)
-    assert "unencrypted" in said
+        _, printed = process.communicate(timeout=60)
+    assert "unencrypted" in printed
 
 
 def test_it_serves_by_https(tmp_path: Path) -> None:

@@ -39,22 +39,22 @@ def test_the_expected_uncertainty_is_that_of_the_calibration_then_made() -> None
     )
     target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03)
     made = calibrate(views, target, (one, two), CalibrationOptions(held_out_mm=held))
-    told = expect(positions, target, (one, two), noise_px=noise, roll_deg=45.0)
-    assert told.reasons == ()
+    expected = expect(positions, target, (one, two), noise_px=noise, roll_deg=45.0)
+    assert expected.reasons == ()
     for name, sigma in made.sigma.items():
-        assert 0.7 < told.sigma[name] / sigma < 1.4, name
-    assert told.volume.shape_rms_mm == pytest.approx(made.uncertainty.shape_rms_mm, rel=0.25)
-    assert told.volume.scale == pytest.approx(made.uncertainty.scale, rel=0.25)
-    assert told.volume.centre_z_mm == pytest.approx(made.uncertainty.centre_z_mm, rel=0.25)
+        assert 0.7 < expected.sigma[name] / sigma < 1.4, name
+    assert expected.volume.shape_rms_mm == pytest.approx(made.uncertainty.shape_rms_mm, rel=0.25)
+    assert expected.volume.scale == pytest.approx(made.uncertainty.scale, rel=0.25)
+    assert expected.volume.centre_z_mm == pytest.approx(made.uncertainty.centre_z_mm, rel=0.25)
     # the middle and the corners, by derivatives taken here: numbers of a triangulation with shifted parameters
-    assert told.points_mm[0].tolist() == [0.0, 0.0, 0.0]
-    assert {tuple(np.sign(p)) for p in told.points_mm[1:]} == {
+    assert expected.points_mm[0].tolist() == [0.0, 0.0, 0.0]
+    assert {tuple(np.sign(p)) for p in expected.points_mm[1:]} == {
         (x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
     }
-    sigma = _sigma_by_differences(made, told.points_mm)
-    assert told.sigma_mm == pytest.approx(sigma, rel=0.5)
+    sigma = _sigma_by_differences(made, expected.points_mm)
+    assert expected.sigma_mm == pytest.approx(sigma, rel=0.5)
     # where the true cameras are off their nominal values by per cent, Z at the middle differs by as much
-    assert math.isclose(told.sigma_mm[0, 2], sigma[0, 2], rel_tol=0.3)
+    assert math.isclose(expected.sigma_mm[0, 2], sigma[0, 2], rel_tol=0.3)
 
 
 def _sigma_by_differences(made: CalibrationResult, points: np.ndarray) -> np.ndarray:
@@ -74,14 +74,14 @@ def _sigma_by_differences(made: CalibrationResult, points: np.ndarray) -> np.nda
 
 
 def test_twice_the_noise_is_twice_the_uncertainty_and_less_travel_more(client: httpx.Client) -> None:
-    def told(**body: object) -> dict[str, float]:
+    def expected_of(**body: object) -> dict[str, float]:
         answer = client.post("/api/v1/calibrations:expect", json=body)
         assert answer.status_code == 200, answer.text
         return dict(answer.json())
 
-    usual, noisy = told(noise_px=0.005), told(noise_px=0.01)
+    usual, noisy = expected_of(noise_px=0.005), expected_of(noise_px=0.01)
     assert noisy["scale"] == pytest.approx(2 * usual["scale"], rel=1e-3)
-    short = told(positions_mm=[0.0, 0.2], held_out_mm=[])
+    short = expected_of(positions_mm=[0.0, 0.2], held_out_mm=[])
     assert short["centre_px"] > 10 * usual["centre_px"]
     assert short["refused"] is True
     assert any("image centre" in text for text in short["reasons"])
@@ -139,8 +139,8 @@ def calibration(client: httpx.Client) -> str:
 
 
 def test_decisions_are_kept_and_heeded(client: httpx.Client, calibration: str) -> None:
-    nobody = client.post("/api/v1/tests", json={"name": "t", "calibration_id": "accepted"})
-    assert (nobody.status_code, nobody.json()["code"]) == (409, "no_calibration_accepted")
+    none_accepted = client.post("/api/v1/tests", json={"name": "t", "calibration_id": "accepted"})
+    assert (none_accepted.status_code, none_accepted.json()["code"]) == (409, "no_calibration_accepted")
     where = f"/api/v1/calibrations/{calibration}/review"
     accepted = client.put(where, json={"decision": "accepted", "note": "fresh"}).json()
     assert accepted["review"]["decision"] == "accepted"

@@ -357,9 +357,9 @@ def test_damaged_files_are_refused(text: str, code: str, word: str) -> None:
 
 
 def test_cameras_that_see_nothing_in_common_are_warned_of() -> None:
-    looks_past = json.loads(json.dumps(PAPER))
-    looks_past["cam2"]["y0_mm"] += 600.0
-    warned = check_calibration(parse_calibration(json.dumps(looks_past).encode(), name="x"))
+    misaligned = json.loads(json.dumps(PAPER))
+    misaligned["cam2"]["y0_mm"] += 600.0
+    warned = check_calibration(parse_calibration(json.dumps(misaligned).encode(), name="x"))
     assert any("in common" in w for w in warned.warnings)
 
 
@@ -452,9 +452,9 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     (tmp_path / "in.caldat").write_text(CALDAT, encoding="utf-8")
     out = tmp_path / "new" / "out.xml"
     assert main(["calibration", "convert", str(tmp_path / "in.caldat"), str(out), "--to", "vic3d"]) == 0
-    said = capsys.readouterr().out
-    assert "fitted, residual" in said
-    assert "lens polynomial is not published" in said
+    printed = capsys.readouterr().out
+    assert "fitted, residual" in printed
+    assert "lens polynomial is not published" in printed
     report = json.loads((tmp_path / "new" / "out.xml.report.json").read_text(encoding="utf-8"))
     assert report["lens"]["cam1"]["max_px"] > 0.01  # its p1 and p2 have no place there
     assert report["lens"]["cam2"]["max_px"] == 0.0

@@ -107,9 +107,9 @@ def test_a_burst_takes_its_steps_at_the_interval_and_tells_each(client: httpx.Cl
     assert done["kind"] == "burst"
     assert [s["index"] for s in done["result"]["steps"]] == [0, 1, 2, 3]
     assert [s["n"] for s in done["result"]["steps"]] == [0, 1, 2, 3] == steps_of(client, test_id)
-    for told in done["result"]["steps"]:
-        step = client.get(f"{API}/tests/{test_id}/steps/{told['n']}").json()
-        assert step["sha256"] == told["sha256"]
+    for listed in done["result"]["steps"]:
+        step = client.get(f"{API}/tests/{test_id}/steps/{listed['n']}").json()
+        assert step["sha256"] == listed["sha256"]
         assert step["label"] == "b"
         assert step["burst"]["job_id"] == job["id"]
     since = [s["since_first_ms"] for s in done["result"]["steps"]]
@@ -202,16 +202,16 @@ def test_a_watched_channel_takes_a_step_at_each_change(client: httpx.Client) -> 
     refused(client.post(f"{url}/channels", json={"channels": {"force_n": 0.0}}), 409, "watch_off")
     watch = client.put(f"{url}/watch", json={"channel": "force_n", "threshold": 100.0, "label": "ramp"}).json()
     assert (watch["active"], watch["last_value"]) == (True, None)
-    told = []
+    answers = []
     for force in (0.0, 60.0, 99.9, 100.0, 150.0, 201.0, 150.0, 100.9, 101.0):
         reading = {"channels": {"force_n": force, "stroke_mm": force / 1000.0}, "timestamp_utc": "2026-03-01T12:00:00Z"}
         answer = client.post(f"{url}/channels", json=reading)
-        told.append((answer.status_code, answer.json()["reason"]))
+        answers.append((answer.status_code, answer.json()["reason"]))
         assert (answer.status_code == 201) == answer.json()["taken"] == (answer.json()["step"] is not None)
     below = (200, "below_threshold")
     changed = (201, "changed")
     # compared with the last step, not the last reading: small changes add up
-    assert told == [(201, "first"), below, below, changed, below, changed, below, changed, below]
+    assert answers == [(201, "first"), below, below, changed, below, changed, below, changed, below]
     steps = [client.get(f"{url}/steps/{n}").json() for n in steps_of(client, test_id)]
     assert [s["channels"]["force_n"] for s in steps] == [0.0, 100.0, 201.0, 100.9]
     assert steps[1]["channels"]["stroke_mm"] == 0.1
@@ -311,13 +311,13 @@ def test_everything_that_is_made_is_made_once_also_after_a_restart(again: Any, t
         (f"{url}/channels", {"load_n": 5.0}),
         ("/noise", {"frames": 8}),
     ]
-    told: list[dict[str, Any]] = []
+    answers: list[dict[str, Any]] = []
     for k, (path, body) in enumerate(asked):
         answer = client.post(API + path, json=body, headers={"Idempotency-Key": f"key {k}"})
         assert answer.status_code in (201, 202), answer.text
-        told.append(answer.json())
-        if "job" in told[-1]:
-            wait_for_job(client, told[-1]["job"])
+        answers.append(answer.json())
+        if "job" in answers[-1]:
+            wait_for_job(client, answers[-1]["job"])
     counts = (
         len(client.get(f"{API}/tests").json()["tests"]),
         len(steps_of(client, test_id)),
@@ -333,7 +333,7 @@ def test_everything_that_is_made_is_made_once_also_after_a_restart(again: Any, t
         key = {"Idempotency-Key": f"key {k}"}
         answer = client.post(API + path, json=body, headers=key)
         assert answer.status_code in (201, 202), answer.text
-        now, then = answer.json(), told[k]
+        now, then = answer.json(), answers[k]
         if "job" in then:
             assert now["job"]["id"] == then["job"]["id"]
             assert now["job"]["state"] == client.get(f"{API}/jobs/{then['job']['id']}").json()["state"]

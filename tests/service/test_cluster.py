@@ -95,7 +95,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         made.close()
 
 
-class Place:
+class Host:
     """A service whose analyses run here or there."""
 
     def __init__(self, data: Path, compute: str) -> None:
@@ -119,9 +119,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 URL = f"{API}/tests/t000001-abcdef"
 
 
-def measured(place: Place, **changes: Any) -> str:
-    url, job = begin(place.client, URL, **changes)
-    done = wait_for_job(place.client, job)
+def measured(host: Host, **changes: Any) -> str:
+    url, job = begin(host.client, URL, **changes)
+    done = wait_for_job(host.client, job)
     assert done["state"] == "succeeded", done["problem"]
     return url
 
@@ -129,23 +129,23 @@ def measured(place: Place, **changes: Any) -> str:
 @pytest.fixture(scope="module")
 def here(data: Path) -> dict[str, list[dict[str, Any]]]:
     """What the service's own worker finds, in a chain and with steps that need the reference alone."""
-    place = Place(data, "")
+    host = Host(data, "")
     try:
         found = {}
         for name, changes in (("chain", {}), ("independent", INDEPENDENT)):
-            folder = folder_of(place, measured(place, **changes))
+            folder = folder_of(host, measured(host, **changes))
             found[name] = [contents(folder / f"step_{n:04d}.nc") for n in range(STEPS)]
     finally:
-        place.close()
+        host.close()
     return found
 
 
 @pytest.fixture(scope="module")
-def elsewhere(data: Path, here: Any, cluster: Cluster) -> Iterator[Place]:
+def elsewhere(data: Path, here: Any, cluster: Cluster) -> Iterator[Host]:
     """The same data folder, its analyses on the cluster, images by path."""
-    place = Place(data, f'[compute]\nscheduler = "{cluster.address}"')
-    yield place
-    place.close()
+    host = Host(data, f'[compute]\nscheduler = "{cluster.address}"')
+    yield host
+    host.close()
 
 
 def assert_equal(found: list[dict[str, Any]], folder: Path) -> None:
@@ -164,13 +164,13 @@ def assert_equal(found: list[dict[str, Any]], folder: Path) -> None:
 
 @pytest.mark.fault(44)
 @pytest.mark.parametrize("kind", ["chain", "independent"])
-def test_a_cluster_finds_what_the_worker_finds(elsewhere: Place, here: Any, kind: str) -> None:
+def test_a_cluster_finds_what_the_worker_finds(elsewhere: Host, here: Any, kind: str) -> None:
     url = measured(elsewhere, **(INDEPENDENT if kind == "independent" else {}))
     assert_equal(here[kind], folder_of(elsewhere, url))
     assert elsewhere.client.get(url).json()["steps_finished"] == list(range(STEPS))
 
 
-def test_a_killed_workers_steps_are_done_again(elsewhere: Place, here: Any, cluster: Cluster) -> None:
+def test_a_killed_workers_steps_are_done_again(elsewhere: Host, here: Any, cluster: Cluster) -> None:
     url, job = begin(elsewhere.client, URL, **INDEPENDENT)
     wait_for_steps(elsewhere.client, url, 2)
     victim = cluster.workers.pop(0)
@@ -183,7 +183,7 @@ def test_a_killed_workers_steps_are_done_again(elsewhere: Place, here: Any, clus
 
 
 @pytest.mark.fault(43)
-def test_an_analysis_on_the_cluster_is_cancelled_within_a_second_and_goes_on(elsewhere: Place, here: Any) -> None:
+def test_an_analysis_on_the_cluster_is_cancelled_within_a_second_and_goes_on(elsewhere: Host, here: Any) -> None:
     client = elsewhere.client
     url, job = begin(client, URL, **INDEPENDENT)
     wait_for_steps(client, url, 2)
@@ -200,33 +200,33 @@ def test_an_analysis_on_the_cluster_is_cancelled_within_a_second_and_goes_on(els
 
 @pytest.mark.parametrize("kind", ["chain", "independent"])
 def test_images_may_travel_with_the_steps(
-    elsewhere: Place, data: Path, here: Any, cluster: Cluster, tmp_path: Path, kind: str
+    elsewhere: Host, data: Path, here: Any, cluster: Cluster, tmp_path: Path, kind: str
 ) -> None:
     shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
-    place = Place(tmp_path, f'[compute]\nscheduler = "{cluster.address}"\nimages = "scatter"')
+    host = Host(tmp_path, f'[compute]\nscheduler = "{cluster.address}"\nimages = "scatter"')
     try:
-        url = measured(place, **(INDEPENDENT if kind == "independent" else {}))
-        assert_equal(here[kind], folder_of(place, url))
-        names = {path.suffix for path in folder_of(place, url).iterdir()}
+        url = measured(host, **(INDEPENDENT if kind == "independent" else {}))
+        assert_equal(here[kind], folder_of(host, url))
+        names = {path.suffix for path in folder_of(host, url).iterdir()}
         assert ".npz" not in names  # nothing is left of what only an unfinished analysis needs
     finally:
-        place.close()
+        host.close()
 
 
 def test_a_scheduler_that_is_not_there_is_named(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.worker.dask_cluster._CONNECT_S", 0.5)
     shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
-    place = Place(tmp_path, '[compute]\nscheduler = "tcp://127.0.0.1:9"')
+    host = Host(tmp_path, '[compute]\nscheduler = "tcp://127.0.0.1:9"')
     try:
-        _, job = begin(place.client, URL, **INDEPENDENT)
-        problem = wait_for_job(place.client, job)["problem"]
+        _, job = begin(host.client, URL, **INDEPENDENT)
+        problem = wait_for_job(host.client, job)["problem"]
         assert problem["code"] == "cluster_unreachable"
         assert "tcp://127.0.0.1:9" in problem["cause"]
     finally:
-        place.close()
+        host.close()
 
 
-def test_steps_that_start_from_the_reference_need_total_correlation(elsewhere: Place) -> None:
+def test_steps_that_start_from_the_reference_need_total_correlation(elsewhere: Host) -> None:
     body = {**BODY, **INDEPENDENT, "reference_update": "always"}
     answer = elsewhere.client.post(f"{URL}/analyses", json=body)
     assert (answer.status_code, answer.json()["code"]) == (422, "values_disagree")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.support.copied_tests import write_test_folder
-from tests.support.running_analyses import API, BODY, Place, begin, contents, folder_of, wait_for_steps
+from tests.support.running_analyses import API, BODY, Host, begin, contents, folder_of, wait_for_steps
 from tests.support.service_rig import a_second, wait_for_job
 
 STEPS = 5
@@ -30,8 +30,8 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def place(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    made = Place(tmp_path_factory.mktemp("place") / "data")
+def host(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Host]:
+    made = Host(tmp_path_factory.mktemp("place") / "data")
     shutil.copytree(taken, made.data / "tests" / taken.name)
     made.start()
     yield made
@@ -50,36 +50,36 @@ def succeed(client: httpx.Client, job: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def plain(place: Place, test_url: str) -> str:
+def plain(host: Host, test_url: str) -> str:
     """Every step in one go."""
-    url, job = begin(place.client, test_url)
-    succeed(place.client, job)
+    url, job = begin(host.client, test_url)
+    succeed(host.client, job)
     return url
 
 
-def assert_close(told: Any, expected: Any) -> None:
+def assert_close(actual: Any, expected: Any) -> None:
     """The same in words and to rounding in figures: code that is compiled twice rounds twice."""
-    if isinstance(told, dict):
-        for name, value in told.items():
+    if isinstance(actual, dict):
+        for name, value in actual.items():
             assert_close(value, expected[name])
     else:
-        assert told == (pytest.approx(expected, rel=1e-9) if isinstance(told, float) else expected)
+        assert actual == (pytest.approx(expected, rel=1e-9) if isinstance(actual, float) else expected)
 
 
-def assert_same_results(place: Place, one: str, two: str) -> None:
+def assert_same_results(host: Host, one: str, two: str) -> None:
     """Bit by bit, in every variable of every step; and in what the summaries tell of it."""
     for n in range(STEPS):
-        a, b = (contents(folder_of(place, url) / f"step_{n:04d}.nc") for url in (one, two))
+        a, b = (contents(folder_of(host, url) / f"step_{n:04d}.nc") for url in (one, two))
         assert a.keys() == b.keys()
         assert len(a) >= 20
         for name in a:
             assert a[name].dtype == b[name].dtype
             assert a[name].tobytes() == b[name].tobytes(), (n, name)
-    told = [place.client.get(url).json()["summary"]["steps"] for url in (one, two)]
+    summaries = [host.client.get(url).json()["summary"]["steps"] for url in (one, two)]
     timings = ("wall_s", "compute_s", "write_s", "seconds")
-    for a_step, b_step in zip(*told, strict=True):
+    for a_step, b_step in zip(*summaries, strict=True):
         assert_close({k: v for k, v in a_step.items() if k not in timings}, b_step)
-    w = contents(folder_of(place, one) / f"step_{STEPS - 1:04d}.nc")["w_mm"]
+    w = contents(folder_of(host, one) / f"step_{STEPS - 1:04d}.nc")["w_mm"]
     assert np.nanmax(np.abs(w)) > 0.05  # a plate that bends
 
 
@@ -89,9 +89,9 @@ def assert_same_results(place: Place, one: str, two: str) -> None:
 @pytest.mark.fault(43)
 @pytest.mark.parametrize("update", ["auto", "always"])
 def test_a_cancelled_analysis_goes_on_as_if_nothing_had_been(
-    place: Place, test_url: str, plain: str, update: str
+    host: Host, test_url: str, plain: str, update: str
 ) -> None:
-    client = place.client
+    client = host.client
     if update != "auto":
         plain, job = begin(client, test_url, reference_update=update)
         succeed(client, job)
@@ -99,7 +99,7 @@ def test_a_cancelled_analysis_goes_on_as_if_nothing_had_been(
     wait_for_steps(client, url, 2)
     limit = a_second(client)
     # as a worker leaves them that is ended while it writes
-    half = [folder_of(place, url) / name for name in (".step_0004.nc.0a1b2c3d.part", "step_0004.nc.sha256")]
+    half = [folder_of(host, url) / name for name in (".step_0004.nc.0a1b2c3d.part", "step_0004.nc.sha256")]
     for path in half:
         path.write_bytes(b"")
     asked = time.monotonic()
@@ -110,20 +110,20 @@ def test_a_cancelled_analysis_goes_on_as_if_nothing_had_been(
     assert not any(path.exists() for path in half)
     kept = client.get(url).json()["steps_finished"]
     assert 2 <= len(kept) < STEPS
-    before = {n: (folder_of(place, url) / f"step_{n:04d}.nc").stat().st_ino for n in kept}
+    before = {n: (folder_of(host, url) / f"step_{n:04d}.nc").stat().st_ino for n in kept}
     key = {"Idempotency-Key": f"rest of {url}"}
     first, again = (client.post(f"{url}:continue", headers=key) for _ in range(2))
     assert first.status_code == again.status_code == 202, first.text
     assert first.json()["job"]["id"] == again.json()["job"]["id"] != job["id"]
     done = succeed(client, first.json()["job"])
     assert done["result"]["steps_finished"] == list(range(STEPS))
-    assert {n: (folder_of(place, url) / f"step_{n:04d}.nc").stat().st_ino for n in kept} == before
+    assert {n: (folder_of(host, url) / f"step_{n:04d}.nc").stat().st_ino for n in kept} == before
     assert client.get(url).json()["job_id"] == done["id"]
-    assert_same_results(place, plain, url)
+    assert_same_results(host, plain, url)
 
 
-def test_a_worker_that_was_killed_is_told_and_its_analysis_goes_on(place: Place, test_url: str, plain: str) -> None:
-    client, worker = place.client, place.service.worker
+def test_a_worker_that_was_killed_is_told_and_its_analysis_goes_on(host: Host, test_url: str, plain: str) -> None:
+    client, worker = host.client, host.service.worker
     url, job = begin(client, test_url)
     wait_for_steps(client, url, 1)
     starts = worker.starts
@@ -138,26 +138,26 @@ def test_a_worker_that_was_killed_is_told_and_its_analysis_goes_on(place: Place,
     assert done["problem"]["context"]["memory_mib"] > 20.0
     assert worker.starts == starts + 1
     succeed(client, client.post(f"{url}:continue").json()["job"])
-    assert_same_results(place, plain, url)
+    assert_same_results(host, plain, url)
 
 
-def test_a_damaged_result_is_measured_again(place: Place, test_url: str, plain: str) -> None:
-    client = place.client
+def test_a_damaged_result_is_measured_again(host: Host, test_url: str, plain: str) -> None:
+    client = host.client
     url, job = begin(client, test_url, steps=[1, 2, 3, 4])
     wait_for_steps(client, url, 3)
     client.post(f"{API}/jobs/{job['id']}/cancel")
     wait_for_job(client, job)
-    path = folder_of(place, url) / "step_0001.nc"
+    path = folder_of(host, url) / "step_0001.nc"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     succeed(client, client.post(f"{url}:continue").json()["job"])
-    assert_same_results(place, plain, url)
+    assert_same_results(host, plain, url)
 
 
 @pytest.mark.fault(51)
-def test_what_cannot_go_on_says_why(place: Place, test_url: str, plain: str) -> None:
-    client = place.client
+def test_what_cannot_go_on_says_why(host: Host, test_url: str, plain: str) -> None:
+    client = host.client
 
     def refused(answer: httpx.Response, status: int, code: str) -> None:
         assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
@@ -173,7 +173,7 @@ def test_what_cannot_go_on_says_why(place: Place, test_url: str, plain: str) -> 
     refused(client.post(f"{url}:finish"), 409, "not_following")
     client.post(f"{API}/jobs/{job['id']}/cancel")
     wait_for_job(client, job)
-    file = folder_of(place, url) / "analysis.json"
+    file = folder_of(host, url) / "analysis.json"
     text = file.read_text()
     version = client.get(url).json()["software"]
     file.write_text(text.replace(f'"{version}"', '"0.0.1"'))
@@ -196,10 +196,10 @@ def send(client: httpx.Client, url: str, taken: Path, n: int) -> None:
 
 
 @pytest.fixture
-def growing(place: Place, taken: Path) -> str:
+def growing(host: Host, taken: Path) -> str:
     """A test with its reference alone, the calibration beside it."""
-    name = f"t{len(list((place.data / 'tests').iterdir())) + 1:06d}-abcdef"
-    folder = place.data / "tests" / name
+    name = f"t{len(list((host.data / 'tests').iterdir())) + 1:06d}-abcdef"
+    folder = host.data / "tests" / name
     shutil.copytree(taken, folder)
     for n in range(1, STEPS):
         shutil.rmtree(folder / "steps" / f"{n:04d}")
@@ -221,9 +221,9 @@ def wait_until_it_waits(client: httpx.Client, job: dict[str, Any]) -> None:
 
 
 def test_an_analysis_follows_its_test_and_leaves_the_lane_to_others(
-    place: Place, taken: Path, test_url: str, plain: str, growing: str
+    host: Host, taken: Path, test_url: str, plain: str, growing: str
 ) -> None:
-    client = place.client
+    client = host.client
     url, job = begin(client, growing, follow=True)
     wait_for_steps(client, url, 1)
     send(client, growing, taken, 1)
@@ -241,15 +241,15 @@ def test_an_analysis_follows_its_test_and_leaves_the_lane_to_others(
     assert client.post(f"{url}:finish").status_code == 202
     done = succeed(client, job)
     assert done["result"]["steps_finished"] == list(range(STEPS))
-    assert_same_results(place, plain, url)
+    assert_same_results(host, plain, url)
     assert client.post(f"{url}:finish").json()["code"] == "not_following"
 
 
 @pytest.mark.fault(43)
 def test_a_follower_that_waits_is_cancelled_at_once_and_goes_on_when_asked(
-    place: Place, taken: Path, plain: str, growing: str
+    host: Host, taken: Path, plain: str, growing: str
 ) -> None:
-    client = place.client
+    client = host.client
     url, job = begin(client, growing, follow=True)
     wait_until_it_waits(client, job)
     limit = a_second(client)
@@ -264,16 +264,16 @@ def test_a_follower_that_waits_is_cancelled_at_once_and_goes_on_when_asked(
         send(client, growing, taken, n)
     client.post(f"{url}:finish")
     succeed(client, rest)
-    assert_same_results(place, plain, url)
+    assert_same_results(host, plain, url)
 
 
 @pytest.mark.fault(2)
 def test_a_follower_outlives_a_restart_as_interrupted_and_goes_on(
-    place: Place, taken: Path, plain: str, growing: str
+    host: Host, taken: Path, plain: str, growing: str
 ) -> None:
-    url, job = begin(place.client, growing, follow=True)
-    wait_until_it_waits(place.client, job)
-    client = place.start()
+    url, job = begin(host.client, growing, follow=True)
+    wait_until_it_waits(host.client, job)
+    client = host.start()
     assert client.get(f"{API}/jobs/{job['id']}").json()["state"] == "interrupted"
     assert client.get(url).json()["state"] == "interrupted"
     for n in range(1, STEPS):
@@ -282,4 +282,4 @@ def test_a_follower_outlives_a_restart_as_interrupted_and_goes_on(
     wait_for_steps(client, url, STEPS)
     client.post(f"{url}:finish")
     succeed(client, rest)
-    assert_same_results(place, plain, url)
+    assert_same_results(host, plain, url)

@@ -96,12 +96,12 @@ def test_a_search_that_hangs_is_not_started_again() -> None:
         release.wait(30)
         return [GOOD]
 
-    look = finder(good=hangs)
+    search = finder(good=hangs)
     for _ in range(3):
-        assert states(look.find(timeout_s=0.02))["good"] == "timeout"
+        assert states(search.find(timeout_s=0.02))["good"] == "timeout"
     assert len(calls) == 1
     release.set()
-    assert len(look.find(timeout_s=5.0).cameras) == 1
+    assert len(search.find(timeout_s=5.0).cameras) == 1
 
 
 @pytest.mark.parametrize("named", ["Maker-Model-1", "10.0.0.2", "1", "by some other name"])

@@ -43,7 +43,7 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-def look(rig: Path, **options: Any) -> Report:
+def diagnose(rig: Path, **options: Any) -> Report:
     return examine(rig, seconds=0.3, data=rig.parent / "data", **options)
 
 
@@ -114,7 +114,7 @@ def test_text_has_a_line_for_each_check_and_the_verdict_last(rig: Path, capsys: 
 def test_a_rig_file_that_cannot_be_read_fails_but_the_machine_is_looked_at(tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(TINY.replace("max_skew_ms = 1.0", "max_skew_mms = 1.0"))
-    report = look(path)
+    report = diagnose(path)
     assert not report.good
     assert report.rig is None
     assert "max_skew_mms" in check_of(report, "rig file", "reading").found
@@ -148,18 +148,18 @@ def test_a_port_that_another_program_holds_is_named(rig: Path) -> None:
         ) as other:
             assert other.stdout is not None
             other.stdout.readline()
-            held = look(rig)
+            held = diagnose(rig)
             other.communicate("\n")
         assert f"process {other.pid}" in check_of(held, "stage", "port").found
         assert not held.good
-        assert check_of(look(rig), "stage", "port").state == "ok"
+        assert check_of(diagnose(rig), "stage", "port").state == "ok"
 
 
 def test_a_real_stage_behind_simulated_cameras_does_not_move(rig: Path) -> None:
     controller = make_controller("esp301", (1, 2), travel_mm=(-12.0, 12.0))
     with ControllerServer(controller) as line:
         rig.write_text(TINY.replace('url = "sim"', f'url = "{line.url}"'))
-        report = look(rig)
+        report = diagnose(rig)
     assert report.good
     assert not controller.commands("OR")
     assert not controller.commands("PA")
@@ -171,7 +171,7 @@ def test_a_real_stage_behind_simulated_cameras_does_not_move(rig: Path) -> None:
 
 def test_a_camera_that_another_program_holds_is_named(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil(monkeypatch, "cam2", lambda camera: setattr(camera.faults, "busy", True))
-    report = look(rig)
+    report = diagnose(rig)
     assert not report.good
     opening = check_of(report, "cam2", "opening")
     assert "camera_busy" in opening.found
@@ -212,7 +212,7 @@ def test_a_camera_that_falls_silent_fails_and_the_stage_is_still_examined(
         camera._description = replace(camera._description, latency_s=0.0)
 
     spoil(monkeypatch, "cam1", silence)
-    report = look(rig)
+    report = diagnose(rig)
     assert "silent" in check_of(report, "cam1", "frames").found
     assert check_of(report, "stage", "answers").state == "ok"
     assert check_of(report, "disk", "writing").state == "ok"
@@ -221,7 +221,7 @@ def test_a_camera_that_falls_silent_fails_and_the_stage_is_still_examined(
 
 def test_damaged_frames_are_counted(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil(monkeypatch, "cam1", lambda camera: setattr(camera.faults, "incomplete", 10**6))
-    report = look(rig)
+    report = diagnose(rig)
     assert not report.good
     some = [check for check in report.checks if check.part in ("cam1", "pairs") and check.state == "failed"]
     assert any("incomplete" in check.found for check in some)
@@ -250,7 +250,7 @@ def test_a_setting_that_the_device_bends_fails(rig: Path, monkeypatch: pytest.Mo
             return replace(super().configure(settings), exposure_ms=8.0, gain_db=0.0)
 
     monkeypatch.setattr(server.rig.build, "SimFrameGrabber", Bends)
-    report = look(rig)
+    report = diagnose(rig)
     settings = check_of(report, "cam1", "settings")
     assert settings.state == "failed"
     assert "exposure_ms 8.0 instead of 10.0" in settings.found
@@ -260,7 +260,7 @@ def test_a_setting_that_the_device_bends_fails(rig: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(("light", "code"), [(0.001, "dark"), (5.0, "saturated")])
 def test_black_and_saturated_images_are_warned_of(rig: Path, light: float, code: str) -> None:
     rig.write_text(TINY + f"gain = {light}\n")  # the file ends in camera 2's truth
-    report = look(rig)
+    report = diagnose(rig)
     image = check_of(report, "cam2", "image")
     assert image.state == "warning"
     assert image.found.startswith(code)
@@ -273,7 +273,7 @@ def test_an_image_of_another_size_than_the_rig_file_says_fails(rig: Path, monkey
         camera._settings = replace(camera._settings, region_px=(0, 0, 64, 48))
 
     spoil(monkeypatch, "cam2", crop)
-    report = look(rig)
+    report = diagnose(rig)
     failed = [check for check in report.checks if check.state == "failed"]
     assert any("cam2 delivers images of 64 x 48 px" in check.found for check in failed)
     assert not report.good

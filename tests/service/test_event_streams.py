@@ -19,7 +19,7 @@ from tests.support.service_rig import new_test, served, tiny_config, wait_for_jo
 API = "/api/v1"
 
 
-def read_events(client: httpx.Client, path: str, last: int | None = None, most: int | None = None) -> list[Any]:
+def read_events(client: httpx.Client, path: str, last: int | None = None, max_events: int | None = None) -> list[Any]:
     """Read (id, name, data) until the stream ends or so many have come."""
     found: list[Any] = []
     headers = {} if last is None else {"Last-Event-ID": str(last)}
@@ -30,7 +30,7 @@ def read_events(client: httpx.Client, path: str, last: int | None = None, most: 
             if line == "" and "data" in fields:
                 found.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
                 fields = {}
-                if most is not None and len(found) >= most:
+                if max_events is not None and len(found) >= max_events:
                     break
             elif ": " in line:
                 name, _, value = line.partition(": ")
@@ -113,9 +113,9 @@ def test_progress_travels_without_the_result(client: httpx.Client, service: Serv
     before = service.hub.last_number
     job = service.jobs.submit("analysis", "an analysis", {}, [Phase("compute", run)])
     wait_for_job(client, {"id": job.id})
-    told = [e.data for e in service.hub.after(before) if e.name == "job"]
-    assert [d["change"] for d in told if "result" not in d] == ["progress"] * 3
-    assert told[-1]["result"]["done"] is True
+    sent = [e.data for e in service.hub.after(before) if e.name == "job"]
+    assert [d["change"] for d in sent if "result" not in d] == ["progress"] * 3
+    assert sent[-1]["result"]["done"] is True
 
 
 def test_streams_resume_over_a_restart(tmp_path: Path) -> None:
@@ -128,11 +128,11 @@ def test_streams_resume_over_a_restart(tmp_path: Path) -> None:
                 wait_for_rig(client)
                 if start == 1:
                     test_id = new_test(client)
-                    gap, *rest = read_events(client, "/events", ids[-1], most=2)
+                    gap, *rest = read_events(client, "/events", ids[-1], max_events=2)
                     assert gap[1] == "gap"
                     assert gap[2]["after"] == ids[-1] < gap[0]
                     while test_id not in str(rest):  # others may have come first
-                        rest = read_events(client, "/events", rest[-1][0], most=1)
+                        rest = read_events(client, "/events", rest[-1][0], max_events=1)
                     # a job of the run before, of whose end the reader has not heard
                     ((number, name, data),) = read_events(client, f"/jobs/{job_id}/events", ids[0])
                     assert (name, data["state"]) == ("job", "succeeded")

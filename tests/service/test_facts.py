@@ -17,7 +17,7 @@ from server.workflows.service import Service
 from tests.support.service_rig import TINY, new_test, tiny_config
 
 API = "/api/v1"
-FACTS = {
+METADATA = {
     "operator": "Jörg <b>",
     "lighting": "two LED panels",
     "cam1": {"maker": "Basler", "pixel_um": 3.45, "lens": {"focal_length_mm": 50.0, "f_number": 8.0}},
@@ -31,9 +31,9 @@ def test_facts_are_kept_in_the_tests_own_folder(client: httpx.Client, service: S
     url = f"{API}/tests/{test_id}/facts"
     empty = client.get(url)
     assert (empty.status_code, empty.json()) == (200, {})
-    put = client.put(url, json=FACTS)
+    put = client.put(url, json=METADATA)
     assert put.status_code == 200, put.text
-    assert put.json()["cam1"] == FACTS["cam1"]
+    assert put.json()["cam1"] == METADATA["cam1"]
     again = client.get(url)
     assert again.json() == put.json()
     assert again.headers["etag"] == put.headers["etag"] != empty.headers["etag"]
@@ -90,9 +90,9 @@ def test_no_facts_of_no_test(client: httpx.Client) -> None:
 def test_a_file_of_facts(tmp_path: Path) -> None:
     path = tmp_path / "facts.toml"
     path.write_text('operator = "A"\nstatic_steps = [1]\n[cam2.lens]\nf_number = 5.6\n')
-    facts = load_metadata(path)
-    assert facts.cam2 == CameraMetadata(lens=LensMetadata(f_number=5.6))
-    assert facts.document() == {"operator": "A", "static_steps": [1], "cam2": {"lens": {"f_number": 5.6}}}
+    metadata = load_metadata(path)
+    assert metadata.cam2 == CameraMetadata(lens=LensMetadata(f_number=5.6))
+    assert metadata.document() == {"operator": "A", "static_steps": [1], "cam2": {"lens": {"f_number": 5.6}}}
     for text, code in (("operator = ", "file_unreadable"), ("operater = 'A'", "metadata_invalid")):
         path.write_text(text)
         with pytest.raises(FileFormatError) as caught:
@@ -106,8 +106,8 @@ def test_a_file_of_facts(tmp_path: Path) -> None:
 
 def test_the_tests_facts_go_before_the_rig_files() -> None:
     rig = {"maker": "Basler", "exposure_ms": 8.0, "lens": {"maker": "Zeiss", "f_number": 8.0}}
-    told = merged(CameraMetadata(maker="IDS", lens=LensMetadata(f_number=11.0)), rig)
-    assert told == CameraMetadata(maker="IDS", lens=LensMetadata(maker="Zeiss", f_number=11.0))
+    combined = merged(CameraMetadata(maker="IDS", lens=LensMetadata(f_number=11.0)), rig)
+    assert combined == CameraMetadata(maker="IDS", lens=LensMetadata(maker="Zeiss", f_number=11.0))
     assert merged(None, None) == CameraMetadata()
 
 

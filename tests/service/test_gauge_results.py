@@ -73,8 +73,8 @@ def gauge(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, 
         rc = main(["gauge", *map(str, args)])
     except SystemExit as ended:
         rc = int(ended.code or 0)
-    said = capsys.readouterr()
-    return rc, said.out, said.err
+    printed = capsys.readouterr()
+    return rc, printed.out, printed.err
 
 
 OPTIONS = (
@@ -105,9 +105,9 @@ BODY: dict[str, Any] = {
 
 def test_time_histories_of_a_known_stretch(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "gauges.json"
-    rc, said, err = gauge(capsys, results, *OPTIONS, "--out", out)
+    rc, printed, err = gauge(capsys, results, *OPTIONS, "--out", out)
     assert (rc, err) == (0, "")
-    assert "extensometer axial from (55, 75) to (145, 75) px" in said
+    assert "extensometer axial from (55, 75) to (145, 75) px" in printed
     document = json.loads(out.read_text())
     for path in results.glob("*.nc"):
         assert document["inputs_sha256"][path.name] == hashlib.sha256(path.read_bytes()).hexdigest()
@@ -139,8 +139,8 @@ def test_gauges_in_mm_read_what_those_in_pixels_do(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ends = ",".join(str(v) for xy in (A, B) for v in flat(*map(np.array, xy))[:2])
-    place = ",".join(str(v) for v in flat(np.array(60.0), np.array(80.0))[:2])
-    mm = ("--extensometer-mm", f"far={ends}", "--point-mm", place)
+    position_text = ",".join(str(v) for v in flat(np.array(60.0), np.array(80.0))[:2])
+    mm = ("--extensometer-mm", f"far={ends}", "--point-mm", position_text)
     rc, _, err = gauge(capsys, results, *OPTIONS, *mm, "--out", tmp_path / "g.json")
     assert (rc, err) == (0, "")
     for step in json.loads((tmp_path / "g.json").read_text())["steps"]:
@@ -186,7 +186,7 @@ def test_rigid_motion_and_frame_on_the_command_line(
     errors = pixel_noise(np.random.default_rng(5), moved, 1)[0]
     assert moved.uvw_mm is not None
     write(tmp_path, 1, replace(moved, xyz_mm=moved.xyz_mm + errors[..., :3], uvw_mm=moved.uvw_mm + errors[..., 3:]))
-    rc, said, err = gauge(
+    rc, printed, err = gauge(
         capsys,
         tmp_path,
         "--align",
@@ -203,7 +203,7 @@ def test_rigid_motion_and_frame_on_the_command_line(
         tmp_path / "g.json",
     )
     assert (rc, err) == (0, "")
-    assert "rigid motion taken out" in said
+    assert "rigid motion taken out" in printed
     document = json.loads((tmp_path / "g.json").read_text())
     assert document["frame"].startswith("aligned by plane")
     # the new X is the old Y, Z stays, so that the new Y is the old -X
@@ -217,8 +217,8 @@ def test_rigid_motion_and_frame_on_the_command_line(
     for name in ("u_mm", "v_mm", "w_mm"):
         assert step["areas"][0]["values"][name]["mean"] == pytest.approx(0.0, abs=1e-4)
         assert abs(step["points"][0]["values"][name]["value"]) < 5 * step["points"][0]["values"][name]["sigma"]
-    places = "3-2-1:50,70,140,75,80,140,55,100,120,104,61,66"
-    rc, _, err = gauge(capsys, results, "--align", places, "--point", "61,66", "--out", tmp_path / "h.json")
+    alignment = "3-2-1:50,70,140,75,80,140,55,100,120,104,61,66"
+    rc, _, err = gauge(capsys, results, "--align", alignment, "--point", "61,66", "--out", tmp_path / "h.json")
     assert (rc, err) == (0, "")
     point = json.loads((tmp_path / "h.json").read_text())["steps"][0]["points"][0]["values"]
     assert point["x_mm"]["value"] == pytest.approx(0.0, abs=1e-9)
@@ -358,14 +358,14 @@ def test_a_step_too_empty_for_its_rigid_motion_says_so_and_the_others_stand(
 ) -> None:
     write(tmp_path, 1, stretched(0.01))
     write(tmp_path, 2, make_field(lambda x: x, shape=flat, failed=np.ones((14, 17), bool)))
-    rc, said, _ = gauge(capsys, tmp_path, "--remove-rigid", "--point", "60,80", "--out", tmp_path / "g.csv")
+    rc, printed, _ = gauge(capsys, tmp_path, "--remove-rigid", "--point", "60,80", "--out", tmp_path / "g.csv")
     assert rc == 0
-    assert "step 2: too_few_points" in said
+    assert "step 2: too_few_points" in printed
     rows = (tmp_path / "g.csv").read_text().splitlines()
     assert sum(r.startswith("1,") for r in rows) == 6 + 6
     assert next(r for r in rows if r.startswith("2,")).count("no rigid motion") == 1
-    rc, said, _ = gauge(capsys, tmp_path, "--point", "60,80")
-    assert "missing (low_correlation)" in said
+    rc, printed, _ = gauge(capsys, tmp_path, "--point", "60,80")
+    assert "missing (low_correlation)" in printed
 
 
 @pytest.mark.fault(37)
@@ -397,11 +397,11 @@ def test_fields_are_written_in_the_frame_and_without_the_motion(
 ) -> None:
     options = ("--align", "plane", "--x-direction", "0,1,0", "--remove-rigid")
     out = tmp_path / "moved"
-    rc, said, err = gauge(
+    rc, printed, err = gauge(
         capsys, results, *options, "--point", "60,80", "--field-out", out, "--out", tmp_path / "a.json"
     )
     assert (rc, err) == (0, "")
-    assert "fields written: 3 files" in said
+    assert "fields written: 3 files" in printed
     # read without any option, the new files show what the old ones do with them
     assert gauge(capsys, out, "--point", "60,80", "--out", tmp_path / "b.json")[0] == 0
     a, b = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
@@ -415,11 +415,11 @@ def test_fields_are_written_in_the_frame_and_without_the_motion(
     moved, measured = (read_field(folder / "step_0002.nc") for folder in (out, results))
     np.testing.assert_array_equal(moved.status, measured.status)
     assert np.nanmean(np.abs(moved.uvw_mm)) < 0.05 < np.nanmean(np.abs(measured.uvw_mm))
-    told = read_head(out / "step_0002.nc")
-    transformation = json.loads(str(told.attributes["transformation"]))
+    head = read_head(out / "step_0002.nc")
+    transformation = json.loads(str(head.attributes["transformation"]))
     assert transformation["align"]["kind"] == "plane"
     assert transformation["rigid_motion"]["values"]["rotation_z_rad"]["value"] is not None
-    assert told.inputs_sha256 == INPUTS
+    assert head.inputs_sha256 == INPUTS
     for wrong in ((results, *options, "--field-out", results), (results, "--point", "60,80", "--field-out", out)):
         rc, _, err = gauge(capsys, *wrong)
         assert rc == 1

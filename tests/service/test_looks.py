@@ -61,7 +61,7 @@ def test_predicted_error_is_the_one_that_shifting_images_shows() -> None:
     gx = (scene(-0.01) - scene(0.01)) / 0.02
     gy = np.gradient(clean, axis=0)
     noise = NOISE_SHARE * 255.0
-    told = predicted_error_px(np.round(clean).astype(np.uint8), 255.0, subset)
+    predicted = predicted_error_px(np.round(clean).astype(np.uint8), 255.0, subset)
     apart = 192 // 64
     row, col = 96, 96
     window = np.s_[row - 16 : row + 17, col - 16 : col + 17]
@@ -72,7 +72,7 @@ def test_predicted_error_is_the_one_that_shifting_images_shows() -> None:
         shifts.append(np.linalg.lstsq(g, difference, rcond=None)[0])
     worst = np.sqrt(np.linalg.eigvalsh(np.cov(np.array(shifts).T))[-1])
     # its own centre differences see 0.9 of the steepest waves
-    assert told[(row - 1) // apart, (col - 1) // apart] == pytest.approx(worst, rel=0.15)
+    assert predicted[(row - 1) // apart, (col - 1) // apart] == pytest.approx(worst, rel=0.15)
 
 
 def test_texture_in_one_direction_only_or_none_is_red() -> None:
@@ -101,9 +101,9 @@ def test_over_http(client: httpx.Client) -> None:
     assert "subset of 21 px" in laid.headers["X-Legend"]
     assert picture(laid.content).shape[2] == 4
     corner = {"x_px": 150, "y_px": 140, "columns": 64, "rows": 3}
-    told = client.get(f"{step}/pixels", params=corner).json()
-    assert told["values"] == stored[140:143, 150:160].tolist()
-    assert (told["x_px"], told["y_px"], told["grey_scale"], told["full_scale"]) == (150, 140, 1.0, 255.0)
+    answer = client.get(f"{step}/pixels", params=corner).json()
+    assert answer["values"] == stored[140:143, 150:160].tolist()
+    assert (answer["x_px"], answer["y_px"], answer["grey_scale"], answer["full_scale"]) == (150, 140, 1.0, 255.0)
     assert client.get(f"{step}/pixels", params=corner | {"x_px": 160}).json()["code"] == "invalid_input"
     assert client.get(f"{step}/pixels", params=corner | {"columns": 257}).status_code == 422
     # frames averaged are stored finer than a grey level

@@ -33,7 +33,7 @@ def test_the_checked_in_description_is_that_of_the_code(described: Json) -> None
     if written == json.loads(text_of(described)):
         return
     before, after = dict(operations(written)), dict(operations(described))
-    differ = [place for place in before | after if before.get(place) != after.get(place)]
+    differ = [where for where in before | after if before.get(where) != after.get(where)]
     pytest.fail(f"docs/openapi.json is not what the code does: {COMMAND}. Operations that differ: {differ}")
 
 
@@ -193,12 +193,12 @@ def test_every_operation_says_what_it_is(described: Json) -> None:
     ids = [operation["operationId"] for _, operation in operations(described)]
     assert len(set(ids)) == len(ids), sorted(ids)
     tags = {tag["name"] for tag in described["tags"]}
-    for place, operation in operations(described):
-        assert re.fullmatch(r"[a-z][a-z_]+", operation["operationId"]), place
-        assert operation["summary"], place
-        assert operation["description"], place
-        assert set(operation["tags"]) <= tags, place
-        assert any(status.startswith("2") for status in operation["responses"]), place
-        assert {"401", "403", "429", "503"} <= set(operation["responses"]), place
+    for where, operation in operations(described):
+        assert re.fullmatch(r"[a-z][a-z_]+", operation["operationId"]), where
+        assert operation["summary"], where
+        assert operation["description"], where
+        assert set(operation["tags"]) <= tags, where
+        assert any(status.startswith("2") for status in operation["responses"]), where
+        assert {"401", "403", "429", "503"} <= set(operation["responses"]), where
         for parameter in operation.get("parameters", ()):
-            assert parameter.get("description"), (place, parameter["name"])
+            assert parameter.get("description"), (where, parameter["name"])

@@ -101,7 +101,7 @@ def test_every_operation_has_summary_examples_and_types(described: Json) -> None
 
 
 @pytest.mark.parametrize(
-    ("spoil", "says"),
+    ("spoil", "fragment"),
     [
         (lambda o: o.pop("summary"), "no summary"),
         (lambda o: o["requestBody"]["content"]["application/json"].pop("examples"), "no example of what is sent"),
@@ -114,14 +114,14 @@ def test_every_operation_has_summary_examples_and_types(described: Json) -> None
         ),
     ],
 )
-def test_what_is_missing_is_seen(spoil: Any, says: str) -> None:
+def test_what_is_missing_is_seen(spoil: Any, fragment: str) -> None:
     fresh = json.loads(json.dumps(current()))
     spoil(fresh["paths"]["/api/v1/stage/moves"]["post"])
-    assert [line for line in missing(fresh) if says in line]
+    assert [line for line in missing(fresh) if fragment in line]
 
 
 def test_every_example_fits_its_schema(described: Json) -> None:
-    looked_at = 0
+    checked = 0
     for name, operation in operations_of(described).items():
         for content in operation.get("requestBody", {}).get("content", {}).values():
             for example in content.get("examples", {}).values():
@@ -129,7 +129,7 @@ def test_every_example_fits_its_schema(described: Json) -> None:
                     jsonschema.validate(example["value"], schema_of(described, content["schema"]))
                 except jsonschema.ValidationError as error:
                     pytest.fail(f"{name}, what is sent: {error.message} at {error.json_path}")
-                looked_at += 1
+                checked += 1
         for status, _, content in successes(operation):
             if "example" not in content:
                 continue
@@ -137,8 +137,8 @@ def test_every_example_fits_its_schema(described: Json) -> None:
                 jsonschema.validate(content["example"], schema_of(described, content.get("schema", {})))
             except jsonschema.ValidationError as error:
                 pytest.fail(f"{name}, answer {status}: {error.message} at {error.json_path}")
-            looked_at += 1
-    assert looked_at > 100
+            checked += 1
+    assert checked > 100
 
 
 def test_the_session_calls_every_operation_and_each_answer_that_has_a_body(session: Session, described: Json) -> None:
@@ -177,13 +177,13 @@ def same_keys(one: Any, other: Any, where: str) -> None:
 
 
 def test_examples_of_answers_have_the_keys_of_real_ones(session: Session, described: Json) -> None:
-    looked_at = 0
+    checked = 0
     for name, operation in operations_of(described).items():
         for status, media, content in successes(operation):
             if media == "application/json":
                 same_keys(content["example"], short(session.replies[name][status][media]), f"{name} {status}")
-                looked_at += 1
-    assert looked_at > 60
+                checked += 1
+    assert checked > 60
 
 
 def test_the_description_holds_the_file_of_examples(described: Json) -> None:

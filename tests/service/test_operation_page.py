@@ -38,13 +38,13 @@ def names(cell: str) -> list[str]:
 
 def test_the_table_of_metrics_is_what_the_service_tells(client: httpx.Client) -> None:
     wait_for_rig(client)
-    told = {
+    expected = {
         family.name: family.type
         for family in text_string_to_metric_families(client.get("/metrics").text)
         if not family.name.startswith("process_")
     }
     listed = {names(row[0])[0]: row[1] for row in table("Metrics")}
-    assert listed == told
+    assert listed == expected
     assert len(listed) > 30
 
 

@@ -70,9 +70,9 @@ def test_one_page_lists_them_all_and_each_type_leads_to_it(client: httpx.Client)
     found = client.get(refused["type"])
     assert found.status_code == 200
     assert "There is no job" in found.text
-    told = client.get(refused["type"], headers={"Accept": "application/json"}).json()
-    assert told["code"] == "not_found"
-    assert told["status"] == [404]
+    reply = client.get(refused["type"], headers={"Accept": "application/json"}).json()
+    assert reply["code"] == "not_found"
+    assert reply["status"] == [404]
     assert client.get("/problems.json").json() == known_problems()
     unknown = client.get("/problems/nothing_like_it")
     assert unknown.status_code == 404

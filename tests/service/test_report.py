@@ -36,7 +36,7 @@ from tests.support.texture_width import two_point_width_mm
 
 API = "/api/v1"
 NASTY = "Plate <script>alert(1)</script> & \"co\" 'x' \u2028 </style>"
-FACTS: dict[str, Any] = {
+METADATA: dict[str, Any] = {
     "purpose": "Deflection of a clamped plate",
     "operator": "J\u00f6rg <b>Smith</b>",
     "laboratory": "A laboratory",
@@ -177,7 +177,7 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Measurement]:
             accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
             done = wait_for_job(client, accepted["job"], 240.0)
             assert done["state"] == "succeeded", done["problem"]
-            assert client.put(f"{API}/tests/{test_id}/facts", json=FACTS).status_code == 200
+            assert client.put(f"{API}/tests/{test_id}/facts", json=METADATA).status_code == 200
             yield Measurement(client, service, test_id, accepted["analysis_id"])
     finally:
         service.close()
@@ -217,10 +217,10 @@ def page(plate: Measurement, tmp_path_factory: pytest.TempPathFactory) -> Page:
 
 def true_camera(name: str) -> PlainCamera:
     """The simulated camera as the rig file's truth has it, in formulas of its own."""
-    told = tomllib.loads(SMALL)
-    true = told["sim"][name]
+    rig = tomllib.loads(SMALL)
+    true = rig["sim"][name]
     return PlainCamera(
-        tuple(told[name]["image_size_px"]),
+        tuple(rig[name]["image_size_px"]),
         true["phd_px"],
         true["cx_px"],
         true["cy_px"],
@@ -241,7 +241,7 @@ def on_plane(camera: PlainCamera, xy: list[float]) -> np.ndarray[Any, Any]:
     return np.array([found[0], found[1], 0.0])
 
 
-def told_numbers(page: Page, key: str) -> list[float]:
+def reported_numbers(page: Page, key: str) -> list[float]:
     return [n for n in page.rows[key].numbers if n is not None]
 
 
@@ -257,43 +257,43 @@ def test_angle_standoff_scale_and_view_are_the_rigs_own(page: Page, plate: Measu
     cameras = [true_camera(name) for name in ("cam1", "cam2")]
     axes = [camera.rotation()[2] for camera in cameras]
     angle = float(np.degrees(np.arccos(axes[0] @ axes[1])))
-    assert told_numbers(page, "stereo_angle") == [pytest.approx(angle, abs=0.02)]
+    assert reported_numbers(page, "stereo_angle") == [pytest.approx(angle, abs=0.02)]
     baseline = float(np.linalg.norm(cameras[0].centre() - cameras[1].centre()))
-    assert told_numbers(page, "baseline") == [pytest.approx(baseline, rel=3e-3)]
+    assert reported_numbers(page, "baseline") == [pytest.approx(baseline, rel=3e-3)]
     with xarray.open_dataset(plate.folder / "step_0000.nc") as data:
         middle = np.array([float(data["x_mm"].median()), float(data["y_mm"].median()), 0.0])
     for k, (camera, axis) in enumerate(zip(cameras, axes, strict=True)):
         # the plate at rest is the plane Z = 0
         standoff = -camera.centre()[2] / axis[2]
-        assert told_numbers(page, "stand_off")[k] == pytest.approx(standoff, rel=4e-3)
-        places = [camera.project(middle + np.array(d)) for d in ((0, 0, 0), (1e-4, 0, 0), (0, 1e-4, 0))]
-        jacobian = np.stack([(p - places[0]) / 1e-4 for p in places[1:]], axis=-1)
+        assert reported_numbers(page, "stand_off")[k] == pytest.approx(standoff, rel=4e-3)
+        images = [camera.project(middle + np.array(d)) for d in ((0, 0, 0), (1e-4, 0, 0), (0, 1e-4, 0))]
+        jacobian = np.stack([(p - images[0]) / 1e-4 for p in images[1:]], axis=-1)
         per_px = np.linalg.norm(np.linalg.inv(jacobian), axis=0)
-        assert told_numbers(page, "image_scale")[k] == pytest.approx(float(np.sqrt(np.prod(per_px))), rel=1e-3)
+        assert reported_numbers(page, "image_scale")[k] == pytest.approx(float(np.sqrt(np.prod(per_px))), rel=1e-3)
         width, height = camera.size
         ends = [on_plane(camera, [x, 0.5 * (height - 1)]) for x in (-0.5, width - 0.5)]
-        assert told_numbers(page, "field_of_view")[k] == pytest.approx(
+        assert reported_numbers(page, "field_of_view")[k] == pytest.approx(
             float(np.linalg.norm(ends[1] - ends[0])), rel=2e-3
         )
 
 
 def test_pattern_size_is_the_textures(page: Page) -> None:
-    told = tomllib.loads(SMALL)
-    scale = told_numbers(page, "image_scale")[0]
-    true_mm = two_point_width_mm(speckle(diameter_mm=told["sim"]["speckle_mm"], seed=11))
+    rig = tomllib.loads(SMALL)
+    scale = reported_numbers(page, "image_scale")[0]
+    true_mm = two_point_width_mm(speckle(diameter_mm=rig["sim"]["speckle_mm"], seed=11))
     # widened by the pixel's square and the lens (0.7 px unless the rig says otherwise)
-    blur = told["sim"].get("blur_px", 0.7)
+    blur = rig["sim"].get("blur_px", 0.7)
     true_px = np.sqrt((true_mm / scale) ** 2 + 2.355**2 * (1.0 / 6.0 + 2.0 * blur**2))
     row = page.rows["pattern.size"]
-    assert told_numbers(page, "pattern.size")[0] == pytest.approx(true_px, rel=0.12)
+    assert reported_numbers(page, "pattern.size")[0] == pytest.approx(true_px, rel=0.12)
     assert "autocorrelation" in row.cells[-1]
     assert "mm" in row.cells[1]
 
 
 def test_settings_are_told_in_px_and_mm(page: Page) -> None:
-    scale = told_numbers(page, "image_scale")[0]
+    scale = reported_numbers(page, "image_scale")[0]
     for key, px in (("subset", 25.0), ("step", 10.0), ("strain.gauge", 65.0)):
-        assert told_numbers(page, key) == [px]
+        assert reported_numbers(page, key) == [px]
         mm = re.search(r"= ([\d.]+) mm", page.rows[key].cells[1])
         assert mm is not None
         assert float(mm[1]) == pytest.approx(px * scale, rel=5e-3)
@@ -315,9 +315,9 @@ def test_settings_are_told_in_px_and_mm(page: Page) -> None:
         ("pattern.technique", "white ground, black spray"),
     ):
         assert text in " ".join(page.rows[key].cells), key
-    assert told_numbers(page, "lens.aperture") == [8.0, 11.0]
+    assert reported_numbers(page, "lens.aperture") == [8.0, 11.0]
     # the fitted pinhole distance in mm, from the pixel's size
-    assert f"{told_numbers(page, 'lens.pinhole')[0] * 3.45e-3:.2f} mm" in page.rows["lens.pinhole"].cells[1]
+    assert f"{reported_numbers(page, 'lens.pinhole')[0] * 3.45e-3:.2f} mm" in page.rows["lens.pinhole"].cells[1]
 
 
 def test_noise_floor_is_that_of_the_static_steps(page: Page, plate: Measurement) -> None:
@@ -338,8 +338,8 @@ def test_noise_floor_is_that_of_the_static_steps(page: Page, plate: Measurement)
     z = np.stack(layers["z"])
     assert page.rows["floor.Z"].numbers[3] == pytest.approx(np.sqrt(np.nanmean(z.var(axis=0, ddof=1))), rel=1e-2)
     # nothing moved: the truth is zero, and what is left is what the points' own covariance predicts
-    bias, _, _, spatial, told, points = page.rows["floor.W"].numbers[1:]
-    assert told == pytest.approx(sigma, rel=0.02)
+    bias, _, _, spatial, reported, points = page.rows["floor.W"].numbers[1:]
+    assert reported == pytest.approx(sigma, rel=0.02)
     assert spatial == pytest.approx(sigma, rel=0.3)
     assert abs(bias or 1.0) < 3.0 * sigma
     assert points == 156
@@ -351,7 +351,7 @@ def test_noise_of_the_images_is_the_sensors(page: Page) -> None:
     # electrons to grey levels of 8 bit, at half of full scale, with the rounding to whole grey levels
     per_grey = noise["full_well_e"] / 255.0
     sd = np.sqrt(noise["read_noise_e"] ** 2 + 0.48 * noise["full_well_e"]) / per_grey
-    assert told_numbers(page, "noise")[0] == pytest.approx(np.hypot(sd, 12**-0.5), rel=0.15)
+    assert reported_numbers(page, "noise")[0] == pytest.approx(np.hypot(sd, 12**-0.5), rel=0.15)
 
 
 def test_calibration_record_is_complete(page: Page, plate: Measurement) -> None:
@@ -361,8 +361,8 @@ def test_calibration_record_is_complete(page: Page, plate: Measurement) -> None:
     for which in ("fitted", "held_out"):
         for name in ("rbe_px", "raz_mm", "nsce"):
             checks = content["checks"][which]
-            told = [checks[name], *(checks["per_camera"][cam][name] for cam in ("cam1", "cam2"))]
-            assert page.rows[f"calibration.{which}.{name}"].numbers[1:] == told
+            expected = [checks[name], *(checks["per_camera"][cam][name] for cam in ("cam1", "cam2"))]
+            assert page.rows[f"calibration.{which}.{name}"].numbers[1:] == expected
     for name, value in content["cam1"].items():
         assert page.rows[f"parameter.{name}"].numbers[1:3] == [value, content["cam2"][name]]
         if f"cam1.{name}" in content["sigma"]:
@@ -409,9 +409,9 @@ def test_steps_and_histories(page: Page) -> None:
 
 
 def test_pictures_are_pictures_with_a_bar_and_a_unit(page: Page) -> None:
-    for told in page.pictures():
-        kind, _, data = str(told["src"]).partition(";base64,")
-        assert told["alt"]
+    for attributes in page.pictures():
+        kind, _, data = str(attributes["src"]).partition(";base64,")
+        assert attributes["alt"]
         if kind == "data:image/png":
             with Image.open(io.BytesIO(base64.b64decode(data))) as image:
                 assert min(image.size) > 250
@@ -423,12 +423,12 @@ def test_pictures_are_pictures_with_a_bar_and_a_unit(page: Page) -> None:
 
 def test_nothing_is_asked_of_anyone_else(answered: Answered) -> None:
     answer, page = answered.response, Page(answered.response.text)
-    for tag, told in page.tags:
+    for tag, attributes in page.tags:
         assert tag not in {"script", "link", "iframe", "object", "embed", "base", "form"}, tag
-        assert not any(name.startswith("on") for name in told), told
-        assert "style" not in told
+        assert not any(name.startswith("on") for name in attributes), attributes
+        assert "style" not in attributes
         for name in ("src", "href", "srcset", "action", "data", "poster", "background"):
-            value = told.get(name)
+            value = attributes.get(name)
             assert value is None or value.startswith(("data:image/", "#")), (tag, name, str(value)[:80])
     assert "url(" not in page.style
     assert "@import" not in page.style
@@ -445,7 +445,7 @@ def test_names_and_labels_cannot_bring_markup_in(page: Page) -> None:
     tags = {tag for tag, _ in page.tags}
     assert not tags & {"script", "i"}
     assert "Smith" in page.rows["test.operator"].cells[1]
-    assert page.rows["test.operator"].cells[1] == FACTS["operator"]
+    assert page.rows["test.operator"].cells[1] == METADATA["operator"]
     assert page.rows["test.specimen"].cells[1] == "<img src=x onerror=alert(2)>"
     assert page.rows["step.3"].cells[1] == "<b>c</b>"
     assert page.heading == NASTY
@@ -466,13 +466,13 @@ def test_no_report_without_results(plate: Measurement) -> None:
 def test_command_line_on_a_data_folder_and_what_is_missing_is_listed(
     plate: Measurement, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    facts = tmp_path / "facts.toml"
-    facts.write_text('operator = "Somebody else"\nstatic_steps = []\n[cam1]\nmaker = "B"\nlens = { f_number = 8 }\n')
+    file = tmp_path / "facts.toml"
+    file.write_text('operator = "Somebody else"\nstatic_steps = []\n[cam1]\nmaker = "B"\nlens = { f_number = 8 }\n')
     copy = tmp_path / "data"
     shutil.copytree(plate.data / "tests", copy / "tests")
     out = tmp_path / "new" / "report.html"
-    assert main(["report", str(copy), "--facts", str(facts), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
+    assert main(["report", str(copy), "--facts", str(file), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
     page = Page(out.read_text())
     assert page.rows["test.operator"].cells[1] == "Somebody else"
     assert page.rows["lens.aperture"].numbers[1:3] == [8.0, None]
@@ -490,7 +490,7 @@ def test_command_line_on_a_data_folder_and_what_is_missing_is_listed(
         "Noise floor and bias of displacement and strain, from static steps",
     ):
         assert name in missing, (name, missing)
-        assert f"  {name}: " in said
+        assert f"  {name}: " in printed
     assert "Camera, maker, cam1" not in missing
     assert "Operator" not in missing
     for key in ("lens.maker", "lighting", "floor.W"):
@@ -503,9 +503,9 @@ def test_command_line_on_a_data_folder_and_what_is_missing_is_listed(
             assert any(name.startswith(row.cells[0]) for name in missing), row.cells
     # the test's own folder and the analysis' are as good; facts are those kept with the test
     test = copy / "tests" / plate.test_id
-    for place in (copy, test, test / "analyses" / plate.analysis_id):
-        source = find_source(place)
-        assert (list(source.files), source.metadata.operator) == (list(range(6)), FACTS["operator"])
+    for path in (copy, test, test / "analyses" / plate.analysis_id):
+        source = find_source(path)
+        assert (list(source.files), source.metadata.operator) == (list(range(6)), METADATA["operator"])
         assert not source.stale
 
 
@@ -562,9 +562,9 @@ def test_results_of_files_without_a_rig(plate: Measurement, tmp_path: Path) -> N
     )
     assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "r.html")]) == 0
     page = Page((tmp_path / "r.html").read_text())
-    assert told_numbers(page, "stereo_angle")[0] == pytest.approx(59.9, abs=0.2)
-    assert told_numbers(page, "prefilter") == [0.7]
-    assert told_numbers(page, "smoothing") == [65.0]
+    assert reported_numbers(page, "stereo_angle")[0] == pytest.approx(59.9, abs=0.2)
+    assert reported_numbers(page, "prefilter") == [0.7]
+    assert reported_numbers(page, "smoothing") == [65.0]
     missing = page.missing()
     for name in ("Camera, model", "Exposure", "Image acquisition rate", "Load of the steps", "Images taken"):
         assert name in missing, missing
@@ -585,7 +585,7 @@ def test_results_of_files_without_a_rig(plate: Measurement, tmp_path: Path) -> N
         "Reference image of camera 1",
     ):
         assert name in missing, missing
-    assert told_numbers(page, "subset") == [25.0]
+    assert reported_numbers(page, "subset") == [25.0]
     assert "= " not in page.rows["subset"].cells[1]
 
 

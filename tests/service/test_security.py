@@ -34,7 +34,7 @@ SECRETS = (b"tiny rig", b"root:", b"canary", b"sha256")
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a data folder in it, and things beside that nobody may reach."""
     folder = tmp_path_factory.mktemp("security")
     (folder / "canary.txt").write_text("canary")
@@ -43,8 +43,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def guarded(place: Path) -> Iterator[tuple[Service, int]]:
-    service = Service(tiny_config(), place / "data").start()
+def guarded(base: Path) -> Iterator[tuple[Service, int]]:
+    service = Service(tiny_config(), base / "data").start()
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.bind(("127.0.0.1", 0))
     listener.listen()  # who comes before the server is up waits in the queue
@@ -73,12 +73,12 @@ def client(port: int) -> Iterator[httpx.Client]:
         yield made
 
 
-def outside(place: Path) -> dict[str, tuple[int, int]]:
+def outside(base: Path) -> dict[str, tuple[int, int]]:
     """Everything beside the data folder, with size and time of change."""
     return {
         str(path): (path.stat().st_size, path.stat().st_mtime_ns)
-        for path in place.rglob("*")
-        if not path.is_relative_to(place / "data")
+        for path in base.rglob("*")
+        if not path.is_relative_to(base / "data")
     }
 
 
@@ -201,10 +201,10 @@ CLIMBS = [
 
 @pytest.mark.fault(46)
 @pytest.mark.parametrize("climb", CLIMBS)
-def test_no_path_of_a_client_reaches_the_disk(client: httpx.Client, port: int, place: Path, climb: str) -> None:
+def test_no_path_of_a_client_reaches_the_disk(client: httpx.Client, port: int, base: Path, climb: str) -> None:
     test_id = new_test(client)
     assert client.post(f"{API}/tests/{test_id}/steps", json={}).status_code == 201
-    before = outside(place)
+    before = outside(base)
     for template in (
         "/tests/{}",
         "/tests/TEST/steps/{}",
@@ -228,7 +228,7 @@ def test_no_path_of_a_client_reaches_the_disk(client: httpx.Client, port: int, p
     for method in ("DELETE", "PATCH", "PUT"):
         answer = ask(port, method, f"{API}/tests/{climb}", "Content-Type: application/json", body=b"{}")
         assert 300 <= answer.status < 500
-    assert outside(place) == before
+    assert outside(base) == before
 
 
 def pair(seed: int) -> tuple[bytes, bytes]:
@@ -245,9 +245,9 @@ def pair(seed: int) -> tuple[bytes, bytes]:
 @pytest.mark.parametrize(
     "name", ["../../canary.txt", "/etc/cron.d/x", "..\\..\\x", "a\x00b.tif", "x" * 300, "CON", ".", "a\nb"]
 )
-def test_names_in_uploads_and_labels_are_kept_as_text_or_refused(client: httpx.Client, place: Path, name: str) -> None:
+def test_names_in_uploads_and_labels_are_kept_as_text_or_refused(client: httpx.Client, base: Path, name: str) -> None:
     test_id = new_test(client)
-    before = outside(place)
+    before = outside(base)
     one, two = pair(len(name))
     answer = client.post(
         f"{API}/tests/{test_id}/steps:import",
@@ -259,20 +259,20 @@ def test_names_in_uploads_and_labels_are_kept_as_text_or_refused(client: httpx.C
         assert answer.json()["label"] == name
     for body in ({"name": name}, {"name": "x", "specimen": name, "notes": name}):
         assert client.post(f"{API}/tests", json=body).status_code in (201, 422)
-    folders = {path.name for path in (place / "data" / "tests" / test_id).rglob("*")}
+    folders = {path.name for path in (base / "data" / "tests" / test_id).rglob("*")}
     allowed = r"steps|analyses|test\.json|\d{4}|cam[12]\.tif|step\.json|incomplete-.*|channels.*"
     assert all(re.fullmatch(allowed, folder) for folder in folders), folders
-    assert outside(place) == before
+    assert outside(base) == before
 
 
 @pytest.mark.fault(46)
-def test_a_link_in_the_data_folder_gives_away_nothing(client: httpx.Client, place: Path) -> None:
+def test_a_link_in_the_data_folder_gives_away_nothing(client: httpx.Client, base: Path) -> None:
     # somebody who can write there could read the rest anyway; a copied folder may hold one all the same
     test_id = new_test(client)
     client.post(f"{API}/tests/{test_id}/steps", json={})
-    image = place / "data" / "tests" / test_id / "steps" / "0000" / "cam1.tif"
+    image = base / "data" / "tests" / test_id / "steps" / "0000" / "cam1.tif"
     image.unlink()
-    image.symlink_to(place / "canary.txt")
+    image.symlink_to(base / "canary.txt")
     answer = client.get(f"{API}/tests/{test_id}/steps/0/cam1")
     assert answer.status_code == 409
     assert answer.json()["code"] == "checksum_mismatch"
@@ -397,10 +397,10 @@ def bombs() -> dict[str, bytes]:
     wide = io.BytesIO()
     tifffile.imwrite(wide, np.zeros((4, 4), np.uint8))
     tiff = bytearray(wide.getvalue())
-    for place in range(len(tiff) - 12):  # ImageWidth and ImageLength
-        tag, kind = bytes(tiff[place : place + 2]), bytes(tiff[place + 2 : place + 4])
+    for offset in range(len(tiff) - 12):  # ImageWidth and ImageLength
+        tag, kind = bytes(tiff[offset : offset + 2]), bytes(tiff[offset + 2 : offset + 4])
         if tag in (b"\x00\x01", b"\x01\x01") and kind in (b"\x03\x00", b"\x04\x00"):
-            tiff[place + 2 : place + 12] = struct.pack("<HII", 4, 1, 100_000)
+            tiff[offset + 2 : offset + 12] = struct.pack("<HII", 4, 1, 100_000)
     return {
         "png_100k": png(100_000, 100_000, 8, zeros),
         "png_huge_sides": png(2**31 - 1, 2**31 - 1),
@@ -422,7 +422,7 @@ def bombs() -> dict[str, bytes]:
 
 @pytest.mark.fault(47)
 @pytest.mark.parametrize("name", sorted(bombs()))
-def test_bombs_and_odd_images_are_refused_and_hold_no_memory(client: httpx.Client, place: Path, name: str) -> None:
+def test_bombs_and_odd_images_are_refused_and_hold_no_memory(client: httpx.Client, base: Path, name: str) -> None:
     test_id = new_test(client)
     good, _ = pair(3)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -540,6 +540,6 @@ def test_unknown_ids_and_wrong_moments_are_told_as_such_by_every_operation(clien
         filled = re.sub(r"\{[^}]*\}", "x999999-abcdef", filled)
         for method in operations:
             answer = client.request(method, filled, json={} if method in ("post", "put", "patch") else None)
-            told = (404, 405, 409, 415, 422, 428)
-            assert answer.status_code in told, (method, filled, answer.status_code, answer.text[:200])
+            refusals = (404, 405, 409, 415, 422, 428)
+            assert answer.status_code in refusals, (method, filled, answer.status_code, answer.text[:200])
             assert answer.json()["code"], (method, filled)

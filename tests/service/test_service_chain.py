@@ -286,9 +286,9 @@ def test_a_crack_and_a_hole_are_kept_to_and_told(client: httpx.Client, plate_tes
     done = wait_for_job(client, accepted["job"])
     assert done["state"] == "succeeded", done["problem"]
     url = f"{API}/tests/{plate_test}/analyses/{accepted['analysis_id']}"
-    told = client.get(url).json()["settings"]["region"]
-    assert told["cracks"] == [crack]
-    assert told["holes"] == [hole]
+    stored = client.get(url).json()["settings"]["region"]
+    assert stored["cracks"] == [crack]
+    assert stored["holes"] == [hole]
     status, x, y, sigma = (
         np.array(client.get(f"{url}/steps/0/fields/{name}").json()["values"], dtype=float)
         for name in ("status", "x_px", "y_px", "sigma_z_mm")

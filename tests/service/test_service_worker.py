@@ -26,7 +26,7 @@ def worker() -> Iterator[ComputeWorker]:
 def test_it_is_an_executor_with_one_long_lived_process_and_pinned_threads(worker: ComputeWorker) -> None:
     assert isinstance(worker, Executor)
     assert worker.submit(work.add, 2, b=3).result(timeout=30) == 5
-    one, two = (worker.submit(work.facts).result(timeout=30) for _ in range(2))
+    one, two = (worker.submit(work.process_of).result(timeout=30) for _ in range(2))
     assert one == two
     assert one["pid"] == worker.pid
     assert one["cv2_threads"] in (0, 1)  # OpenCV calls sequential work both
@@ -73,7 +73,7 @@ def test_a_task_that_waits_for_kernels_to_be_compiled_is_told(tmp_path: Path, mo
 
 @pytest.mark.fault(43)
 def test_a_running_task_stops_within_a_second_and_the_process_lives_on(worker: ComputeWorker) -> None:
-    pid = worker.submit(work.facts).result(timeout=30)["pid"]
+    pid = worker.submit(work.process_of).result(timeout=30)["pid"]
     future = worker.submit(work.count, 1000, 0.05)
     time.sleep(0.3)
     asked = time.monotonic()
@@ -81,7 +81,7 @@ def test_a_running_task_stops_within_a_second_and_the_process_lives_on(worker: C
     with pytest.raises(Cancelled):
         future.result(timeout=10)
     assert time.monotonic() - asked < 1.0
-    assert worker.submit(work.facts).result(timeout=30)["pid"] == pid
+    assert worker.submit(work.process_of).result(timeout=30)["pid"] == pid
 
 
 def test_a_deaf_task_is_ended_with_its_process_and_the_next_one_runs(worker: ComputeWorker) -> None:
@@ -125,11 +125,11 @@ def test_compiling_is_told_once_and_loading_never() -> None:
     def once(x: int) -> int:
         return x + 1
 
-    told: list[int] = []
-    with report_compiling(lambda: told.append(1)):
+    compiled: list[int] = []
+    with report_compiling(lambda: compiled.append(1)):
         assert once(1) == 2
         assert once(1.5) == 2.5  # another signature, compiled too
-    assert told == [1]
-    with report_compiling(lambda: told.append(2)):
+    assert compiled == [1]
+    with report_compiling(lambda: compiled.append(2)):
         assert once(2) == 3
-    assert told == [1]
+    assert compiled == [1]

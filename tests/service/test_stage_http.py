@@ -180,11 +180,11 @@ def test_a_move_whose_job_is_cancelled_is_stopped(homed: StageService) -> None:
 def test_who_sees_that_a_job_has_ended_may_move_at_once(homed: StageService) -> None:
     seen: dict[str, object] = {}
 
-    def look(name: str, data: dict[str, object]) -> None:
+    def note_holder(name: str, data: dict[str, object]) -> None:
         if name == "job" and data["state"] in ("cancelled", "succeeded"):
             seen[str(data["id"])] = homed.service.gate.holder
 
-    homed.service.hub.listen(look)
+    homed.service.hub.listen(note_holder)
     homed.axis(1).velocity_mm_s = 0.2
     try:
         stopped = homed.job("/stage/moves", positions_mm={"1": 5.0})
@@ -197,7 +197,7 @@ def test_who_sees_that_a_job_has_ended_may_move_at_once(homed: StageService) -> 
         assert [seen[job["id"]] for job in (stopped, back)] == [None, None]
     finally:
         homed.axis(1).velocity_mm_s = 10.0
-        homed.service.hub._listeners.remove(look)
+        homed.service.hub._listeners.remove(note_holder)
 
 
 @pytest.mark.fault(27)

@@ -128,9 +128,9 @@ def test_a_spoiled_test_is_not_measured(taken: Path, tmp_path: Path, capfd: Any,
     spoil(test, what)
     code, word = REFUSED[what]
     assert main(["measure", str(test), *ARGUMENTS]) != 0
-    said = capfd.readouterr().err
-    assert f"stereorig: {code}: " in said
-    assert word in said
+    printed = capfd.readouterr().err
+    assert f"stereorig: {code}: " in printed
+    assert word in printed
     assert not (test / "exports").exists()
 
 
@@ -200,32 +200,32 @@ FAILED_JOB = {
 def copied_in(test: Path, service: Service) -> tuple[str, Path]:
     """A folder copied by hand from elsewhere is a valid test."""
     name = service.folder.ids.new("t")
-    place = service.folder.tests / name
-    shutil.copytree(test, place)
-    (place / "analyses").mkdir(exist_ok=True)
-    record = json.loads((place / "test.json").read_text())
-    (place / "test.json").write_text(json.dumps({**record, "id": name, "name": "a plate"}))
-    for mark in place.glob("steps/*/step.json"):
+    test_folder = service.folder.tests / name
+    shutil.copytree(test, test_folder)
+    (test_folder / "analyses").mkdir(exist_ok=True)
+    record = json.loads((test_folder / "test.json").read_text())
+    (test_folder / "test.json").write_text(json.dumps({**record, "id": name, "name": "a plate"}))
+    for mark in test_folder.glob("steps/*/step.json"):
         mark.write_text(mark.read_text())  # comes last
-    return f"{API}/tests/{name}", place
+    return f"{API}/tests/{name}", test_folder
 
 
 @pytest.fixture(scope="module")
 def analysed(taken: Path, service: Service, client: httpx.Client) -> tuple[Path, str]:
     """A test with a finished analysis, and the analysis' id."""
-    url, place = copied_in(taken, service)
+    url, test_folder = copied_in(taken, service)
     accepted = client.post(f"{url}/analyses", json=BODY)
     assert accepted.status_code == 202, accepted.text
     done = wait_for_job(client, accepted.json()["job"], 240.0)
     assert done["state"] == "succeeded", done
-    return place, accepted.json()["analysis_id"]
+    return test_folder, accepted.json()["analysis_id"]
 
 
 @pytest.mark.parametrize("what", list(REFUSED_BY_SERVICE))
 def test_the_service_refuses_a_spoiled_test(taken: Path, service: Service, client: httpx.Client, what: str) -> None:
     """FAULTS 42."""
-    url, place = copied_in(taken, service)
-    spoil(place, what)
+    url, test_folder = copied_in(taken, service)
+    spoil(test_folder, what)
     answer = client.post(f"{url}/analyses", json=BODY)
     status, code = REFUSED_BY_SERVICE[what]
     assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
@@ -235,8 +235,8 @@ def test_the_service_refuses_a_spoiled_test(taken: Path, service: Service, clien
 @pytest.mark.parametrize("what", list(FAILED_JOB))
 def test_a_replaced_image_ends_the_job(taken: Path, service: Service, client: httpx.Client, what: str) -> None:
     """FAULTS 42."""
-    url, place = copied_in(taken, service)
-    spoil(place, what)
+    url, test_folder = copied_in(taken, service)
+    spoil(test_folder, what)
     accepted = client.post(f"{url}/analyses", json=BODY)
     done = wait_for_job(client, accepted.json()["job"], 240.0)
     assert done["state"] == "failed"
@@ -247,31 +247,31 @@ def test_what_changes_between_asking_and_measuring_is_refused(
     taken: Path, service: Service, client: httpx.Client
 ) -> None:
     """FAULTS 42: inputs are fixed when an analysis is made; the task of a step finds them as they were."""
-    _, place = copied_in(taken, service)
+    _, test_folder = copied_in(taken, service)
     document = {
         "kind": "displacement",
         "steps": [0, 1],
         "settings": {**BODY, "noise": None},
         "label": "",
-        "inputs": analysis_start.inputs_of(service, place.name, [0, 1], place / "calibration.json"),
+        "inputs": analysis_start.inputs_of(service, test_folder.name, [0, 1], test_folder / "calibration.json"),
     }
-    made = service.tests.create_analysis(place.name, document)
-    spoil(place, "the reference was taken again")
+    made = service.tests.create_analysis(test_folder.name, document)
+    spoil(test_folder, "the reference was taken again")
     with pytest.raises(FileFormatError) as caught:
         task_of(service, made, 1, {}, None)
     assert caught.value.code == "step_changed"
-    _, place = copied_in(taken, service)
-    made = service.tests.create_analysis(place.name, document)
-    spoil(place, "the calibration was replaced")
+    _, test_folder = copied_in(taken, service)
+    made = service.tests.create_analysis(test_folder.name, document)
+    spoil(test_folder, "the calibration was replaced")
     with pytest.raises(FileFormatError) as caught:
-        task_of(service, made.model_copy(update={"test_id": place.name}), 1, {}, None)
+        task_of(service, made.model_copy(update={"test_id": test_folder.name}), 1, {}, None)
     assert caught.value.code == "calibration_changed"
 
 
 def test_an_untouched_analysis_is_not_stale(analysed: tuple[Path, str], client: httpx.Client) -> None:
     """FAULTS 42."""
-    place, analysis = analysed
-    url = f"{API}/tests/{place.name}/analyses/{analysis}"
+    test_folder, analysis = analysed
+    url = f"{API}/tests/{test_folder.name}/analyses/{analysis}"
     shown = client.get(url).json()
     assert (shown["stale"], shown["stale_reasons"]) == (False, [])
     assert "x-stale" not in client.get(f"{url}/export", params={"step": 2}).headers
@@ -283,8 +283,8 @@ def test_an_analysis_whose_inputs_changed_is_marked(
     analysed: tuple[Path, str], service: Service, client: httpx.Client, what: str
 ) -> None:
     """FAULTS 42: in the analysis, with its export and in gauges; what was measured can still be read."""
-    place, analysis = analysed
-    _, copy = copied_in(place, service)
+    test_folder, analysis = analysed
+    _, copy = copied_in(test_folder, service)
     spoil(copy, what)
     url = f"{API}/tests/{copy.name}/analyses/{analysis}"
     shown = client.get(url).json()

@@ -267,9 +267,9 @@ def test_what_is_no_data_folder_or_a_newer_one_is_refused(data: Path, tmp_path: 
         verify(tmp_path / "nothing")
     assert caught.value.code == "no_data_folder"
     (data / "format.json").write_text('{"format": 99}')
-    for look in (verify, repair):
+    for check in (verify, repair):
         with pytest.raises(FileFormatError) as caught:
-            look(data)
+            check(data)
         assert caught.value.code == "data_format_newer"
 
 

@@ -62,7 +62,7 @@ class Impatient:
         answered = asyncio.Event()
         ended = False
 
-        async def says(message: Any) -> None:
+        async def on_send(message: Any) -> None:
             nonlocal ended
             if ended:
                 return  # nobody hears it any more
@@ -70,7 +70,7 @@ class Impatient:
             await send(message)
             answered.set()
 
-        work = asyncio.ensure_future(self._app(scope, hears, says))
+        work = asyncio.ensure_future(self._app(scope, hears, on_send))
         try:
             answer = asyncio.ensure_future(answered.wait())
             await asyncio.wait({work, answer}, return_when=asyncio.FIRST_COMPLETED)
@@ -190,7 +190,7 @@ class Known:
     def before_call(self, context: Any, case: Any, kwargs: Any) -> None:
         """Put ids that there are into a request's path, where it was not meant to be wrong."""
         parts = case.meta.components if case.meta is not None else {}
-        path = next((info for place, info in parts.items() if place.value == "path_parameters"), None)
+        path = next((info for kind, info in parts.items() if kind.value == "path_parameters"), None)
         if path is not None and path.mode.is_negative:
             return
         for name, value in list((case.path_parameters or {}).items()):

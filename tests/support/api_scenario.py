@@ -21,7 +21,7 @@ from tests.support.service_rig import SMALL, true_cameras, wait_for_job, wait_fo
 
 API = "/api/v1"
 REGION = {"rectangle": [95, 95, 165, 150]}
-LONGEST = 4
+MAX_ITEMS = 4
 TEXT_CHARACTERS = 400
 #: stands in an example for a file that text cannot hold
 FILE = "(the bytes of a file)"
@@ -117,7 +117,7 @@ def short(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: short(v) for name, v in value.items()}
     if isinstance(value, list):
-        return [short(v) for v in (value if len(value) <= LONGEST else value[: LONGEST - 1])]
+        return [short(v) for v in (value if len(value) <= MAX_ITEMS else value[: MAX_ITEMS - 1])]
     if isinstance(value, str):
         return value if len(value) <= TEXT_CHARACTERS else value[:TEXT_CHARACTERS].rsplit("\n", 1)[0] + "\n"
     if isinstance(value, float) and math.isfinite(value) and value != 0.0:
@@ -146,7 +146,7 @@ def run(client: httpx.Client, description: dict[str, Any]) -> Session:
     """Go through the whole job; every operation is called at least once."""
     session = Session(client, operations_of(description))
     wait_for_rig(client)
-    _look(session.call)
+    _read_everything(session.call)
     _stage(session)
     calibration = _calibration(session)
     noise = session.call("create_noise", summary="Eight frames of what stands still", body={"frames": 8}).json()
@@ -161,7 +161,7 @@ def run(client: httpx.Client, description: dict[str, Any]) -> Session:
     return session
 
 
-def _look(call: Callable[..., httpx.Response]) -> None:
+def _read_everything(call: Callable[..., httpx.Response]) -> None:
     for operation in ("healthz", "metrics", "get_rig", "get_cameras", "get_devices", "get_session"):
         call(operation)
     etag = call("get_camera", "cam1").headers["ETag"]
@@ -256,7 +256,7 @@ def _test(session: Session, calibration: str) -> str:
     call("get_step_preview", test, 1, "cam1")
     call("get_step_pixels", test, 1, "cam1", query={"x_px": 128, "y_px": 120})
     call("get_step_map", test, 1, "cam1", "texture")
-    facts = {
+    metadata = {
         "purpose": "Deflection of a clamped plate",
         "operator": "A. Smith",
         "material": "Aluminium 6061-T6",
@@ -265,7 +265,7 @@ def _test(session: Session, calibration: str) -> str:
         "cam1": {"maker": "Basler", "pixel_um": 3.45, "lens": {"maker": "Schneider", "focal_length_mm": 50.0}},
         "static_steps": [1],
     }
-    call("put_metadata", test, summary="What the guide's tables ask for and no device can say", body=facts)
+    call("put_metadata", test, summary="What the guide's tables ask for and no device can say", body=metadata)
     call("get_metadata", test)
     watch = {"channel": "load_n", "threshold": 500.0, "frames": 1}
     call("put_watch", test, summary="A step at each further 500 N", body=watch)

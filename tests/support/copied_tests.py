@@ -39,8 +39,15 @@ def write_test_folder(folder: Path, steps: int, load_a_step: float = 0.0) -> Non
             content = encode_tiff(world.expose(cam, exposure_ms=10.0, gain_db=0.0, rng=rng))  # type: ignore[arg-type]
             (step / f"{cam}.tif").write_bytes(content)
             sha256[cam] = hashlib.sha256(content).hexdigest()
-        facts = {"label": "", "load_n": None, "source": "import", "captured_utc": TIME, "skew_ms": None, "quality": {}}
-        document = {"n": n, "test_id": folder.name, **facts, "sha256": sha256}
+        metadata = {
+            "label": "",
+            "load_n": None,
+            "source": "import",
+            "captured_utc": TIME,
+            "skew_ms": None,
+            "quality": {},
+        }
+        document = {"n": n, "test_id": folder.name, **metadata, "sha256": sha256}
         (step / "step.json").write_text(json.dumps(document))
     document = {"id": folder.name, "name": "copied", "specimen": "", "notes": "", "calibration_id": None}
     (folder / "test.json").write_text(json.dumps({**document, "created_utc": TIME}))

@@ -34,7 +34,7 @@ def reference(seed: int = 1) -> bench.Images:
     return bench.take("block", 1.0, STILL, seed=seed)
 
 
-def parted(side: Side, seed: int = 2) -> bench.Images:
+def opened(side: Side, seed: int = 2) -> bench.Images:
     """Both cameras' images after the side for which ``side`` is False went UP and the other DOWN."""
     cameras = (bench.pair().cam1, bench.pair().cam2)
     up, down = bench.take("block", 1.0, UP, seed=seed), bench.take("block", 1.0, DOWN, seed=seed + 1)

@@ -48,8 +48,8 @@ def cuts() -> Cuts:
 def failed() -> NDArray[np.bool_]:
     x, y = np.meshgrid(40.0 + 7 * np.arange(COLS), 60.0 + 7 * np.arange(ROWS))
     gone = (x > 85.0) & (x < 111.0) & (y > 108.0) & (y < 137.0)
-    for place in FAILED:
-        gone[place] = True
+    for index in FAILED:
+        gone[index] = True
     return gone
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.support.requirements import missing
 
 
-def judge(folder: Path, *, phases: tuple[str, ...], each: int, seed: int, least: int) -> None:
+def check_fuzz(folder: Path, *, phases: tuple[str, ...], each: int, seed: int, min_cases: int) -> None:
     """Run phases, and fail with everything that they found."""
     try:
         from tests.support.api_fuzz import fuzz, running_service
@@ -22,6 +22,6 @@ def judge(folder: Path, *, phases: tuple[str, ...], each: int, seed: int, least:
     assert not report.errors, report.errors
     undocumented = {status for status in report.statuses if status >= 500} - {503, 507}
     assert not undocumented
-    assert report.cases >= least
+    assert report.cases >= min_cases
     # enough must get past the door, or nothing is tried; most values at and beyond bounds are wrong on purpose
     assert sum(n for status, n in report.statuses.items() if status < 300) > 0.03 * report.cases

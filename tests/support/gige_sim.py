@@ -80,7 +80,7 @@ class WorldCamera:
         ctypes.memmove(lib.arv_buffer_get_data(buffer, ctypes.byref(size)), picture.ctypes.data, picture.nbytes)
 
 
-def _look_ahead(world: SimWorld, controller: SimESP301, ending: threading.Event) -> None:
+def _render_ahead(world: SimWorld, controller: SimESP301, ending: threading.Event) -> None:
     """Render what a camera sees as soon as the stage rests: the fake camera's one thread must not wait for it."""
     before: list[float] = []
     while not ending.wait(0.05):
@@ -100,7 +100,7 @@ def main(rig_file: str, *addresses: str) -> None:
         world.expose(cam, exposure_ms=10.0, rng=None)  # compiles, and renders where the stage stands
     lib = _library()
     ending = threading.Event()
-    threading.Thread(target=_look_ahead, args=(world, controller, ending), daemon=True).start()
+    threading.Thread(target=_render_ahead, args=(world, controller, ending), daemon=True).start()
     with ControllerServer(controller) as server:
         cameras = [WorldCamera(lib, world, cam, address) for cam, address in zip(CAMERAS, addresses, strict=True)]
         print(json.dumps({"stage": server.url, "cameras": len(cameras)}), flush=True)

@@ -52,10 +52,10 @@ def paper_camera(
     )
 
 
-def node_places(target: GridTarget, tolerance_mm: float, seed: int) -> Float:
+def node_positions(target: GridTarget, tolerance_mm: float, seed: int) -> Float:
     """Nodes (n_a, n_b, 2), each off by a uniform error within the tolerance on both axes."""
-    places = target.all_points_mm()
-    return places + np.random.default_rng(seed).uniform(-tolerance_mm, tolerance_mm, places.shape)
+    positions = target.all_points_mm()
+    return positions + np.random.default_rng(seed).uniform(-tolerance_mm, tolerance_mm, positions.shape)
 
 
 def truth_px(camera: Camera, target: GridTarget, nodes_mm: Float | None = None) -> Float:

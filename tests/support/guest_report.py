@@ -25,8 +25,8 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> object:
-    told = yield
-    report = told.get_result()
+    wrapped = yield
+    report = wrapped.get_result()
     path = os.environ.get("GUEST_REPORT")
     if path and (report.when == "call" or report.outcome != "passed"):
         text = report.longrepr[2] if report.skipped and isinstance(report.longrepr, tuple) else report.longreprtext
@@ -43,4 +43,4 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
             out.write(line + "\n")
             out.flush()
             os.fsync(out.fileno())
-    return told
+    return wrapped

@@ -119,7 +119,7 @@ class Plane:
         point = camera.back_project_to_plane(xy, point_sys_mm=self.origin, normal_sys=normal).xyz_mm
         return (point - self.origin) @ np.linalg.pinv(self.basis).T
 
-    def place(self, ab: NDArray) -> NDArray:
+    def position(self, ab: NDArray) -> NDArray:
         """System coordinates of material points."""
         return self.origin + ab @ self.basis.T
 
@@ -158,7 +158,7 @@ def true_g(camera: Camera, before: Plane, after: Plane, xy: NDArray) -> NDArray:
         wk = w[:, 0] + w[:, 1] * d[0] + w[:, 2] * d[1]
         p = camera.sys_from_cam.apply(ray / wk[:, None])
         ab = (p - before.origin) @ np.linalg.pinv(before.basis).T
-        G[..., k] = camera.cam_from_sys.apply(after.place(ab)) * wk[:, None]
+        G[..., k] = camera.cam_from_sys.apply(after.position(ab)) * wk[:, None]
     G[..., 1:] = (G[..., 1:] - G[..., :1]) / 1e-3
     return G
 
@@ -211,7 +211,7 @@ class Bent:
         t = 2.0 * C / (B + np.copysign(np.sqrt(B * B - 4.0 * A * C), B))
         return p + t[..., None] * d[..., :2]
 
-    def place(self, ab: NDArray) -> NDArray:
+    def position(self, ab: NDArray) -> NDArray:
         """System coordinates of material points."""
         return self.origin + ab @ self.basis.T + self.height(ab[..., 0], ab[..., 1])[..., None] * self.normal
 
@@ -233,7 +233,7 @@ def true_g6(camera: Camera, before: Bent, after: Bent, xy: NDArray) -> NDArray:
 def _seen(camera: Camera, before: Bent, after: Bent, ray: NDArray) -> NDArray:
     """Where the material that camera rays (..., 3) meet on ``before`` lies on ``after``, camera frame."""
     ab = before.met(camera.centre_sys_mm, ray @ camera.cam_from_sys.rotation)
-    return camera.cam_from_sys.apply(after.place(ab))
+    return camera.cam_from_sys.apply(after.position(ab))
 
 
 def _second_order(function: Callable[[NDArray], NDArray], camera: Camera, xy: NDArray, h: float = 1e-3) -> NDArray:

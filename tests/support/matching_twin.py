@@ -70,7 +70,7 @@ class Twin:
         """3 for plane, 6 for curved patches."""
         return (len(unknowns) - 1) // (1 if len(self.splines) == 2 else 4)
 
-    def place(self, k: int, unknowns: NDArray, XY: NDArray) -> NDArray:
+    def position(self, k: int, unknowns: NDArray, XY: NDArray) -> NDArray:
         """Image points of comparison k for unknowns (w, e, G)."""
         terms = self.terms(unknowns)
         m = monomials(XY, terms)
@@ -87,7 +87,7 @@ class Twin:
 
     def residual(self, k: int, unknowns: NDArray) -> tuple[NDArray, float, float]:
         """Zero-mean normalised residual in reference grey levels, contrast, zncc."""
-        g = self._grey(k + 1, self.place(k, unknowns, self.XY))
+        g = self._grey(k + 1, self.position(k, unknowns, self.XY))
         g = g - g.mean()
         contrast = np.sqrt((g @ g) / (self.f @ self.f))
         return g / contrast - self.f, contrast, g @ self.f / np.sqrt((g @ g) * (self.f @ self.f))
@@ -96,7 +96,7 @@ class Twin:
         """Reference gradients carried through the warp, (pixels, unknowns)."""
         h = 1e-6
         by_x, by_y = (
-            (self.place(k, unknowns, self.XY + d) - self.place(k, unknowns, self.XY - d)) / (2 * h)
+            (self.position(k, unknowns, self.XY + d) - self.position(k, unknowns, self.XY - d)) / (2 * h)
             for d in np.eye(2) * h
         )
         inverse = np.linalg.inv(np.stack([by_x, by_y], -1))
@@ -104,7 +104,7 @@ class Twin:
         for i, step in enumerate(steps):
             d = np.zeros(len(steps))
             d[i] = step
-            moved = (self.place(k, unknowns + d, self.XY) - self.place(k, unknowns - d, self.XY)) / (2 * step)
+            moved = (self.position(k, unknowns + d, self.XY) - self.position(k, unknowns - d, self.XY)) / (2 * step)
             columns.append((self.gradient * np.einsum("nij,nj->ni", inverse, moved)).sum(-1))
         return np.stack(columns, -1)
 
@@ -112,7 +112,7 @@ class Twin:
         """Pixels of comparison k that show what one pixel of the reference shows."""
         h = 1e-6
         by_x, by_y = (
-            (self.place(k, unknowns, h * d[None]) - self.place(k, unknowns, -h * d[None]))[0] / (2 * h)
+            (self.position(k, unknowns, h * d[None]) - self.position(k, unknowns, -h * d[None]))[0] / (2 * h)
             for d in np.eye(2)
         )
         return abs(np.linalg.det(np.stack([by_x, by_y]))) / abs(np.linalg.det(self.to_px))

@@ -72,8 +72,8 @@ class Watched:
         assert self.outside == []
         assert [line for line in self.refused if int(line.split()[0]) not in expected] == []
         # the browser itself reports a refused request as an error of the console
-        told = [line for line in self.complaints if not ("Failed to load resource" in line and expected)]
-        assert told == []
+        unexpected = [line for line in self.complaints if not ("Failed to load resource" in line and expected)]
+        assert unexpected == []
 
 
 def browser() -> contextlib.AbstractContextManager[Browser]:
@@ -97,7 +97,7 @@ def watched(made: Browser, origin: str, **options: Any) -> Iterator[Watched]:
             watch.outside.append(url)
 
     page.on("request", lambda request: asked(request.url))
-    page.on("console", lambda said: said.type == "error" and watch.complaints.append(said.text))
+    page.on("console", lambda message: message.type == "error" and watch.complaints.append(message.text))
     page.on("pageerror", lambda error: watch.complaints.append(str(error)))
     page.on("response", lambda answer: answer.status >= 400 and watch.refused.append(f"{answer.status} {answer.url}"))
     try:

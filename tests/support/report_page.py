@@ -36,26 +36,26 @@ class Page(HTMLParser):
         assert not self._open, f"never closed: {self._open}"
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = dict(attrs)
-        self.tags.append((tag, told))
-        if tag == "meta" and (told.get("http-equiv") or "").lower() == "content-security-policy":
-            self.policy = told["content"] or ""
+        attributes = dict(attrs)
+        self.tags.append((tag, attributes))
+        if tag == "meta" and (attributes.get("http-equiv") or "").lower() == "content-security-policy":
+            self.policy = attributes["content"] or ""
         if tag not in _VOID:
-            self._open.append((tag, told.get("id")))
-            if told.get("id"):
-                self.texts.setdefault(str(told["id"]), "")
+            self._open.append((tag, attributes.get("id")))
+            if attributes.get("id"):
+                self.texts.setdefault(str(attributes["id"]), "")
         if tag == "table":
-            self._table = told.get("id")
+            self._table = attributes.get("id")
         if tag == "tr":
             self._row = Row()
-            if told.get("data-item"):
-                assert told["data-item"] not in self.rows, f"twice: {told['data-item']}"
-                self.rows[str(told["data-item"])] = self._row
+            if attributes.get("data-item"):
+                assert attributes["data-item"] not in self.rows, f"twice: {attributes['data-item']}"
+                self.rows[str(attributes["data-item"])] = self._row
             if self._table:
                 self.tables.setdefault(self._table, []).append(self._row)
         if tag in ("td", "th") and self._row is not None:
             self._row.cells.append("")
-            number = told.get("data-value")
+            number = attributes.get("data-value")
             self._row.numbers.append(None if number is None else float(number))
 
     def handle_endtag(self, tag: str) -> None:
@@ -79,7 +79,7 @@ class Page(HTMLParser):
 
     def pictures(self) -> list[dict[str, str | None]]:
         """Attributes of every picture."""
-        return [told for tag, told in self.tags if tag == "img"]
+        return [attributes for tag, attributes in self.tags if tag == "img"]
 
     def missing(self) -> list[str]:
         """What the page lists as not stated."""

@@ -71,12 +71,12 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
     """The plate's results with three points missing, a cut between two columns, and 1 um more deflection."""
     whole = service.tests.analysis_path(test_id, analysis_id)
-    told = service.tests.analysis(test_id, analysis_id).plain()
-    kept = {k: told[k] for k in ("kind", "settings", "steps", "inputs", "software")}
+    stored = service.tests.analysis(test_id, analysis_id).plain()
+    kept = {k: stored[k] for k in ("kind", "settings", "steps", "inputs", "software")}
     document = service.tests.create_analysis(test_id, {**kept, "label": "with a cut"})
     service.catalog.put_entry("analysis", test_id, document.id, analysis_entry(document))
     folder = service.tests.analysis_path(test_id, document.id)
-    for n in told["steps"]:
+    for n in stored["steps"]:
         field = read_field(whole / f"step_{n:04d}.nc")
         field.status[4, 5] = field.status[4, 6] = field.status[8, 2] = 6
         object.__setattr__(field, "cuts", Cuts([[(155.0, 50.0), (155.0, 120.0)]]))

@@ -36,9 +36,9 @@ def wait_for_steps(client: httpx.Client, url: str, count: int, seconds: float = 
     raise AssertionError(client.get(url).text)
 
 
-def folder_of(place: Place, url: str) -> Path:
+def folder_of(host: Host, url: str) -> Path:
     parts = url.split("/")
-    return place.data / "tests" / parts[-3] / "analyses" / parts[-1]
+    return host.data / "tests" / parts[-3] / "analyses" / parts[-1]
 
 
 def contents(path: Path) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def contents(path: Path) -> dict[str, Any]:
         return {name: np.asarray(variable[...]) for name, variable in data.variables.items()}
 
 
-class Place:
+class Host:
     """A service on a data folder, begun anew when wanted."""
 
     def __init__(self, data: Path) -> None:

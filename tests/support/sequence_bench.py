@@ -47,15 +47,15 @@ def still() -> Scene:
     return plane_scene(rig().texture(3), motion=RigidTransform.identity())
 
 
-def shoot(scene: Scene, seed: int, noise: float = 2.0) -> Images:
-    return list(rig().shoot(scene, seed=seed, noise=noise))
+def capture(scene: Scene, seed: int, noise: float = 2.0) -> Images:
+    return list(rig().capture(scene, seed=seed, noise=noise))
 
 
-def shoot_fading(scene: Scene, angle: float, seed: int) -> Images:
+def capture_fading(scene: Scene, angle: float, seed: int) -> Images:
     """Pictures of a plate whose pattern has gone over to another one by an angle; at 90 degrees nothing is left."""
     a = np.deg2rad(angle)
     rng = np.random.default_rng(seed)
-    one, two = (rig().shoot(s, noise=0.0) for s in (scene, replace(scene, texture=rig().texture(4))))
+    one, two = (rig().capture(s, noise=0.0) for s in (scene, replace(scene, texture=rig().texture(4))))
     mixed = [110.0 + np.cos(a) * (x - 110.0) + np.sin(a) * (y - 110.0) for x, y in zip(one, two, strict=True)]
     return [expose(m, rng) for m in mixed]
 

@@ -66,19 +66,19 @@ def plane(a: Array, b: Array) -> Array:
 def cylinder(radius_mm: float) -> Callable[[Array, Array], Array]:
     """A cylinder along Y_sys that bulges towards the cameras."""
 
-    def place(a: Array, b: Array) -> Array:
+    def position(a: Array, b: Array) -> Array:
         return np.stack([a, b, radius_mm - np.sqrt(radius_mm**2 - a**2)], axis=-1)
 
-    return place
+    return position
 
 
 def sphere(radius_mm: float) -> Callable[[Array, Array], Array]:
     """A sphere that bulges towards the cameras."""
 
-    def place(a: Array, b: Array) -> Array:
+    def position(a: Array, b: Array) -> Array:
         return np.stack([a, b, radius_mm - np.sqrt(radius_mm**2 - a**2 - b**2)], axis=-1)
 
-    return place
+    return position
 
 
 def turned(axis: tuple[float, float, float], angle_deg: float) -> Array:

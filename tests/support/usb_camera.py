@@ -254,7 +254,7 @@ class UsbCamera:
 
     @staticmethod
     def _turn(dial: Dial, request: int, data: bytes) -> bytes | None:
-        def told(number: int) -> bytes:
+        def encoded(number: int) -> bytes:
             return number.to_bytes(dial.size, "little", signed=number < 0)
 
         if request == _SET_CUR:
@@ -275,7 +275,7 @@ class UsbCamera:
             return bytes((dial.info,))
         if request == _GET_LEN:
             return struct.pack("<H", dial.size)
-        return told(answers[request]) if request in answers else None
+        return encoded(answers[request]) if request in answers else None
 
     # -- descriptors -------------------------------------------------------------------------------------------------
 
@@ -298,8 +298,8 @@ class UsbCamera:
         control = bytes((9, 4, 0, 0, 0, 0x0E, 1, 0, 2))
         control += struct.pack("<BBBHHIBB", 13, 0x24, 1, 0x0100, 13 + len(units), 6_000_000, 1, 1) + units
         formats = b""
-        for place, (_, code, size) in enumerate(FORMATS, 1):
-            formats += struct.pack("<BBBBB", 27, 0x24, 4, place, len(SIZES)) + code + _GUID_TAIL
+        for index, (_, code, size) in enumerate(FORMATS, 1):
+            formats += struct.pack("<BBBBB", 27, 0x24, 4, index, len(SIZES)) + code + _GUID_TAIL
             formats += bytes((8 * size, 1, 0, 0, 0, 0))
             for at, (width, height) in enumerate(SIZES, 1):
                 count = width * height * size

@@ -283,7 +283,7 @@ def run_in_guest(tests: Sequence[str], folder: Path, *, limit_s: float, argument
             break
         if accelerator == "kvm":
             (CACHE / "without_kvm").touch()
-    return _told(folder, time.monotonic() - begin)
+    return _report_of(folder, time.monotonic() - begin)
 
 
 def _accelerators() -> list[str]:
@@ -302,13 +302,13 @@ def _runs(machine: list[str], folder: Path, limit_s: float, word_s: float) -> bo
     begin = time.monotonic()
     serial = folder / "serial"
     serial.write_text("")
-    with (folder / "qemu").open("a") as told:
-        process = subprocess.Popen(machine, stdin=subprocess.DEVNULL, stdout=told, stderr=told)
+    with (folder / "qemu").open("a") as log:
+        process = subprocess.Popen(machine, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         try:
             while process.poll() is None:
                 spent = time.monotonic() - begin
                 if spent > limit_s or (spent > word_s and _WORD not in serial.read_bytes()):
-                    told.write(f"killed after {spent:.0f} s\n")
+                    log.write(f"killed after {spent:.0f} s\n")
                     break
                 time.sleep(0.2)
         finally:
@@ -317,13 +317,13 @@ def _runs(machine: list[str], folder: Path, limit_s: float, word_s: float) -> bo
     return _WORD in serial.read_bytes()
 
 
-def _told(folder: Path, seconds: float) -> Report:
+def _report_of(folder: Path, seconds: float) -> Report:
     made = Report(seconds=seconds)
     outcomes = folder / "report" / "outcomes"
     for line in outcomes.read_text(encoding="utf-8").splitlines() if outcomes.is_file() else []:
-        told_of = json.loads(line)
-        name = told_of.pop("name")
-        made.outcomes[name] = Outcome(**told_of)
+        fields = json.loads(line)
+        name = fields.pop("name")
+        made.outcomes[name] = Outcome(**fields)
     made.serial = (folder / "serial").read_text(errors="replace") + (folder / "qemu").read_text()
     return made
 

@@ -22,7 +22,7 @@ def refuse(value: int) -> None:
     raise RegionError(f"value {value} is no region.", code="region_empty", value=value)
 
 
-def facts() -> dict[str, object]:
+def process_of() -> dict[str, object]:
     return {"pid": os.getpid(), "cv2_threads": cv2.getNumThreads(), "numba": os.environ["NUMBA_NUM_THREADS"]}
 
 

@@ -105,10 +105,10 @@ def _scene(setting: _Setting) -> _Scene:
     still = plane_scene(rig.texture(1))
     moved = plane_scene(rig.texture(1), in_plane=np.diag([1.004, 0.9985]), motion=tilt)
     other = plane_scene(rig.texture(7), motion=turn(np.array([0.0, 0.0, 1.0]), np.deg2rad(0.3)))
-    clean = (*rig.shoot(still, seed=1), *rig.shoot(moved, seed=2))
+    clean = (*rig.capture(still, seed=1), *rig.capture(moved, seed=2))
     grid = PointGrid.rectangle(*setting.region, spacing_px=setting.spacing_px)
     here, motion = true_points(still, moved, rig.pair.cam1, grid.xy_px)
-    pictures = Pictures(clean, tuple(rig.shoot(other, seed=3)))  # type: ignore[arg-type]
+    pictures = Pictures(clean, tuple(rig.capture(other, seed=3)))  # type: ignore[arg-type]
     return _Scene(setting, rig, still, moved, grid, pictures, here, motion)
 
 
@@ -126,9 +126,9 @@ def _touched(mask: Mask, xy_px: Float, subset_px: int) -> Mask:
 def _run(scene: _Scene, case: Case) -> _Outcome:
     pair = scene.rig.pair
     cameras = (pair.cam1, pair.cam2, pair.cam1, pair.cam2)
-    places = [c.project(scene.here + (scene.motion if k > 1 else 0.0)).xy for k, c in enumerate(cameras)]
+    positions = [c.project(scene.here + (scene.motion if k > 1 else 0.0)).xy for k, c in enumerate(cameras)]
     clean = np.full(scene.grid.shape, case.matchable)
-    for mask, xy in zip(case.spoiled, places, strict=True):
+    for mask, xy in zip(case.spoiled, positions, strict=True):
         clean &= ~_touched(mask, xy, scene.setting.subset_px)
     nothing = np.full(scene.grid.shape, np.nan)
     try:
@@ -160,12 +160,12 @@ def adversarial(figures: Path) -> Section:
             if outcome.clean.any():
                 right = 0 if outcome.field is None else int((outcome.field.valid & outcome.clean).sum())
                 share = 100.0 * right / int(outcome.clean.sum())
-                scatter_px = _scatter_px(scene, case) if share < KEPT_PERCENT else 0.0
-                allowed = scatter_px < ValidityOptions().max_sigma_px
+                sigma_px = _sigma_px(scene, case) if share < KEPT_PERCENT else 0.0
+                allowed = sigma_px < ValidityOptions().max_sigma_px
                 what = "the same: valid where every image shows the subset"
                 rows.append(Row(what, share, "%", KEPT_PERCENT if allowed else None, at_least=True))
-                if scatter_px > 0.0:
-                    rows.append(Row("the same: scatter of matches without the limit on it, rms", scatter_px, "px"))
+                if sigma_px > 0.0:
+                    rows.append(Row("the same: scatter of matches without the limit on it, rms", sigma_px, "px"))
                 if allowed:
                     clean, kept = clean + int(outcome.clean.sum()), kept + right
             if outcome.field is None:
@@ -198,7 +198,7 @@ def adversarial(figures: Path) -> Section:
     )
 
 
-def _scatter_px(scene: _Scene, case: Case) -> float:
+def _sigma_px(scene: _Scene, case: Case) -> float:
     """How far matches are off in camera 1, rms, if none is refused for its scatter: what the pictures allow."""
     free = ValidityOptions(max_sigma_px=10.0, max_depth_sigma_px=10.0)
     options = MeasureOptions(subset_px=scene.setting.subset_px, validity=free)
@@ -246,7 +246,7 @@ def _refusals(scene: _Scene) -> list[str]:
     """Cases that are refused before any point is measured."""
     clean = scene.pictures.clean
     lattice = plane_scene(dots(pitch_mm=0.6, diameter_mm=0.3, rim_mm=0.03))
-    repeated = scene.rig.shoot(lattice, seed=1)
+    repeated = scene.rig.capture(lattice, seed=1)
     blank = np.full_like(clean[0], 128)
     tries = {
         "cameras exchanged at the reference": (clean[1], clean[0], *clean[2:]),

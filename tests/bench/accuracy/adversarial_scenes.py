@@ -126,12 +126,12 @@ class Pictures:
         """Both images at t exposed so long that the bright half saturates."""
         return self._everywhere(lambda p: gain * p.astype(float), matchable=False)
 
-    def _lit(self, places: list[tuple[float, float]], *, width: float, height: float) -> Case:
+    def _lit(self, positions: list[tuple[float, float]], *, width: float, height: float) -> Case:
         rows, cols = self._shape
         y, x = np.mgrid[:rows, :cols]
         light = [
             height * np.exp(-((x - u * cols) ** 2 + (y - v * rows) ** 2) / (2.0 * (width * cols) ** 2))
-            for u, v in places
+            for u, v in positions
         ]
         changed = {k: _grey(self.clean[k] + light[k]) for k in range(4)}
         return self._case(changed, {k: light[k] > 3.0 for k in range(4)})

@@ -49,8 +49,8 @@ def _calibrate(
     for dz in POSITIONS:
         stage[1] = stage[2] = dz
         for name in CAMERAS:
-            shots = [world.expose(name, exposure_ms=10.0, rng=rng) for _ in range(frames)]
-            mean = shots[0] if frames == 1 else np.mean(shots, axis=0, dtype=np.float32)
+            exposures = [world.expose(name, exposure_ms=10.0, rng=rng) for _ in range(frames)]
+            mean = exposures[0] if frames == 1 else np.mean(exposures, axis=0, dtype=np.float32)
             images.append(ImageOfTarget(name, dz, mean))
     options = CalibrationOptions(held_out_mm=HELD_OUT, estimate_nodes=nodes)
     return calibrate_views(images, _target(tolerance_mm), NOMINALS, options, localiser=localiser)
@@ -135,8 +135,8 @@ def aspect(figures: Path) -> Section:
     for _ in range(20):
         # normal to the axis but for half a degree of carelessness, moved about by up to a millimetre
         angles = np.radians([45.0 + rng.uniform(-1, 1), rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)])
-        place = np.array([rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), 400.0])
-        camera = Camera(lens, RigidTransform(rotation_from_angles(*angles), place))
+        translation = np.array([rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), 400.0])
+        camera = Camera(lens, RigidTransform(rotation_from_angles(*angles), translation))
         clean = render(
             make_scene(RIG, "grid", node_tolerance_mm=0.0),
             camera,

@@ -39,7 +39,7 @@ def _cut(camera: Camera) -> Camera:
     return replace(camera, lens=replace(lens, cx_px=lens.cx_px - CORNER_PX[0], cy_px=lens.cy_px - CORNER_PX[1]))
 
 
-def _shoot(clean: list[NDArray[np.float32]], seed: int) -> list[NDArray[np.uint8]]:
+def _capture(clean: list[NDArray[np.float32]], seed: int) -> list[NDArray[np.uint8]]:
     rng = np.random.default_rng(seed)
     return [np.clip(np.rint(255 * i + 2 * rng.standard_normal(i.shape)), 0, 255).astype(np.uint8) for i in clean]
 
@@ -57,18 +57,18 @@ def cracks(figures: Path) -> Section:
     before, after = make_scene(rig, "panel", load=0.0), make_scene(rig, "panel", load=LOAD_KN)
     half = CrackedPanel().half_crack_mm
     along = np.linspace(-half, half, 41)
-    place = before.surface.place(np.stack([along, np.zeros(41)], axis=-1), 1.0)
-    line = np.asarray(pair.cam1.project(before.sys_from_body.apply(place)).xy)
+    points = before.surface.place(np.stack([along, np.zeros(41)], axis=-1), 1.0)
+    line = np.asarray(pair.cam1.project(before.sys_from_body.apply(points)).xy)
     plain = PointGrid.rectangle(20, 20, SIZE_PX[0] - 21, SIZE_PX[1] - 21, spacing_px=SPACING_PX)
     grid, options = plain.with_cracks([line]), MeasureOptions(subset_px=SUBSET_PX, patch="affine")
     clean = [_render(rig, pair, scene) for scene in (before, after)]
     truth = truth_at(before, pair.cam1, grid.xy_px, now=after)
     away, middle = _distance(grid.xy_px, line), np.abs(truth.st_mm[..., 0]) < MIDDLE_MM
     fields = [
-        ReferencePair(pair, *_shoot(clean[0], 2 * k)).motion(*_shoot(clean[1], 2 * k + 1), grid, options)
+        ReferencePair(pair, *_capture(clean[0], 2 * k)).motion(*_capture(clean[1], 2 * k + 1), grid, options)
         for k in range(REPEATS)
     ]
-    without = ReferencePair(pair, *_shoot(clean[0], 0)).motion(*_shoot(clean[1], 1), plain, options)
+    without = ReferencePair(pair, *_capture(clean[0], 0)).motion(*_capture(clean[1], 1), plain, options)
     errors = np.stack([_moved(f) - truth.uvw_mm for f in fields])
     sigma = np.stack([f.sigma_mm[..., 3:] for f in fields])
     rows = _rows(fields, without, errors, sigma, away, middle)

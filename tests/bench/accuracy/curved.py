@@ -78,8 +78,8 @@ def _measure(
 ) -> dict[PatchSetting, Errors]:
     """Measure the same pictures with each patch; a shape if there is no ``after``."""
     grid = _grid() if grid is None else grid
-    reference = ReferencePair(rig.pair, *rig.shoot(before, noise=noise, seed=seed))
-    now = None if after is None else rig.shoot(after, noise=noise, seed=seed + 1000)
+    reference = ReferencePair(rig.pair, *rig.capture(before, noise=noise, seed=seed))
+    now = None if after is None else rig.capture(after, noise=noise, seed=seed + 1000)
     xyz, uvw = true_points(before, after or before, rig.pair.cam1, grid.xy_px)
     out = {}
     for patch in patches:

@@ -33,7 +33,7 @@ def _copies() -> list[Field]:
     rig = load_rig()
     motion = turn(np.array([1.0, 1.0, 2.0]), np.radians(0.3))
     after = plane_scene(rig.texture(1), motion=RigidTransform(motion.rotation, np.array([0.05, -0.03, 0.1])))
-    clean = [np.asarray(v) for s in (plane_scene(rig.texture(1)), after) for v in rig.shoot(s, noise=0.0)]
+    clean = [np.asarray(v) for s in (plane_scene(rig.texture(1)), after) for v in rig.capture(s, noise=0.0)]
     rng = np.random.default_rng(17)
     options = MeasureOptions(subset_px=SUBSET, patch="affine")
     seeds = GRID.xy_px[3:4, 4]

@@ -48,14 +48,14 @@ def large_motion(figures: Path) -> Section:
     rig = rig_of_size(SIZE_PX)
     texture = rig.texture(1)
     still = plane_scene(texture)
-    reference = ReferencePair(rig.pair, *rig.shoot(still, seed=1, noise=2.0))
+    reference = ReferencePair(rig.pair, *rig.capture(still, seed=1, noise=2.0))
     grid = PointGrid.rectangle(*REGION, spacing_px=SPACING_PX)
     options = MeasureOptions(subset_px=33)
     shape = reference.shape(grid, options)
     rows, pictures = [], []
     for name, (in_plane, motion) in MOTIONS.items():
         moved = plane_scene(texture, in_plane=in_plane, motion=motion)
-        images = rig.shoot(moved, seed=2, noise=2.0)
+        images = rig.capture(moved, seed=2, noise=2.0)
         field = reference.motion(*images, grid, options, shape=shape)
         assert field.uvw_mm is not None
         _, truth = true_points(still, moved, rig.pair.cam1, grid.xy_px)

@@ -52,8 +52,8 @@ def _motion(
     interpolation: str = "quintic",
     pair: StereoPair | None = None,
 ) -> Field:
-    ref = rig.shoot(before, noise=noise, seed=seed)
-    cur = rig.shoot(after, noise=noise, seed=seed + 1000)
+    ref = rig.capture(before, noise=noise, seed=seed)
+    cur = rig.capture(after, noise=noise, seed=seed + 1000)
     options = MeasureOptions(subset_px=subset, patch=patch, interpolation=interpolation)  # type: ignore[arg-type]
     return measure_motion(pair or rig.pair, *ref, *cur, _grid(), options)
 
@@ -66,7 +66,7 @@ def plane(figures: Path) -> Section:
         errors, sigmas, lost = [], [], 0
         for seed in TEXTURES:
             scene = plane_scene(rig.texture(seed))
-            field = measure_shape(rig.pair, *rig.shoot(scene, seed=seed), _grid(), MeasureOptions(subset_px=subset))
+            field = measure_shape(rig.pair, *rig.capture(scene, seed=seed), _grid(), MeasureOptions(subset_px=subset))
             xyz, _ = true_points(scene, scene, rig.pair.cam1, _xy(field))
             # along Z_sys at the measured place: the plane is Z = 0, so Z itself
             errors.append(((field.xyz_mm - xyz)[..., 2] * 1e3)[field.valid])

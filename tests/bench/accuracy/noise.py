@@ -14,7 +14,7 @@ from core.matching.image import ImageData
 from core.noise import NoiseModel, measure_noise
 from sim.sensor import Sensor
 from tests.bench.accuracy.noise_bound import bound, displacement_bound, height_bound
-from tests.bench.accuracy.noise_scenes import LOOKS, Window, digitise
+from tests.bench.accuracy.noise_scenes import APPEARANCES, Window, digitise
 from tests.bench.accuracy.table import Row, Section
 
 NOISES = (1.0, 2.0, 4.0, 6.0)
@@ -40,9 +40,9 @@ class Sample:
         """Empirical sd (points, components) about each point's own mean."""
         return np.asarray(np.nanstd(self.error, axis=0, ddof=1))
 
-    def over(self, least: Float) -> tuple[float, float]:
+    def over(self, min_sigma: Float) -> tuple[float, float]:
         """Random error over its bound, rms over points and components, and its own standard deviation."""
-        ratio = np.sqrt(np.mean((self.random / least) ** 2))
+        ratio = np.sqrt(np.mean((self.random / min_sigma) ** 2))
         return float(ratio), float(ratio / np.sqrt(2.0 * self.error.size))
 
     def honesty(self) -> Float:
@@ -95,14 +95,14 @@ def _departure(head: str, got: Sample, limit: float | None) -> Row:
 def random_error(figures: Path) -> Section:
     """Random error over the bound, and reported over empirical sd, against the noise."""
     rows, curves, honesty = [], {}, {}
-    for label, look in (("standard", LOOKS["standard"]), ("coarse", LOOKS["coarse"])):
-        window = Window("paper", look, size_px=330)
+    for label, appearance in (("standard", APPEARANCES["standard"]), ("coarse", APPEARANCES["coarse"])):
+        window = Window("paper", appearance, size_px=330)
         shift = window.shift_mm(*SHIFT_PX)
         clean = [*window.clean(), *window.clean(shift)]
         for subset in SUBSETS:
             xy = window.points(subset)
             w, G = window.unknowns(xy, shift)
-            least = {
+            min_sigma = {
                 "shape": height_bound(window, xy, w, bound(window, clean[:2], xy, w, None, subset))[:, None],
                 "motion": displacement_bound(window, xy, w, G, bound(window, clean, xy, w, G, subset)),
             }
@@ -118,7 +118,7 @@ def random_error(figures: Path) -> Section:
                         moved = None if what == "shape" else shift
                         sets = _noisy(images, noise, times * repeats, kind, seed)
                         got = measure(window, sets, xy, moved, subset, kind)
-                        ratio, ratio_sd = got.over(sd * least[what])
+                        ratio, ratio_sd = got.over(sd * min_sigma[what])
                         curves[label, subset, kind, what, noise] = ratio, ratio_sd
                         honesty[label, subset, kind, what, noise] = got.honesty()
                         if noise in STATED:
@@ -186,11 +186,11 @@ def mean_error(figures: Path) -> Section:
     subset = 21
     rows, curves = [], {}
     for rig in ("paper", "modern"):
-        for label, look in LOOKS.items():
+        for label, appearance in APPEARANCES.items():
             for kind in KINDS:
                 for noise in (0.0, 6.0):
                     curves[rig, label, kind, noise] = []
-            window = Window(rig, look, size_px=300)
+            window = Window(rig, appearance, size_px=300)
             xy = window.points(subset)
             before = window.clean()
             for k, phase in enumerate(PHASES):
@@ -245,7 +245,7 @@ def phase_error_px(
     pose = window.pair.cam2_from_cam1
     rays = window.pair.cam1.rays_cam(xy).xyz_mm
 
-    def places(w: Float, G: Float) -> Float:
+    def positions(w: Float, G: Float) -> Float:
         at0 = window.pair.cam2.lens.image_from_normalised(
             _flat(rays @ pose.rotation.T + w[:, :1] * pose.translation_mm)
         ).xy
@@ -255,13 +255,13 @@ def phase_error_px(
         ).xy
         return np.concatenate([at0, one, two], axis=1)
 
-    true = places(w, G)
-    step = places(w * 1.0001, G)[:, :2] - true[:, :2]
+    true = positions(w, G)
+    step = positions(w * 1.0001, G)[:, :2] - true[:, :2]
     along = step / np.linalg.norm(step, axis=1)[:, None]
     errors = []
     for images in sets:
         fit = fit_motion(window.pair, *images, xy, w, G, options)
-        e = places(fit.w, fit.G) - true
+        e = positions(fit.w, fit.G) - true
         errors.append(np.concatenate([(e[:, :2] * along).sum(1)[:, None], e[:, 2:]], axis=1)[fit.status == 0])
     e = np.concatenate(errors)
     scatter = np.std(e, axis=0) / np.sqrt(len(e))
@@ -277,7 +277,7 @@ def _plot_mean(figures: Path, curves: dict) -> None:
     for row, rig in enumerate(("paper", "modern")):
         for column, (kind, noise) in enumerate((k, n) for n in (0.0, 6.0) for k in KINDS):
             ax = axes[row, column]
-            for i, label in enumerate(LOOKS):
+            for i, label in enumerate(APPEARANCES):
                 mean = np.array(curves[rig, label, kind, noise])[..., 0]
                 for component, style in ((0, ":"), (1, "-"), (3, "--")):
                     ax.plot(
@@ -326,7 +326,7 @@ def camera_noise(figures: Path) -> Section:
     for subset in SUBSETS:
         xy = window.points(subset)
         w, G = window.unknowns(xy, shift)
-        least = {
+        min_sigma = {
             "shape": height_bound(window, xy, w, bound(window, clean[:2], xy, w, None, subset, variances[:2]))[:, None],
             "motion": displacement_bound(window, xy, w, G, bound(window, clean, xy, w, G, subset, variances)),
         }
@@ -339,7 +339,7 @@ def camera_noise(figures: Path) -> Section:
                 got = measure(
                     window, sets if four else [s[:2] for s in sets], xy, shift if four else None, subset, kind
                 )
-                ratio, ratio_sd = got.over(least[what])
+                ratio, ratio_sd = got.over(min_sigma[what])
                 model = "with the model" if used else "without a model"
                 name = f"{'u, v, w' if four else 'Z'}, {subset} px, {kind}, {model}"
                 limit = 1.02 if used else None

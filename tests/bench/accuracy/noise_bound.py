@@ -68,13 +68,13 @@ class _Point:
         at = pixels.astype(int)
         f, slope = self.clean[0][at[:, 1], at[:, 0]], self.slope[at[:, 1], at[:, 0]]
         count = len(self.clean) - 1
-        places = [self._place(k, unknowns, pixels, xy) for k in range(count)]
-        grey = [self._grey(k + 1, *p.T) for k, p in enumerate(places)]
+        positions = [self._position(k, unknowns, pixels, xy) for k in range(count)]
+        grey = [self._grey(k + 1, *p.T) for k, p in enumerate(positions)]
         contrast = np.array([np.std(g) / np.std(f) for g in grey])
         v = np.ones((count + 1, len(f)))
         if self.variances is not None:
             v[0] = self.variances[0][at[:, 1], at[:, 0]]
-            for k, p in enumerate(places):
+            for k, p in enumerate(positions):
                 v[k + 1] = map_coordinates(self.variances[k + 1], p.T[::-1], order=1)
         # an image that sees the patch larger has more pixels on it, each with noise of its own
         scales = [np.abs(np.linalg.det(self._carried(k, unknowns, pixels, xy))) for k in range(count)]
@@ -95,7 +95,7 @@ class _Point:
         inverse = np.linalg.inv(N * np.outer(scale, scale)) * np.outer(scale, scale)
         return np.asarray(inverse[: len(unknowns), : len(unknowns)])
 
-    def _place(self, k: int, unknowns: Float, pixels: Float, xy: Float) -> Float:
+    def _position(self, k: int, unknowns: Float, pixels: Float, xy: Float) -> Float:
         """Image points of comparison k."""
         pair = self.window.pair
         rays = pair.cam1.rays_cam(pixels).xyz_mm
@@ -123,7 +123,9 @@ class _Point:
         for i, step in enumerate(_STEPS[: len(unknowns)]):
             d = np.zeros(len(unknowns))
             d[i] = step
-            moved = (self._place(k, unknowns + d, pixels, xy) - self._place(k, unknowns - d, pixels, xy)) / (2 * step)
+            moved = (self._position(k, unknowns + d, pixels, xy) - self._position(k, unknowns - d, pixels, xy)) / (
+                2 * step
+            )
             columns.append(np.einsum("ni,nij,nj->n", slope, inverse, moved))
         return np.stack(columns, axis=-1)
 
@@ -131,7 +133,7 @@ class _Point:
         """Derivative (pixels, 2, 2) of comparison k's image places over the reference's."""
         h = 0.02
         by = [
-            (self._place(k, unknowns, pixels + d, xy) - self._place(k, unknowns, pixels - d, xy)) / (2 * h)
+            (self._position(k, unknowns, pixels + d, xy) - self._position(k, unknowns, pixels - d, xy)) / (2 * h)
             for d in np.eye(2) * h
         ]
         return np.stack(by, -1)

@@ -20,7 +20,7 @@ GAINS = (1.0, 0.88)
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """A texture as the cameras see it: speckle and rim in px, blur in px, contrast."""
 
     speckle_px: float = 4.0
@@ -29,12 +29,12 @@ class Look:
     contrast: float = 1.0
 
 
-LOOKS = {
-    "standard": Look(),
-    "coarse": Look(speckle_px=8.0, blur_px=1.1),
-    "fine": Look(speckle_px=3.0),
-    "sharp": Look(rim=0.2, blur_px=0.4),
-    "low contrast": Look(contrast=0.5),
+APPEARANCES = {
+    "standard": Appearance(),
+    "coarse": Appearance(speckle_px=8.0, blur_px=1.1),
+    "fine": Appearance(speckle_px=3.0),
+    "sharp": Appearance(rim=0.2, blur_px=0.4),
+    "low contrast": Appearance(contrast=0.5),
 }
 
 
@@ -54,15 +54,15 @@ class Window:
     """
 
     def __init__(
-        self, rig: str = "paper", look: Look = LOOKS["standard"], *, size_px: int = 300, seed: int = 1
+        self, rig: str = "paper", appearance: Appearance = APPEARANCES["standard"], *, size_px: int = 300, seed: int = 1
     ) -> None:
         full = load_rig(RIGS[rig])
-        self.look, self.size_px = look, size_px
+        self.appearance, self.size_px = appearance, size_px
         self.pair = StereoPair(*(self._window(camera) for camera in (full.pair.cam1, full.pair.cam2)))
         phd, z = self.pair.cam1.paper_parameters()["phd_px"], self.pair.cam1.paper_parameters()["z0_mm"]
         self.mm_per_px = z / phd
-        d = look.speckle_px * self.mm_per_px
-        self.texture = speckle(diameter_mm=d, seed=seed, rim_mm=look.rim * d)
+        d = appearance.speckle_px * self.mm_per_px
+        self.texture = speckle(diameter_mm=d, seed=seed, rim_mm=appearance.rim * d)
 
     def _window(self, camera: Camera) -> Camera:
         lens = camera.lens
@@ -81,11 +81,11 @@ class Window:
         motion = None if shift_mm is None else RigidTransform(np.eye(3), np.asarray(shift_mm))
         scene = plane_scene(self.texture, motion=motion)
         size = (self.size_px, self.size_px)
-        options = RenderOptions(blur_px=self.look.blur_px, threads=2)
+        options = RenderOptions(blur_px=self.appearance.blur_px, threads=2)
         middle = 0.5 * (DARK + BRIGHT)
         return [
             middle
-            + self.look.contrast
+            + self.appearance.contrast
             * (gain * (DARK + (BRIGHT - DARK) * render(scene, camera, size, options=options)) - middle)
             for gain, camera in zip(GAINS, (self.pair.cam1, self.pair.cam2), strict=True)
         ]

@@ -32,7 +32,7 @@ class Rig:
     def texture(self, seed: int = 1) -> Texture:
         return speckle(diameter_mm=self.speckle_mm, seed=seed)
 
-    def shoot(
+    def capture(
         self, scene: Scene, *, noise: float = 2.0, seed: int = 0, cam: int | None = None, dz_mm: float = 0.0
     ) -> list[NDArray[np.uint8]] | list[Float]:
         """Pictures of both cameras, 8 bit with noise; unrounded where noise is 0, so that nothing but the method shows."""

@@ -13,7 +13,7 @@ from core.matching.blur import Blur
 from core.matching.image import ImageData
 from core.noise import NoiseModel
 from tests.bench.accuracy.noise import SHIFT_PX, Sample, measure, phase_error_px
-from tests.bench.accuracy.noise_scenes import LOOKS, Window, digitise
+from tests.bench.accuracy.noise_scenes import APPEARANCES, Window, digitise
 from tests.bench.accuracy.table import Row, Section
 
 WIDTHS_PX = (0.0, 0.5, 1.0, 2.0)
@@ -38,7 +38,7 @@ def prefilter(figures: Path) -> Section:
     means: dict[tuple[str, float], Float] = {}
     random: dict[tuple[str, int, float, float], Sample] = {}
     for texture in TEXTURES:
-        window = Window("paper", LOOKS[texture], size_px=330)
+        window = Window("paper", APPEARANCES[texture], size_px=330)
         xy = window.points(21)
         before = window.clean()
         for width in WIDTHS_PX:
@@ -56,7 +56,7 @@ def prefilter(figures: Path) -> Section:
                 )
             )
     for texture in ("sharp", "standard"):
-        window = Window("paper", LOOKS[texture], size_px=330)
+        window = Window("paper", APPEARANCES[texture], size_px=330)
         shift = window.shift_mm(*SHIFT_PX)
         clean = [*window.clean(), *window.clean(shift)]
         for subset in SUBSETS:
@@ -74,19 +74,19 @@ def prefilter(figures: Path) -> Section:
                             spread = 1e3 * np.sqrt(np.mean(got.random**2))
                             rows.append(Row(f"{head}: random error of u, v, w, rms", float(spread), "um"))
                         apart = np.abs(got.honesty() - 1.0).max()
-                        told = "with a noise model" if known else "without"
+                        weighting = "with a noise model" if known else "without"
                         # in sharp texture the residuals hold interpolation besides noise, prefilter or not
                         limit = 5.0 if known or texture == "standard" else None
                         rows.append(
                             Row(
-                                f"{head}, {told}: reported over empirical sd, departure from 1, worst component",
+                                f"{head}, {weighting}: reported over empirical sd, departure from 1, worst component",
                                 100.0 * float(apart),
                                 "%",
                                 limit,
                             )
                         )
                         if got.lost:
-                            rows.append(Row(f"{head}, {told}: points lost", got.lost, "", 0))
+                            rows.append(Row(f"{head}, {weighting}: points lost", got.lost, "", 0))
     _plot(figures / "accuracy_prefilter.png", means, random)
     return Section(
         "Gaussian prefilter",

@@ -26,7 +26,7 @@ def window_slope(window: int, axis: int) -> Float:
     return np.asarray(along / (along**2).sum())
 
 
-def seen_over_told(
+def observed_over_reported(
     values: Float, sigma: Float, weights: Float, shared: SharedPixels, spacing_px: float, lag: int
 ) -> float:
     """Return the noise that is seen over that which is told.

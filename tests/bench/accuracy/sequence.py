@@ -49,7 +49,7 @@ class _Followed:
 
     valid: Float
     error: Float
-    told: Float
+    reported: Float
     scatter: Float
     mean: Float
     updates: Float
@@ -86,10 +86,10 @@ def _clean(rig: Rig, motion: _Motion) -> list[list[Float]]:
     out = []
     for n in range(motion.steps + 1):
         scene = motion.scene(n)
-        pictures = [np.asarray(p, dtype=np.float64) for p in rig.shoot(scene, noise=0.0)]
+        pictures = [np.asarray(p, dtype=np.float64) for p in rig.capture(scene, noise=0.0)]
         if motion.fading_deg:
             a = np.deg2rad(motion.fading_deg * n)
-            others = rig.shoot(replace(scene, texture=rig.texture(4)), noise=0.0)
+            others = rig.capture(replace(scene, texture=rig.texture(4)), noise=0.0)
             pictures = [
                 GREY + np.cos(a) * (p - GREY) + np.sin(a) * (q - GREY) for p, q in zip(pictures, others, strict=True)
             ]
@@ -159,7 +159,7 @@ def _follow(
     return _Followed(
         valid=100.0 * np.isfinite(error[..., 0]).mean(axis=(0, 2, 3)),
         error=rms(error),
-        told=rms(sigma),
+        reported=rms(sigma),
         scatter=scatter,
         mean=np.nansum(error, axis=(0, 2, 3)) / count,
         updates=changes.mean(axis=0),
@@ -175,7 +175,7 @@ def updates(figures: Path) -> Section:
     clean = _clean(rig, small)
     noisy, exact = (_follow(rig, small, clean, "always", *a) for a in ((SMALL_SEEDS, NOISE), (1, 0.0)))
     for n in AFTER:
-        ratio = noisy.told[n] / noisy.scatter[n]
+        ratio = noisy.reported[n] / noisy.scatter[n]
         for name, value in zip("uvw", ratio, strict=True):
             rows.append(
                 Row(f"reported over empirical sd of {name} after {n} update{'s' if n > 1 else ''}", float(value), "")
@@ -196,7 +196,7 @@ def updates(figures: Path) -> Section:
             rows.append(
                 Row(f"{name}, {NAMES[mode]}: references used after the first", float(followed.updates[last]), "")
             )
-            error, told = (np.linalg.norm(a[last]) for a in (followed.error, followed.told))
+            error, reported = (np.linalg.norm(a[last]) for a in (followed.error, followed.reported))
             rows.append(
                 Row(
                     f"{name}, {NAMES[mode]}: error in the last step that was measured ({last + 1}), rms",
@@ -204,7 +204,7 @@ def updates(figures: Path) -> Section:
                     "um",
                 )
             )
-            rows.append(Row(f"{name}, {NAMES[mode]}: reported over true error there", float(told / error), ""))
+            rows.append(Row(f"{name}, {NAMES[mode]}: reported over true error there", float(reported / error), ""))
     _draw(figures / "accuracy_updates.png", results)
     return Section(
         "Long sequences and later references",
@@ -231,10 +231,10 @@ def _draw(path: Path, results: dict[str, dict[ReferenceUpdate, _Followed]]) -> N
     for column, (name, modes) in enumerate(results.items()):
         for mode, f in modes.items():
             steps = np.arange(1, len(f.valid) + 1)
-            error, told = (np.linalg.norm(a, axis=1) for a in (f.error, f.told))
-            look = {"color": colours[mode], "ls": styles[mode], "lw": 2.0, "label": NAMES[mode]}
-            for row, values in enumerate((f.valid, error, told / error)):
-                axes[row, column].plot(steps, values, **look)
+            error, reported = (np.linalg.norm(a, axis=1) for a in (f.error, f.reported))
+            style = {"color": colours[mode], "ls": styles[mode], "lw": 2.0, "label": NAMES[mode]}
+            for row, values in enumerate((f.valid, error, reported / error)):
+                axes[row, column].plot(steps, values, **style)
         axes[0, column].set(title=name, ylim=(-5, 105))
         axes[2, column].set(xlabel="step", ylim=(0, 3))
         axes[2, column].axhline(1.0, color="0.7", lw=0.8, zorder=0)

@@ -31,8 +31,8 @@ def smoothing(figures: Path) -> Section:
     noise: dict[int, tuple[float, float]] = {}
     for window in WINDOWS:
         fields = [smoothed_displacement(f, window, subset_px=SUBSET) if window else f for f in measured]
-        uvw, told = np.array([f.uvw_mm for f in fields]), np.array([f.sigma_mm[..., 3:] for f in fields])
-        ratio, scatter = _compared(uvw, told)
+        uvw, reported = np.array([f.uvw_mm for f in fields]), np.array([f.sigma_mm[..., 3:] for f in fields])
+        ratio, scatter = _compared(uvw, reported)
         noise[window] = 1e3 * float(scatter.max()), float(ratio.mean())
         if window not in STATED:
             continue
@@ -84,11 +84,11 @@ def smoothing(figures: Path) -> Section:
     )
 
 
-def _compared(values: Float, told: Float) -> tuple[Float, Float]:
+def _compared(values: Float, reported: Float) -> tuple[Float, Float]:
     """Reported over empirical sd, and the empirical sd, by component, rms over the points that all repeats have."""
     ok = np.isfinite(values).all(axis=(0, -1))
     scatter = np.sqrt(np.mean(np.var(values[:, ok], axis=0, ddof=1), axis=0))
-    return np.asarray(np.sqrt(np.mean(told[:, ok] ** 2, axis=(0, 1))) / scatter), np.asarray(scatter)
+    return np.asarray(np.sqrt(np.mean(reported[:, ok] ** 2, axis=(0, 1))) / scatter), np.asarray(scatter)
 
 
 def _left_of_waves(field: Field, window: int) -> Float:

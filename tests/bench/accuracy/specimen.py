@@ -21,7 +21,7 @@ from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
 from tests.bench.accuracy.experiments import specimen_folder
 from tests.bench.accuracy.paper_rig import ROOT
-from tests.bench.accuracy.rapid_noise import seen_over_told, window_slope
+from tests.bench.accuracy.rapid_noise import observed_over_reported, window_slope
 from tests.bench.accuracy.table import Row, Section
 
 REGION = (340, 430, 1560, 690)
@@ -98,14 +98,14 @@ def strain(figures: Path) -> Section:
     strains = [s for s in found if s is not None]
     rows = []
     for k, step in enumerate(steps, start=1):
-        told = step["strain"]
-        rows.append(Row(f"step {k}: points with strain", 100 * told["points"] / step["valid"], "%"))
+        summary = step["strain"]
+        rows.append(Row(f"step {k}: points with strain", 100 * summary["points"] / step["valid"], "%"))
         for name in NAMES:
             rows += [
-                Row(f"step {k}: {name}, mean over the gauges", told["mean_microstrain"][name], "ue"),
+                Row(f"step {k}: {name}, mean over the gauges", summary["mean_microstrain"][name], "ue"),
                 Row(
                     f"step {k}: {name}, mean of the patches less that of the gauges",
-                    told["patch"]["difference_mean_microstrain"][name],
+                    summary["patch"]["difference_mean_microstrain"][name],
                     "ue",
                 ),
             ]
@@ -164,21 +164,24 @@ def _noise(field: Field) -> tuple[list[Row], dict[int, tuple[float, Float, Float
     assert field.uvw_mm is not None
     for k, name in enumerate("uvw"):
         sigma = field.sigma_mm[..., 3 + k]
-        told = 1e3 * float(np.sqrt(np.nanmean(sigma**2)))
-        ratio = seen_over_told(field.uvw_mm[..., k], sigma, np.ones((1, 1)), shared, STEP, LAG)
-        rows += [Row(f"noise of {name}, reported", told, "um"), Row(f"noise of {name}, observed", ratio * told, "um")]
+        reported = 1e3 * float(np.sqrt(np.nanmean(sigma**2)))
+        ratio = observed_over_reported(field.uvw_mm[..., k], sigma, np.ones((1, 1)), shared, STEP, LAG)
+        rows += [
+            Row(f"noise of {name}, reported", reported, "um"),
+            Row(f"noise of {name}, observed", ratio * reported, "um"),
+        ]
     for window in WINDOWS:
         strain = surface_strain(field, StrainOptions(window=window), subset_px=SUBSET)
         whole = slice(window // 2, -(window // 2))
-        told, seen = np.zeros(2), np.zeros(2)
+        reported, seen = np.zeros(2), np.zeros(2)
         for k in range(2):
             value, sigma = strain.strain[whole, whole, k], strain.sigma[whole, whole, k]
-            told[k] = MICRO * float(np.sqrt(np.nanmean(sigma**2)))
-            seen[k] = told[k] * seen_over_told(value, sigma, window_slope(window, k), shared, STEP, LAG)
-        curve[window] = (strain.gauge_mm, told, seen)
+            reported[k] = MICRO * float(np.sqrt(np.nanmean(sigma**2)))
+            seen[k] = reported[k] * observed_over_reported(value, sigma, window_slope(window, k), shared, STEP, LAG)
+        curve[window] = (strain.gauge_mm, reported, seen)
         for k, name in enumerate(NAMES):
             where = f"noise floor of {name}, {window} points ({strain.gauge_mm:.1f} mm)"
-            rows += [Row(f"{where}, reported", told[k], "ue"), Row(f"{where}, observed", seen[k], "ue")]
+            rows += [Row(f"{where}, reported", reported[k], "ue"), Row(f"{where}, observed", seen[k], "ue")]
     return rows, curve
 
 

@@ -66,9 +66,9 @@ def _fields(
     options = MeasureOptions(subset_px=SUBSET)
     out = []
     for seed in seeds:
-        reference = ReferencePair(rig.pair, *rig.shoot(before, noise=noise, seed=seed))
+        reference = ReferencePair(rig.pair, *rig.capture(before, noise=noise, seed=seed))
         shape = reference.shape(grid, options)
-        out.append(reference.motion(*rig.shoot(after, noise=noise, seed=seed + 1000), grid, options, shape=shape))
+        out.append(reference.motion(*rig.capture(after, noise=noise, seed=seed + 1000), grid, options, shape=shape))
     return out
 
 
@@ -162,7 +162,7 @@ def moved_fields(rig: Rig, repeats: int) -> list[Field]:
     """Measure a plane's small motion from repeated noisy pictures."""
     before = plane_scene(rig.texture(3))
     after = plane_scene(rig.texture(3), motion=_moved((0.026, -0.014, 0.042)))
-    clean = rig.shoot(before, noise=0.0), rig.shoot(after, noise=0.0)
+    clean = rig.capture(before, noise=0.0), rig.capture(after, noise=0.0)
     grid = PointGrid.rectangle(*REGION, spacing_px=10)
     options = MeasureOptions(subset_px=SUBSET, patch="affine")
     fields = []
@@ -185,8 +185,8 @@ def _noise(rig: Rig, repeats: int = 12) -> tuple[list[Row], dict[int, tuple[floa
         found = [_strain(f, window) for f in fields]
         kept = np.logical_and.reduce([s.valid for s in found])
         scatter = np.sqrt(np.mean(np.var([s.strain[kept] for s in found], axis=0, ddof=1), axis=0))
-        told = np.sqrt(np.mean([s.sigma[kept] ** 2 for s in found], axis=(0, 1)))
-        curve[window] = (found[0].gauge_mm, MICRO * float(scatter[0]), MICRO * float(told[0]))
+        reported = np.sqrt(np.mean([s.sigma[kept] ** 2 for s in found], axis=(0, 1)))
+        curve[window] = (found[0].gauge_mm, MICRO * float(scatter[0]), MICRO * float(reported[0]))
         for k, name in enumerate(NAMES):
             if window == 9 or k == 0:
                 rows.append(
@@ -197,7 +197,7 @@ def _noise(rig: Rig, repeats: int = 12) -> tuple[list[Row], dict[int, tuple[floa
                     )
                 )
                 rows.append(
-                    Row(f"{name}, {window} points: reported over empirical sd", float(told[k] / scatter[k]), "")
+                    Row(f"{name}, {window} points: reported over empirical sd", float(reported[k] / scatter[k]), "")
                 )
     patches = [s.patch for s in found]
     scatter = np.sqrt(np.mean(np.var([p[kept] for p in patches if p is not None], axis=0, ddof=1), axis=0))
@@ -219,9 +219,9 @@ def _plot(path: Path, maps: dict[str, StrainField]) -> None:
 
 def _plot_noise(path: Path, curve: dict[int, tuple[float, float, float]]) -> None:
     fig, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
-    gauge, scatter, told = np.array(list(curve.values())).T
+    gauge, scatter, reported = np.array(list(curve.values())).T
     ax.loglog(gauge, scatter, "o", label="scatter of repeated pictures")
-    ax.loglog(gauge, told, "k-", lw=0.8, label="reported")
+    ax.loglog(gauge, reported, "k-", lw=0.8, label="reported")
     for window, x, y in zip(curve, gauge, scatter, strict=True):
         ax.annotate(f"{window} points", (x, y), xytext=(4, 6), textcoords="offset points", fontsize=7)
     ax.set(

@@ -168,7 +168,7 @@ class Found:
                 texts.append(text)
 
 
-def _places(module: ast.Module) -> Iterator[tuple[ast.Call, dict[str, list[ast.expr]]]]:
+def _makers_called(module: ast.Module) -> Iterator[tuple[ast.Call, dict[str, list[ast.expr]]]]:
     """Yield every call of a module with what the names around it are set to."""
     outside = _assigned(ast.Module([n for n in module.body if isinstance(n, ast.Assign)], []))
 
@@ -191,7 +191,7 @@ def scan() -> dict[str, dict[str, Any]]:
     for cls in classes.values():
         found.setdefault(cls.code, Found()).add(cls.status(cls.code), cls.about, cls.remedy)
     for path, module in parsed.items():
-        for call, names in _places(module):
+        for call, names in _makers_called(module):
             name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
             if name in classes:
                 _error(found, classes[name], call, names)
@@ -230,10 +230,10 @@ def _error(found: dict[str, Found], cls: Kind, call: ast.Call, names: dict[str, 
 
 
 def _answer(found: dict[str, Found], name: str, call: ast.Call, names: dict[str, list[ast.expr]]) -> None:
-    def at(place: int | None) -> ast.expr | None:
-        return None if place is None or place >= len(call.args) else call.args[place]
+    def at(index: int | None) -> ast.expr | None:
+        return None if index is None or index >= len(call.args) else call.args[index]
 
-    status, code, cause, remedy = (at(place) for place in _MAKERS[name])
+    status, code, cause, remedy = (at(index) for index in _MAKERS[name])
     number = status.value if isinstance(status, ast.Constant) and isinstance(status.value, int) else None
     advice = _text(remedy, names)
     if name == "_unknown":

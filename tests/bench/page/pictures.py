@@ -29,7 +29,7 @@ from tests.bench.speed.scaling import RIG, ROOT
 
 FIGURES = ROOT / "docs" / "figures"
 API = "/api/v1"
-LARGEST = 300_000  # bytes
+MAX_BYTES = 300_000  # bytes
 PRESSURE_KPA = 689.0
 REGION = ((86.0, 70.0), (426.0, 410.0))  # the paper's, px
 
@@ -39,7 +39,7 @@ def kept(page: Page, path: Path) -> None:
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     picture.save(path, optimize=True)
     for colours in (256, 128, 64):
-        if path.stat().st_size < LARGEST:
+        if path.stat().st_size < MAX_BYTES:
             break
         fewer(picture, colours).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size // 1000} kB")
@@ -102,12 +102,12 @@ def test(page: Page, out: Path) -> None:
     view.locator("img").first.scroll_into_view_if_needed()
     box = view.locator(".content > img").first.bounding_box()
     assert box is not None
-    places = [
+    corners = [
         (box["x"] + (x + 0.5) / 512 * box["width"], box["y"] + (y + 0.5) / 480 * box["height"]) for x, y in REGION
     ]
-    page.mouse.move(*places[0])
+    page.mouse.move(*corners[0])
     page.mouse.down()
-    page.mouse.move(*places[1], steps=4)
+    page.mouse.move(*corners[1], steps=4)
     page.mouse.up()
     page.get_by_label("Subset", exact=True).fill("21")
     page.locator('[data-role="texture"] .badge').wait_for()

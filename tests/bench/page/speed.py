@@ -93,23 +93,23 @@ class Figure:
     what: str
     value: float
     unit: str
-    most: float | None = None
-    least: float | None = None
+    max_value: float | None = None
+    min_value: float | None = None
 
     @property
     def met(self) -> str:
         """Whether it is what was asked."""
-        if self.most is None and self.least is None:
+        if self.max_value is None and self.min_value is None:
             return ""
-        good = self.value <= self.most if self.most is not None else self.value >= (self.least or 0.0)
+        good = self.value <= self.max_value if self.max_value is not None else self.value >= (self.min_value or 0.0)
         return "yes" if good else "**no**"
 
     @property
     def asked(self) -> str:
         """What was asked, in words."""
-        if self.most is not None:
-            return f"at most {self.most:g}"
-        return "" if self.least is None else f"at least {self.least:g}"
+        if self.max_value is not None:
+            return f"at most {self.max_value:g}"
+        return "" if self.min_value is None else f"at least {self.min_value:g}"
 
 
 def first_paint(made: Browser, url: str) -> list[Figure]:
@@ -124,7 +124,9 @@ def first_paint(made: Browser, url: str) -> list[Figure]:
                 found = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
                 page.wait_for_function(found)
                 times.append(float(page.evaluate(found)) / 1e3)
-        figures.append(Figure(f"first paint, {screen}, median of {PAINTS}", statistics.median(times), "s", most=1.0))
+        figures.append(
+            Figure(f"first paint, {screen}, median of {PAINTS}", statistics.median(times), "s", max_value=1.0)
+        )
         figures.append(Figure(f"first paint, {screen}, slowest", max(times), "s"))
     return figures
 
@@ -160,8 +162,8 @@ def live_views(made: Browser, url: str) -> list[Figure]:
         frames = page.evaluate(_COUNT, LIVE_S)
         seconds, used = time.monotonic() - began, processor_s() - before
     return [
-        *(Figure(f"live view, camera {k + 1}", n / LIVE_S, "frames/s", least=9.5) for k, n in enumerate(frames)),
-        Figure("service's processor time meanwhile", 100.0 * used / seconds, "% of a core", most=60.0),
+        *(Figure(f"live view, camera {k + 1}", n / LIVE_S, "frames/s", min_value=9.5) for k, n in enumerate(frames)),
+        Figure("service's processor time meanwhile", 100.0 * used / seconds, "% of a core", max_value=60.0),
     ]
 
 
@@ -193,7 +195,7 @@ def large_field(made: Browser, url: str) -> list[Figure]:
                 times[name].append(painted(page, act, f"{shown} reference"))
                 page.wait_for_timeout(1500)
     return [
-        Figure(f"field of {points:,} points, {name}, median of 3", statistics.median(found), "s", most=2.0)
+        Figure(f"field of {points:,} points, {name}, median of 3", statistics.median(found), "s", max_value=2.0)
         for name, found in times.items()
     ]
 

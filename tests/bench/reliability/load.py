@@ -275,14 +275,14 @@ def _bear(
     load: Load, client: httpx.Client, controller: SimESP301, seconds: float, readers: int, data: Path
 ) -> list[tuple[str, int, dict[str, str]]]:
     service = int((data / "service.lock").read_text().split()[1])
-    place = urlsplit(str(client.base_url))
+    address = urlsplit(str(client.base_url))
     reading = subprocess.Popen(
         [
             sys.executable,
             "-m",
             "tests.bench.reliability.load_readers",
-            place.hostname or "",
-            str(place.port),
+            address.hostname or "",
+            str(address.port),
             str(readers),
             str(READ_EVERY_S),
         ],
@@ -306,8 +306,8 @@ def _bear(
         watcher.join()
         mine, (work, whole) = spent_s(ours) - before, (busy_s()[0] - work, busy_s()[1] - whole)
         load.seconds = time.monotonic() - began
-        said, _ = reading.communicate(timeout=60.0)
-    seen: dict[str, Any] = json.loads(said)
+        printed, _ = reading.communicate(timeout=60.0)
+    seen: dict[str, Any] = json.loads(printed)
     load.gets = [(at - wall, kind, ms) for at, kind, ms in seen["gets"]]
     load.wrong = seen["wrong"] + [f"{path}: ended" for path in seen["closed"]]
     load.streamed = seen["streamed"]

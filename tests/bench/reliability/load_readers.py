@@ -98,8 +98,8 @@ async def read_on(target: Target, readers: int, every_s: float) -> Seen:
     inlet = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(inlet), sys.stdin)
     while line := await inlet.readline():
-        said: dict[str, Any] = json.loads(line)
-        target.test, target.step = said["test"], said["step"]
+        target_of: dict[str, Any] = json.loads(line)
+        target.test, target.step = target_of["test"], target_of["step"]
     for task in tasks:
         if task.done() and task.exception() is not None:
             seen.wrong.append(repr(task.exception()))

@@ -108,8 +108,8 @@ class StopTimes:
 
     def row(self) -> str:
         """Return a row of the table in docs/explanation/reliability.md."""
-        p50, p99, most = self.percentile(0.5), self.percentile(0.99), self.latencies_ms[-1]
-        return f"| {len(self.latencies_ms)} | {self.busy_share:.0%} | {p50:.1f} | {p99:.1f} | {most:.1f} |"
+        p50, p99, longest = self.percentile(0.5), self.percentile(0.99), self.latencies_ms[-1]
+        return f"| {len(self.latencies_ms)} | {self.busy_share:.0%} | {p50:.1f} | {p99:.1f} | {longest:.1f} |"
 
 
 def rig_text(url: str) -> str:

@@ -49,7 +49,7 @@ ACTS: dict[str, tuple[int, float]] = {
     "start": (6, 0.5),
 }
 JOBS = ("analyse", "calibrate", "noise")
-LONGEST_JOB_S = 30.0
+MAX_JOB_S = 30.0
 
 
 @dataclass
@@ -259,7 +259,7 @@ def torture_folder(starter: Starter, lab: Lab, outcome: Outcome, kills: int, rng
             break
         threads = lab.begin(act, url)
         if act in JOBS:  # by how far the job is, and not by the clock: on a busy machine none would ever get far
-            goal, deadline = rng.uniform(0.0, 1.1), time.monotonic() + LONGEST_JOB_S
+            goal, deadline = rng.uniform(0.0, 1.1), time.monotonic() + MAX_JOB_S
             while lab.progress < min(goal, 1.0) and time.monotonic() < deadline:
                 time.sleep(0.002)
         time.sleep(rng.uniform(0.0, ACTS[act][1]))

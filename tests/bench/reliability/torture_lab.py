@@ -67,9 +67,9 @@ class Pictures:
             step.mkdir(parents=True)
             for cam, content in images.items():
                 (step / f"{cam}.tif").write_bytes(content)
-            facts = {"label": "", "load_n": None, "source": "import", "captured_utc": MADE, "skew_ms": None}
+            metadata = {"label": "", "load_n": None, "source": "import", "captured_utc": MADE, "skew_ms": None}
             sha256 = {cam: hashlib.sha256(content).hexdigest() for cam, content in images.items()}
-            document = {"n": n, "test_id": folder.name, **facts, "quality": {}, "sha256": sha256}
+            document = {"n": n, "test_id": folder.name, **metadata, "quality": {}, "sha256": sha256}
             (step / "step.json").write_text(json.dumps(document))
         document = {"id": folder.name, "name": "copied", "specimen": "", "notes": "", "calibration_id": None}
         (folder / "test.json").write_text(json.dumps({**document, "created_utc": MADE}))
@@ -207,14 +207,14 @@ class Lab:
             self.complain(f"{url} answered {answer.status_code}: {answer.text[:300]}")
         return None
 
-    def _follow(self, client: httpx.Client, job_id: str, look: Callable[[], None] = lambda: None) -> None:
+    def _follow(self, client: httpx.Client, job_id: str, meanwhile: Callable[[], None] = lambda: None) -> None:
         while not self.over.is_set():
-            look()
+            meanwhile()
             job = client.get(f"/jobs/{job_id}").json()
             state = self.jobs[job_id] = job["state"]
             self.progress = max(self.progress, _share(job))
             if state in FINAL:
-                look()
+                meanwhile()
                 self.counts[f"{state} jobs"] += 1
                 return
             time.sleep(0.01)
@@ -246,7 +246,7 @@ class Lab:
                 continue
             analysis_id = made["analysis_id"]
 
-            def look(analysis_id: str = analysis_id) -> None:
+            def meanwhile(analysis_id: str = analysis_id) -> None:
                 shown = client.get(f"/tests/{self.copied}/analyses/{analysis_id}").json()
                 for n in shown["steps_finished"]:
                     if (analysis_id, n) not in self.results:
@@ -254,7 +254,7 @@ class Lab:
                         self.results[analysis_id, n] = hashlib.sha256(path.read_bytes()).hexdigest()
                         self.counts["results"] += 1
 
-            self._follow(client, made["job"]["id"], look)
+            self._follow(client, made["job"]["id"], meanwhile)
 
     def _delete(self, client: httpx.Client) -> None:
         while not self.over.is_set():
@@ -321,7 +321,7 @@ class Lab:
             if now != {n for t, n in self.steps if t == test_id}:
                 self.complain(f"after sending {len(waiting)} requests again, test {test_id} has steps {sorted(now)}")
         # the files of all are compared below; over HTTP the new ones, and some of the others
-        old = [place for place in self.steps if place not in self.fresh]
+        old = [key for key in self.steps if key not in self.fresh]
         for test_id, n in {*self.fresh, *self.random.sample(old, min(len(old), 10))}:
             document = self.steps[test_id, n]
             if client.get(f"/tests/{test_id}/steps/{n}").json() != document:

@@ -26,7 +26,7 @@ TARGETS = {
     "sapphirerapids": "+avx512f,+avx512vl",
 }
 HERE = "this machine"
-LONGEST_S = 300.0
+MAX_S = 300.0
 
 # in this order; an instruction counts once. AT&T syntax: the destination comes last, memory is written with brackets
 _CLASSES = (
@@ -79,12 +79,12 @@ class LoopCount:
 def innermost_loops(assembly: str) -> list[list[str]]:
     """Instructions of each innermost loop: from a label to a jump back to it with no other such jump between."""
     lines = [line.split("#")[0].strip().replace("\t", " ") for line in assembly.splitlines()]
-    place = {line[:-1]: i for i, line in enumerate(lines) if line.endswith(":")}
+    line_of = {line[:-1]: i for i, line in enumerate(lines) if line.endswith(":")}
     spans = []
     for i, line in enumerate(lines):
         jump = re.match(r"j\w+ (\.?\w+)$", line)
-        if jump and place.get(jump[1], i) < i:
-            spans.append((place[jump[1]], i))
+        if jump and line_of.get(jump[1], i) < i:
+            spans.append((line_of[jump[1]], i))
     inner = [s for s in spans if not any(o != s and s[0] <= o[0] and o[1] <= s[1] for o in spans)]
     return [[x for x in lines[a : b + 1] if x and not x.endswith(":") and not x.startswith(".")] for a, b in inner]
 
@@ -136,7 +136,7 @@ def inspect_target(target: str) -> list[LoopCount]:
         text=True,
         check=False,
         env=environment,
-        timeout=LONGEST_S,
+        timeout=MAX_S,
         cwd=ROOT,
     )
     if done.returncode != 0:

@@ -94,30 +94,30 @@ def peer(report: Report, folder: Path) -> None:
         for threads in counts():
             own, other = _runs(name, threads, report.quick)
             _, found = run_ours(scene, own, threads, folder)
-            report.ours[name] += _told(scene, found)
+            report.ours[name] += _printed(scene, found)
             if python is not None:
                 report.peer_version, found = run_peer(python, scene, other, threads, folder)
-                report.peer[name] += _told(scene, found)
+                report.peer[name] += _printed(scene, found)
         if python is None:
             del report.peer[name]
 
 
 def _runs(scene: str, threads: int, quick: bool) -> tuple[list[Run], list[Run]]:
     """What both programs measure; the first run of each only warms the process up."""
-    large, most = scene == "modern", threads == counts()[-1]
-    steps = 2 if quick else 3 if large and not most else 6
+    large, all_threads = scene == "modern", threads == counts()[-1]
+    steps = 2 if quick else 3 if large and not all_threads else 6
     own, other = [], []
-    for subset in (33, 21) if most else (33,):
+    for subset in (33, 21) if all_threads else (33,):
         for kind in ("cubic", "quintic"):
             options = {"interpolation": kind}
             own.append(Run(f"{kind} single, {subset} px", subset, 1, options, repeats=2))
             own.append(Run(f"{kind} sequence of {steps}, {subset} px", subset, steps, options, repeats=2))
-        settings = ["tuned"] if large or not most or subset == 21 or quick else ["tuned", "loose", "unfiltered"]
+        settings = ["tuned"] if large or not all_threads or subset == 21 or quick else ["tuned", "loose", "unfiltered"]
         for setting in settings:
             if setting == "tuned":
                 other.append(Run(f"tuned single, {subset} px", subset, 1, PEER_SETTINGS["tuned"]))
             other.append(Run(f"{setting} sequence of {steps}, {subset} px", subset, steps, PEER_SETTINGS[setting]))
-    if large and most:
+    if large and all_threads:
         other.append(Run("default single, 33 px", 33, 1, PEER_SETTINGS["default"]))
     warm = [Run(f"{WARM} {kind}", 33, 1, {"interpolation": kind}) for kind in ("cubic", "quintic")]
     return [*warm, *own], [Run(WARM, 21, 1, PEER_SETTINGS["tuned"]), *other]
@@ -130,7 +130,7 @@ def whole(report: Report, folder: Path) -> None:
     report.rows += figures.rows()
 
 
-def _told(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
+def _printed(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
     kept = [o for o in outcomes if not o.run.name.startswith(WARM)]
     for o in kept:
         sd = ", ".join(f"{v:.3f}" for v in o.errors.sd_um)

@@ -24,7 +24,7 @@ import numpy as np
 
 _COLUMNS = 256  # of the picture that gathers and row loads read: eight rows and their taps stay in L1
 _INDICES = 1024
-_LEAST_S = 0.03
+_MIN_S = 0.03
 _REPEATS = 5
 
 Kernel = Callable[[int, int, int, int], float]
@@ -209,7 +209,7 @@ def _per_second(work: list[Callable[[int], object]], unit: int) -> float:
     while True:
         start = time.perf_counter()
         work[0](n)
-        if time.perf_counter() - start > _LEAST_S:
+        if time.perf_counter() - start > _MIN_S:
             break
         n *= 2
     best = 0.0

@@ -110,8 +110,8 @@ def make_kernel_scene(spacing_px: int = 4) -> KernelScene:
     rig = load_rig()
     moved = RigidTransform(np.eye(3), np.array([0.013, -0.007, 0.021]))
     pictures = [
-        *rig.shoot(plane_scene(rig.texture(1)), seed=1),
-        *rig.shoot(plane_scene(rig.texture(1), motion=moved), seed=2),
+        *rig.capture(plane_scene(rig.texture(1)), seed=1),
+        *rig.capture(plane_scene(rig.texture(1), motion=moved), seed=2),
     ]
     images = {kind: [prepare(picture, kind) for picture in pictures] for kind in KINDS}
     xy = PointGrid.rectangle(60, 60, 450, 420, spacing_px=spacing_px).xy_px.reshape(-1, 2)

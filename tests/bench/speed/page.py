@@ -119,15 +119,15 @@ def targets(report: Report) -> list[Row]:
     """What the project asks of itself."""
     rows: list[Row] = []
     if report.rates:
-        most = max(r.threads for r in report.rates)
-        for fit, subset, least in (("motion", 33, 6e4), ("motion", 21, 1.2e5), ("shape", 33, 2e5)):
-            rate = pick_rate(report, fit, "cubic", subset, most)
+        max_threads = max(r.threads for r in report.rates)
+        for fit, subset, min_rate in (("motion", 33, 6e4), ("motion", 21, 1.2e5), ("shape", 33, 2e5)):
+            rate = pick_rate(report, fit, "cubic", subset, max_threads)
             rows.append(
                 Row(
-                    f"{fit}, cubic, {subset} px, {most} thread{'s' if most > 1 else ''}",
+                    f"{fit}, cubic, {subset} px, {max_threads} thread{'s' if max_threads > 1 else ''}",
                     rate,
                     "points/s",
-                    least,
+                    min_rate,
                     at_least=True,
                 )
             )
@@ -195,9 +195,9 @@ def peer_rows(report: Report) -> list[Row]:
             peer = find(report.peer[scene], f"tuned {what}", ours.threads)
             if peer is None or scene != "modern":
                 continue
-            least = 10.0 if "sequence" in what else 3.0
+            min_rate = 10.0 if "sequence" in what else 3.0
             label = f"{ours.run.name}, {ours.threads} thread{'s' if ours.threads > 1 else ''}"
-            rows.append(Row(f"speed over the peer's: {label}", ours.rate / peer.rate, "", least, at_least=True))
+            rows.append(Row(f"speed over the peer's: {label}", ours.rate / peer.rate, "", min_rate, at_least=True))
             if "sequence" in what:
                 further = further_s(report.peer[scene], peer) / further_s(outcomes, ours)
                 rows.append(Row("the same, steps after the first alone", further, ""))
@@ -265,9 +265,9 @@ def _accuracy_plot(report: Report) -> str:
     scenes = list(report.peer)
     figure, axes = plt.subplots(1, len(scenes), figsize=(4.6 * len(scenes), 3.6), layout="constrained", squeeze=False)
     for ax, scene in zip(axes[0], scenes, strict=True):
-        most = max(o.threads for o in report.ours[scene])
+        max_threads = max(o.threads for o in report.ours[scene])
         for colour, outcomes in (("C0", report.ours[scene]), ("C1", report.peer[scene])):
-            for k, o in enumerate(o for o in outcomes if o.threads == most and "sequence" in o.run.name):
+            for k, o in enumerate(o for o in outcomes if o.threads == max_threads and "sequence" in o.run.name):
                 ax.plot(o.rate, o.errors.sd3_um, "o" if o.run.subset_px == 33 else "s", color=colour)
                 label = f"{o.run.name.split()[0]}, {o.run.subset_px} px"
                 ax.annotate(
@@ -340,8 +340,8 @@ def _iterations_plot(report: Report) -> str:
     for k, name in enumerate(names):
         spent = report.iterations[name]
         share = np.bincount(spent, minlength=top + 1)[1:] / spent.size
-        place = np.arange(1, top + 1) + 0.2 * (k - (len(names) - 1) / 2)
-        ax.bar(place, 100 * share, 0.2, label=f"{name.removeprefix('motion, ')}: mean {spent.mean():.2f}")
+        middles = np.arange(1, top + 1) + 0.2 * (k - (len(names) - 1) / 2)
+        ax.bar(middles, 100 * share, 0.2, label=f"{name.removeprefix('motion, ')}: mean {spent.mean():.2f}")
     ax.set(xlabel="iterations", ylabel="points / %", xticks=range(1, top + 1))
     ax.set_title("Motion, starts some 0.05 px away; far starts some 0.7 px", fontsize=10)
     ax.legend(fontsize=8)
@@ -522,7 +522,7 @@ def write_page(report: Report) -> Path:
     """Write the page and its plots; returns its path."""
     rows = [target_line(row) for row in targets(report)]
     sections: list[tuple[str, list[str]]] = [
-        ("Machine", [*(f"- {fact}" for fact in machine())]),
+        ("Machine", [*(f"- {line}" for line in machine())]),
         ("Targets", [table(["what", "measured", "unit", "asked", "met"], rows)]),
         ("Beside pyvale", peer_text(report) if report.ours else []),
         ("One point", kernel_text(report) if report.rates else []),

@@ -130,7 +130,7 @@ def make_scene(request: Request, folder: Path, *, noise: float = NOISE, texture:
     files: tuple[list[Path], list[Path]] = ([], [])
     for n in range(request.steps + 1):
         now = plane_scene(rig.texture(texture), motion=motion_of(n))
-        for k, image in enumerate(rig.shoot(now, noise=noise, seed=100 * texture + n)):
+        for k, image in enumerate(rig.capture(now, noise=noise, seed=100 * texture + n)):
             path = folder / f"cam{k + 1}_{n:04d}.tif"
             tifffile.imwrite(path, np.clip(np.round(image), 0, 255).astype(np.uint8), photometric="minisblack")
             files[k].append(path)
@@ -174,7 +174,7 @@ class Errors:
         return float(np.linalg.norm(self.sd_um[:3]))
 
 
-def judge(scene: BenchScene, subset_px: int, xyz_cam1_mm: Float, uvw_cam1_mm: Float) -> Errors:
+def compare(scene: BenchScene, subset_px: int, xyz_cam1_mm: Float, uvw_cam1_mm: Float) -> Errors:
     """Compare fields in camera 1's frame, (N, 3) and (steps, N, 3) with NaN where lost, with the truth."""
     xyz, moved = scene.truth(subset_px, len(uvw_cam1_mm))
     to_sys = scene.pair.cam1.sys_from_cam

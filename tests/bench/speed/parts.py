@@ -27,7 +27,7 @@ from tests.bench.speed.kernel import KernelScene
 
 DEGREE = 1  # plane patches
 _UNKNOWNS = 13
-_LEAST_S = 0.01
+_MIN_S = 0.01
 _REPEATS = 7
 
 
@@ -183,7 +183,7 @@ def _us(call: Callable[[int], object]) -> float:
     while True:
         start = time.perf_counter()
         call(n)
-        if time.perf_counter() - start > _LEAST_S:
+        if time.perf_counter() - start > _MIN_S:
             break
         n *= 2
     best = np.inf

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from core.cameras.lens import OpenCVLens
-from tests.bench.speed.pairs import BenchScene, Errors, judge
+from tests.bench.speed.pairs import BenchScene, Errors, compare
 from tests.support.requirements import ROOT
 
 PEER_PYTHON = ROOT / ".venv-bench" / "bin" / "python"
-LONGEST_S = 1800.0
+MAX_S = 1800.0
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,7 @@ def _run(
     job.write_text(json.dumps(_job(scene, runs, threads, folder)))
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(
-        [*command, str(job)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environment,
-        timeout=LONGEST_S,
-        cwd=folder,
+        [*command, str(job)], capture_output=True, text=True, check=False, env=environment, timeout=MAX_S, cwd=folder
     )
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
@@ -156,5 +150,5 @@ def _outcome(scene: BenchScene, run: Run, threads: int, folder: Path, took: dict
         wanted = scene.request.points(run.subset_px)
         if not np.array_equal(np.stack([fields["x"], fields["y"]], axis=1), wanted):
             raise RuntimeError(f"{run.name} did not measure the points that it was asked for.")
-        errors = judge(scene, run.subset_px, fields["xyz"], fields["uvw"])
+        errors = compare(scene, run.subset_px, fields["xyz"], fields["uvw"])
     return Outcome(run, threads, len(wanted), min(took["wall_s"]), min(took["cpu_s"]), errors)

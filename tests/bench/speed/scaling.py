@@ -68,8 +68,15 @@ def write_test(folder: Path, steps: int = STEPS) -> None:
             content = encode_tiff(world.expose(cam, exposure_ms=10.0, gain_db=0.0, rng=rng))
             (step / f"{cam}.tif").write_bytes(content)
             sha256[cam] = hashlib.sha256(content).hexdigest()
-        facts = {"label": "", "load_n": None, "source": "import", "captured_utc": now, "skew_ms": None, "quality": {}}
-        (step / "step.json").write_text(json.dumps({"n": n, "test_id": TEST, **facts, "sha256": sha256}))
+        metadata = {
+            "label": "",
+            "load_n": None,
+            "source": "import",
+            "captured_utc": now,
+            "skew_ms": None,
+            "quality": {},
+        }
+        (step / "step.json").write_text(json.dumps({"n": n, "test_id": TEST, **metadata, "sha256": sha256}))
     document = {"id": TEST, "name": "scaling", "specimen": "", "notes": "", "calibration_id": None, "created_utc": now}
     (folder / "test.json").write_text(json.dumps(document))
 
@@ -144,7 +151,7 @@ class Run:
     difference: float
 
 
-def largest_difference(data: Path, one: str, two: str) -> float:
+def max_difference(data: Path, one: str, two: str) -> float:
     """Largest difference of two analyses' double-precision numbers over the largest of each variable."""
     worst = 0.0
     for n in range(STEPS):
@@ -183,7 +190,7 @@ def measure(folder: Path) -> tuple[list[Run], int]:
             if not plain:
                 plain = analysis
                 points = client.get(f"/tests/{TEST}/analyses/{plain}").json()["summary"]["steps"][0]["points"]
-        runs.append(Run(name, wall_s, cpu_s, largest_difference(data, plain, analysis)))
+        runs.append(Run(name, wall_s, cpu_s, max_difference(data, plain, analysis)))
         print(runs[-1], flush=True)
 
     one("the service's own worker, 1 thread")

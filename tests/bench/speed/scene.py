@@ -59,9 +59,9 @@ def scene_at(rig: Rig, step: float) -> Scene:
     return plane_scene(rig.texture(1), in_plane=stretch, motion=motion)
 
 
-def shoot(rig: Rig, step: float) -> list[NDArray[np.uint8]]:
+def capture(rig: Rig, step: float) -> list[NDArray[np.uint8]]:
     """Both cameras' pictures of a step, 8 bit."""
-    pictures = rig.shoot(scene_at(rig, step), noise=NOISE, seed=int(100 * step))
+    pictures = rig.capture(scene_at(rig, step), noise=NOISE, seed=int(100 * step))
     return [np.asarray(picture, dtype=np.uint8) for picture in pictures]
 
 
@@ -115,7 +115,7 @@ def sequence_files(
         names = [store / f"{cam}_{n:04d}.{suffix}" for cam in CAMERAS]
         if all(name.exists() for name in names):
             continue
-        for name, picture in zip(names, shoot(rig, n), strict=True):
+        for name, picture in zip(names, capture(rig, n), strict=True):
             if suffix == "tif":
                 name.write_bytes(encode_tiff(picture))
             else:

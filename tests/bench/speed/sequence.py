@@ -122,11 +122,11 @@ def run_child(arguments: list[str], *, threads: int | None = None, cache: Path |
         process.returncode = os.waitstatus_to_exitcode(status)
         wall = time.perf_counter() - start
         out.seek(0)
-        said = out.read()
+        printed = out.read()
     if process.returncode != 0:
-        raise RuntimeError(f"{arguments} ended with {process.returncode}: {said[-2000:]}")
+        raise RuntimeError(f"{arguments} ended with {process.returncode}: {printed[-2000:]}")
     kilobytes = used.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
-    return Used(wall, used.ru_utime + used.ru_stime, kilobytes / 1000.0, said)
+    return Used(wall, used.ru_utime + used.ru_stime, kilobytes / 1000.0, printed)
 
 
 # a sequence

@@ -36,9 +36,9 @@ class Figures:
     def rows(self) -> list[Row]:
         """Figures with their targets."""
         out = []
-        most = available_threads()
+        max_threads = available_threads()
         for s in self.sequences:
-            limit = RATE if (s.threads, s.suffix, s.interpolation) == (most, "tif", "cubic") else None
+            limit = RATE if (s.threads, s.suffix, s.interpolation) == (max_threads, "tif", "cubic") else None
             what = f"sequence, disk to disk, {s.interpolation}, {s.suffix}, {_threads(s.threads)}"
             out.append(Row(what, s.rate, "points/s", limit, at_least=True))
         if self.shape is not None:
@@ -51,7 +51,7 @@ class Figures:
             out.append(Row(f"{what}, processor time of both processes", cold.cpu_s - warm.cpu_s, "s"))
         for f in self.seeds:
             what = f"feature seeds on 2448 x 2048 px, {f.what}, {_threads(f.threads)}"
-            out.append(Row(what, f.wall_s, "s", SEEDS_S if f.what == "shape" and f.threads == most else None))
+            out.append(Row(what, f.wall_s, "s", SEEDS_S if f.what == "shape" and f.threads == max_threads else None))
         if len(self.points) > 1:
             few, many = self.points[-2], self.points[-1]
             ratio = (many.later_s / many.points) / (few.later_s / few.points)

@@ -43,11 +43,11 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
         "off",
         *(text for name, value in run["options"].items() for text in (f"--{name}", str(value))),
     ]
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         status = main(arguments)
     if status != 0:
-        raise RuntimeError(said.getvalue())
+        raise RuntimeError(printed.getvalue())
 
 
 def read_fields(out: Path, steps: int) -> dict[str, Any]:

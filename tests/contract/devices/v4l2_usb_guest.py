@@ -198,7 +198,7 @@ def test_a_pulled_cable_is_a_fault_at_once_and_the_camera_works_again_after_its_
         begin = time.monotonic()
         camera.unplug()
         seconds_until(lambda: reader.fault is not None, 1.0)
-        told_s = time.monotonic() - begin
+        noticed_s = time.monotonic() - begin
         assert reader.fault is not None
         assert reader.fault.code == "camera_lost"
         with pytest.raises(CameraError) as caught:
@@ -219,7 +219,7 @@ def test_a_pulled_cable_is_a_fault_at_once_and_the_camera_works_again_after_its_
         assert frames_of(grabber, 1)[0].status is FrameStatus.OK
         assert (camera.mode.value, camera.exposure.value) == (1, 200)
         print(
-            f"fault and node gone {told_s * 1e3:.0f} ms after the pull; "
+            f"fault and node gone {noticed_s * 1e3:.0f} ms after the pull; "
             f"closed in {closed_s * 1e3:.0f} ms, pictures {(time.monotonic() - begin) * 1e3:.0f} ms after opening"
         )
 
@@ -287,8 +287,8 @@ def test_the_rig_s_camera_comes_back_with_its_settings_within_three_seconds(tmp_
         assert took_s < 3.0
         assert unit.settings == had
         assert fresh.shape == ("GREY", 160, 120)
-        told = [dial.value for dial in (fresh.mode, fresh.exposure, fresh.brightness, fresh.gain)]
-        assert told == [1, 120, 7, 30]
+        dials = [dial.value for dial in (fresh.mode, fresh.exposure, fresh.brightness, fresh.gain)]
+        assert dials == [1, 120, 7, 30]
         print(f"a picture {took_s * 1e3:.0f} ms after the camera's return")
         # another camera of the same model in its place is refused
         fresh.unplug()

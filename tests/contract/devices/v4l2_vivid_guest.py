@@ -96,14 +96,14 @@ def test_every_format_is_what_the_kernel_s_tool_records(node: str, name: str, tm
         gray = np.tile([byte != ["c"] for byte in table], lines.shape[1] // len(table))
         np.testing.assert_array_equal(lines[:, gray], lines_there[:, gray])
         # and the pattern is what it is called
-        most = (1 << frames_depth(name)) - 1
+        full_scale = (1 << frames_depth(name)) - 1
         for pattern, low, high in (("100% White", 0.9, 1.0), ("100% Black", 0.0, 0.07)):
             put(node, test_pattern=pattern)
             pixels = picture(grabber).pixels
-            assert low * most <= pixels.min() == pixels.max() <= high * most, pattern
+            assert low * full_scale <= pixels.min() == pixels.max() <= high * full_scale, pattern
         put(node, test_pattern="1x1 Checkers")  # white and black by turns: no pixel in its neighbour's place
         pixels = picture(grabber).pixels
-        white = pixels > 0.5 * most
+        white = pixels > 0.5 * full_scale
         even = np.indices(pixels.shape).sum(axis=0) % 2 == 0
         assert (white == even).all() or (white == ~even).all()
 
@@ -417,9 +417,9 @@ def test_trigger_modes_are_what_the_options_name() -> None:
         assert set(grabber.describe().trigger_modes) == {"free", "hardware", "software"}
         for mode, boolean, menu in (("hardware", 1, 1), ("software", 1, 4), ("hardware", 1, 1)):
             assert grabber.configure(CameraSettings(trigger=mode)).trigger == mode
-            told = ctl(WEBCAM, "--get-ctrl=boolean,menu")
-            assert f"boolean: {boolean}" in told
-            assert f"menu: {menu} " in told
+            output = ctl(WEBCAM, "--get-ctrl=boolean,menu")
+            assert f"boolean: {boolean}" in output
+            assert f"menu: {menu} " in output
         with pytest.raises(CameraError) as caught:
             grabber.trigger()
         assert caught.value.code == "wrong_trigger"
@@ -615,10 +615,10 @@ def _drain(grabber: FrameGrabber) -> None:
 def test_the_ring_is_given_back_so_that_others_may_stream() -> None:
     with camera(WEBCAM) as grabber:
         assert picture(grabber).status is FrameStatus.OK
-        told = subprocess.run(
+        output = subprocess.run(
             ["v4l2-ctl", "-d", WEBCAM, "--stream-mmap", "--stream-count=2"], capture_output=True, text=True, timeout=60
         )
-        assert told.returncode == 0, told.stderr
+        assert output.returncode == 0, output.stderr
 
 
 def test_the_guest_has_what_these_tests_rely_on() -> None:

@@ -21,7 +21,7 @@ from core.target import GridTarget
 from server.cli.main import main
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, write_image
-from tests.support.grid_images import PAPER_TARGET, Exposure, expose, node_places, paper_camera, render_cover
+from tests.support.grid_images import PAPER_TARGET, Exposure, expose, node_positions, paper_camera, render_cover
 
 FOUND: dict[Any, GridView] = {}
 POSITIONS = (0.0, 2.0, 5.0)
@@ -34,19 +34,19 @@ CAMERA = "image_size_px = [512, 480]\nphd_px = 12500.0\nstandoff_mm = 410.0\nasp
 RIG = f"[cam1]\n{CAMERA}-30.0\n[cam2]\n{CAMERA}30.0\n"
 
 
-def shots(tolerance_mm: float, seed: int) -> dict[tuple[str, float], GrayImage]:
-    places = node_places(PAPER_TARGET, tolerance_mm, seed)
+def captured(tolerance_mm: float, seed: int) -> dict[tuple[str, float], GrayImage]:
+    positions = node_positions(PAPER_TARGET, tolerance_mm, seed)
     images = {}
     for dz in POSITIONS:
         for k, (name, camera) in enumerate((("cam1", TRUE.cam1), ("cam2", TRUE.cam2))):
-            cover = render_cover(camera.moved(dz), PAPER_TARGET, nodes_mm=places)
+            cover = render_cover(camera.moved(dz), PAPER_TARGET, nodes_mm=positions)
             images[name, dz] = expose(cover, Exposure(seed=seed + 10 * int(dz) + k))
     return images
 
 
 @pytest.fixture(scope="module")
 def exact() -> dict[tuple[str, float], GrayImage]:
-    return shots(0.0, 1)
+    return captured(0.0, 1)
 
 
 @pytest.fixture(autouse=True)
@@ -111,7 +111,7 @@ def test_images_become_a_calibration(
 
 
 def test_a_toleranced_grid_stays_within_the_band() -> None:
-    images = shots(0.004, 3)
+    images = captured(0.004, 3)
     target = dataclasses.replace(PAPER_TARGET, node_tolerance_mm=0.004)
     nominal = (
         NominalCamera((512, 480), 12500.0, 410.0, -30.0, 0.9617),
@@ -212,14 +212,14 @@ BAD: list[tuple[str, Callable[[Path], None] | None, list[str], str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "more", "code", "says"), [b[1:] for b in BAD], ids=[b[0] for b in BAD])
+@pytest.mark.parametrize(("change", "more", "code", "fragment"), [b[1:] for b in BAD], ids=[b[0] for b in BAD])
 def test_bad_input_gets_one_line_and_no_file(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
     change: Callable[[Path], None] | None,
     more: list[str],
     code: str,
-    says: str,
+    fragment: str,
 ) -> None:
     if change is not None:
         change(folder)
@@ -228,7 +228,7 @@ def test_bad_input_gets_one_line_and_no_file(
     *progress, line = capsys.readouterr().err.strip().splitlines()
     assert not any(p.startswith("stereorig:") for p in progress)
     assert line.startswith(f"stereorig: {code}: ")
-    assert says in line
+    assert fragment in line
     assert " Remedy: " in line
     assert not (folder / "calibration.json").is_file()
 

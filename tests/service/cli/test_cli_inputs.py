@@ -223,8 +223,8 @@ def test_wrong_usage_is_one_line(arguments: list[str], capsys: pytest.CaptureFix
 
 
 def test_durations_read_as_people_say_them() -> None:
-    said = [duration(s) for s in (0.4, 59.4, 61.0, 3600.0, 7500.0)]
-    assert said == ["0.4 s", "59 s", "1 min 01 s", "1 h 00 min", "2 h 05 min"]
+    texts = [duration(s) for s in (0.4, 59.4, 61.0, 3600.0, 7500.0)]
+    assert texts == ["0.4 s", "59 s", "1 min 01 s", "1 h 00 min", "2 h 05 min"]
 
 
 class Terminal(io.StringIO):

@@ -295,7 +295,7 @@ BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
 def test_bad_options(folder: Path, tmp_path: Path, capfd: Any, changes: dict[str, Any], code: str, word: str) -> None:
     Image.fromarray(np.full((100, 100), 255, np.uint8)).save(folder / "wrong.png")
     Image.fromarray(np.zeros((SIZE[1], SIZE[0]), np.uint8)).save(folder / "black.png")
-    place = {
+    options = {
         k: [s.replace("IN", str(folder), 1) for s in v]
         if isinstance(v, list)
         else v
@@ -304,7 +304,7 @@ def test_bad_options(folder: Path, tmp_path: Path, capfd: Any, changes: dict[str
         for k, v in changes.items()
     }
     before = sorted(folder.iterdir())
-    fails(command(folder, tmp_path / "out", **place), code, word, capfd)
+    fails(command(folder, tmp_path / "out", **options), code, word, capfd)
     assert not (tmp_path / "out").exists()
     assert sorted(folder.iterdir()) == before
 
@@ -469,16 +469,16 @@ def test_smoothing_is_told_and_the_measurement_stays_reproducible(
     originals: Path, measured: Path, tmp_path: Path, capfd: Any
 ) -> None:
     assert main(command(originals, tmp_path / "out", smooth="5")) == 0
-    said = capfd.readouterr()
-    assert "smoothed over 5 points: their spatial resolution is 61 px" in said.err + said.out
-    assert "gauge grows from 101 to 141 px" in said.err + said.out
+    printed = capfd.readouterr()
+    assert "smoothed over 5 points: their spatial resolution is 61 px" in printed.err + printed.out
+    assert "gauge grows from 101 to 141 px" in printed.err + printed.out
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["settings"]["smoothing_window"] == 5
     assert summary["steps"][0]["smoothing"] is None
-    told = summary["steps"][2]["smoothing"]
-    assert (told["window"], told["resolution_px"]) == (5, 61.0)
+    smoothed = summary["steps"][2]["smoothing"]
+    assert (smoothed["window"], smoothed["resolution_px"]) == (5, 61.0)
     # 33 um a pixel, more along the surface where it stands aslant
-    assert 0.033 * 61 < told["resolution_mm"] < 0.04 * 61
+    assert 0.033 * 61 < smoothed["resolution_mm"] < 0.04 * 61
     raw, smooth = (read_field(folder / "step_0002.nc") for folder in (measured, tmp_path / "out"))
     assert smooth.smoothing is not None
     np.testing.assert_array_equal(smooth.status, raw.status)

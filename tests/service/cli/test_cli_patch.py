@@ -70,10 +70,10 @@ def test_auto_decides_shape_and_motion_apart_keeps_to_it_and_says_why(
     rig: SimRig, folder: Path, tmp_path: Path, capfd: Any
 ) -> None:
     assert main(command(folder, tmp_path / "out", patch="auto")) == 0
-    said = capfd.readouterr().err
-    assert "shape: quadratic: plane patches have a bias of" in said
-    assert "step 1: affine: plane patches have a bias of less than" in said
-    assert "step 2: quadratic: plane patches have a bias of" in said
+    printed = capfd.readouterr().err
+    assert "shape: quadratic: plane patches have a bias of" in printed
+    assert "step 1: affine: plane patches have a bias of less than" in printed
+    assert "step 2: quadratic: plane patches have a bias of" in printed
     steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
     assert [step["patch"]["patch"] for step in steps] == ["quadratic", "affine", "quadratic", "quadratic"]
     assert [step["patch"]["kept"] for step in steps] == [False, False, False, True]
@@ -104,10 +104,10 @@ def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
 ) -> None:
     two = {cam: [str(folder / f"{cam}_{n}.tif") for n in (0, 2)] for cam in ("cam1", "cam2")}
     assert main(command(folder, tmp_path / "out", patch="affine", **two)) == 0
-    said = capfd.readouterr().err
-    assert "shape: plane: asked for; plane patches have a bias of" in said
-    assert "step 1: affine: asked for; plane patches have a bias of" in said
-    assert said.count("quadratic ones would have the smaller total error") == 2
+    printed = capfd.readouterr().err
+    assert "shape: plane: asked for; plane patches have a bias of" in printed
+    assert "step 1: affine: asked for; plane patches have a bias of" in printed
+    assert printed.count("quadratic ones would have the smaller total error") == 2
     with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
         z, _ = errors_um(rig, data, "still")
         choice = json.loads(data.attrs["patch_choice"])

@@ -285,11 +285,11 @@ def test_pictures_of_gauges_are_drawn_with_readings_missing(tmp_path: Path) -> N
     plate_strain.judge(outcome, found, strains, pressures, plate, [(5e-4, 2e-5), (9.8e-4, 2e-5)])
     assert [check.passed for check in outcome.checks] == [True] * 5
     drawn = strain_pictures.plate(tmp_path, fields, strains, found, pressures, plate)
-    place = np.array([-1.35, -0.5, 0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.35])
+    position = np.array([-1.35, -0.5, 0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.35])
     some = np.full((2, 9), 0.1)
     some[0, 3] = np.nan
-    drawn |= gauge_pictures.opening(tmp_path, Opening(place, *[some] * 7), [1.0, 2.0], 50.8)
-    line = Slice(np.zeros((9, 2)), 40.0 * place, some, some, some)
+    drawn |= gauge_pictures.opening(tmp_path, Opening(position, *[some] * 7), [1.0, 2.0], 50.8)
+    line = Slice(np.zeros((9, 2)), 40.0 * position, some, some, some)
     drawn |= gauge_pictures.buckle(tmp_path, line, line, [1.0, 2.0])
     motion = steel_motion.Moved("shifted", *[np.zeros(6)] * 4, 1.0, *[np.zeros(1)] * 2, *[np.zeros(3)] * 5, 1.0, {})
     drawn |= gauge_pictures.moved(tmp_path, fields, strains, [motion, motion])

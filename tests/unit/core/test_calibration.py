@@ -93,7 +93,7 @@ def test_too_little_travel_is_refused_with_the_predicted_uncertainty(positions: 
 
 @pytest.mark.fault(31)
 @pytest.mark.parametrize(
-    ("declared", "code", "says"),
+    ("declared", "code", "fragment"),
     [
         (lambda dz: -dz, "positions_sign_reversed", "sign"),
         (lambda dz: 1000.0 * dz, "positions_unit", "micrometres for millimetres"),
@@ -103,8 +103,10 @@ def test_too_little_travel_is_refused_with_the_predicted_uncertainty(positions: 
         (lambda dz: {0.0: 0.0, 2.0: 2.5, 4.0: 4.0, 5.0: 5.0}[dz], "position_wrong", r"worst is cam1 at \+2.500"),
     ],
 )
-def test_wrong_positions_are_refused_with_the_cause(declared: Callable[[float], float], code: str, says: str) -> None:
-    with pytest.raises(CalibrationInputError, match=says) as caught:
+def test_wrong_positions_are_refused_with_the_cause(
+    declared: Callable[[float], float], code: str, fragment: str
+) -> None:
+    with pytest.raises(CalibrationInputError, match=fragment) as caught:
         calibrate(make_views(declared=declared), Grid(), NOMINAL)
     assert caught.value.code == code
 

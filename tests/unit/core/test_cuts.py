@@ -44,8 +44,8 @@ def test_crosses_agrees_with_fractions_on_a_small_lattice() -> None:
         found = crosses(a, b, Cuts([line]))
         pieces = [(tuple(map(int, c)), tuple(map(int, d))) for c, d in pairwise(line)]
         lines = zip(a.tolist(), b.tolist(), strict=True)
-        told = [any(share_a_point(tuple(p), tuple(q), c, d) for c, d in pieces) for p, q in lines]
-        np.testing.assert_array_equal(found, told)
+        expected = [any(share_a_point(tuple(p), tuple(q), c, d) for c, d in pieces) for p, q in lines]
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_crossing_has_no_direction_and_broadcasts() -> None:

@@ -57,7 +57,7 @@ def good_points(w: np.ndarray, G: np.ndarray | None, rng: np.random.Generator) -
     return points
 
 
-def gate(points: PointFits) -> None:
+def apply_checks(points: PointFits) -> None:
     apply_validity_checks(
         points,
         pair=pair(),
@@ -116,12 +116,12 @@ def test_local_fits_ignore_wrong_samples() -> None:
     values = np.column_stack([3.0 + 0.2 * points[:, 0], 1.0 - 0.1 * points[:, 1]])
     wrong = rng.random(400) < 0.25
     values[wrong] += rng.uniform(5, 50, (wrong.sum(), 2))
-    places = rng.uniform(20, 80, (50, 2))
-    fits = robust_local_fits(places, points, values, tolerance=0.5)
-    np.testing.assert_allclose(fits.value[:, 0], 3.0 + 0.2 * places[:, 0], atol=1e-9)
+    positions = rng.uniform(20, 80, (50, 2))
+    fits = robust_local_fits(positions, points, values, tolerance=0.5)
+    np.testing.assert_allclose(fits.value[:, 0], 3.0 + 0.2 * positions[:, 0], atol=1e-9)
     np.testing.assert_allclose(fits.slope, np.broadcast_to([[0.2, 0.0], [0.0, -0.1]], (50, 2, 2)), atol=1e-9)
     assert (consistent(points, values, tolerance=0.5) == ~wrong).mean() > 0.99
-    assert np.isnan(robust_local_fits(places, points[:3], values[:3], tolerance=0.5).value).all()
+    assert np.isnan(robust_local_fits(positions, points[:3], values[:3], tolerance=0.5).value).all()
 
 
 def test_features_of_a_shifted_image_match_at_the_shift() -> None:
@@ -227,14 +227,14 @@ def test_gates_let_a_sound_field_pass_and_take_out_what_was_put_in(motion: bool)
     w, G = plane_w(0.2, 0.1), no_motion(pair(), XY)
     w[:, 0] *= 1.0 + 2e-7 * rng.standard_normal(len(w))
     sound = good_points(w, G if motion else None, rng)
-    gate(sound)
+    apply_checks(sound)
     assert sound.ok.mean() > 0.995
     points = good_points(w, G if motion else None, rng)
     bad = rng.choice(len(XY), 12, replace=False)
     points.w[bad[:4], 0] *= 1.0 + 2e-4  # half a pixel and more of depth
     points.epipolar_px[bad[4:8]] += 0.1
     points.zncc[bad[8:], -1] = 0.9
-    gate(points)
+    apply_checks(points)
     assert not points.ok[bad].any()
     assert np.isnan(points.w[bad]).all()
     assert (points.status[bad[:4]] == PointStatus.NEIGHBOUR_MISMATCH).all()

@@ -118,9 +118,11 @@ def test_no_value_reaches_over_a_failed_point() -> None:
     failed = np.zeros((14, 17), bool)
     failed[3, 4] = True  # at 68, 81
     field = make_field(rigid, failed=failed)
-    places = sample(field, [(68, 81), (68 + 1, 81 + 1), (68 + 6, 81 + 6), (68 + STEP, 81), (68 + 3, 81), (68 + 8, 81)])
-    assert places.missing == ("low_correlation", "low_correlation", "", "", "low_correlation", "")
-    values = places.of(field.x_px * 2.0 + field.y_px)
+    positions = sample(
+        field, [(68, 81), (68 + 1, 81 + 1), (68 + 6, 81 + 6), (68 + STEP, 81), (68 + 3, 81), (68 + 8, 81)]
+    )
+    assert positions.missing == ("low_correlation", "low_correlation", "", "", "low_correlation", "")
+    values = positions.of(field.x_px * 2.0 + field.y_px)
     assert np.isnan(values[[0, 1, 4]]).all()
     assert values[[2, 3, 5]] == pytest.approx([2 * 74 + 87, 2 * 75 + 81, 2 * 76 + 81])
 
@@ -253,9 +255,9 @@ def test_places_in_mm_are_found_where_the_shape_has_them() -> None:
     on_it = sample(field, xy).of(field.xyz_mm)
     assert positions_from_mm(field, on_it[:, :2]) == pytest.approx(xy, abs=1e-6)
     lost = surface(np.array(70.0), np.array(83.0)) @ TURN.T + SHIFT
-    for place in (lost[:2], [500.0, 0.0]):
+    for position in (lost[:2], [500.0, 0.0]):
         with pytest.raises(RegionError) as caught:
-            positions_from_mm(field, [place])
+            positions_from_mm(field, [position])
         assert caught.value.code == "gauge_outside"
 
 
@@ -389,27 +391,27 @@ def test_plane_alignment_finds_the_plane_and_turns_everything() -> None:
 
 def test_three_two_one_puts_its_places_where_it_says() -> None:
     field = make_field(rigid)
-    places = [(50, 70), (140, 75), (80, 140), (55, 100), (120, 104), (61, 66)]
-    new = aligned(field, align_3_2_1(field, places, shared=SHARED))
-    p = sample(new, places).of(new.xyz_mm)
+    positions = [(50, 70), (140, 75), (80, 140), (55, 100), (120, 104), (61, 66)]
+    new = aligned(field, align_3_2_1(field, positions, shared=SHARED))
+    p = sample(new, positions).of(new.xyz_mm)
     assert p[:3, 2] == pytest.approx(0.0, abs=1e-12)
     assert p[3:5, 1] == pytest.approx(0.0, abs=1e-12)
     assert p[4, 0] > p[3, 0]
     assert p[5, 0] == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(RegionError, match="one line"):
-        align_3_2_1(make_field(rigid, shape=tilted), [(50, 70), (60, 70), (70, 70), *places[3:]], shared=SHARED)
+        align_3_2_1(make_field(rigid, shape=tilted), [(50, 70), (60, 70), (70, 70), *positions[3:]], shared=SHARED)
 
 
 @pytest.mark.parametrize("how", ["plane", "3-2-1"])
 def test_alignment_states_its_covariance(how: str) -> None:
     field = make_field(rigid, rows=8, cols=10, shape=tilted)
-    places = [(41, 61), (100, 66), (70, 107), (45, 80), (95, 84), (61, 66)]
+    positions = [(41, 61), (100, 66), (70, 107), (45, 80), (95, 84), (61, 66)]
 
     def align(f: Field) -> Alignment:
         return (
             align_plane(f, shared=SHARED, x_direction=TURN[:, 0])
             if how == "plane"
-            else align_3_2_1(f, places, shared=SHARED)
+            else align_3_2_1(f, positions, shared=SHARED)
         )
 
     truth = align(field)

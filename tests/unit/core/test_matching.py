@@ -45,7 +45,7 @@ def starts(name):
 def truth(name):
     pair = paper_pair()
     at = pair.cam1.back_project_to_plane(XY).xyz_mm
-    return at, PLANES[name].place(at[:, :2]) - at
+    return at, PLANES[name].position(at[:, :2]) - at
 
 
 @pytest.mark.parametrize(("interpolation", "limit_um"), [("cubic", 0.06), ("quintic", 0.03)])

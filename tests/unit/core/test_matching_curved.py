@@ -91,7 +91,7 @@ def test_the_solution_is_the_twins(kind, interpolation, order, noise):
         ):
             p = twin.solve(mine)
             for k, correlation in enumerate(zncc):
-                assert np.abs(twin.place(k, p, twin.XY) - twin.place(k, mine, twin.XY)).max() < limit
+                assert np.abs(twin.position(k, p, twin.XY) - twin.position(k, mine, twin.XY)).max() < limit
                 assert abs(correlation - twin.residual(k, p)[2]) < 1e-5
 
 

@@ -39,7 +39,7 @@ def test_shape_solution_is_the_twins(kind, interpolation, order):
         twin = Twin(pair, images[:2], xy, subset=25, order=order)
         p = twin.solve(np.array([*w[i], 0.0]))
         mine = np.array([*fit.w[i], fit.epipolar_px[i]])
-        assert np.abs(twin.place(0, p, twin.XY) - twin.place(0, mine, twin.XY)).max() < 1e-5
+        assert np.abs(twin.position(0, p, twin.XY) - twin.position(0, mine, twin.XY)).max() < 1e-5
         assert abs(fit.zncc[i, 0] - twin.residual(0, p)[2]) < 1e-6
 
 
@@ -58,12 +58,12 @@ def test_motion_solution_is_the_twins(kind, interpolation, order):
         mine = np.array([*fit.w[i], fit.epipolar_px[i], *fit.G[i].ravel()])
         p = twin.solve(mine)
         for k in range(3):
-            at = twin.place(k, p, twin.XY)
+            at = twin.position(k, p, twin.XY)
             # the twin's Jacobian is whole, the kernel's leaves out what perspective adds to the columns: at the corners
             # that is a hundredth of what the images' noise does
-            assert np.abs(at - twin.place(k, mine, twin.XY)).max() < 5e-4
+            assert np.abs(at - twin.position(k, mine, twin.XY)).max() < 5e-4
             before = np.array([*first.w[i], first.epipolar_px[i], *first.G[i].ravel()])
-            assert np.abs(at - twin.place(k, before, twin.XY)).max() < 7e-4
+            assert np.abs(at - twin.position(k, before, twin.XY)).max() < 7e-4
             assert abs(fit.zncc[i, k] - twin.residual(k, p)[2]) < 1e-6
 
 

@@ -76,9 +76,11 @@ def test_unknown_patches_are_refused(patch: str) -> None:
 @pytest.mark.parametrize("make", [paper_pair, opencv_pair])
 def test_curvatures_are_the_surfaces_own(make) -> None:
     camera, xy = make().cam1, np.array([[79.5, 79.5]])
-    place = camera.back_project_to_plane(xy, point_sys_mm=np.zeros(3), normal_sys=np.array([0.0, 0.0, 1.0])).xyz_mm[0]
+    position = camera.back_project_to_plane(xy, point_sys_mm=np.zeros(3), normal_sys=np.array([0.0, 0.0, 1.0])).xyz_mm[
+        0
+    ]
     for bend in ((1 / 30, 0.004, 1 / 40), (-1 / 30, 0.004, 1 / 40), (-0.02, 0.0, -0.02)):
-        w = true_w6(camera, Bent(bend, origin=place), xy)
+        w = true_w6(camera, Bent(bend, origin=position), xy)
         a, b, c = bend
         expected = np.linalg.eigvalsh([[a, b], [b, c]])[::-1]
         np.testing.assert_allclose(principal_curvatures(make(), xy, w)[0], expected, rtol=1e-4, atol=1e-6)

@@ -22,8 +22,8 @@ RAYS = CAMERA.rays_cam(XY).xyz_mm
 def seen(before: Bent, after: Bent, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth at t0 and w times the place at t, camera 1's frame, of what pixels see."""
     ab = before.material(CAMERA, xy)
-    w = 1.0 / CAMERA.cam_from_sys.apply(before.place(ab))[..., 2]
-    return w, CAMERA.cam_from_sys.apply(after.place(ab)) * w[..., None]
+    w = 1.0 / CAMERA.cam_from_sys.apply(before.position(ab))[..., 2]
+    return w, CAMERA.cam_from_sys.apply(after.position(ab)) * w[..., None]
 
 
 def field(before: Bent, after: Bent | None, *, noise_mm: float) -> tuple[PointFits, float]:
@@ -34,10 +34,10 @@ def field(before: Bent, after: Bent | None, *, noise_mm: float) -> tuple[PointFi
     middle = np.linalg.pinv(design)[0]  # value in the middle of the best plane
     (w, G), (true_w, true_G) = seen(before, after or before, pixels), seen(before, after or before, XY)
     w, G = w @ middle, np.einsum("npk,p->nk", G, middle)
-    place, true_place = RAYS / w[:, None], RAYS / true_w[:, None]
-    error = place - true_place
+    position, true_position = RAYS / w[:, None], RAYS / true_w[:, None]
+    error = position - true_position
     if moved:
-        error = (G / w[:, None] - place) - (true_G / true_w[:, None] - true_place)
+        error = (G / w[:, None] - position) - (true_G / true_w[:, None] - true_position)
     points = PointFits.empty(len(XY), 3 if moved else 1)
     rng = np.random.default_rng(4)
     sigma = noise_mm * w**2 / np.linalg.norm(RAYS, axis=1)
@@ -54,7 +54,7 @@ def field(before: Bent, after: Bent | None, *, noise_mm: float) -> tuple[PointFi
     return points, float(np.sqrt((error**2).sum(1).mean()))
 
 
-def told(points: PointFits, *, step: float = STEP) -> PlaneError | None:
+def estimate(points: PointFits, *, step: float = STEP) -> PlaneError | None:
     return plane_error(points, shape=X.shape, rays=RAYS, spacing_px=step, subset_px=SUBSET)
 
 
@@ -65,22 +65,22 @@ BULGE = Bent((1 / 30, 0.003, 1 / 45))
 @pytest.mark.parametrize("noise_mm", [1e-6, 3e-4, 1e-3])
 def test_the_error_of_a_shape(noise_mm: float) -> None:
     points, error = field(BULGE, None, noise_mm=noise_mm)
-    said = told(points)
-    assert said is not None
+    estimated = estimate(points)
+    assert estimated is not None
     assert error > 1.2e-3
-    assert abs(said.error_mm / error - 1.0) < 0.05
-    assert abs(said.noise_mm / noise_mm - 1.0) < 0.02
-    assert said.below_mm >= said.error_mm
+    assert abs(estimated.error_mm / error - 1.0) < 0.05
+    assert abs(estimated.noise_mm / noise_mm - 1.0) < 0.02
+    assert estimated.below_mm >= estimated.error_mm
 
 
 @pytest.mark.parametrize("noise_mm", [1e-6, 3e-4, 1e-3])
 def test_the_error_of_a_motion(noise_mm: float) -> None:
     after = Bent((1 / 60, 0.0, 1 / 20), origin=np.array([0.1, -0.2, 0.4]))
     points, error = field(BULGE, after, noise_mm=noise_mm)
-    said = told(points)
-    assert said is not None
+    estimated = estimate(points)
+    assert estimated is not None
     assert error > 3e-4
-    assert abs(said.error_mm / error - 1.0) < 0.15
+    assert abs(estimated.error_mm / error - 1.0) < 0.15
 
 
 def test_planes_that_lean_and_turn_show_no_error() -> None:
@@ -88,27 +88,27 @@ def test_planes_that_lean_and_turn_show_no_error() -> None:
     for after in (None, Bent(basis=turned, origin=np.array([0.3, 0.1, -0.2]))):
         points, error = field(Bent(basis=TILTED), after, noise_mm=1e-6)
         assert error < 5e-6
-        said = told(points)
-        assert said is not None
-        assert said.below_mm < 5e-6
+        estimated = estimate(points)
+        assert estimated is not None
+        assert estimated.below_mm < 5e-6
         points, _ = field(Bent(basis=TILTED), after, noise_mm=3e-4)
-        said = told(points)
-        assert said is not None
-        assert said.below_mm < 0.2 * said.noise_mm
+        estimated = estimate(points)
+        assert estimated is not None
+        assert estimated.below_mm < 0.2 * estimated.noise_mm
 
 
 def test_a_curved_surface_that_only_shifts_moves_without_error() -> None:
     points, _ = field(BULGE, Bent(BULGE.bend, origin=np.array([0.2, 0.1, -0.3])), noise_mm=1e-6)
-    said = told(points)
-    assert said is not None
-    assert said.below_mm < 2e-6
+    estimated = estimate(points)
+    assert estimated is not None
+    assert estimated.below_mm < 2e-6
 
 
 def test_points_too_far_apart_or_too_few_say_nothing() -> None:
     points, _ = field(BULGE, None, noise_mm=3e-4)
-    assert told(points, step=2.1 * SUBSET) is None
+    assert estimate(points, step=2.1 * SUBSET) is None
     points.reject(np.arange(len(XY)) % 7 > 0, 4)  # type: ignore[arg-type]
-    assert told(points) is None
+    assert estimate(points) is None
 
 
 def test_plane_patches_asked_for_get_advice_where_curved_ones_would_err_less() -> None:
@@ -129,7 +129,7 @@ def test_auto_fits_nothing_twice_where_curvature_cannot_pay() -> None:
         comparisons = 3
 
     points, _ = field(Bent(basis=TILTED), Bent(), noise_mm=3e-4)
-    choice = choose_patch(NoFits(), points, XY, told(points))  # type: ignore[arg-type]
+    choice = choose_patch(NoFits(), points, XY, estimate(points))  # type: ignore[arg-type]
     assert choice.patch == "affine"
     assert choice.sample == 0
     assert choice.asked == "auto"

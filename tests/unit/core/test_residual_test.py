@@ -146,7 +146,7 @@ def measured(reference, now, options=OPTIONS):
     return field, field.uvw_mm - true.uvw_mm
 
 
-def told_over_true(field, error):
+def reported_over_true(field, error):
     """Of u, v and w, rms over the valid points."""
     v = field.valid
     return np.sqrt((field.sigma_mm[v][:, 3:] ** 2).mean(0) / (error[v] ** 2).mean(0))
@@ -159,7 +159,7 @@ def test_noise_alone_is_told_as_it_is():
     factor = observed_factor(reference, now, field)
     assert np.all(np.abs(factor[:4] - 1.0) < 0.2), factor
     assert 0.9 < factor[4] < 1.5  # across the epipolar line the interpolation's own error shows, too
-    assert np.all(np.abs(told_over_true(field, error) - 1.0) < 0.15)
+    assert np.all(np.abs(reported_over_true(field, error) - 1.0) < 0.15)
 
 
 def observed_factor(reference, now, field):
@@ -172,8 +172,8 @@ def observed_factor(reference, now, field):
         bench.pair(), [*reference, *now], xy, fit.w, fit.G, fit.epipolar_px, options
     )
     assert known.all()
-    told = np.diagonal(fit.covariance, axis1=1, axis2=2)
-    return (np.diagonal(robust, axis1=1, axis2=2) / told).mean(0)
+    reported = np.diagonal(fit.covariance, axis1=1, axis2=2)
+    return (np.diagonal(robust, axis1=1, axis2=2) / reported).mean(0)
 
 
 def test_another_pattern_shining_through_is_told_by_the_residuals_not_by_the_fit():
@@ -183,7 +183,7 @@ def test_another_pattern_shining_through_is_told_by_the_residuals_not_by_the_fit
     assert field.valid.mean() > 0.95
     factor = observed_factor(reference, now, field)
     assert factor[1:3].min() > 2.5  # the fit alone says less than half of the variance
-    ratio = told_over_true(field, error)
+    ratio = reported_over_true(field, error)
     assert np.all((ratio > 0.7) & (ratio < 1.5)), ratio
 
 
@@ -192,7 +192,7 @@ def test_images_much_noisier_than_the_reference_are_told_as_they_are(noise):
     """Their normalised grey levels, and so the residuals, are smaller than their noise by the correlation lost."""
     field, error = measured(*pictures(noise=noise))
     assert field.valid.mean() > (0.99 if noise < 30.0 else 0.8)  # beyond, many scatter by more than 0.1 px
-    assert np.all(np.abs(told_over_true(field, error) - 1.0) < 0.12)
+    assert np.all(np.abs(reported_over_true(field, error) - 1.0) < 0.12)
 
 
 def test_noise_at_t_alone_does_not_touch_the_shape():
@@ -202,7 +202,7 @@ def test_noise_at_t_alone_does_not_touch_the_shape():
     v = field.valid
     assert v.mean() > 0.99
     np.testing.assert_allclose(field.sigma_mm[v][:, :3], shape.sigma_mm[v], rtol=0.5)
-    ratio = told_over_true(field, error)
+    ratio = reported_over_true(field, error)
     assert np.all((ratio > 0.8) & (ratio < 1.25)), ratio
 
 
@@ -224,8 +224,8 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
     assert (statuses[1.0] == PointStatus.OK).mean() > 0.4
 
 
-@pytest.mark.parametrize(("depth_said", "offset_said", "kept"), [(1.0, 1.0, 1.0), (1.0, 1.5, 1.0), (1.5, 1.0, 0.0)])
-def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(depth_said, offset_said, kept):
+@pytest.mark.parametrize(("depth_factor", "offset_factor", "kept"), [(1.0, 1.0, 1.0), (1.0, 1.5, 1.0), (1.5, 1.0, 0.0)])
+def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(depth_factor, offset_factor, kept):
     """Residuals show this many times the variances that the fit tells; of noise there is too much for any point."""
     reference, _ = pictures()
     inputs = prepare(bench.pair(), reference, None, bench.grid(spacing_px=6.0), OPTIONS)
@@ -233,11 +233,11 @@ def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(d
     points, count = state.points, int(state.points.ok.sum())
     sd = np.sqrt(np.diagonal(points.covariance[points.ok], axis1=1, axis2=2)).mean(0)
     depth_px = max(sd[1], (sd[0] / depth_per_px(inputs.pair, inputs.rays, points.w[:, 0])).mean())
-    said = np.array([depth_said, offset_said])
-    points.covariance /= np.sqrt(said[:, None] * said)
+    factors = np.array([depth_factor, offset_factor])
+    points.covariance /= np.sqrt(factors[:, None] * factors)
     limits = SigmaLimits(motion_px=0.1, depth_px=0.75 * depth_px)
     tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
-    assert tested.factor == pytest.approx(said, rel=0.25)
+    assert tested.factor == pytest.approx(factors, rel=0.25)
     assert points.ok.sum() / count == pytest.approx(kept, abs=0.05)
 
 

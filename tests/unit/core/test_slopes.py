@@ -23,7 +23,7 @@ def texture(kind, seed=2):
     return 120.0 + grey * scale, gx * scale, gy * scale
 
 
-def judged(filtered, true):
+def compared(filtered, true):
     """Information kept (1 at best) and sensitivity over sum of squares (1 where no noise is left to take out)."""
     kept = (filtered * true).sum() ** 2 / ((filtered**2).sum() * (true**2).sum())
     return kept, (filtered * true).sum() / (filtered**2).sum()
@@ -41,8 +41,8 @@ def test_more_information_than_the_spline_and_nothing_to_take_out(kind, noise, k
             plain = correlate1d(image, derivative(order), axis=1 - axis, mode="mirror")
             # a little is given away at the highest frequencies, which the spline between the pixels cannot carry
             gained = 0.005 if noise > 2.0 else -0.001
-            assert judged(filtered, exact)[0] > judged(plain, exact)[0] + gained
-        ratio = judged(filtered, exact)[1]
+            assert compared(filtered, exact)[0] > compared(plain, exact)[0] + gained
+        ratio = compared(filtered, exact)[1]
         assert abs(ratio - 1.0) < (0.02 if known else 0.04)
     if not known:
         assert 0.85 < np.sqrt(found.noise_variance) / noise < 1.1
@@ -57,7 +57,7 @@ def test_without_noise_it_is_the_derivative(kind):
     found = slope_filter(grey, 5)
     assert found.noise_variance < 1e-4
     for filtered, exact in zip(found.apply(grey), true, strict=True):
-        kept, ratio = judged(filtered[8:-8, 8:-8], exact[8:-8, 8:-8])
+        kept, ratio = compared(filtered[8:-8, 8:-8], exact[8:-8, 8:-8])
         assert kept > 0.994
         assert abs(ratio - 1.0) < 0.008
 
@@ -72,8 +72,8 @@ def test_blank_parts_and_shading_do_not_spoil_it():
     whole = slope_filter(texture("fine")[0] + 6.0 * rng.normal(size=SHAPE), 5)
     part = np.s_[8:-8, 8:190]
     for mine, best, exact in zip(found.apply(noisy), whole.apply(noisy), true, strict=True):
-        kept, ratio = judged(mine[part] - mine[part].mean(), exact[part])
-        assert kept > judged(best[part] - best[part].mean(), exact[part])[0] - 0.01
+        kept, ratio = compared(mine[part] - mine[part].mean(), exact[part])
+        assert kept > compared(best[part] - best[part].mean(), exact[part])[0] - 0.01
         assert abs(ratio - 1.0) < 0.05
 
 

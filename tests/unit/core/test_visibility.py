@@ -59,22 +59,22 @@ def test_neighbours_that_a_crack_parts_are_none() -> None:
     rows, cols = grid.shape
     xy = grid.xy_px
     neighbours = Attempts.on(grid.shape, visibility).neighbours.reshape(rows, cols, 8)
-    parted = 0
+    separated_count = 0
     for dr in range(-2, 3):
         for dc in range(-2, 3):
             if (dr, dc) == (0, 0):
                 continue
-            told = visibility.separated_at(dr, dc).reshape(rows, cols)
+            separated = visibility.separated_at(dr, dc).reshape(rows, cols)
             for r, c in np.ndindex(rows, cols):
                 i, j = r + dr, c + dc
                 if not (0 <= i < rows and 0 <= j < cols):
                     continue
                 over = bool(crosses(xy[r, c], xy[i, j], grid.cuts))
-                assert told[r, c] == over
-                parted += over
+                assert separated[r, c] == over
+                separated_count += over
                 if max(abs(dr), abs(dc)) == 1:
                     assert (i * cols + j in neighbours[r, c]) == (not over)
-    assert parted > 100
+    assert separated_count > 100
 
 
 def test_a_mask_is_seen_along_its_white_alone() -> None:
@@ -125,14 +125,14 @@ def test_local_fits_hear_only_what_they_see() -> None:
     def value(xy: np.ndarray) -> np.ndarray:
         return np.where(xy[:, 1] > 50.0, 5.0, 0.0) + 0.05 * xy[:, 0] + 0.02 * xy[:, 1]
 
-    places = np.stack([np.linspace(10.0, 90.0, 30), np.full(30, 50.5)], axis=-1)
+    positions = np.stack([np.linspace(10.0, 90.0, 30), np.full(30, 50.5)], axis=-1)
     options = {"tolerance": 20.0, "neighbours": 14}
     heard = robust_local_fits(
-        places, points, value(points)[:, None], are_separated=lambda a, b: crosses(a, b, cuts), **options
+        positions, points, value(points)[:, None], are_separated=lambda a, b: crosses(a, b, cuts), **options
     )
-    np.testing.assert_allclose(heard.value[:, 0], value(places), atol=1e-9)
-    plain = robust_local_fits(places, points, value(points)[:, None], **options)
-    assert np.abs(plain.value[:, 0] - value(places)).max() > 1.0
+    np.testing.assert_allclose(heard.value[:, 0], value(positions), atol=1e-9)
+    plain = robust_local_fits(positions, points, value(points)[:, None], **options)
+    assert np.abs(plain.value[:, 0] - value(positions)).max() > 1.0
 
 
 def test_a_click_starts_on_its_own_side() -> None:

@@ -271,17 +271,17 @@ def test_without_pygobject_the_remedy_says_what_to_install(monkeypatch: pytest.M
 @pytest.mark.fault(11)
 def test_the_watch_tells_why_a_camera_is_lost() -> None:
     def lost(camera: _Register, *, ours: bool = True, frames: bool = False, limit_s: float = 2.0) -> list[str]:
-        said: list[str] = []
+        messages: list[str] = []
         began = time.monotonic()
-        watch = Watch(camera.address, lambda: time.monotonic() if frames else 0.0, lambda: ours, said.append)
+        watch = Watch(camera.address, lambda: time.monotonic() if frames else 0.0, lambda: ours, messages.append)
         watch.start()
         if camera.answers_until is not None:
             camera.answers_until = 1  # the question of `start`
-        while not said and time.monotonic() - began < limit_s:
+        while not messages and time.monotonic() - began < limit_s:
             time.sleep(0.01)
         watch.end()
         camera.close()
-        return said
+        return messages
 
     held = struct.pack(">HHHHI", 0, 0x0081, 4, 0, 2)
     free = struct.pack(">HHHHI", 0, 0x0081, 4, 0, 0)

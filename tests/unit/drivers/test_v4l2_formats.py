@@ -50,7 +50,7 @@ def test_pixels_come_back_from_the_documented_bytes(name: str, width: int) -> No
 @pytest.mark.parametrize("name", sorted(BYTES))
 def test_format_codes_are_the_headers(name: str) -> None:
     text = name.removesuffix("-BE")
-    code = sum(ord(letter) << 8 * place for place, letter in enumerate(text)) | (name.endswith("-BE") << 31)
+    code = sum(ord(letter) << 8 * index for index, letter in enumerate(text)) | (name.endswith("-BE") << 31)
     assert BY_CODE[code].name == name == fourcc_name(code)
 
 

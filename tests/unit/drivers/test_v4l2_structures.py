@@ -51,8 +51,8 @@ def header(tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
     folder = tmp_path_factory.mktemp("header")
     (folder / "print.c").write_text("\n".join([*lines, "return 0; }"]))
     subprocess.run(["gcc", "-Wall", "-Werror", "-o", folder / "print", folder / "print.c"], check=True)
-    told = subprocess.run([folder / "print"], check=True, capture_output=True, text=True).stdout
-    return {name: int(number) for name, number in (line.split() for line in told.splitlines())}
+    printed = subprocess.run([folder / "print"], check=True, capture_output=True, text=True).stdout
+    return {name: int(number) for name, number in (line.split() for line in printed.splitlines())}
 
 
 def test_sizes_and_offsets_are_the_headers(header: dict[str, int]) -> None:

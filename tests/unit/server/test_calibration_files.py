@@ -35,7 +35,7 @@ def test_target_at_top_level_and_in_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "code", "says"),
+    ("text", "code", "fragment"),
     [
         (TARGET.replace("pitch_mm = 1.0", ""), "field_invalid", "pitch_mm is missing"),
         (TARGET.replace("= 1.0", "= nan"), "field_invalid", "pitch_mm is nan"),
@@ -50,16 +50,16 @@ def test_target_at_top_level_and_in_a_table(tmp_path: Path) -> None:
         ("pitch_mm = = 1", "toml_malformed", "no valid TOML"),
     ],
 )
-def test_a_bad_target_is_refused_by_field(tmp_path: Path, text: str, code: str, says: str) -> None:
+def test_a_bad_target_is_refused_by_field(tmp_path: Path, text: str, code: str, fragment: str) -> None:
     with pytest.raises(FileFormatError, match=r"target\.toml") as caught:
         read_target(put(tmp_path, "target.toml", text))
     assert caught.value.code == code
-    assert says in caught.value.cause
+    assert fragment in caught.value.cause
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "code", "says"),
+    ("text", "code", "fragment"),
     [
         (RIG.split("[cam2]")[0], "field_invalid", "[cam2] is missing"),
         (RIG.replace("aspect = 0.9617", "", 1), "field_invalid", "[cam1]: aspect is missing"),
@@ -70,11 +70,11 @@ def test_a_bad_target_is_refused_by_field(tmp_path: Path, text: str, code: str, 
         ("cam1 = 3", "field_invalid", "[cam1] is not a table"),
     ],
 )
-def test_a_bad_rig_is_refused_by_field(tmp_path: Path, text: str, code: str, says: str) -> None:
+def test_a_bad_rig_is_refused_by_field(tmp_path: Path, text: str, code: str, fragment: str) -> None:
     with pytest.raises(FileFormatError) as caught:
         read_rig(put(tmp_path, "rig.toml", text))
     assert caught.value.code == code
-    assert says in caught.value.cause
+    assert fragment in caught.value.cause
 
 
 def test_a_rig_file_of_the_service_serves_as_well(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def watched(mb_per_s: float, side: int = 512) -> Watch:
     return seen
 
 
-def looked(machine: Path, seen: Watch, *, speed: str, mtu: str, two: str = "192.168.1.6") -> dict[str, Check]:
+def checked(machine: Path, seen: Watch, *, speed: str, mtu: str, two: str = "192.168.1.6") -> dict[str, Check]:
     for name in ("cam0", "cam1"):
         write(machine / "class" / name / "speed", speed)
         write(machine / "class" / name / "mtu", mtu)
@@ -78,7 +78,7 @@ def looked(machine: Path, seen: Watch, *, speed: str, mtu: str, two: str = "192.
 
 
 def test_two_cameras_on_one_link_load_it_together(machine: Path) -> None:
-    found = looked(machine, watched(55.0), speed="1000\n", mtu="9000\n")
+    found = checked(machine, watched(55.0), speed="1000\n", mtu="9000\n")
     assert found["cam0"].figures["load"] == pytest.approx(2 * 55.0 * 8 / 1000)
     assert found["cam0"].state == "warning"
     assert "88 % of 1000 Mbit/s" in found["cam0"].found
@@ -86,20 +86,20 @@ def test_two_cameras_on_one_link_load_it_together(machine: Path) -> None:
 
 
 def test_a_link_for_each_camera_is_good(machine: Path) -> None:
-    found = looked(machine, watched(55.0), speed="1000\n", mtu="9000\n", two="192.168.1.200")
+    found = checked(machine, watched(55.0), speed="1000\n", mtu="9000\n", two="192.168.1.200")
     assert found["cam0"].state == found["cam1"].state == "ok"
     assert found["cam1"].figures["load"] == pytest.approx(0.44)
 
 
 def test_small_packets_at_a_high_rate_ask_for_jumbo_frames(machine: Path) -> None:
-    found = looked(machine, watched(70.0), speed="10000\n", mtu="1500\n")
+    found = checked(machine, watched(70.0), speed="10000\n", mtu="1500\n")
     assert found["cam0"].state == "warning"
     assert "mtu 9000" in str(found["cam0"].remedy)
 
 
 def test_a_link_without_a_known_speed_has_no_limit(machine: Path) -> None:
     # what the kernel says of a link that is down, and of many virtual ones
-    found = looked(machine, watched(20.0), speed="-1\n", mtu="1500\n")
+    found = checked(machine, watched(20.0), speed="-1\n", mtu="1500\n")
     assert found["cam0"].state == "ok"
     assert found["cam0"].limit is None
     assert found["cam0"].figures["load"] is None
@@ -107,7 +107,7 @@ def test_a_link_without_a_known_speed_has_no_limit(machine: Path) -> None:
 
 @pytest.mark.parametrize(("side", "state"), [(400, "ok"), (512, "warning")])
 def test_socket_buffers_hold_an_image(machine: Path, side: int, state: str) -> None:
-    found = looked(machine, watched(1.0, side), speed="1000\n", mtu="9000\n")
+    found = checked(machine, watched(1.0, side), speed="1000\n", mtu="9000\n")
     assert found["socket buffers"].state == state
 
 
@@ -115,7 +115,7 @@ def test_a_camera_that_no_interface_leads_to(machine: Path) -> None:
     write(
         machine / "net" / "route", "\n".join(line for line in ROUTES.splitlines() if "cam" in line or "Iface" in line)
     )
-    found = looked(machine, watched(1.0), speed="1000\n", mtu="9000\n", two="10.1.1.1")
+    found = checked(machine, watched(1.0), speed="1000\n", mtu="9000\n", two="10.1.1.1")
     assert found["way to cam2"].state == "warning"
 
 

@@ -90,9 +90,14 @@ def test_a_tables_comments_tell_unit_and_meaning_of_each_column(source: Source, 
     text = _made(source, tmp_path, "csv", steps=[1])[0].read_text(encoding="utf-8")
     comments = [line for line in text.splitlines() if line.startswith("#")]
     header = text.splitlines()[len(comments)].split(",")
-    told = dict(re.fullmatch(r"# column (\w+), unit (\S+): .+", c).groups() for c in comments if "column" in c)  # type: ignore[union-attr]
-    assert set(header) - {"status_name", "strain_status_name"} == set(told)
-    assert (told["u_mm"], told["exx"], told["rotation_x_rad"], told["x_px"]) == ("mm", "1", "rad", "pixel")
+    described = dict(re.fullmatch(r"# column (\w+), unit (\S+): .+", c).groups() for c in comments if "column" in c)  # type: ignore[union-attr]
+    assert set(header) - {"status_name", "strain_status_name"} == set(described)
+    assert (described["u_mm"], described["exx"], described["rotation_x_rad"], described["x_px"]) == (
+        "mm",
+        "1",
+        "rad",
+        "pixel",
+    )
 
 
 def test_chosen_variables_and_steps(source: Source, tmp_path: Path) -> None:
@@ -396,13 +401,13 @@ def _provenance(path: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("form", ["csv", "vtu", "mat", "h5", "png", "svg", "gif"])
 def test_every_export_says_frame_settings_calibration_and_version(source: Source, tmp_path: Path, form: str) -> None:
-    said = _provenance(_made(source, tmp_path, form, steps=[1])[0])
-    assert said["settings"] == SETTINGS
-    assert said["calibration_sha256"] == CALIBRATION
-    assert said["frame"].startswith("sys: X_sys, Y_sys in the calibration target's plane")
-    assert said["measured_with"] == "stereorig 9.8.7"
-    assert said["software"] == f"stereorig {software_version()}"
-    assert said["length_unit"] == "mm"
+    provenance = _provenance(_made(source, tmp_path, form, steps=[1])[0])
+    assert provenance["settings"] == SETTINGS
+    assert provenance["calibration_sha256"] == CALIBRATION
+    assert provenance["frame"].startswith("sys: X_sys, Y_sys in the calibration target's plane")
+    assert provenance["measured_with"] == "stereorig 9.8.7"
+    assert provenance["software"] == f"stereorig {software_version()}"
+    assert provenance["length_unit"] == "mm"
 
 
 def test_what_is_not_there_is_refused_by_name(source: Source, tmp_path: Path) -> None:

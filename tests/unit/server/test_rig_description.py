@@ -13,7 +13,7 @@ from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, Axis
 from server.api.models.rig import FrameCounts, PairCounts
 from server.base.models import Reply, Reported
 from server.config.camera_metadata import CameraMetadata, LensMetadata
-from server.rig import description as said
+from server.rig import description as replies
 from server.rig.devices import ListedDevice
 from tests.support.service_rig import tiny_config
 
@@ -21,17 +21,17 @@ from tests.support.service_rig import tiny_config
 @pytest.mark.parametrize(
     ("declared", "reply"),
     [
-        (CameraDescription, said.CameraDevice),
-        (CameraSettings, said.CameraSettingsReply),
+        (CameraDescription, replies.CameraDevice),
+        (CameraSettings, replies.CameraSettingsReply),
         (FoundDevice, ListedDevice),
         (FrameCounters, FrameCounts),
         (PairingAccount, PairCounts),
-        (AxisIdentity, said.AxisIdentityReply),
-        (StageIdentity, said.StageIdentityReply),
-        (AxisLimits, said.AxisLimitsReply),
-        (AxisDynamics, said.DynamicsReply),
-        (AxisStatus, said.AxisReply),
-        (ControllerMessage, said.StageMessage),
+        (AxisIdentity, replies.AxisIdentityReply),
+        (StageIdentity, replies.StageIdentityReply),
+        (AxisLimits, replies.AxisLimitsReply),
+        (AxisDynamics, replies.DynamicsReply),
+        (AxisStatus, replies.AxisReply),
+        (ControllerMessage, replies.StageMessage),
     ],
 )
 def test_each_field_of_a_driver_is_replied_with_its_meaning(declared: type, reply: type[Reply]) -> None:
@@ -44,7 +44,7 @@ def test_each_field_of_a_driver_is_replied_with_its_meaning(declared: type, repl
 
 def test_a_record_keeps_settings_that_were_not_had_and_no_fact_that_nobody_told() -> None:
     settings = CameraSettings(exposure_ms=5.0, bit_depth=8, features={"BlackLevel": 4.0})
-    kept = said.kept_camera(settings, CameraMetadata(maker="Basler", lens=LensMetadata(f_number=8.0)))
+    kept = replies.kept_camera(settings, CameraMetadata(maker="Basler", lens=LensMetadata(f_number=8.0)))
     assert kept.model_dump(exclude_unset=True) == {
         "exposure_ms": 5.0,
         "gain_db": None,

@@ -83,13 +83,13 @@ def test_a_stop_leaves_the_axis_where_the_ramp_ends(clock: HandClock) -> None:
 def test_lost_motion_shows_only_after_turning_back(clock: HandClock) -> None:
     axis = axis_on(clock)
     axis.faults.backlash_mm = 0.03
-    places = []
+    positions = []
     for target in (5.0, 4.99, 4.0, 4.01, 5.0):
         axis.move_to(target)
         clock.at += 10.0
-        places.append(axis.true_position_mm())
+        positions.append(axis.true_position_mm())
     # upwards the load is at the motor; back by 0.01 it stays, back by more it lags by 0.03
-    assert places == pytest.approx([5.0, 5.0, 4.03, 4.03, 5.0])
+    assert positions == pytest.approx([5.0, 5.0, 4.03, 4.03, 5.0])
 
 
 def test_a_wrong_screw_and_a_tilted_axis_show_in_the_truth_only(clock: HandClock) -> None:

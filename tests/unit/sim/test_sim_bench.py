@@ -31,7 +31,7 @@ def test_a_move_over_the_wire_changes_the_image_and_the_way_back_restores_it() -
             cam.configure(CameraSettings(trigger="software"))
             cam.arm()
 
-        def shoot() -> list[np.ndarray]:
+        def capture() -> list[np.ndarray]:
             numbers = [cam.trigger() for cam in cams]
             frames = [cam.next_frame(120.0) for cam in cams]
             assert numbers[0] == numbers[1]
@@ -40,11 +40,11 @@ def test_a_move_over_the_wire_changes_the_image_and_the_way_back_restores_it() -
             return [frame.pixels.astype(float) for frame in frames if frame]
 
         stage.move_to(1, 0.0)
-        before = shoot()
+        before = capture()
         stage.move_to(1, 5.0)
-        moved = shoot()
+        moved = capture()
         stage.move_to(1, 0.0)
-        after = shoot()
+        after = capture()
         for cam in cams:
             cam.close()
         stage.close()
