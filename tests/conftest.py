@@ -2,7 +2,7 @@
 
 `unit` mirrors the packages and needs no service, no process and no rendered field; `contract` is one suite over every
 backend of cameras and stages; `service` runs the service and the command line; `accuracy` compares rendered scenes and
-drawn noise with their truth; `browser` looks at the page; `crash` kills, fills, fuzzes and loads. The folder's name is
+drawn noise with their truth; `browser` operates the page; `crash` kills, fills, fuzzes and loads. The folder's name is
 the marker of its tests. Depth is a second marker, `deep`: long forms that `make test` leaves to `make test-deep`.
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # most tests need neither
     from server.workflows.service import Service
     from tests.support.page_bench import Watched
 
-pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions say what they found
+pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions print what they found
 
 
 TESTS = Path(__file__).parent

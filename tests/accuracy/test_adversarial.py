@@ -80,7 +80,7 @@ def test_a_texture_that_repeats_gives_no_start():
     grid = bench.grid(spacing_px=12.0)
     with pytest.raises(SeedError):
         reference.shape(grid, OPTIONS)
-    # a user who says which dot is which gets the shape, but no guess at how many dots it moved
+    # a user who states which dot is which gets the shape, but no guess at how many dots it moved
     xy = np.array([[130.0, 110.0]])
     position = bench.truth(grid, lattice("block", 0.0)).xyz_mm.reshape(-1, 3)
     nearest = np.argmin(np.linalg.norm(grid.xy_px.reshape(-1, 2) - xy, axis=1))

@@ -1,4 +1,4 @@
-"""The bench's pieces work; nothing here looks at a time."""
+"""The bench's pieces work; no time is checked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bench of whole measurements on small pictures: its pieces work; no time is judged."""
+"""The bench of whole measurements on small pictures: its pieces work; no time is checked."""
 
 from __future__ import annotations
 

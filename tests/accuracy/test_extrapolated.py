@@ -1,4 +1,4 @@
-"""Points outside the calibrated volume: told apart by geometry, their uncertainty against drawn calibrations."""
+"""Points outside the calibrated volume: distinguished by geometry, their uncertainty against drawn calibrations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_volume_is_what_both_cameras_saw_and_a_little_more() -> None:
     where = volume()
     nodes = TARGET.all_points_mm().reshape(-1, 2)
     assert where.contains(np.column_stack([nodes, np.zeros(len(nodes))])).all()
-    # between the cameras' axes depth and place in the image change together
+    # between the cameras' axes depth and image coordinates change together
     assert where.contains(np.array([[0.0, 0.0, -4.0], [0.0, 0.0, 4.0]])).all()
     assert not where.contains(np.array([[0.0, 0.0, -8.0], [0.0, 0.0, 8.0]])).any()
     along = pair().cam1.cam_from_sys.rotation[2]  # camera 1's optical axis in the system frame
@@ -71,7 +71,7 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
             for values, part in zip(nominal, np.split(change, 2), strict=True)
         ]
         drawn_pair = StereoPair(*cameras)
-        # least squares in the images, as the prediction has it: one step from the true place
+        # least squares in the images, as in the prediction: one step from the true position
         positions = []
         for points, (xy1, xy2) in zip((before, now), seen, strict=True):
             A = np.concatenate([c.point_jacobian(points) for c in cameras], axis=-2)

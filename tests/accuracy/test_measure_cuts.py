@@ -58,7 +58,7 @@ def test_both_lips_stand_up_to_the_line(kind: str) -> None:
     over = without.valid & (away < 5.0)
     wrong = np.abs(without.uvw_mm - true)[over][:, :2].max(initial=0.0)
     assert over.sum() < 0.4 * (away < 5.0).sum() or wrong > 0.02
-    # with the line nearly every point stands
+    # with the line nearly every point is valid
     assert field.uvw_mm is not None
     assert field.valid[lips].mean() > 0.97
     error = field.uvw_mm - true
@@ -108,7 +108,7 @@ def test_a_crack_that_ends_inside_the_field() -> None:
 
 @pytest.mark.fault(37)
 def test_what_shows_through_a_hole_counts_for_nothing() -> None:
-    """Another surface, which does not move, fills the hole's place in all four images."""
+    """Another surface, which does not move, fills the hole in all four images."""
     hole = np.array([(95.5, 80.5), (160.5, 80.5), (160.5, 140.5), (95.5, 140.5)])
     behind = bench.take("sphere", 0.0, seed=9)
     images = [
@@ -137,7 +137,7 @@ def test_what_shows_through_a_hole_counts_for_nothing() -> None:
 
 
 def truth_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where camera 1's places lie on the still block, system frame."""
+    """Points of the still block at positions of camera 1's image, system frame."""
     return truth_at(bench.scene("block", 1.0, STILL), bench.pair().cam1, positions).xyz_mm
 
 

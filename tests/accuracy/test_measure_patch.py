@@ -32,7 +32,7 @@ class Refusing:
 
 
 def test_growth_tries_with_and_without_the_neighbours_curvature() -> None:
-    # a curvature found in a small noisy patch says nothing several subsets further on
+    # a curvature found in a small noisy patch does not apply several subsets further on
     points = PointFits.empty(9, 1, 6)
     points.w[[0, 2, 6, 8]], points.zncc[[0, 2, 6, 8]] = [2.5e-3, 1e-3, 0.0, 40.0, 0.0, 0.0], 0.99
     points.status[[0, 2, 6, 8]] = PointStatus.OK

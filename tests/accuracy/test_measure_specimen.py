@@ -1,4 +1,4 @@
-"""The real specimen: a field as the issue asks for it, judged by the geometry and by the specimen's flatness."""
+"""The real specimen: a field compared with the geometry and with the specimen's flatness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise model against the simulated sensor's own numbers, and against scenes that do not stand still."""
+"""The noise model against the simulated sensor's own numbers, and against scenes that move."""
 
 from __future__ import annotations
 

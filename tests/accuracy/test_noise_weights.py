@@ -1,4 +1,4 @@
-"""A noise model in the matching: less scatter under shot noise, and a reported scatter that is the real one."""
+"""A noise model in the matching: less scatter under shot noise, and the true standard uncertainty reported."""
 
 from __future__ import annotations
 

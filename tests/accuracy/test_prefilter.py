@@ -1,4 +1,4 @@
-"""The Gaussian prefilter: noise and covariance judged by scatter over repeated pictures, and what it must refuse."""
+"""The Gaussian prefilter: noise and covariance against the scatter of repeated pictures, and refused inputs."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def test_noise_is_seen_as_drawn_under_a_deformation(window: int, axis: int) -> N
     field = 2.0 * noise + 3e3 * (x + 0.4 * x**2 - 0.2 * x**3 + x * y**2)
     weights = np.ones((1, 1)) if window == 1 else window_slope(window, axis)
     values = fftconvolve(field, weights[::-1, ::-1], mode="valid")
-    # what an unbiased statement tells: the scatter of many copies
+    # an unbiased estimate: the scatter of many copies
     copies = fftconvolve(
         fftconvolve(rng.normal(0.0, 1.0 / 3.0, (603, 603)), np.ones((3, 3)), mode="valid"),
         weights[::-1, ::-1],

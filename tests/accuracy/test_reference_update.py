@@ -170,7 +170,7 @@ def test_a_fresh_worker_goes_on_from_the_files(n: int, tmp_path: Path) -> None:
 
 
 def test_told_errors_after_updates_are_the_empirical_ones() -> None:
-    """Monte Carlo over the noise: five updates, each leaving the same scatter about the truth as told."""
+    """Monte Carlo over the noise: five updates, each leaving the reported scatter about the truth."""
     scenes = [bench.plate(0.4 * n, np.array([0.021, -0.013, 0.02]) * n) for n in range(7)]
     clean = [bench.rig().capture(s, noise=0.0) for s in scenes]
     grid = PointGrid.rectangle(90, 90, 430, 390, spacing_px=28)
@@ -208,7 +208,7 @@ def test_a_pattern_that_changes_ends_total_correlation_and_not_auto() -> None:
     assert 1 <= len(set(references)) - 1 <= 4  # it stays with a reference as long as that serves
     for n, field in fields.items():
         assert field.valid.mean() > 0.95
-        # the other pattern draws the points along: so is told, before an update and after
+        # the other pattern draws the points along: so it is reported, before an update and after
         error = field.uvw_mm - truth[n]  # type: ignore[operator]
         reported, true = (np.sqrt(np.nanmean(a[..., :2] ** 2)) for a in (field.sigma_mm[..., 3:], error))
         assert 0.75 < reported / true < 1.35
@@ -315,7 +315,7 @@ def test_rest_is_rest() -> None:
 
 @pytest.mark.fault(37)
 def test_a_leg_that_begins_with_an_open_crack_reaches_over_neither_lip() -> None:
-    """The line is drawn at the first reference; at the second the lips are parted by four pixels."""
+    """The line is drawn at the first reference; at the second the lips are opened by four pixels."""
     x = np.linspace(0.0, 263.0, 41)
     line = np.stack([x, 112.0 + 18.0 * np.sin(x / 42.0)], axis=-1)
     side = below(line)

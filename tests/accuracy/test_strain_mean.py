@@ -24,7 +24,7 @@ TURN = Rotation.from_rotvec([0.1, -0.2, 0.4]).as_matrix()
 def test_told_is_the_scatter(tensor, window, order, smooth):
     failed = np.zeros((14, 17), bool)
     failed[6:8, 4:6] = True
-    # small strain is told of small rotations; how the others' frames turn under noise does not enter
+    # small strain assumes small rotations; how the others' frames turn under noise does not enter
     turn = np.eye(3) if tensor == "infinitesimal" else TURN
     field = make_field(lambda X: 1.01 * X @ turn.T, shape=surface, failed=failed)
     options = StrainOptions(window=window, order=order, tensor=tensor)

@@ -74,7 +74,7 @@ def test_false_strain_of_rigid_motions(axis, angle_deg, shift_mm) -> None:
 
 
 def test_even_strain_under_rotation() -> None:
-    """Two per cent and shear, turned by 5 degrees: gauge and patch both tell the tensor of the formula."""
+    """Two per cent and shear, turned by 5 degrees: gauge and patch both give the tensor of the formula."""
     F = np.array([[1.02, 0.004], [0.0, 0.994]])
     to_sys = UPRIGHT.rotation[:2, :2]
     e = to_sys @ (0.5 * (F.T @ F - np.eye(2))) @ to_sys.T
@@ -87,7 +87,7 @@ def test_even_strain_under_rotation() -> None:
 
 
 def test_uncertainty_of_repeated_pictures() -> None:
-    """What is told against the scatter of eight pairs of noisy pictures, window by window."""
+    """Reported uncertainty against the scatter of eight pairs of noisy pictures, window by window."""
     before, after = _capture(STILL), _capture(RigidTransform(np.eye(3), np.array([0.013, -0.02, 0.03])))
     found = [_strain(_noisy(before, k), _noisy(after, 100 + k), window=5) for k in range(8)]
     kept = np.logical_and.reduce([s.valid for s in found])
@@ -99,7 +99,7 @@ def test_uncertainty_of_repeated_pictures() -> None:
 
 @pytest.mark.fault(37)
 def test_lips_of_an_open_crack_have_no_false_strain() -> None:
-    """Two halves part by 120 um along a drawn line: on both lips the strain is zero within what is told."""
+    """Two halves part by 120 um along a drawn line: on both lips the strain is zero within its reported uncertainty."""
     line = np.array([(0.0, 107.3), (263.0, 118.1)])
     marked = bench.grid(spacing_px=5.0, margin_px=36.0).with_cracks([line])
     reference = ReferencePair(bench.pair(), *cut_scenes.reference())

@@ -1,4 +1,4 @@
-"""Texture verdicts against the scatter of a match with noise; seeds whose two places are one point, or are not."""
+"""Speckle quality against the scatter of a match with noise; seeds whose two positions are one point, or are not."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ Audit = Callable[[str], None]
 
 @pytest.fixture
 def audit(page: Watched) -> Audit:
-    """Fail where axe finds anything on the page as it stands, in any of its looks, or it is wider than the screen."""
+    """Fail where axe finds anything on the page in its present state, in any style, or it is wider than the screen."""
     return auditor(page.page)
 
 

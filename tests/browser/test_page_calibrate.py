@@ -66,7 +66,7 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
     expect(shown.get_by_text(f"{document['checks']['held_out']['rbe_px']:.5f} px").first).to_be_visible()
     # one figure of the parameters, with its uncertainty
     expect(shown.get_by_role("region", name="Ten parameters")).to_contain_text(f"{document['cam1']['z0_mm']:.2f}")
-    # what was foreseen came to be: the simulated grid stands on its corner
+    # the estimate is confirmed: the simulated grid is on its corner
     noise = sum(document["noise_px"].values()) / 2
     reply = client.post(
         f"{API}/calibrations:expect", json={"positions_mm": [0, 5], "noise_px": noise, "roll_deg": 45.0}
@@ -139,7 +139,7 @@ def test_what_a_verdict_refused_is_shown_with_its_reasons(
     assert world is not None
     expose = world.expose
 
-    # somebody leans on camera 2 while it stands at 2 mm
+    # camera 2 is pushed while it is at 2 mm
     def leant_on(cam: CameraName, **how: Any) -> Any:
         image = expose(cam, **how)
         return np.roll(image, 1, axis=1) if cam == "cam2" and abs(world._position_mm(2) - 2.0) < 0.2 else image

@@ -33,7 +33,7 @@ API = "/api/v1"
 SLOW = 200_000
 expect.set_options(timeout=30_000)  # the machine may be busy
 WIDTH, HEIGHT = 256, 240
-# load on the simulated plate in kPa, and what the load frame would tell in N
+# load on the simulated plate in kPa, and the load frame's value in N
 STEPS = ((0.0, 0.0), (344.5, 193.9), (689.0, 387.8))
 # the paper's plate: radius and thickness in mm, Young's modulus in N/mm^2, Poisson's ratio
 RADIUS, THICKNESS, MODULUS, POISSON = 13.385, 0.762, 71.0e3, 0.334
@@ -145,7 +145,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     made.calibration_id = client.get(f"{API}/calibrations").json()["calibrations"][-1]["id"]
     expect(verdict).to_contain_text(made.calibration_id)
 
-    # a test with the accepted calibration, and what only the operator knows
+    # a test with the accepted calibration, and the operator's metadata
     put_before_the_cameras(shown, "plate", STEPS[0][0])
     go(shown, "Test", "Tests")
     expect(shown.get_by_label("Calibration", exact=True)).to_have_value(made.calibration_id)
@@ -225,7 +225,7 @@ def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
     frame.scroll_into_view_if_needed()
     spot = (131.2, 104.7)  # where the mouse is to be, px
     shown.get_by_label("Opacity", exact=True).fill("0")
-    for turns in (0, 4, 8):  # of the wheel, over that place
+    for turns in (0, 4, 8):  # of the wheel, over that position
         for _ in range(turns):
             shown.mouse.move(*on_screen(canvas, *spot))
             shown.mouse.wheel(0, -250)
@@ -280,7 +280,7 @@ def export_opens(shown: Page, client: httpx.Client, test_id: str) -> None:
 
 
 def check_report(shown: Page) -> None:
-    """The report opens in a window of its own, whole, and says what was measured, how, and what is missing."""
+    """The report opens in a window of its own, whole, and states what was measured, how, and what is missing."""
     with shown.context.expect_page(timeout=SLOW) as opened:
         shown.get_by_role("link", name="Open the report").click()
     report = opened.value
@@ -327,7 +327,7 @@ def test_a_calibration_that_is_refused(page: Watched, client: httpx.Client, made
     for part in ("cause", "remedy", "code"):
         expect(progress).to_contain_text(problem[part])
     expect(shown.locator("tr", has_text=refused["id"])).to_contain_text("failed")
-    # nobody can accept it, and no test can be made with it
+    # it cannot be accepted, and no test can be made with it
     panel = shown.locator("section.panel", has=shown.get_by_role("heading", name=refused["id"]))
     expect(panel).to_contain_text(problem["cause"])
     expect(panel.get_by_role("button", name="Accept")).to_have_count(0)
@@ -358,7 +358,7 @@ def test_a_camera_lost_in_mid_run(page: Watched, client: httpx.Client, service: 
         expect(problem).to_contain_text("camera_lost")
         job = client.get(f"{API}/jobs", params={"limit": 1}).json()["jobs"][0]
         expect(problem).to_contain_text(job["problem"]["remedy"])
-        # the rig's screen says it as well, and goes on by itself once the camera is there again
+        # the rig's screen states it as well, and continues by itself once the camera is there again
         go(shown, "Rig", "tiny rig")
         box = shown.get_by_role("region", name="cam2", exact=True)
         for part in ("cause", "remedy", "code"):

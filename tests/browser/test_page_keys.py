@@ -98,7 +98,7 @@ def test_stop_from_anywhere(page: Watched, plate: str) -> None:
     # while a number is being typed
     at.get_by_label("Exposure").first.focus()
     stopped(at, lambda: twice(at))
-    # in a drawing that hears Escape itself
+    # in a drawing that uses Escape itself
     page.open(f"#/test/{plate}")
     at.get_by_role("button", name="Polygon", exact=True).press("Enter")
     at.keyboard.press("ArrowLeft")

@@ -157,7 +157,7 @@ def test_steps_scales_and_images_are_chosen(page: Watched, bench: Bench) -> None
         x, y = positions[5, 6]
         assert pixel(at, round(x), round(y))[3] == 255
     at.get_by_label("Image", exact=True).select_option("reference")
-    # a reference has no displacement, and says so
+    # a reference has no displacement, and a message states so
     at.get_by_role("button", name="Step before").click()
     expect(at.get_by_text("it is the reference, from which displacements are counted")).to_be_visible()
     at.get_by_role("button", name="Next step").click()
@@ -287,7 +287,7 @@ def test_the_grey_level_under_the_mouse_is_that_of_the_picture_shown(page: Watch
         drawn(at, f"2 w_mm {image}")
         stored_answer = bench.client.get(f"{API}/tests/{bench.test_id}/steps/{of[0]}/{of[1]}", params={"format": "png"})
         stored = np.asarray(Image.open(io.BytesIO(stored_answer.content)))
-        # inside the field, and beside it, where there is no value to tell
+        # inside the field, and beside it, where there is no value
         for presses, spots in ((0, ((130, 120), (20, 30))), (6, ((126, 119),))):
             frame.focus()
             at.keyboard.press("0")

@@ -68,7 +68,7 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
     shown.get_by_role("button", name="Make the test").click()
     expect(shown.get_by_role("heading", name="Plate <b> & more")).to_be_visible()
     test_id = page.page.url.split("/")[-1]
-    # facts that the report asks for
+    # metadata for the report
     shown.get_by_text("Metadata for the report").click()
     shown.get_by_label("Operator").fill("A. Smith")
     camera = shown.get_by_role("group", name="Camera 2 and its lens")
@@ -79,7 +79,7 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
         "operator": "A. Smith",
         "cam2": {"lens": {"focal_length_mm": 50.0}},
     }
-    # a step with what the load frame said, and what the pair is worth
+    # a step with the load frame's values, and the quality of the pair
     group = shown.get_by_role("group", name="Capture")
     group.get_by_label("Label").fill("1.25 kN")
     group.get_by_label("Load").fill("1250")
@@ -124,7 +124,7 @@ def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: h
             data = client.get(f"{API}/tests/{test_id}/steps/{n}/{cam}", params={"format": "png"}).content
             got = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
             assert np.array_equal(got, cv2.imread(str(tmp_path / f"{side}_{number}.png"), cv2.IMREAD_UNCHANGED))
-    # without a calibration it cannot be measured, and says so
+    # without a calibration the measurement is refused with the cause
     shown.get_by_role("button", name="Rectangle in the middle").click()
     shown.get_by_role("button", name="Measure", exact=True).click()
     expect(shown.get_by_role("alert").filter(has_text="calibration")).to_be_visible()
@@ -234,7 +234,7 @@ def test_seeds_in_both_views_and_a_measurement(
     page: Watched, client: httpx.Client, plate: str, cameras: dict[str, dict[str, float]]
 ) -> None:
     pair = StereoPair(*(Camera.from_paper(**cameras[cam]) for cam in ("cam1", "cam2")))
-    # places on the plate, by the rig's own cameras
+    # points on the plate, by the rig's own cameras
     positions = np.array([[-0.8, -0.5, 0.0], [0.9, -0.4, 0.0], [0.1, 0.9, 0.0]])
     one, two = (camera.project(positions).xy for camera in (pair.cam1, pair.cam2))
     shown = page.open(f"#/test/{plate}")

@@ -1,4 +1,4 @@
-"""The page's tutorial, clicked through as it is printed: each bold name, each field with its value, each text to appear."""
+"""The page's tutorial, clicked through as it is printed: bold names, fields with their values, texts that appear."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ RIG = ROOT / "config" / "sim_paper.toml"
 API = "/api/v1"
 SLOW = 200_000
 SIZE = (512, 480)
-# drawn where the tutorial says so, px of camera 1: 30 px inside the plate's rim, and a line across its middle
+# drawn as the tutorial states, px of camera 1: 30 px inside the plate's rim, and a line across its middle
 REGION = ((86.0, 70.0), (426.0, 410.0))
 LINE = ((120.0, 240.0), (400.0, 240.0))
 # a screen, a name to click, a field with its value, a text to appear
 STEP = re.compile(
-    r"Screen \*\*(?P<screen>[^*]+)\*\*|\*\*(?P<click>[^*]+)\*\*|\*(?P<field>[^*]+)\*\s+`(?P<value>[^`]+)`|`(?P<text>[^`]+)`"
+    r"Screen \*\*(?P<screen>[^*]+)\*\*|\*\*(?P<click>[^*]+)\*\*"
+    r"|\*(?P<field>[^*]+)\*\s+`(?P<value>[^`]+)`|`(?P<text>[^`]+)`"
 )
 
 

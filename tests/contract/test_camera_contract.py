@@ -352,7 +352,7 @@ def test_a_lost_camera_is_a_fault_within_a_second_and_works_again_after_its_retu
 
 
 def _lose_and_find(bench: CameraBench, how: str) -> tuple[float, float, float]:
-    """Take camera 1 away and bring it back; how long it took to tell, to release and to have it working again."""
+    """Take camera 1 away and bring it back; how long it took to report, to release and to have it working again."""
     with opened(bench, "cam1") as grabber, opened(bench, "cam2") as other:
         wanted = grabber.configure(_other_settings(grabber))
         # the other camera must not be taken along; whether the machine lets it run smoothly is another matter
@@ -451,7 +451,7 @@ def test_a_counter_that_wraps_goes_on_counting(bench: CameraBench) -> None:
             seconds_until(wrapped, 40.0)
             assert _rising(seen)
             assert reader.fault is None
-            # a wrap that was not understood would look like a flood of lost frames
+            # a wrap that was not understood would appear as a flood of lost frames
             assert reader.counters.dropped < 100
 
 

@@ -221,7 +221,7 @@ def test_a_stop_voids_a_motion_that_still_waits_for_its_turn(kind: tuple[str, Tr
         first, first_errors = in_thread(lambda: stand.stage.move_to(1, 40.0))
         wait_until(lambda: stand.controller.commands(f"1{MOVE_WORD}"))
         second, second_errors = in_thread(lambda: stand.stage.move_to(2, 40.0))
-        time.sleep(0.05)  # give it time to stand in the queue
+        time.sleep(0.05)  # give it time to enter the queue
         stand.stage.stop()
         first.join(5.0)
         second.join(5.0)
@@ -279,7 +279,7 @@ def test_stop_ends_homing_and_the_axis_counts_as_not_homed(kind: tuple[str, Tran
 def test_a_stop_between_a_question_and_its_answer_is_a_stop_and_no_fault(
     kind: tuple[str, Transport], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Homing has just been seen to go on when the stop comes; the next answer says that the axis rests."""
+    """Homing has just been seen to go on when the stop comes; the next answer states that the axis is at rest."""
     with bench(*kind, time_scale=1.0, start_mm=30.0) as stand:
         stand.stage.enable(1)
         read = stand.stage._read_status
@@ -347,7 +347,7 @@ def test_a_move_is_never_sent_again(homed: Bench, fault: str) -> None:
     thread.join(10.0)
     assert [error.code for error in errors] == ["stage_lost"]
     assert len(homed.controller.commands(MOVE_WORD)) == 1
-    if fault == "silent":  # it still hears: the axis was stopped
+    if fault == "silent":  # it still receives: the axis was stopped
         wait_until(lambda: homed.controller.commands("1ST"))
         wait_until(lambda: not homed.axis(1).moving)
         assert homed.controller.true_position_mm(1) < 39.0
@@ -463,7 +463,7 @@ def test_velocity_and_acceleration_are_set_at_run_time_and_read_back(homed: Benc
     assert stage.move_to(1, 1.0).position_mm == pytest.approx(1.0, abs=1e-4)
     stage.home(1)
     assert homed.axis(1).velocity_mm_s == pytest.approx(2.5)  # homing keeps it
-    if homed.driver == "esp301":  # it tells what it can do: four times and ten times the power-on values
+    if homed.driver == "esp301":  # it reports its limits: four times and ten times the power-on values
         assert (taken.max_velocity_mm_s, taken.max_acceleration_mm_s2) == pytest.approx((40.0, 400.0))
 
 
@@ -527,7 +527,7 @@ def test_what_an_earlier_program_left_moving_is_stopped_at_opening(kind: tuple[s
     with bench(*kind, time_scale=1.0, start_mm=0.0, options={1: option, 2: option}) as stand:
         stand.ready(1, 2)
         end = stand.controller.terminator
-        # the program that sent this is dead: nobody is left to stop it
+        # the program that sent this is dead: no client is left to stop it
         stand.stage.close()
         stand.controller.take_line(b"1PA40" + end)
         wait_until(lambda: stand.axis(1).velocity_now_mm_s > 1)
@@ -536,7 +536,7 @@ def test_what_an_earlier_program_left_moving_is_stopped_at_opening(kind: tuple[s
         assert stand.controller.true_position_mm(1) < 20.0
         found = [message for message in stand.stage.errors() if message.code == "opened_moving"]
         assert [message.axis for message in found] == [1]
-        # the ESP301 cannot say whether that was a search for home; the SMC100 knows that it still has its reference
+        # the ESP301 cannot report whether that was a search for home; the SMC100 reports its reference
         assert stand.stage.state(1).homed is (stand.driver != "esp301")
         assert stand.stage.state(2).homed
 

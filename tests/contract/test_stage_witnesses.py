@@ -238,7 +238,7 @@ def test_hvl_ccb_configures_homes_and_moves(smc: tuple[SimSMC100, str]) -> None:
         device.go_home()
         rest(device)
         assert controller.true_position_mm(1) == pytest.approx(0.0, abs=1e-6)
-        assert controller.true_position_mm(2) == pytest.approx(3.0)  # nobody spoke to its neighbour
+        assert controller.true_position_mm(2) == pytest.approx(3.0)  # no command was sent to its neighbour
     finally:
         device.stop()
 

@@ -89,7 +89,7 @@ def test_calibrate_finds_the_rig_from_pictures(tmp_path: Path, localiser: str) -
     assert found["checks"]["held_out"]["rbe_px"] < limit
     assert {"rbe_px", "raz_mm", "nsce", "per_camera"} <= set(found["checks"]["fitted"])
 
-    # judged in space: true image points of true points, triangulated by the calibration that was found
+    # compared in space: true image points of true points, triangulated by the calibration that was found
     points = np.stack(np.meshgrid(*[np.linspace(-4.0, 4.0, 5)] * 2, [-1.0, 0.0, 1.0]), -1).reshape(-1, 3)
     rows, sides = [], []
     for name, cam in (("cam1", CAM1), ("cam2", CAM2)):

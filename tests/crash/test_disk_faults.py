@@ -42,7 +42,7 @@ class Session:
         self.acknowledged: list[tuple[Path, str]] = []  # files and what they must hold
 
     def _ask(self, work: Callable[[], Any]) -> Any:
-        """Do one thing as the service does; what fails is told and not tried again."""
+        """Do one thing as the service does; a failure is reported and not tried again."""
         try:
             return work()
         except StorageError as error:

@@ -1,4 +1,4 @@
-"""The end in order: the stage first, then requests, then the rest; and what systemd hears of it."""
+"""The end in order: the stage first, then requests, then the rest; and the messages to systemd."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ UNIT = ROOT / "deploy" / "stereorig.service"
 
 
 class Listener:
-    """Stands where systemd would: a datagram socket, and when each message came."""
+    """In place of systemd: a datagram socket, and when each message came."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

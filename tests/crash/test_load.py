@@ -1,4 +1,4 @@
-"""The short form of the load run: losses and memory judged strictly, times generously (`make load`: the long form)."""
+"""The short form of the load run: strict on losses and memory, generous on times (`make load`: the long form)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_captures_readers_slow_streams_an_analysis_and_stops_at_once(
     load = Load(**json.loads(figures.read_text()))
     print("\n".join(lines(load)))
     record_property("load", "; ".join(lines(load)))
-    # strictly: nothing lost, nobody turned away, no stream dropped
+    # strictly: nothing lost, no client turned away, no stream dropped
     assert load.lost == []
     assert load.wrong == []
     assert len(load.captures) >= 30

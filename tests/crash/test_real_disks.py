@@ -90,7 +90,7 @@ try:
                     wrong.append(step["n"])
         out["wrong"] = wrong
         out["shown"] = len(client.get(f"{api}/tests/{test_id}").json()["steps"])
-        # whoever looks after the machine makes room
+        # an administrator makes room
         (data / "ballast").unlink()
         again = new_test(client)
         out["again"] = client.post(f"{api}/tests/{again}/steps", json={}).status_code

@@ -139,7 +139,7 @@ def test_a_service_that_ends_or_dies_in_mid_move_leaves_nothing_moving(tmp_path:
             job = start_long_move(client, controller)
             process.kill()
             process.wait()
-            assert controller.axis(1).moving  # nobody could stop it
+            assert controller.axis(1).moving  # no client could stop it
         with serving(tmp_path, server.url, driver) as (_, client):
             # opening did
             assert not controller.axis(1).moving

@@ -99,7 +99,7 @@ def test_each_role_may_do_its_part(asks: httpx.Client, keys: dict[str, str]) -> 
     for role in keys:
         assert asks.get(f"{API}/rig", headers=bearer(keys[role])).status_code == 200
         assert asks.get(f"{API}/session", headers=bearer(keys[role])).json() == {"name": f"{role}-key", "role": role}
-        # whoever sees that something goes wrong may stop it
+        # any user who sees that something goes wrong may stop it
         assert asks.post(f"{API}/stage/stop", headers=bearer(keys[role])).status_code == 200
     refused = asks.post(f"{API}/tests", json={"name": "x"}, headers=bearer(keys["viewer"]))
     assert refused.status_code == 403
@@ -252,7 +252,7 @@ def test_keys_on_a_network_without_tls_are_warned_about(tmp_path: Path) -> None:
         assert tls_is_missing(host, None)
         assert not tls_is_missing(host, tmp_path / "cert.pem")
     for host in ("127.0.0.1", "localhost", "::1"):
-        assert not tls_is_missing(host, None)  # nobody else hears it there
+        assert not tls_is_missing(host, None)  # no other machine receives it there
     KeyFile(tmp_path / "data").path.parent.mkdir()
     KeyFile(tmp_path / "data").add("one", "viewer")
     (tmp_path / "rig.toml").write_text(TINY)

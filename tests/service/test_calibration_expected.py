@@ -24,7 +24,7 @@ API = "/api/v1"
 
 
 def test_the_expected_uncertainty_is_that_of_the_calibration_then_made() -> None:
-    """Observations by the printed equations, with noise; the plan knows the nominal cameras only."""
+    """Observations by the printed equations, with noise; the plan has the nominal cameras only."""
     rng = np.random.default_rng(3)
     noise, positions, held = 0.01, (-4.0, 0.0, 4.0), (2.0,)
     X, Y = nodes(Grid())

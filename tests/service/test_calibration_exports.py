@@ -58,7 +58,7 @@ PAPER = {
     },
     "image_size_px": {"cam1": list(SIZE), "cam2": list(SIZE)},
 }
-# two cameras of a public VIC-3D project (test data of DICe, BSD-3): what such files look like
+# two cameras of a public VIC-3D project (test data of DICe, BSD-3): an example of such files
 VIC3D = """<?xml version="1.0" encoding="ISO-8859-1"?>
 <!DOCTYPE vpml>
 <project dir="C:/Versuche/Größe">
@@ -209,7 +209,7 @@ def test_other_readers_see_what_was_calibrated(form: Any, what: str) -> None:
         assert made.report.exact is True
         assert back.max_px < 1e-8
         assert back.max_mm < 1e-8
-    else:  # nothing is said to be exact that is not
+    else:  # nothing inexact is reported as exact
         assert made.report.exact is False
         assert left > 1e-3
         assert back.max_mm > 1e-6
@@ -288,7 +288,7 @@ def test_vic3d_cameras_look_at_one_place() -> None:
     assert loaded.pair.cam1.lens.kernel_parameters()[1:6] == pytest.approx(
         [6636.033383, 6636.440175, -5.693077075e-04, 955.0537385, 645.2301624]
     )
-    # another order of the angles lets the cameras look apart: they meet in front of them, half a baseline / tan away
+    # another order of the angles makes the axes diverge: they meet in front of them, half a baseline / tan away
     met = loaded.pair.triangulate(np.array([959.5, 599.5]), np.array([959.5, 599.5]))
     assert met.valid
     z = loaded.pair.cam1.cam_from_sys.apply(met.xyz_mm)[2]

@@ -348,7 +348,7 @@ def test_everything_that_is_made_is_made_once_also_after_a_restart(again: Any, t
         len(steps_of(client, test_id)),
         len(client.get(f"{API}/noise").json()["noise"]),
     )
-    # the watch lives on, and knows what it took last
+    # the watch lives on, with its last step
     shown = client.get(f"{API}{url}/watch").json()
     assert (shown["active"], shown["last_value"]) == (True, 5.0)
     assert client.post(f"{API}{url}/channels", json={"load_n": 5.5}).json()["taken"] is False

@@ -189,7 +189,7 @@ def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(own: Servic
         with dial(port) as newcomer:
             newcomer.sendall(request("GET", "/healthz"))
             assert newcomer.recv(65536).startswith(b"HTTP/1.1 200")
-            assert ended(view)  # what only looks went first
+            assert ended(view)  # a mere reader went first
         busy.append(opened(f"{API}/events"))  # now all work
         with dial(port) as crowded:
             crowded.sendall(request("POST", f"{API}/stage/stop", "Content-Length: 0"))

@@ -67,7 +67,7 @@ def assert_close(actual: Any, expected: Any) -> None:
 
 
 def assert_same_results(host: Host, one: str, two: str) -> None:
-    """Bit by bit, in every variable of every step; and in what the summaries tell of it."""
+    """Bit by bit, in every variable of every step; and in the summaries."""
     for n in range(STEPS):
         a, b = (contents(folder_of(host, url) / f"step_{n:04d}.nc") for url in (one, two))
         assert a.keys() == b.keys()

@@ -47,7 +47,7 @@ def test_what_has_not_changed_is_not_sent_again(client: httpx.Client) -> None:
     changed = client.get(url, headers={"If-None-Match": tag})
     assert changed.status_code == 200
     assert changed.headers["etag"] != tag
-    # what nobody thought of has one too
+    # an unforeseen error has one too
     listed = client.get(f"{API}/calibrations")
     assert client.get(f"{API}/calibrations", headers={"If-None-Match": listed.headers["etag"]}).status_code == 304
 

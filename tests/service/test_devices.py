@@ -1,4 +1,4 @@
-"""`stereorig devices`, `GET /devices`: what is found, what is wrong with it, and that looking disturbs nobody."""
+"""`stereorig devices`, `GET /devices`: what is found, what is wrong with it, and a search that disturbs no program."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_a_port_that_another_program_holds_names_it(port: str, how: str, tmp_pat
         assert other.stdout.readline() == "held\n"
         proc = Path("/proc")
         if how == "locked":
-            # as another user would see it: the table of locks, but nobody's open files
+            # as another user would see it: the table of locks, but no open files
             proc = tmp_path
             (proc / "locks").write_text(Path("/proc/locks").read_text())
             (proc / str(other.pid)).mkdir()

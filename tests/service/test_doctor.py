@@ -1,4 +1,4 @@
-"""`stereorig doctor`: a good bench is called good, and each thing that is wrong is found, named and judged."""
+"""`stereorig doctor`: a good bench is reported good, and each fault is found, named and rated."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_black_and_saturated_images_are_warned_of(rig: Path, light: float, code:
     assert image.state == "warning"
     assert image.found.startswith(code)
     assert image.remedy is not None
-    assert report.good  # the bench works; what stands before it is another matter
+    assert report.good  # the bench works; what is before it is another matter
 
 
 def test_an_image_of_another_size_than_the_rig_file_says_fails(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:

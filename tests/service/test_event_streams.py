@@ -1,4 +1,4 @@
-"""Event streams that resume: after a lost connection, after a restart, and what a reader is told that lost events."""
+"""Event streams that resume: after a lost connection, after a restart, and the message to a reader that lost events."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_jobs_stream_resumes_and_ends_with_the_job(client: httpx.Client, servi
     assert states[-1] == "succeeded"
     middle = everything[1][0]
     assert read_events(client, f"/jobs/{job['id']}/events", middle) == everything[2:]
-    # all seen: the job's end is told once more, so that the reader knows
+    # all seen: the job's end is sent once more, so that the reader has it
     last = read_events(client, f"/jobs/{job['id']}/events", service.hub.last_number)
     assert [data["state"] for _, _, data in last] == ["succeeded"]
     assert everything[-1][2]["result"]["axes"]["1"]["position_mm"] == pytest.approx(0.7, abs=0.002)

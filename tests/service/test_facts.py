@@ -1,4 +1,4 @@
-"""Facts of a test: kept, replaced as a whole, guarded by If-Match; and what the rig file tells of camera and lens."""
+"""Metadata of a test: kept, replaced as a whole, guarded by If-Match; and those of camera and lens in the rig file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Computations that wait: no more than the rig file allows, and the one too many is told when to come again."""
+"""Computations that wait: no more than the rig file allows, and one too many is refused with a time to retry."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_one_too_many_is_told_when_to_come_again(
     assert int(refused.headers["retry-after"]) >= 1
     assert refused.json()["code"] == "queue_full"
     assert "Retry-After" in refused.json()["remedy"]
-    # nothing was begun, and the hardware is nobody's
+    # nothing was begun, and the hardware is free
     assert {kind: len(client.get(f"{API}/{kind}").json()[kind]) for kind in before} == {
         kind: len(found) for kind, found in before.items()
     }

@@ -69,7 +69,7 @@ def successes(operation: Json) -> Iterator[tuple[str, str, Json]]:
 
 
 def untyped(described: Json, schema: Json) -> bool:
-    """Whether a schema says of an object no more than that it is one."""
+    """Return True if a schema states of an object no more than that it is one."""
     if "$ref" in schema:
         return untyped(described, described["components"]["schemas"][schema["$ref"].rsplit("/", 1)[1]])
     return not schema or (schema.get("type") == "object" and not schema.get("properties"))

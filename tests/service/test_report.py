@@ -249,7 +249,7 @@ def test_every_item_of_the_guide_is_there_with_a_value(page: Page) -> None:
     assert page.rows.keys() >= GUIDE
     for key in GUIDE - {"floor.X", "floor.Y", "floor.Z"}:
         assert not any("not stated" in cell for cell in page.rows[key].cells), (key, page.rows[key])
-    # what nobody can know is said to be so
+    # what cannot be known is reported as unknown
     assert [page.rows[f"floor.{k}"].cells[1] for k in "XYZ"] == ["cannot be stated"] * 3
 
 
@@ -281,7 +281,7 @@ def test_pattern_size_is_the_textures(page: Page) -> None:
     rig = tomllib.loads(SMALL)
     scale = reported_numbers(page, "image_scale")[0]
     true_mm = two_point_width_mm(speckle(diameter_mm=rig["sim"]["speckle_mm"], seed=11))
-    # widened by the pixel's square and the lens (0.7 px unless the rig says otherwise)
+    # widened by the pixel's square and the lens (0.7 px unless the rig states otherwise)
     blur = rig["sim"].get("blur_px", 0.7)
     true_px = np.sqrt((true_mm / scale) ** 2 + 2.355**2 * (1.0 / 6.0 + 2.0 * blur**2))
     row = page.rows["pattern.size"]
@@ -495,13 +495,13 @@ def test_command_line_on_a_data_folder_and_what_is_missing_is_listed(
     assert "Operator" not in missing
     for key in ("lens.maker", "lighting", "floor.W"):
         assert any("not stated" in cell for cell in page.rows[key].cells), page.rows[key]
-    # what the points say of themselves stands beside all the same
+    # the points' own values are reported beside it all the same
     assert page.rows["floor.W"].numbers[5] is not None
     # each item that is not stated in the tables is in the list
     for key, row in page.rows.items():
         if key.startswith(("camera.", "lens.", "pattern.", "test.")) and "not stated" in row.cells[1]:
             assert any(name.startswith(row.cells[0]) for name in missing), row.cells
-    # the test's own folder and the analysis' are as good; facts are those kept with the test
+    # the test's own folder and the analysis' are as good; metadata are those kept with the test
     test = copy / "tests" / plate.test_id
     for path in (copy, test, test / "analyses" / plate.analysis_id):
         source = find_source(path)
@@ -570,7 +570,7 @@ def test_results_of_files_without_a_rig(plate: Measurement, tmp_path: Path) -> N
         assert name in missing, missing
     assert any(name.startswith("Calibration checks") for name in missing)
     assert len(page.pictures()) >= 7
-    # without calibration and images, what needs them is missing and the rest stands
+    # without calibration and images, what needs them is missing and the rest is reported
     for path in [*tmp_path.glob("cam*.tif"), tmp_path / "calibration.json"]:
         path.unlink()
     assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "r.html")]) == 0

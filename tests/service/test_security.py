@@ -29,13 +29,13 @@ from tests.support.raw_http import ask, send
 from tests.support.service_rig import new_test, tiny_config, wait_for_rig
 
 API = "/api/v1"
-#: texts that only the inside knows
+#: texts that must stay inside
 SECRETS = (b"tiny rig", b"root:", b"canary", b"sha256")
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a data folder in it, and things beside that nobody may reach."""
+    """A folder with a data folder in it, and files beside it that no client may reach."""
     folder = tmp_path_factory.mktemp("security")
     (folder / "canary.txt").write_text("canary")
     (folder / "calibration.json").write_text('{"canary": 1}')
@@ -267,7 +267,7 @@ def test_names_in_uploads_and_labels_are_kept_as_text_or_refused(client: httpx.C
 
 @pytest.mark.fault(46)
 def test_a_link_in_the_data_folder_gives_away_nothing(client: httpx.Client, base: Path) -> None:
-    # somebody who can write there could read the rest anyway; a copied folder may hold one all the same
+    # a user who can write there could read the rest anyway; a copied folder may hold one all the same
     test_id = new_test(client)
     client.post(f"{API}/tests/{test_id}/steps", json={})
     image = base / "data" / "tests" / test_id / "steps" / "0000" / "cam1.tif"
@@ -381,7 +381,7 @@ def test_no_operation_falls_over_any_of_these_bodies(client: httpx.Client) -> No
 
 
 def png(width: int, height: int, depth: int = 8, data: bytes = b"", *chunks: tuple[bytes, bytes]) -> bytes:
-    """Build a gray PNG whose header says what it likes."""
+    """Build a gray PNG with an arbitrary header."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))

@@ -540,7 +540,7 @@ def test_moves_before_homing_are_refused(tmp_path: Path) -> None:
     made = Service(tiny_config(settle_ms="settle_ms = 0\nhome_at_start = false"), tmp_path / "data").start()
     try:
         with served(made) as own:
-            # the simulated controller powers up with its motors off and knows no position
+            # the simulated controller powers up with its motors off and without a position
             assert_problem(own.post(f"{API}/stage/moves", json={"positions_mm": {"1": 1.0}}), 409, "motor_off")
             assert_problem(own.post(f"{API}/calibrations"), 409, "motor_off")
             assert wait_for_job(own, own.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"

@@ -296,7 +296,7 @@ def test_a_crack_and_a_hole_are_kept_to_and_told(client: httpx.Client, plate_tes
     inside = (x >= 95) & (x <= 115) & (y >= 80) & (y <= 100)
     assert (status[inside] == 2).all()
     assert (status[~inside] == 0).mean() > 0.97
-    # half a subset says less than a whole one
+    # half a subset has a larger uncertainty than a whole one
     lips = (np.abs(y - 118.6) < 4) & (x > 85) & (x < 115)
     assert np.nanmedian(sigma[lips]) > 1.3 * np.nanmedian(sigma[y > 133])
 

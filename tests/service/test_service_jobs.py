@@ -82,7 +82,7 @@ def test_hardware_jobs_exclude_each_other_and_name_the_holder(bench: Bench) -> N
 
 @pytest.mark.fault(28)
 def test_what_is_done_to_a_holder_never_meets_the_next_one() -> None:
-    """A cancelled job is stopped again until it has let go; whoever holds the hardware then must not be stopped."""
+    """A cancelled job is stopped again until it has let go; the next holder of the hardware must not be stopped."""
     gate = HardwareGate()
     first = gate.claim("a move", job_id="j1")
     stopping, stopped, order = threading.Event(), threading.Event(), []

@@ -80,7 +80,7 @@ def test_a_fresh_worker_goes_on_from_the_files(inputs: Path, tmp_path: Path) -> 
             for name in ("u_mm", "v_mm", "w_mm", "stretch_11", "sigma_u_mm", "propagated_noise_xx_px2", "status"):
                 np.testing.assert_allclose(a[name], b[name], rtol=1e-5, atol=1e-9, err_msg=name)
             assert json.loads(a.attrs["settings"])["reference_update"] == "always"
-            # a file written anew by somebody else is no reference any more
+            # a file written anew by another program is no reference any more
     document = fresh[3]
     spoiled = replace(document, earlier={6: replace(document.earlier[6], sha256=("0" * 64, "0" * 64))})
     measurement._kept.clear()

@@ -1,4 +1,4 @@
-"""The compute worker: an executor whose one process tells its progress, can be stopped and may die."""
+"""The compute worker: an executor whose one process reports its progress, can be stopped and may die."""
 
 from __future__ import annotations
 

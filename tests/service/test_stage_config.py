@@ -77,7 +77,7 @@ def test_simulated_cameras_can_look_at_a_real_stage_which_is_not_homed_unasked()
             devices.stage.home(1)
             devices.stage.move_to(1, 2.0)
             assert devices.world is not None
-            # the pictures follow the stage: at 2 mm the camera stands where the true rig would be
+            # the pictures follow the stage: at 2 mm the camera is where the true rig would be
             assert devices.world._position_mm(1) == pytest.approx(2.0, abs=1e-4)
         finally:
             devices.close()

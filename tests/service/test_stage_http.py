@@ -1,4 +1,4 @@
-"""The stage over HTTP, with the controller outside the service: what may go wrong, and what stands on the wire then."""
+"""The stage over HTTP, with the controller outside the service: faults, and the commands on the wire then."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_a_move_whose_job_is_cancelled_is_stopped(homed: StageService) -> None:
         wait_until(lambda: not homed.axis(1).moving)
         assert homed.done(job)["state"] == "cancelled"
         assert homed.controller.true_position_mm(1) < 4.0
-        # the position is read back, since the controller knows it: nothing is unknown
+        # the position is read back, since the controller has it: nothing is unknown
         axis = homed.stage()["axes"][0]
         assert axis["position_mm"] == pytest.approx(homed.controller.true_position_mm(1), abs=2e-4)
     finally:
@@ -192,7 +192,7 @@ def test_who_sees_that_a_job_has_ended_may_move_at_once(homed: StageService) -> 
         homed.post("/stage/stop")
         assert homed.done(stopped)["state"] == "cancelled"
         homed.axis(1).velocity_mm_s = 10.0
-        back = homed.job("/stage/moves", positions_mm={"1": 0.0})  # refused, if somebody still had the hardware
+        back = homed.job("/stage/moves", positions_mm={"1": 0.0})  # refused, if the hardware were still held
         assert homed.done(back)["state"] == "succeeded"
         assert [seen[job["id"]] for job in (stopped, back)] == [None, None]
     finally:

@@ -1,4 +1,4 @@
-"""Every command of the tutorial is run as it stands there, against a served rig, and what it measures is the truth."""
+"""Every command of the tutorial is run as it is printed, against a served rig, and what it measures is the truth."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_from_files(client: httpx.Client, tmp_path: Path) -> None:
     (tmp_path / "read.py").write_text(one_block(FILES, "python", "netCDF4"), encoding="utf-8")
     done = run([sys.executable, "read.py"], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert float(done.stdout) == pytest.approx(-0.117, abs=0.001)  # mm, as the page says
+    assert float(done.stdout) == pytest.approx(-0.117, abs=0.001)  # mm, as the page states
     assert json.loads((tmp_path / "calibration.json").read_text())["verdict"]["level"] == "good"
     with (tmp_path / "gauges.csv").open(encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))

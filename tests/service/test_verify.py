@@ -274,7 +274,7 @@ def test_what_is_no_data_folder_or_a_newer_one_is_refused(data: Path, tmp_path: 
 
 
 def everything_else(client: httpx.Client) -> None:
-    """What else a service writes: decisions, facts, a watch, noise, an export, and something in the trash."""
+    """What else a service writes: decisions, metadata, a watch, noise, an export, and something in the trash."""
     test_id = client.get(f"{API}/tests").json()["tests"][0]["id"]
     test = f"{API}/tests/{test_id}"
     body: dict[str, Any] = {"region": {"rectangle": [80, 80, 160, 150]}, "subset_px": 21, "strain": None}

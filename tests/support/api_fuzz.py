@@ -65,7 +65,7 @@ class Impatient:
         async def on_send(message: Any) -> None:
             nonlocal ended
             if ended:
-                return  # nobody hears it any more
+                return  # it is not received any more
             ended = message["type"] == "http.response.body" and not message.get("more_body", False)
             await send(message)
             answered.set()
@@ -78,7 +78,7 @@ class Impatient:
             done, _ = await asyncio.wait({work}, timeout=_STREAM_S)
             if not done:
                 gone.set()
-                # it may have said its last word, and not have returned yet
+                # it may have sent its last message, and not have returned yet
                 over, ended = ended, True
                 if not over:
                     await send({"type": "http.response.body", "body": b"", "more_body": False})
@@ -91,7 +91,7 @@ class Impatient:
 
 
 def _until(gone: asyncio.Event, receive: Any) -> Any:
-    """What an application hears from a client: its body, and once it has gone, that."""
+    """What an application receives from a client: its body, and once it has gone, that."""
     begun = False
 
     async def hears() -> Any:

@@ -23,7 +23,7 @@ API = "/api/v1"
 REGION = {"rectangle": [95, 95, 165, 150]}
 MAX_ITEMS = 4
 TEXT_CHARACTERS = 400
-#: stands in an example for a file that text cannot hold
+#: placeholder in an example for a file that text cannot hold
 FILE = "(the bytes of a file)"
 
 

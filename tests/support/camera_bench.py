@@ -89,7 +89,7 @@ class CameraBench(ABC):
 
 
 class _Corridor:
-    """A world that knows nothing but noise, so that no two frames are alike."""
+    """A world of noise alone, so that no two frames are alike."""
 
     def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         assert rng is not None

@@ -57,7 +57,7 @@ def _side_of(motion: Motion, camera: Camera, side: Side, shape: tuple[int, int],
 
 
 def true_uvw(points: NDArray[np.float64], side: Side) -> NDArray[np.float64]:
-    """True displacement (r, c, 3) of places (r, c, 2) of camera 1's reference image."""
+    """True displacement (r, c, 3) at positions (r, c, 2) of camera 1's reference image."""
     grid = bench.PointGrid(points[..., 0], points[..., 1], np.ones(points.shape[:2], bool), 1.0, (0.0, 0.0, 1.0, 1.0))
     before = bench.scene("block", 1.0, STILL)
     up, down = (bench.truth(grid, before, bench.scene("block", 1.0, motion)).uvw_mm for motion in (UP, DOWN))

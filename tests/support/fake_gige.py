@@ -191,7 +191,7 @@ def _clean_up_after_others() -> None:
 
 
 def settings_of(camera: FakeCamera) -> Mapping[str, str]:
-    """What a rig file says of it."""
+    """Its part of a rig file."""
     return {"driver": "aravis", "device": camera.device, "trigger_source": "Line0"}
 
 

@@ -40,7 +40,7 @@ def make_field(
     cuts: Cuts | None = None,
     growing: bool = True,
 ) -> Field:
-    """A field without noise, whose covariance says what it would have; ``motion`` maps X to its place now."""
+    """A field without noise, with the covariance that it would have; ``motion`` maps X to its current position."""
     x, y = np.meshgrid(40.0 + STEP * np.arange(cols), 60.0 + STEP * np.arange(rows))
     xyz = shape(x, y)
     status = np.zeros(x.shape, np.int8)

@@ -1,4 +1,4 @@
-"""Two GigE cameras that look at the simulated world, and the simulated controller that moves them, as a process.
+"""Two GigE cameras in front of the simulated world, and the simulated controller that moves them, as a process.
 
 Aravis' own fake camera speaks GigE Vision on the wire; only its pictures are ours. So the images of a simulated rig go
 through the same driver, network and buffers as a real camera's.
@@ -97,7 +97,7 @@ def main(rig_file: str, *addresses: str) -> None:
     controller = SimESP301(axes=2, travel_mm=(-12.0, 12.0), time_scale=2.5)
     world = SimWorld(rig, controller.true_position_mm)
     for cam in CAMERAS:
-        world.expose(cam, exposure_ms=10.0, rng=None)  # compiles, and renders where the stage stands
+        world.expose(cam, exposure_ms=10.0, rng=None)  # compiles, and renders at the stage's position
     lib = _library()
     ending = threading.Event()
     threading.Thread(target=_render_ahead, args=(world, controller, ending), daemon=True).start()

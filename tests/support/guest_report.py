@@ -1,6 +1,6 @@
-"""A pytest plugin for the tests in the guest: tells each outcome as soon as it stands, lists tests with their marks.
+"""A pytest plugin for the tests in the guest: reports each outcome at once, lists tests with their marks.
 
-What was told stays told when the guest dies in the next test.
+What was reported stays when the guest dies in the next test.
 """
 
 from __future__ import annotations

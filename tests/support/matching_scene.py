@@ -202,7 +202,7 @@ class Bent:
         c, d = frame @ (centre - self.origin), directions @ frame.T
         k11, k12, k22 = self.bend
         a, b = d[..., 0], d[..., 1]
-        # from where the ray meets the tangent plane: of the two places on the bent surface the near one
+        # from where the ray meets the tangent plane: of the two positions on the bent surface the near one
         p = c[:2] - (c[2] / d[..., 2])[..., None] * d[..., :2]
         p1, p2 = p[..., 0], p[..., 1]
         # height(p + t d) = t d2, as A t^2 - B t + C = 0

@@ -1,4 +1,4 @@
-"""Debian's Chromium on the page: what it says and asks is watched."""
+"""Debian's Chromium on the page: its messages and requests are watched."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Watched:
 
 def browser() -> contextlib.AbstractContextManager[Browser]:
     """Start Chromium without a window."""
-    chromium()  # says what is missing
+    chromium()  # reports what is missing
     return page_browser.browser()
 
 

@@ -92,7 +92,7 @@ def measure(
 def measure_from_files(
     images: Sequence[Sequence[np.ndarray]], known: dict[int, Field], n: int, mode: ReferenceUpdate, folder: Path
 ) -> Field:
-    """Measure step ``n`` alone, with what the files of the steps before tell."""
+    """Measure step ``n`` alone, from the files of the steps before."""
     for k, field in known.items():
         write_field(folder / f"step_{k:04d}.nc", field, Provenance({}, {}, "test", step=k))
     pairs = [(MeasureImage(one), MeasureImage(two)) for one, two in images]

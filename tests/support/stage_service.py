@@ -1,4 +1,4 @@
-"""The service with simulated cameras and a stage whose controller stands outside, where the wire can be watched."""
+"""The service with simulated cameras and a stage whose controller is outside, where the wire can be watched."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def make_field(
 
 
 def plane(a: Array, b: Array) -> Array:
-    """A plane square to Z_sys, seen as by a camera that looks at it under perspective."""
+    """A plane square to Z_sys, seen as by a camera under perspective."""
     scale = 1.0 + 0.004 * a + 0.006 * b
     return np.stack([a * scale, b * scale, np.zeros_like(a)], axis=-1)
 

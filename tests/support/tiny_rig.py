@@ -8,7 +8,7 @@ TINY = (ROOT / "config" / "sim_tiny.toml").read_text(encoding="utf-8")
 
 
 def tiny_rig(**replacements: str) -> str:
-    """Return the file's text with lines replaced, wherever they stand (``velocity_mm_s="velocity_mm_s = 1.0"``)."""
+    """Return the file's text with lines replaced, wherever they are (``velocity_mm_s="velocity_mm_s = 1.0"``)."""
     lines = TINY.splitlines()
     known = {line.split(" =")[0] for line in lines}
     if missing := set(replacements) - known:

@@ -39,7 +39,7 @@ class Dial:
     step: int
     value: int
     info: int = 0x03  # can be read and set; 0x08: changes by itself
-    clamp_at: int | None = None  # takes no more than this, and says nothing
+    clamp_at: int | None = None  # takes no more than this, without an error
     writes: list[int] = field(default_factory=list)
 
 

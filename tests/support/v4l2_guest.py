@@ -66,7 +66,7 @@ $B poweroff -f
 
 
 class Missing(Exception):
-    """Something that the guest needs is not installed; the text says what."""
+    """Something that the guest needs is not installed; the text names it."""
 
 
 @dataclass
@@ -81,7 +81,7 @@ class Outcome:
 
 @dataclass
 class Report:
-    """What the guest told."""
+    """Results of the guest."""
 
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     serial: str = ""
@@ -295,7 +295,7 @@ def _accelerators() -> list[str]:
 
 
 def _runs(machine: list[str], folder: Path, limit_s: float, word_s: float) -> bool:
-    """Run the machine to its end; False when it had not said a word after ``word_s``.
+    """Run the machine to its end; False when it had printed nothing after ``word_s``.
 
     /dev/kvm may open and still not carry a guest: inside another virtual machine it may hang in its first instructions.
     """

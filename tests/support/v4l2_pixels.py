@@ -37,7 +37,7 @@ BYTES: dict[str, list[list[str]]] = {
 
 
 def packed(table: list[list[str]], pixels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Write lines as the table says; colour is noise."""
+    """Write lines by the table; colour is noise."""
     group = 1 + max(int(m) for byte in table for part in byte for m in re.findall(r"^(\d+)\[", part))
     rows, width = pixels.shape
     groups = -(-width // group)

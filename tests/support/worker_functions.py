@@ -47,7 +47,7 @@ def die() -> None:
 
 
 class Image:
-    """Something large that knows itself, as a context and what it measures with know each other."""
+    """A large object with a reference cycle, as between a context and what it measures with."""
 
     def __init__(self) -> None:
         self.pixels = np.zeros((2048, 2048))

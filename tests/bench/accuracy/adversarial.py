@@ -113,7 +113,7 @@ def _scene(setting: _Setting) -> _Scene:
 
 
 def _touched(mask: Mask, xy_px: Float, subset_px: int) -> Mask:
-    """Where a subset about places (r, c, 2) reaches a spoiled pixel."""
+    """Mask of subsets about positions (r, c, 2) that reach a spoiled pixel."""
     if not mask.any():
         return np.zeros(xy_px.shape[:2], bool)
     reach = subset_px // 2 + SPLINE_PX + 1

@@ -30,7 +30,7 @@ NAMES = {"affine": "plane", "quadratic": "quadratic", "auto": "auto"}
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one field, um: of the place along Z_sys (r, c) and of the displacement (r, c, 3), NaN where empty."""
+    """Errors of one field, um: of the position along Z_sys (r, c) and of the displacement (r, c, 3), NaN where empty."""
 
     field: Field
     z_um: Float

@@ -32,7 +32,7 @@ def _xy(field: Field) -> Float:
 
 
 def _errors(rig: Rig, before: Scene, after: Scene, field: Field) -> tuple[Float, Float, Float]:
-    """Errors of displacement (n, 3), of the place along Z_sys (n,), and (r, c, 3) displacement errors with holes, um."""
+    """Errors of displacement (n, 3), of the position along Z_sys (n,), and (r, c, 3) displacement errors with holes, um."""
     assert field.uvw_mm is not None
     xyz, uvw = true_points(before, after, rig.pair.cam1, _xy(field))
     error = (field.uvw_mm - uvw) * 1e3
@@ -68,7 +68,7 @@ def plane(figures: Path) -> Section:
             scene = plane_scene(rig.texture(seed))
             field = measure_shape(rig.pair, *rig.capture(scene, seed=seed), _grid(), MeasureOptions(subset_px=subset))
             xyz, _ = true_points(scene, scene, rig.pair.cam1, _xy(field))
-            # along Z_sys at the measured place: the plane is Z = 0, so Z itself
+            # along Z_sys at the measured position: the plane is Z = 0, so Z itself
             errors.append(((field.xyz_mm - xyz)[..., 2] * 1e3)[field.valid])
             sigmas.append(field.sigma_mm[..., 2][field.valid] * 1e3)
             lost += int((~field.valid).sum())

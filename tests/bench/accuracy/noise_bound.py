@@ -130,7 +130,7 @@ class _Point:
         return np.stack(columns, axis=-1)
 
     def _carried(self, k: int, unknowns: Float, pixels: Float, xy: Float) -> Float:
-        """Derivative (pixels, 2, 2) of comparison k's image places over the reference's."""
+        """Derivative (pixels, 2, 2) of comparison k's image coordinates over the reference's."""
         h = 0.02
         by = [
             (self._position(k, unknowns, pixels + d, xy) - self._position(k, unknowns, pixels - d, xy)) / (2 * h)

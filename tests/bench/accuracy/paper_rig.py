@@ -69,7 +69,7 @@ def plane_scene(texture: Texture, *, in_plane: Float | None = None, motion: Rigi
 
 
 def true_points(scene: Scene, moved: Scene, camera: Camera, xy_px: Float) -> tuple[Float, Float]:
-    """Reference places and displacements (..., 3), system frame, of the material that camera 1's pixels see."""
+    """Reference positions and displacements (..., 3), system frame, of the material that camera 1's pixels see."""
     st, lip = material_points(scene, camera, xy_px)
     here = scene.sys_from_body.apply(scene.surface.place(st, lip))
     there = moved.sys_from_body.apply(moved.surface.place(st, lip))

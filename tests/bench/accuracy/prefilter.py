@@ -1,4 +1,4 @@
-"""What a Gaussian prefilter gains and costs: mean error over sub-pixel phase, random error, and what is told of it."""
+"""What a Gaussian prefilter gains and costs: mean error over sub-pixel phase, random error, and its reported uncertainty."""
 
 from __future__ import annotations
 

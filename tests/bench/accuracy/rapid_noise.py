@@ -1,4 +1,4 @@
-"""Noise of a field told from the field itself: differences of neighbours, which what is smooth does not reach.
+"""Noise of a field, estimated from the field itself: differences of neighbours, to which smooth parts do not add.
 
 Fourth differences over a few steps along the rows take out whatever is a cubic there: the specimen's own deformation.
 Noise stays, and by how much follows from the pixels that subsets share. The ratio of what is seen to what the results
@@ -29,12 +29,12 @@ def window_slope(window: int, axis: int) -> Float:
 def observed_over_reported(
     values: Float, sigma: Float, weights: Float, shared: SharedPixels, spacing_px: float, lag: int
 ) -> float:
-    """Return the noise that is seen over that which is told.
+    """Return the noise that is observed over that which is reported.
 
     Parameters
     ----------
     values, sigma
-        (r, c) a quantity that is the same weighted sum of the points about each point, and what is told of its noise.
+        (r, c) a quantity that is the same weighted sum of the points about each point, and its reported noise.
     weights
         (m, n) of that sum; ``[[1]]`` for the points themselves.
     shared
@@ -42,7 +42,7 @@ def observed_over_reported(
     spacing_px
         Distance of neighbouring points.
     lag
-        Steps between the places that are differenced.
+        Steps between the positions that are differenced.
     """
     signs = np.zeros((1, ORDER * lag + 1))
     signs[0, ::lag] = [(-1) ** k * comb(ORDER, k) for k in range(ORDER + 1)]

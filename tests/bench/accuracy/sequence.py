@@ -45,7 +45,7 @@ class _Motion:
 
 @dataclass(frozen=True)
 class _Followed:
-    """Per step, over seeds and points: share valid, error rms and told sigma rms of u, v, w in um, references used."""
+    """Per step, over seeds and points: share valid, error rms and reported sigma rms of u, v, w in um, references used."""
 
     valid: Float
     error: Float

@@ -1,4 +1,4 @@
-"""Displacement smoothing: noise left, what is told of it, and how much of a wave is left."""
+"""Displacement smoothing: noise left, its reported uncertainty, and how much of a wave is left."""
 
 from __future__ import annotations
 

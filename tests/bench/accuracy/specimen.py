@@ -1,4 +1,4 @@
-"""The real specimen in tension, as a user measures it: strain, its noise told and seen, extensometers."""
+"""The real specimen in tension, as a user measures it: strain, its noise reported and observed, extensometers."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _extensometers(read: Sequence[dict[str, Any]]) -> list[Row]:
 
 
 def _noise(field: Field) -> tuple[list[Row], dict[int, tuple[float, Float, Float]]]:
-    """Noise of displacements, and of strain for several windows: told, and seen."""
+    """Noise of displacements, and of strain for several windows: reported, and observed."""
     shared = SharedPixels.of(field, SUBSET)
     rows, curve = [], {}
     assert field.uvw_mm is not None

@@ -178,7 +178,7 @@ def moved_fields(rig: Rig, repeats: int) -> list[Field]:
 
 
 def _noise(rig: Rig, repeats: int = 12) -> tuple[list[Row], dict[int, tuple[float, float, float]]]:
-    """Scatter of repeated noisy pictures against what is told, for several windows."""
+    """Scatter of repeated noisy pictures against the reported uncertainty, for several windows."""
     fields = moved_fields(rig, repeats)
     rows, curve = [], {}
     for window in WINDOWS:

@@ -1,4 +1,4 @@
-"""Tells what of a change of an OpenAPI description breaks clients that were written against the older one."""
+"""Reports what of a change of an OpenAPI description breaks clients that were written against the older one."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class _Pages:
             for method, operation in methods.items():
                 if method in _METHODS:
                     self.tags.setdefault(operation["tags"][0], []).append((method, path, operation))
-        #: the page on which a model stands: that of the first tag that uses it
+        #: the page that describes a model: that of the first tag that uses it
         self.home: dict[str, str] = {}
         for tag, operations in self.tags.items():
             for _, _, operation in operations:

@@ -1,4 +1,4 @@
-"""Writes docs/openapi.json, the description of the API, and says whether its version must be stepped.
+"""Writes docs/openapi.json, the description of the API, and reports whether its version must be stepped.
 
 ``docs/openapi_released.json`` is the description of the last release. What differs from it in a way that breaks
 clients needs a step of ``API_VERSION`` (server/api/docs/openapi.py); everything else only this script.

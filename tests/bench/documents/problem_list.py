@@ -1,6 +1,6 @@
 """Writes server/static/problems.json: every code that the program can raise, with status, causes and remedies.
 
-It is read out of the source: each place where an error of the project's tree, or a problem of the API, is made. The
+It is read out of the source: each line where an error of the project's tree, or a problem of the API, is made. The
 service shows it at ``/problems``.
 
 ::
@@ -25,9 +25,9 @@ from tests.support.requirements import ROOT
 LIST = ROOT / "server" / "static" / "problems.json"
 PACKAGES = ("core", "drivers", "server", "sim")
 _WORD = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-#: answers that are made without an error of the tree: name, then the places of status, code, cause, remedy
+#: answers that are made without an error of the tree: name, then the argument indices of status, code, cause, remedy
 _MAKERS = {"problem_response": (0, 1, 2, 3), "_unknown": (None, 0, 1, None)}
-#: what no sentence of the source tells: made of the web framework's own errors, or of several sentences
+#: found in no sentence of the source: made of the web framework's own errors, or of several sentences
 _MORE = {
     "http_error": (400, "The request is not one that this service answers."),
     "internal_error": (500, "An unexpected error inside the service."),
@@ -42,11 +42,11 @@ _UNKNOWN_KEY = (401, "Send 'Authorization: Bearer KEY' with a key made by 'stere
 
 
 class Kind:
-    """A class of the exception tree, as its source says."""
+    """A class of the exception tree, by its source."""
 
     def __init__(self, name: str, base: Kind | None, node: ast.ClassDef) -> None:
         self.name, self.base = name, base
-        #: what the status goes by: the class itself, or the nearest one above it that everybody knows
+        #: what the status goes by: the class itself, or the nearest one above it that is public
         self.known: type[core.errors.StereorigError] = (
             getattr(core.errors, name, None) or getattr(server.base.errors, name, None) or base.known  # type: ignore[union-attr]
         )
@@ -160,7 +160,7 @@ class Found:
         self.remedies: list[str] = []
 
     def add(self, status: int | None, cause: str | None, remedy: str | None) -> None:
-        """Note one place where it is raised."""
+        """Note one call that raises it."""
         if status is not None:
             self.statuses.add(status)
         for text, texts in ((cause, self.causes), (remedy, self.remedies)):
@@ -224,7 +224,7 @@ def _error(found: dict[str, Found], cls: Kind, call: ast.Call, names: dict[str, 
     if cause is None or not cause.strip("{.}"):
         cause = cls.about
     for code in codes:
-        # a remedy that is put together of several is told by its class
+        # a remedy that is put together of several is named by its class
         remedy = (_text(given["remedy"], names) if "remedy" in given else None) or cls.remedy
         found.setdefault(code, Found()).add(cls.status(code), cause, remedy)
 

@@ -128,7 +128,7 @@ def variables() -> list[tuple[str, str, str, str]]:
 
 
 def _attributes(model: type) -> dict[str, str]:
-    """Return the documented attributes of a class: their names, and what its docstring says of them."""
+    """Return the documented attributes of a class: their names, and their description in its docstring."""
     text = inspect.getdoc(model) or ""
     found = {}
     for names, meaning in re.findall(

@@ -155,7 +155,7 @@ def write_test_folder(folder: Path, text: str) -> None:
 
 
 def set_priority(nice: int) -> None:
-    """Set the niceness of this process, and of its session where it leads one; a right that not everybody has."""
+    """Set the niceness of this process, and of its session where it leads one; a right that not every user has."""
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, nice)
         if os.getsid(0) == os.getpid():
@@ -267,7 +267,7 @@ def time_stops(client: httpx.Client, controller: SimESP301, stops: int) -> list[
 
 @contextlib.contextmanager
 def homed_bench(folder: Path, rig: Callable[[str], str]) -> Iterator[tuple[str, httpx.Client, SimESP301]]:
-    """A service on ``rig`` (stage's address -> rig file) with load steps to chew on; its controller stands in here."""
+    """A service on ``rig`` (stage's address -> rig file) with load steps to chew on; its controller is simulated here."""
     controller = SimESP301(axes=2, travel_mm=(-11.0, 11.0))
     with ControllerServer(controller) as server:
         text = rig(server.url)

@@ -1,4 +1,4 @@
-"""Kills the service a thousand times while it works, and looks after each time whether anything was lost.
+"""Kills the service a thousand times while it works, and checks each time whether anything was lost.
 
 Each kill is a SIGKILL at a random instant, while the service captures, imports, calibrates, measures noise, analyses,
 deletes or starts. After each the same data folder is served again, and everything that was ever acknowledged is compared
@@ -63,7 +63,7 @@ class Running:
     process: subprocess.Popen[bytes] | None = None
 
     def url(self) -> str:
-        """Wait until it says where it serves."""
+        """Wait until it prints where it serves."""
         deadline = time.monotonic() + _WAIT_S
         while time.monotonic() < deadline:
             line = self.out.read_text() if self.out.exists() else ""
@@ -240,7 +240,7 @@ def bring_up(running: Running, outcome: Outcome, *, cold: bool, first: bool = Fa
 
 
 def torture_folder(starter: Starter, lab: Lab, outcome: Outcome, kills: int, rng: random.Random) -> None:
-    """Kill ``kills`` services on one folder, then look a last time and end in order."""
+    """Kill ``kills`` services on one folder, then check a last time and end in order."""
     names, weights = list(ACTS), [share for share, _ in ACTS.values()]
     for k in range(kills + 1):
         act = rng.choices(names, weights)[0]
@@ -298,7 +298,7 @@ def torture(
     cold_every: int = COLD_EVERY,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Outcome:
-    """Kill and look, in data folders of ``KILLS_IN_A_FOLDER`` kills each; stops at the first folder with a loss.
+    """Kill and check, in data folders of ``KILLS_IN_A_FOLDER`` kills each; stops at the first folder with a loss.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ def serve(order: dict[str, Any]) -> None:
         from server.cli.main import main
 
         status = main(order["argv"])
-    except BaseException:  # noqa: BLE001 - whoever looks at the service finds it there
+    except BaseException:  # noqa: BLE001 - a client of the service finds it there
         import traceback
 
         traceback.print_exc()
@@ -83,7 +83,7 @@ def main() -> int:
     """Load, then fork for every line."""
     load()
     fork_workers()
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for what is killed
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # killed processes are not waited for
     print(json.dumps({"ready": True}), flush=True)
     for line in sys.stdin:
         order = json.loads(line)

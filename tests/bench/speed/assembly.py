@@ -18,7 +18,7 @@ from typing import Any
 
 from tests.support.requirements import ROOT
 
-# numba takes this machine's features unless it is told others; the processor's name implies the rest
+# numba takes this machine's features unless given others; the processor's name implies the rest
 TARGETS = {
     "haswell": "+avx2,+fma",
     "znver3": "+avx2,+fma",
@@ -107,7 +107,7 @@ def count_loop(target: str, name: str, assembly: str) -> LoopCount:
 
 
 def assemblies() -> dict[str, str]:
-    """Compile the loops over pixels for the processor that numba was told, and return their assembly."""
+    """Compile the loops over pixels for the processor that numba was given, and return their assembly."""
     from numba import float32, float64, int64, njit, void
 
     from core.matching.kernels.loops import compare_cubic, compare_quintic

@@ -62,7 +62,7 @@ class Report:
 
 
 def machine() -> list[str]:
-    """What it ran on, one fact an entry."""
+    """The machine that it ran on, one item an entry."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -159,7 +159,7 @@ def target_line(row: Row) -> list[str]:
     """One line of the page's first table."""
 
     def figure(value: float) -> str:
-        return f"{value:.3g}" if abs(value) < 1e3 else thousands(value)  # which also knows what to do with NaN
+        return f"{value:.3g}" if abs(value) < 1e3 else thousands(value)  # which also handles NaN
 
     limit = "" if row.limit is None else f"{'at least' if row.at_least else 'at most'} {figure(row.limit)}"
     met = "" if row.limit is None else ("yes" if row.met else "**no**")

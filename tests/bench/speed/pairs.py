@@ -80,7 +80,7 @@ class BenchScene:
     calibration: Path
 
     def truth(self, subset_px: int, steps: int) -> tuple[Float, Float]:
-        """True places (N, 3) at the reference and displacements (steps, N, 3), mm, system frame."""
+        """True positions (N, 3) at the reference and displacements (steps, N, 3), mm, system frame."""
         texture = load_rig(self.request.config).texture(1)  # does not matter for the truth
         before, xy = plane_scene(texture), self.request.points(subset_px)
         pairs = [

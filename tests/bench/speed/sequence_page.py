@@ -199,7 +199,7 @@ def _threads(n: int) -> str:
 
 
 def measure_all(folder: Path, *, quick: bool, only: tuple[str, ...] = ()) -> Figures:
-    """Measure everything, or the parts named in ``only``; says what it finds."""
+    """Measure everything, or the parts named in ``only``; prints the results."""
     wanted = only or PARTS
     out = Figures()
     counts = sorted({1, min(2, available_threads())})

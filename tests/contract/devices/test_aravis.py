@@ -382,7 +382,7 @@ def test_a_hardware_trigger_delivers_nothing_without_a_pulse(plain: FakeCamera, 
     grabber.arm()
     assert grabber.next_frame(0.7) is None
     assert _refused(grabber.trigger).code == "wrong_trigger"
-    # the socket also sees what a new network says of itself
+    # the socket also sees messages of a new network
     sent = grabber.statistics()
     assert sent["transferred_bytes"] == sent["completed_buffers"] == sent["failed_buffers"] == 0
 
@@ -442,7 +442,7 @@ def test_a_trigger_whose_frame_never_comes_does_not_shift_the_numbers(plain: Fak
     grabber.configure(CameraSettings(trigger="software"))
     grabber.arm()
     for _ in range(20):
-        # it looks for triggers every 40 ms: mostly the cable is out by then
+        # it checks for triggers every 40 ms: mostly the cable is out by then
         number = grabber.trigger()
         plain.unplug()
         time.sleep(0.1)
@@ -473,7 +473,7 @@ def test_statistics_tell_what_became_of_the_buffers(plain: FakeCamera, make: Mak
     assert count["completed_buffers"] >= 5
     assert count["free_buffers"] + count["waiting_frames"] in (2, 3)  # one may be being filled
     assert count["transferred_bytes"] >= 5 * 512 * 512
-    # nobody takes frames: three wait, the others find no buffer and are lost, which the numbers show
+    # frames are not taken: three wait, the others find no buffer and are lost, which the numbers show
     time.sleep(0.6)
     starved = grabber.statistics()
     assert starved["underruns"] >= count["underruns"] + 10
@@ -499,7 +499,7 @@ def test_waiting_for_a_frame_does_not_hold_up_other_threads(plain: FakeCamera, m
     thread.start()
     begin = time.monotonic()
     for _ in range(100):
-        time.sleep(0.001)  # each must get the interpreter back from the waiting thread, which looks up every 20 ms
+        time.sleep(0.001)  # each must get the interpreter back from the waiting thread, which checks every 20 ms
     assert time.monotonic() - begin < 1.0
     grabber.close()
     thread.join(2.0)
@@ -581,7 +581,7 @@ def test_it_works_again_soon_after_a_long_absence(plain: FakeCamera, make: Make,
     grabber.arm()
     _frames(grabber, 2)
     getattr(plain, how)()
-    # somebody keeps the error, and with it everything that its traceback holds
+    # a caller keeps the error, and with it everything that its traceback holds
     kept = _refused(lambda: grabber.configure(CameraSettings(exposure_ms=5.0)))
     assert kept.code == "camera_lost"
     begin = time.monotonic()

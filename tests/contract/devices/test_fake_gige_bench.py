@@ -1,4 +1,4 @@
-"""config/bench_fake_gige.toml as the file tells it: devices and doctor on real drivers, in a network of their own."""
+"""config/bench_fake_gige.toml as described there: devices and doctor on real drivers, in a network of their own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CONFIG = ROOT / "config" / "bench_fake_gige.toml"
 # root needs no user namespace, which containers often forbid
 NETWORK = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--user", "--map-root-user", "--net"]
 
-# what the head of the rig file says; the examination is one process, since each program takes seconds to start
+# the commands in the head of the rig file; the examination is one process, since each program takes seconds to start
 SCRIPT = """
 set -e
 trap 'kill $(jobs -p) 2>/dev/null' EXIT
@@ -46,7 +46,7 @@ def run(path: Path, *command: str) -> int:
 
 
 def examine_all(out: Path, cam1: int) -> None:
-    """Inside that network: look for devices and examine the bench, in all the ways that the tests look at."""
+    """Inside that network: look for devices and examine the bench, in all the ways that the tests need."""
     for _ in range(20):
         run(out / "devices.json", "devices")
         if (out / "devices.json").read_text().count("Aravis-Fake-BENCH") == 2:
@@ -138,7 +138,7 @@ def test_the_bench_is_examined(found: Path) -> None:
     for key in sure:
         assert seen[key].state == "ok", seen[key]
     assert "BENCH2" in seen["cam2", "identity"].found
-    # the fake camera looks for triggers 25 times a second
+    # the fake camera checks for triggers 25 times a second
     assert 5.0 < (seen["cam1", "frame rate"].figures["rate_hz"] or 0.0) < 26.0
     assert (seen["cam1", "link"].figures["received_packets"] or 0) > 100
     assert seen["network", "lo"].figures["mtu"] == 65536

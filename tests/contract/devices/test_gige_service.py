@@ -49,7 +49,7 @@ def network() -> Iterator[Namespace]:
 
 
 def bench_file(path: Path, text: str, devices: tuple[str, str], rig: str, size: tuple[int, int], stage: str) -> Path:
-    """A rig file for two GigE cameras, made from a simulated rig's: what its user knows of it stays."""
+    """A rig file for two GigE cameras, made from a simulated rig's: the user's part of it stays."""
     text = text.split("[sim]")[0].replace('kind = "simulated"\nmax_skew_ms = 1.0', f'kind = "real"\n{rig}')
     for cam, device in zip(("cam1", "cam2"), devices, strict=True):
         text = text.replace(

@@ -87,7 +87,7 @@ def test_pixels_are_what_the_camera_sent(webcam: tuple[UsbCamera, str], name: st
             assert frame.bit_depth == bits
             high = (frame.pixels >> bits - 8).astype(np.uint8)
             firsts.append(int(high[0, 0]))
-            # the pattern is as bright everywhere as its first pixel says, as the camera draws it
+            # the pattern is as bright everywhere as its first pixel, as the camera draws it
             pattern = camera.gray(0)
             np.testing.assert_array_equal(high, pattern - pattern[0, 0] + high[0, 0])
             if bits == 16:
@@ -140,7 +140,7 @@ def test_a_value_that_the_camera_cuts_off_in_silence_is_refused(webcam: tuple[Us
         assert error.code == "setting_not_taken"
         assert "80" in error.cause
         assert "60" in error.cause
-        # an exposure may be rounded by the camera: what it took is told
+        # an exposure may be rounded by the camera: the applied value is reported
         camera.exposure.clamp_at = 250
         assert grabber.configure(CameraSettings(exposure_ms=30.0)).exposure_ms == 25.0
 

@@ -60,7 +60,7 @@ def picture(grabber: FrameGrabber) -> Frame:
 
 
 def ctl(node: str, *arguments: str) -> str:
-    """What the kernel's own tool says."""
+    """Output of the kernel's own tool."""
     return subprocess.run(["v4l2-ctl", "-d", node, *arguments], check=True, capture_output=True, text=True).stdout
 
 

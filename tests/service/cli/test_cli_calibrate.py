@@ -237,7 +237,7 @@ def test_bad_input_gets_one_line_and_no_file(
 def test_a_calibration_that_failed_its_check_is_not_written(
     folder: Path, capsys: pytest.CaptureFixture[str], exact: dict[tuple[str, float], GrayImage]
 ) -> None:
-    # somebody bumped camera 2 before the held-out view
+    # camera 2 was bumped before the held-out view
     write_image(folder / "views" / "cam2_+2.000mm.tif", np.roll(exact["cam2", 2.0], 1, axis=1))
     assert main(command(folder, "--hold-out", "2")) == 1
     captured = capsys.readouterr()

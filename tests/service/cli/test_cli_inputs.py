@@ -237,7 +237,7 @@ def test_progress_estimates_the_time_left(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("server.cli.terminal.time.monotonic", lambda: clock[0])
     stream = Terminal()
     line = ProgressLine(stream)
-    clock[0] += 30.0  # loading, which says nothing about the pace
+    clock[0] += 30.0  # loading, which has nothing to do with the pace
     line.show("step 0 of 1", 0.0)
     clock[0] += 10.0
     line.show("step 0 of 1", 0.25)

@@ -210,7 +210,7 @@ def test_defaults_are_the_measurements_own() -> None:
 
 
 def test_strain_is_in_files_and_summary(measured: Path) -> None:
-    """A block moves as a whole: its strain is noise, of the size that is told."""
+    """A block moves as a whole: its strain is noise, of the reported size."""
     summary = json.loads((measured / "summary.json").read_text())
     assert summary["settings"]["strain"] == {"window": 9, "order": 1, "tensor": "green_lagrange"}
     assert summary["steps"][0]["strain"] is None
@@ -477,7 +477,7 @@ def test_smoothing_is_told_and_the_measurement_stays_reproducible(
     assert summary["steps"][0]["smoothing"] is None
     smoothed = summary["steps"][2]["smoothing"]
     assert (smoothed["window"], smoothed["resolution_px"]) == (5, 61.0)
-    # 33 um a pixel, more along the surface where it stands aslant
+    # 33 um a pixel, more along the surface where it is inclined
     assert 0.033 * 61 < smoothed["resolution_mm"] < 0.04 * 61
     raw, smooth = (read_field(folder / "step_0002.nc") for folder in (measured, tmp_path / "out"))
     assert smooth.smoothing is not None
@@ -497,7 +497,7 @@ def test_smoothing_is_told_and_the_measurement_stays_reproducible(
 
 
 def test_each_step_against_the_one_before_it(folder: Path, tmp_path: Path, rig: SimRig) -> None:
-    """Incremental correlation: displacements stay totals; each file says what it was matched against."""
+    """Incremental correlation: displacements stay totals; each file states what it was matched against."""
     out = tmp_path / "out"
     assert main([*command(folder, out), "--reference-update", "always", "--smooth", "3"]) == 0
     steps = json.loads((out / "summary.json").read_text())["steps"]

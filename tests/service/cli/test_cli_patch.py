@@ -112,7 +112,7 @@ def test_plane_patches_asked_for_are_taken_and_their_error_is_said(
         z, _ = errors_um(rig, data, "still")
         choice = json.loads(data.attrs["patch_choice"])
         assert choice["quadratic_advised"]
-        # what it says of itself, against the truth: the error is along camera 1's ray, 30 degrees from Z
+        # its own estimate, against the truth: the error is along camera 1's ray, 30 degrees from Z
         assert abs(choice["plane_error_mm"] * 1e3 * np.cos(np.radians(30.0)) / abs(z.mean()) - 1.0) < 0.1
         assert "curvature_1" not in data
 

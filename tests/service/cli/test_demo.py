@@ -230,7 +230,7 @@ def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
     assert answers(port)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    # a shell says 130 to both; Python ends by the signal itself where it came while a string was executed
+    # a shell reports 130 for both; Python ends by the signal itself where it came while a string was executed
     assert process.returncode in (130, -signal.SIGINT)
     assert "stereorig: interrupted" in err
     assert "Traceback" not in err

@@ -261,7 +261,7 @@ def test_the_calibrations_part_of_a_rigid_motion_is_that_of_drawn_calibrations()
         F = np.linalg.lstsq(arm[:, :2], back[:, :2], rcond=None)[0]
         e = 0.5 * (F @ F.T - np.eye(2))
         drawn.append(np.concatenate([(R * true.inv()).as_rotvec(), shift, [e[0, 0], e[1, 1], e[0, 1]]]))
-    # 300 draws tell an sd to 4 %
+    # 300 draws give an sd to 4 %
     np.testing.assert_allclose(np.std(drawn, axis=0), np.sqrt(np.diag(predicted)), rtol=0.15)
     blind = dataclasses.replace(volume, covariance=None)
     assert (steel_motion.calibration_covariance(blind, points, motion) == 0.0).all()

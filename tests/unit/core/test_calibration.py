@@ -228,7 +228,7 @@ def test_residuals_are_judged_by_the_bands(noise: float, level: str) -> None:
 
 
 def test_a_stage_that_travels_off_the_optical_axis_is_suspected() -> None:
-    # 20 mrad across cam1's axis: the whole image moves in proportion to dZ, which the residuals cannot tell
+    # 20 mrad across cam1's axis: the whole image moves in proportion to dZ, which the residuals cannot show
     shift = 12000.0 * 0.02 / 400.0
     views = [
         dataclasses.replace(v, xy_px=v.xy_px + np.array([0.0, shift * v.dz_mm])) if v.camera == "cam1" else v

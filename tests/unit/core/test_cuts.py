@@ -15,7 +15,7 @@ Point = tuple[int, int]
 
 
 def share_a_point(a: Point, b: Point, c: Point, d: Point) -> bool:
-    """Solve a + s (b - a) = c + t (d - c) in fractions; parallel lines by the places of their ends along each other."""
+    """Solve a + s (b - a) = c + t (d - c) in fractions; parallel ones by their ends along each other."""
     ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], d[0] - c[0], d[1] - c[1]
     wx, wy = c[0] - a[0], c[1] - a[1]
     det = ux * vy - uy * vx

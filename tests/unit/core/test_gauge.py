@@ -84,7 +84,7 @@ def test_sums_over_neighbours_are_the_double_sum() -> None:
         assert shared.summed(field, values) == pytest.approx(expected, abs=1e-12)
 
 
-# places between points ------------------------------------------------------------------------------------------
+# positions between points ------------------------------------------------------------------------------------------
 
 
 def test_values_between_points_are_exact_for_what_is_linear_in_a_cell() -> None:
@@ -296,7 +296,7 @@ def test_rigid_motion_states_its_covariance_and_that_of_what_is_left() -> None:
         m = rigid_motion(f, shared=SHARED)
         left = without_rigid_motion(f, m, shared=SHARED)
         assert left.uvw_mm is not None
-        # the centre moves with the noise; the motion of one place does not
+        # the centre moves with the noise; the motion of one position does not
         fixed = m.translation_mm + m.centre_mm + m.rotation @ (stated.centre_mm - m.centre_mm) - stated.centre_mm
         return np.concatenate([m.rotation_vector_rad, fixed, left.uvw_mm[at]])
 

@@ -1,4 +1,4 @@
-"""Kernels of one factory must not share a name: from the disk cache, one would stand for the other."""
+"""Kernels of one factory must not share a name: from the disk cache, one would be taken for the other."""
 
 from __future__ import annotations
 

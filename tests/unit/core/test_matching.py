@@ -132,7 +132,7 @@ def test_a_wrong_cy_shows_as_epipolar_offset_and_not_as_motion():
     assert (fit.status == 0).all()
     error_um = 1e3 * (motion_geometry(true_pair, XY, fit.w, fit.G).uvw_mm - truth("moved")[1])
     assert np.abs(error_um.mean(0)).max() < 0.15
-    # what an independent triangulation of the exact image points says about the sign and size
+    # sign and size by an independent triangulation of the exact image points
     at = true_pair.cam1.back_project_to_plane(XY).xyz_mm
     expected = wrong.epipolar_residual_px(true_pair.cam1.project(at).xy, true_pair.cam2.project(at).xy)
     np.testing.assert_allclose(fit.epipolar_px.mean(), expected.mean(), rtol=0.05)

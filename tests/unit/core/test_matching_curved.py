@@ -52,7 +52,7 @@ def displacement(pair, w, G):
 @pytest.mark.parametrize("kind", ["seidel", "opencv"])
 def test_the_twin_itself_finds_a_bent_surface_that_bends_on(kind):
     pair, images, w, G = scene(kind)
-    # interpolation error and third order; the wide angle of the first rig tells depth much better than the second's
+    # interpolation error and third order; the wide angle of the first rig resolves depth much better than the second's
     depth_um, moved_um = (0.05, 0.05) if kind == "seidel" else (0.6, 0.3)
     for i, xy in enumerate(XY):
         twin = Twin(pair, images, xy, subset=25, order=5)

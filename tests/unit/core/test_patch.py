@@ -1,4 +1,4 @@
-"""The choice between plane and curved patches, and what a curved patch says of its surroundings."""
+"""The choice between plane and curved patches, and what a curved patch predicts of its surroundings."""
 
 from __future__ import annotations
 

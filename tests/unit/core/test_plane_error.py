@@ -1,4 +1,4 @@
-"""What a field says of its plane patches' error, against averages over the subsets' own pixels."""
+"""A field's estimate of its plane patches' error, against averages over the subsets' own pixels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RAYS = CAMERA.rays_cam(XY).xyz_mm
 
 
 def seen(before: Bent, after: Bent, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse depth at t0 and w times the place at t, camera 1's frame, of what pixels see."""
+    """Inverse depth at the reference and w times the current position, camera 1's frame, of what pixels see."""
     ab = before.material(CAMERA, xy)
     w = 1.0 / CAMERA.cam_from_sys.apply(before.position(ab))[..., 2]
     return w, CAMERA.cam_from_sys.apply(after.position(ab)) * w[..., None]

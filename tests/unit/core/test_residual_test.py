@@ -1,4 +1,4 @@
-"""What residuals say of a match: the block sums against a plain twin, and the told scatter against the true one."""
+"""The residual test: the block sums against a plain twin, and the reported standard uncertainty against the scatter."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def test_another_pattern_shining_through_is_told_by_the_residuals_not_by_the_fit
     field, error = measured(reference, now)
     assert field.valid.mean() > 0.95
     factor = observed_factor(reference, now, field)
-    assert factor[1:3].min() > 2.5  # the fit alone says less than half of the variance
+    assert factor[1:3].min() > 2.5  # the fit alone reports less than half of the variance
     ratio = reported_over_true(field, error)
     assert np.all((ratio > 0.7) & (ratio < 1.5)), ratio
 
@@ -226,7 +226,7 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
 
 @pytest.mark.parametrize(("depth_factor", "offset_factor", "kept"), [(1.0, 1.0, 1.0), (1.0, 1.5, 1.0), (1.5, 1.0, 0.0)])
 def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(depth_factor, offset_factor, kept):
-    """Residuals show this many times the variances that the fit tells; of noise there is too much for any point."""
+    """Residuals show this many times the variances that the fit reports; of noise there is too much for any point."""
     reference, _ = pictures()
     inputs = prepare(bench.pair(), reference, None, bench.grid(spacing_px=6.0), OPTIONS)
     state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)

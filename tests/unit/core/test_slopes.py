@@ -1,4 +1,4 @@
-"""The derivative under noise: judged by the gradients of the noise-free picture, which the filter never sees."""
+"""The derivative under noise: compared with the gradients of the noise-free picture, which the filter never sees."""
 
 from __future__ import annotations
 

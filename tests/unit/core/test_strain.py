@@ -125,7 +125,7 @@ def _rolled(angle_deg, before_mm, after_mm, **more):
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("angle_deg", "before_mm"), [(0.0, 0.0), (33.0, 0.0), (20.0, 90.0)])
 def test_a_sheet_that_bends_has_no_strain(order, angle_deg, before_mm):
-    """Planes would tell h^2 / (10 R^2) too little, some 240 microstrain on R = 30 mm."""
+    """Planes would give h^2 / (10 R^2) too little, some 240 microstrain on R = 30 mm."""
     found = _strain(_rolled(angle_deg, before_mm, 30.0), window=9, order=order)
     x = 0.33 * np.arange(-4, 5)
     short = (x**4).sum() / (x**2).sum() / 6.0 * abs(1.0 / 30.0**2 - (before_mm and 1.0 / before_mm**2))
@@ -150,7 +150,7 @@ def test_noise_does_not_bend_a_flat_sheet():
 
 
 def test_strain_gradient_planes_and_quadratics():
-    """exx = k x: whole windows agree; at an edge quadratics tell the strain there, planes that in their middle."""
+    """exx = k x: whole windows agree; at an edge quadratics give the strain there, planes that in their middle."""
     k = 2e-4
 
     def pull(p):
@@ -193,7 +193,7 @@ def test_gauge_size():
 
 @pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal", "hencky"])
 def test_patch_strain_is_the_same_tensor(tensor):
-    """Stretch and rotation of the patches, made from the same deformation, say what the gauge says."""
+    """Stretch and rotation of the patches, made from the same deformation, agree with the gauge."""
     R = turned((0.2, -0.5, 1.0), 12.0)
     C = (F_LARGE.T @ F_LARGE)[:2, :2]
     U = np.real(sqrtm(C))
@@ -233,7 +233,7 @@ def test_no_window_reaches_over_a_cut():
 
 @pytest.mark.parametrize("slant", [0, 1, 2])
 def test_no_window_reaches_over_empty_points(slant):
-    """A crack that nobody drew leaves a line of lost points, however it slants."""
+    """A crack that was not drawn leaves a line of lost points, however it slants."""
     rows, cols = np.mgrid[:31, :35]
     lost = cols == 17 if slant == 0 else cols - 17 == (rows - 15) // slant
     right = cols > np.where(lost.any(axis=1), lost.argmax(axis=1), 17)[:, None]

@@ -21,7 +21,7 @@ KINKED = [(12.3, 50.2), (60.1, 48.7), (75.4, 80.9)]
 
 
 def distance(p: tuple[float, float], a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Of a place from a straight piece, by trying the foot and both ends."""
+    """Distance of a position from a straight piece, by trying the foot and both ends."""
     length = math.dist(a, b)
     along = ((p[0] - a[0]) * (b[0] - a[0]) + (p[1] - a[1]) * (b[1] - a[1])) / length
     if 0.0 <= along <= length:

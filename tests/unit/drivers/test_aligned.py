@@ -16,7 +16,7 @@ PIXELS = np.zeros((2, 2), np.uint8)
 
 
 def frame(number: int, pulse: int, jitter_ns: int = 0) -> Frame:
-    """A frame of one pulse; its device time tells the pulse, its exposure time is what pairing may look at."""
+    """A frame of one pulse; its device time identifies the pulse, its exposure time is what pairing may use."""
     at = pulse * PERIOD_NS
     return Frame(PIXELS, 8, number, at, at + jitter_ns, exposed_ns=at + jitter_ns)
 

@@ -1,4 +1,4 @@
-"""Every trigger has one fate, pairs are made of the right frames, and skew is judged."""
+"""Every trigger has one fate, pairs are made of the right frames, and skew is checked."""
 
 from __future__ import annotations
 

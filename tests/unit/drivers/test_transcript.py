@@ -86,7 +86,7 @@ def test_old_lines_go_when_the_limit_is_reached(tmp_path: Path) -> None:
     transcript.close()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["wire.txt", "wire.txt.1"]
     assert all(path.stat().st_size < 6000 for path in tmp_path.iterdir())
-    assert lines_of(record)[0][4] == "a title"  # each file says what it is
+    assert lines_of(record)[0][4] == "a title"  # each file states what it is
     assert [line[4] for line in lines_of(record)][-2:] == ["b'last'", "closed"]
     # nothing is lost between the two files
     both = [line[4] for name in ("wire.txt.1", "wire.txt") for line in lines_of(tmp_path / name)]

@@ -1,4 +1,4 @@
-"""What the V4L2 driver says of paths that are no camera, and how it spells controls; needs no device."""
+"""The V4L2 driver's errors for paths that are no camera, and its names of controls; needs no device."""
 
 from __future__ import annotations
 

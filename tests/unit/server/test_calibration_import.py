@@ -245,7 +245,7 @@ def test_dice_euler_angles_mean_what_its_own_matrix_says(specimen_dir: Path) -> 
 def test_the_specimens_calibration(specimen_dir: Path) -> None:
     loaded = load_calibration(specimen_dir / "calibration_dice.xml")
     assert loaded.image_size1_px == loaded.image_size2_px == (1920, 1200)
-    assert loaded.pair.baseline_mm == pytest.approx(123.6, abs=0.05)  # as its README says
+    assert loaded.pair.baseline_mm == pytest.approx(123.6, abs=0.05)  # as its README states
     assert np.degrees(loaded.pair.stereo_angle_rad) == pytest.approx(19.0, abs=0.3)
     assert isinstance(loaded.pair.cam1.lens, OpenCVLens)
     assert loaded.pair.cam1.lens.k3 == 55.92468005109

@@ -98,7 +98,7 @@ def test_small_packets_at_a_high_rate_ask_for_jumbo_frames(machine: Path) -> Non
 
 
 def test_a_link_without_a_known_speed_has_no_limit(machine: Path) -> None:
-    # what the kernel says of a link that is down, and of many virtual ones
+    # the kernel's values for a link that is down, and of many virtual ones
     found = checked(machine, watched(20.0), speed="-1\n", mtu="1500\n")
     assert found["cam0"].state == "ok"
     assert found["cam0"].limit is None

@@ -365,7 +365,7 @@ def test_films_have_a_frame_a_step_on_one_scale(source: Source, tmp_path: Path) 
         _made(source, tmp_path, "gif", fps=0.0)
 
 
-# provenance, wishes that cannot be met, command line ---------------------------------------------------------------
+# provenance, requests that cannot be met, command line ---------------------------------------------------------------
 
 
 def _provenance(path: Path) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def test_inputs_have_todays_names(folder: Path) -> None:
 def test_both_hold_the_same_field() -> None:
     one, two = (read_field(OLD / name / "step_0001.nc") for name in ("command_line", "service"))
     assert one.valid.all()
-    np.testing.assert_allclose(one.uvw_mm, two.uvw_mm, atol=1e-4)  # one chose its patch, to the other it was told
+    np.testing.assert_allclose(one.uvw_mm, two.uvw_mm, atol=1e-4)  # one chose its patch, to the other it was given
     np.testing.assert_array_equal(read_measured(OLD / "service" / "step_0001.nc").covariance, two.covariance)
 
 

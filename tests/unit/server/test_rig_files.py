@@ -45,7 +45,7 @@ def test_every_key_of_the_model_stands_on_the_page_with_a_meaning() -> None:
 
 
 def _accepts(schema: dict[str, Any], value: Any, known: dict[str, Any]) -> bool:
-    """Judge a value by a JSON schema, written anew from the standard for the words that are used here."""
+    """Check a value against a JSON schema, written anew from the standard for the words that are used here."""
     if "$ref" in schema:
         return _accepts(known[schema["$ref"].rsplit("/", 1)[-1]], value, known)
     if "anyOf" in schema:

@@ -18,7 +18,7 @@ SIZE = (24, 16)  # width, height
 
 
 class Corridor:
-    """A world whose images tell which camera took them and with what."""
+    """A world whose images encode their camera and its settings."""
 
     def __init__(self) -> None:
         self.exposures: list[tuple[str, float, float]] = []

@@ -89,7 +89,7 @@ def test_the_plates_face_strains_as_its_places_move(large: bool) -> None:
         r = np.linspace(0.5, 13.0, 26)
         out, round_ = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
         at = r[:, None] * out
-        # the metric of the face by differences of its places
+        # the metric of the face by differences of its positions
         along = [(surface.place(at + h * d) - surface.place(at - h * d)) / (2 * h) for d in (out, round_)]
         radial, hoop = plate.face_strain(r, 551.2)
         np.testing.assert_allclose(radial, 0.5 * ((along[0] ** 2).sum(-1) - 1.0), atol=2e-9)
@@ -136,7 +136,7 @@ def test_panel_opens_straightens_and_buckles() -> None:
     assert panel.buckle_at_mm(4.45) < 0.05 < 0.5 < panel.buckle_at_mm(35.6) < panel.buckle_at_mm(48.95)
     y = np.linspace(2, 80, 79)
     out = -panel.surface(48.95).place(np.stack([0 * y, y], -1))[:, 2]
-    assert 15 < y[np.argmax(out)] < 40  # the crest stands off the crack
+    assert 15 < y[np.argmax(out)] < 40  # the crest is off the crack
 
 
 @pytest.mark.parametrize("name", ["steel", "plate", "panel", "strip", "sphere"])
@@ -221,7 +221,7 @@ def test_material_keeps_its_brightness() -> None:
 
 
 def test_crack_shows_as_a_gap_that_grows() -> None:
-    # look closely: the panel through the paper rig, 33 um/px, so that 0.2 mm of opening are six pixels
+    # at close range: the panel through the paper rig, 33 um/px, so that 0.2 mm of opening are six pixels
     rig = PAPER
     size = (60, 60)
     p = rig.cam1.camera.paper_parameters()
@@ -287,7 +287,7 @@ def test_rigs_see_their_whole_target_at_every_position(file: str) -> None:
             assert (xy > 15).all()
             assert (xy < np.array(cam.size_px) - 15).all()
         true = cam.camera.paper_parameters()
-        # what the user knows is near the truth, and not the truth
+        # the user's values are near the truth, and not the truth
         assert 0.002 < abs(nominal["phd_px"] / true["phd_px"] - 1) < 0.05
         assert 0.1 < abs(nominal["angle_deg"] - np.degrees(true["gamma_rad"])) < 3.0
         assert 3.0 < rig.speckle_mm * true["phd_px"] / true["z0_mm"] < 5.0
