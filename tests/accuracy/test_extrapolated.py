@@ -56,11 +56,11 @@ def test_one_distance_spans_no_volume() -> None:
 
 def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
     before = np.array([[0.0, 0.0, 0.0], [3.0, -2.0, 1.0], [-6.0, 5.0, 8.0]])
-    now = before + np.array([0.5, 0.2, -2.0])
-    predicted = volume(covariance=covariance()).covariance_mm2(before, now)
+    current = before + np.array([0.5, 0.2, -2.0])
+    predicted = volume(covariance=covariance()).covariance_mm2(before, current)
     rng = np.random.default_rng(5)
     drawn = rng.multivariate_normal(np.zeros(20), covariance(), 3000)
-    seen = [[camera.project(points).xy for camera in (pair().cam1, pair().cam2)] for points in (before, now)]
+    seen = [[camera.project(points).xy for camera in (pair().cam1, pair().cam2)] for points in (before, current)]
     nominal = [camera.paper_parameters() for camera in (pair().cam1, pair().cam2)]
     found = []
     for change in drawn:
@@ -73,7 +73,7 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
         drawn_pair = StereoPair(*cameras)
         # least squares in the images, as in the prediction: one step from the true position
         positions = []
-        for points, (xy1, xy2) in zip((before, now), seen, strict=True):
+        for points, (xy1, xy2) in zip((before, current), seen, strict=True):
             A = np.concatenate([c.point_jacobian(points) for c in cameras], axis=-2)
             r = np.concatenate(
                 [
@@ -92,9 +92,9 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
 
 @pytest.mark.fault(41)
 def test_points_outside_are_flagged_and_less_certain() -> None:
-    first, now = take("block"), take("block", 1.0)
+    first, current = take("block"), take("block", 1.0)
     grid = PointGrid.rectangle(30, 30, SIZE[0] - 31, SIZE[1] - 31, spacing_px=16)
-    field = measure_motion(pair(), *first, *now, grid, MeasureOptions(subset_px=25))
+    field = measure_motion(pair(), *first, *current, grid, MeasureOptions(subset_px=25))
     # a target that covered the middle only
     small = GridTarget(pitch_mm=0.25, lines=(7, 7), line_width_mm=0.02)
     where = calibrated_volume(

@@ -62,16 +62,16 @@ def test_stretched_copies_keep_their_places() -> None:
         found = scattered_motion(copy, plain)
         assert len(found.xy_px) > 100
         assert (found.xy_px >= box[:2]).all()
-        apart = np.linalg.norm(found.xy_px - found.xy_current_px, axis=1)
-        assert np.median(apart) < 0.4
+        shift = np.linalg.norm(found.xy_px - found.xy_current_px, axis=1)
+        assert np.median(shift) < 0.4
 
 
 def test_the_copies_are_what_finds_a_large_strain() -> None:
     moved = plane_scene(rig().texture(3), in_plane=np.diag([1.5, 0.8]))
-    now = detect(np.asarray(rig().capture(moved, seed=2, noise=2.0)[0]))
+    current = detect(np.asarray(rig().capture(moved, seed=2, noise=2.0)[0]))
     image = np.asarray(reference().image1.pixels)
     box = (REGION[0], REGION[1], REGION[2], REGION[3])
-    plain = len(scattered_motion(detect(image, box=box), now).xy_px)
-    best = max(len(scattered_motion(stretched_features(image, box, s), now).xy_px) for s in stretches())
+    plain = len(scattered_motion(detect(image, box=box), current).xy_px)
+    best = max(len(scattered_motion(stretched_features(image, box, s), current).xy_px) for s in stretches())
     assert best > 40
     assert best > 5 * plain

@@ -48,12 +48,12 @@ def test_both_lips_stand_up_to_the_line(kind: str) -> None:
     plain = bench.grid(spacing_px=5.0, margin_px=36.0)
     grid = plain.with_cracks([line])
     pair = ReferencePair(bench.pair(), *reference())
-    now = opened(side)
-    field = pair.motion(*now, grid, OPTIONS)
+    current = opened(side)
+    field = pair.motion(*current, grid, OPTIONS)
     away = distance_px(grid.xy_px, Cuts([line]))
     lips, true = away < 10.0, true_uvw(grid.xy_px, side)
     assert lips.sum() > 100
-    without = pair.motion(*now, plain, OPTIONS)
+    without = pair.motion(*current, plain, OPTIONS)
     assert without.uvw_mm is not None
     over = without.valid & (away < 5.0)
     wrong = np.abs(without.uvw_mm - true)[over][:, :2].max(initial=0.0)
@@ -85,9 +85,9 @@ def test_a_crack_that_ends_inside_the_field() -> None:
     line = pair.cam1.project(np.stack([along, -along, np.full_like(along, -model.bow_mm)], axis=-1)).xy
     columns, rows = panel.SIZE
     plain = PointGrid.rectangle(20, 20, columns - 21, rows - 21, spacing_px=5)
-    images, now = panel.take(pair, before, rig, 1), panel.take(pair, after, rig, 2)
-    field = ReferencePair(pair, *images).motion(*now, plain.with_cracks([line]), OPTIONS)
-    without = ReferencePair(pair, *images).motion(*now, plain, OPTIONS)
+    images, current = panel.take(pair, before, rig, 1), panel.take(pair, after, rig, 2)
+    field = ReferencePair(pair, *images).motion(*current, plain.with_cracks([line]), OPTIONS)
+    without = ReferencePair(pair, *images).motion(*current, plain, OPTIONS)
     away = distance_px(plain.xy_px, Cuts([line]))
     assert without.valid[away < 8.0].mean() < 0.2
     assert field.valid.mean() > 0.98
@@ -149,13 +149,13 @@ def fields_equal(a: Field, b: Field) -> None:
 @pytest.mark.skipif(available_threads() < 2, reason="one processor")
 def test_threads_change_no_digit() -> None:
     side = below(LINES["kinked"])
-    now, before = opened(side), threads()
+    current, before = opened(side), threads()
     fields = []
     try:
         for n in (1, 2):
             set_threads(n)
             grid = bench.grid(spacing_px=8.0, margin_px=36.0).with_cracks([LINES["kinked"]])
-            fields.append(ReferencePair(bench.pair(), *reference()).motion(*now, grid, OPTIONS))
+            fields.append(ReferencePair(bench.pair(), *reference()).motion(*current, grid, OPTIONS))
     finally:
         set_threads(before)
     fields_equal(*fields)

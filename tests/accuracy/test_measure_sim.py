@@ -94,8 +94,8 @@ def test_large_motion_is_found_again_from_new_seeds(
 def test_a_sequence_goes_on_from_its_last_step(reference: ReferencePair, shape: Field) -> None:
     previous = None
     for load in (0.25, 0.5):
-        now = take("block", load, seed=2)
-        previous = reference.motion(*now, GRID, OPTIONS, shape=shape, previous=previous)
+        current = take("block", load, seed=2)
+        previous = reference.motion(*current, GRID, OPTIONS, shape=shape, previous=previous)
         nothing_wrong(previous, truth(GRID, scene("block"), scene("block", load)))
         assert previous.valid.mean() > 0.99
 
@@ -233,9 +233,9 @@ def test_unrelated_images_give_no_field() -> None:
 @pytest.mark.parametrize("noise", [2.0, 8.0, 20.0])
 def test_images_that_are_noisier_than_the_reference_are_told(noise: float) -> None:
     first, second = take("block")
-    now = take("block", 1.0, seed=3, noise=noise)
+    current = take("block", 1.0, seed=3, noise=noise)
     dense = grid(spacing_px=6.0)
-    field = measure_motion(pair(), first, second, *now, dense, replace(OPTIONS, patch="affine"))
+    field = measure_motion(pair(), first, second, *current, dense, replace(OPTIONS, patch="affine"))
     error = (field.uvw_mm - truth(dense, scene("block"), scene("block", 1.0)).uvw_mm)[field.valid]
     reported = np.sqrt((field.sigma_mm[field.valid][:, 3:] ** 2).mean(axis=0))
     assert field.valid.mean() > 0.97

@@ -61,8 +61,8 @@ def test_nearly_every_point_is_measured_and_the_face_is_flat(shape: Field) -> No
 def test_a_tensile_step_is_followed_from_where_the_specimen_stood(
     reference: ReferencePair, specimen_dir: Path, grid: PointGrid, shape: Field
 ) -> None:
-    now = [read_image(specimen_dir / f"0002_{k}.tif") for k in (0, 1)]
-    field = reference.motion(*now, grid, MeasureOptions(), shape=shape)
+    current = [read_image(specimen_dir / f"0002_{k}.tif") for k in (0, 1)]
+    field = reference.motion(*current, grid, MeasureOptions(), shape=shape)
     assert field.valid.mean() >= 0.97
     assert field.uvw_mm is not None
     no_point_off_its_line(field)

@@ -306,7 +306,7 @@ def test_curved_patches_are_followed_too() -> None:
 
 
 def test_rest_is_rest() -> None:
-    """A plate that does not move: forty pixels off its place would show in a turned frame, nothing shows here."""
+    """A plate that does not move: forty pixels off its position would show in a turned frame, nothing shows here."""
     still = bench.plate(0.0, RigidTransform.identity().translation_mm)
     images = [bench.capture(still, seed=k) for k in range(4)]
     for field in bench.measure(images, "always").values():

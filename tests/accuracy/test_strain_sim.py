@@ -103,8 +103,8 @@ def test_lips_of_an_open_crack_have_no_false_strain() -> None:
     line = np.array([(0.0, 107.3), (263.0, 118.1)])
     marked = bench.grid(spacing_px=5.0, margin_px=36.0).with_cracks([line])
     reference = ReferencePair(bench.pair(), *cut_scenes.reference())
-    now = cut_scenes.opened(cut_scenes.below(line))
-    field = reference.motion(*now, marked, MeasureOptions(subset_px=SUBSET, patch="affine"))
+    current = cut_scenes.opened(cut_scenes.below(line))
+    field = reference.motion(*current, marked, MeasureOptions(subset_px=SUBSET, patch="affine"))
     found = surface_strain(field, StrainOptions(window=7), subset_px=SUBSET)
     beside = np.abs(field.y_px - np.interp(field.x_px, line[:, 0], line[:, 1])) < 15.0
     assert found.valid[beside].mean() > 0.9

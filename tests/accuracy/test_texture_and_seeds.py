@@ -130,7 +130,7 @@ def test_where_camera_2_may_see_a_seed(
     assert right["distance_px"] < 1e-3
     assert unknown["distance_px"] is None
     assert 5 < wrong["distance_px"] <= 30
-    # the true place lies on the line that is drawn: between neighbouring points of it
+    # the true position lies on the line that is drawn: between neighbouring points of it
     line = np.array(right["line_px"])
     assert len(line) > 10
     assert ((line >= 0) & (line <= [WIDTH - 1, HEIGHT - 1])).all()

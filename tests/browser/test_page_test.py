@@ -250,7 +250,7 @@ def test_seeds_in_both_views_and_a_measurement(
     off = shown.get_by_text("from its epipolar line")
     expect(off).to_have_count(3)
     for text in off.all_inner_texts():
-        assert float(re.search(r"lies ([\d.]+) px", text)[1]) < 2.0  # type: ignore[index]
+        assert float(re.search(r"is ([\d.]+) px", text)[1]) < 2.0  # type: ignore[index]
     shown.get_by_label("Subset", exact=True).fill("25")
     shown.get_by_label("Label", exact=True).last.fill("seeded")
     button = shown.get_by_role("button", name="Measure", exact=True)

@@ -105,7 +105,7 @@ def test_one_sided_arrival_takes_up_the_backlash_from_either_direction(kind: tup
                 stand.stage.move_to(axis, away)
                 stand.stage.move_to(axis, 4.0)
             true.append([stand.controller.true_position_mm(axis) for axis in (1, 2)])
-    # axis 1 with the option arrives at one place; axis 2 without it shows that the lost motion is there
+    # axis 1 with the option arrives at one position; axis 2 without it shows that the lost motion is there
     assert true[0][0] == pytest.approx(true[1][0], abs=1e-6)
     assert true[1][1] - true[0][1] == pytest.approx(0.03, abs=1e-6)
 

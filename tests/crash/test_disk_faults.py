@@ -117,7 +117,7 @@ def test_every_call_that_can_fail_fails_once(way: Way, tmp_path: Path, monkeypat
     else:
         raise AssertionError("the session has more calls than the test tries")
     assert n > 5
-    print(f"{way}: {n - 1} places")
+    print(f"{way}: {n - 1} calls")
 
 
 def add_steps(tests: TestStore, test_id: str, images: dict[str, bytes]) -> None:

@@ -154,7 +154,7 @@ def test_an_answer_that_nobody_reads_ends_the_connection_and_holds_little(own: S
             assert time.monotonic() < deadline
             time.sleep(0.1)
     deadline = time.monotonic() + END_S
-    while own.streams.counts()["live_view"]:  # and its place is free again
+    while own.streams.counts()["live_view"]:  # and its slot is free again
         assert time.monotonic() < deadline
         time.sleep(0.05)
 

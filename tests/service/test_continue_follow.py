@@ -31,7 +31,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def host(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Host]:
-    made = Host(tmp_path_factory.mktemp("place") / "data")
+    made = Host(tmp_path_factory.mktemp("host") / "data")
     shutil.copytree(taken, made.data / "tests" / taken.name)
     made.start()
     yield made

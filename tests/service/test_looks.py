@@ -62,7 +62,7 @@ def test_predicted_error_is_the_one_that_shifting_images_shows() -> None:
     gy = np.gradient(clean, axis=0)
     noise = NOISE_SHARE * 255.0
     predicted = predicted_error_px(np.round(clean).astype(np.uint8), 255.0, subset)
-    apart = 192 // 64
+    spacing = 192 // 64
     row, col = 96, 96
     window = np.s_[row - 16 : row + 17, col - 16 : col + 17]
     g = np.stack([gx[window].ravel(), gy[window].ravel()], axis=1)
@@ -72,7 +72,7 @@ def test_predicted_error_is_the_one_that_shifting_images_shows() -> None:
         shifts.append(np.linalg.lstsq(g, difference, rcond=None)[0])
     worst = np.sqrt(np.linalg.eigvalsh(np.cov(np.array(shifts).T))[-1])
     # its own centre differences see 0.9 of the steepest waves
-    assert predicted[(row - 1) // apart, (col - 1) // apart] == pytest.approx(worst, rel=0.15)
+    assert predicted[(row - 1) // spacing, (col - 1) // spacing] == pytest.approx(worst, rel=0.15)
 
 
 def test_texture_in_one_direction_only_or_none_is_red() -> None:

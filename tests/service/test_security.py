@@ -218,7 +218,7 @@ def test_no_path_of_a_client_reaches_the_disk(client: httpx.Client, port: int, b
     ):
         target = API + template.replace("TEST", test_id).format(climb)
         answer = ask(port, "GET", target)
-        # a name that ends with a slash is sent to the one without; `..` means the place above
+        # a name that ends with a slash is sent to the one without; `..` means the folder above
         assert answer.status in (200, 307, 400, 403, 404, 405, 409, 422), (target, answer.status, answer.body[:200])
         assert answer.headers.get("location", "http://127.0.0.1/").startswith("http://127.0.0.1/")
         assert b"root:" not in answer.body, target

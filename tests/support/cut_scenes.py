@@ -25,7 +25,7 @@ _GAP = 12
 
 
 def below(line_px: NDArray[np.float64]) -> Side:
-    """Whether places lie below a line that runs from left to right through the whole image."""
+    """Return True for positions below a line that runs from left to right through the whole image."""
     return lambda xy: xy[..., 1] > np.interp(xy[..., 0], line_px[:, 0], line_px[:, 1])
 
 

@@ -79,14 +79,14 @@ def _measure(
     """Measure the same pictures with each patch; a shape if there is no ``after``."""
     grid = _grid() if grid is None else grid
     reference = ReferencePair(rig.pair, *rig.capture(before, noise=noise, seed=seed))
-    now = None if after is None else rig.capture(after, noise=noise, seed=seed + 1000)
+    current = None if after is None else rig.capture(after, noise=noise, seed=seed + 1000)
     xyz, uvw = true_points(before, after or before, rig.pair.cam1, grid.xy_px)
     out = {}
     for patch in patches:
         options = MeasureOptions(subset_px=subset, patch=patch)
         field = reference.shape(grid, options)
-        if now is not None:
-            field = reference.motion(now[0], now[1], grid, options, shape=field)
+        if current is not None:
+            field = reference.motion(current[0], current[1], grid, options, shape=field)
         moved = None if field.uvw_mm is None else (field.uvw_mm - uvw) * 1e3
         out[patch] = Errors(field, ((field.xyz_mm - xyz)[..., 2]) * 1e3, moved)
     return out

@@ -73,14 +73,14 @@ def prefilter(figures: Path) -> Section:
                             random[texture, subset, noise, width] = got
                             spread = 1e3 * np.sqrt(np.mean(got.random**2))
                             rows.append(Row(f"{head}: random error of u, v, w, rms", float(spread), "um"))
-                        apart = np.abs(got.honesty() - 1.0).max()
+                        departure = np.abs(got.honesty() - 1.0).max()
                         weighting = "with a noise model" if known else "without"
                         # in sharp texture the residuals hold interpolation besides noise, prefilter or not
                         limit = 5.0 if known or texture == "standard" else None
                         rows.append(
                             Row(
                                 f"{head}, {weighting}: reported over empirical sd, departure from 1, worst component",
-                                100.0 * float(apart),
+                                100.0 * float(departure),
                                 "%",
                                 limit,
                             )

@@ -129,8 +129,8 @@ def make_scene(request: Request, folder: Path, *, noise: float = NOISE, texture:
     folder.mkdir(parents=True, exist_ok=True)
     files: tuple[list[Path], list[Path]] = ([], [])
     for n in range(request.steps + 1):
-        now = plane_scene(rig.texture(texture), motion=motion_of(n))
-        for k, image in enumerate(rig.capture(now, noise=noise, seed=100 * texture + n)):
+        current = plane_scene(rig.texture(texture), motion=motion_of(n))
+        for k, image in enumerate(rig.capture(current, noise=noise, seed=100 * texture + n)):
             path = folder / f"cam{k + 1}_{n:04d}.tif"
             tifffile.imwrite(path, np.clip(np.round(image), 0, 255).astype(np.uint8), photometric="minisblack")
             files[k].append(path)

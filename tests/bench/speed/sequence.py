@@ -280,7 +280,7 @@ def _seeds_once(files: SequenceFiles, grid: PointGrid, options: MeasureOptions, 
 def measure_points(folder: Path, counts: tuple[int, ...], *, threads: int, runs: int = 2) -> list[PointCost]:
     """Fields of growing numbers of points over the same 2448 x 2048 px images, 21 px subsets, images prepared."""
     files = sequence_files(folder, steps=1, size_px=SEED_SIZE)
-    now = _images(files, 1)
+    current = _images(files, 1)
     options = MeasureOptions(subset_px=21, interpolation="cubic")
     set_threads(threads)
     width, height = SEED_SIZE[0] - 120.0, SEED_SIZE[1] - 120.0
@@ -293,12 +293,12 @@ def measure_points(folder: Path, counts: tuple[int, ...], *, threads: int, runs:
             best = (np.inf, np.inf, np.inf)
             for _ in range(runs if count < 100_000 else 1):
                 reference = _images(files, 0)  # anew, so that its features are found anew
-                for image in (*reference, *now):
+                for image in (*reference, *current):
                     image.prepared("cubic")
                 pair = ReferencePair(files.pair, *reference)
                 shape_s, shape = _timed(partial(pair.shape, grid, options))
-                first_s, first = _timed(partial(pair.motion, *now, grid, options, shape=shape))
-                later_s, _ = _timed(partial(pair.motion, *now, grid, options, shape=shape, previous=first))
+                first_s, first = _timed(partial(pair.motion, *current, grid, options, shape=shape))
+                later_s, _ = _timed(partial(pair.motion, *current, grid, options, shape=shape, previous=first))
                 best = (min(best[0], shape_s), min(best[1], first_s), min(best[2], later_s))
             out.append(PointCost(grid.x_px.size, *best))
     finally:

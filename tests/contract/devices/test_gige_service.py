@@ -136,7 +136,7 @@ def test_fake_cameras_end_in_a_clear_refusal_after_all_moves_and_captures(networ
             document = client.get(f"{API}/calibrations/{accepted['calibration_id']}").json()
             assert document["problem"]["code"].startswith(("grid", "target")), document["problem"]
             assert document["problem"]["remedy"]
-            # every stop of the plan and the way back to zero, by both cameras, with the place that was read back
+            # every stop of the plan and the way back to zero, by both cameras, with the position that was read back
             taken = document["taken"]
             assert {view["camera"] for view in taken} == {"cam1", "cam2"}
             wanted = sorted({0.0, 2.0, 5.0})

@@ -49,8 +49,8 @@ def plate_field(pressure_kpa: float, noise_mm: float = 0.0) -> tuple[Field, Trut
     """The face of the bending plate, every point where the formulas put it, and its truth."""
     flat = field_of(lambda x, y: 0.0 * x, noise_mm=noise_mm)
     xy = flat.xyz_mm[..., :2]
-    now = CircularPlate().surface(pressure_kpa).place(xy)
-    uvw = now - flat.xyz_mm
+    current = CircularPlate().surface(pressure_kpa).place(xy)
+    uvw = current - flat.xyz_mm
     nothing = np.zeros((*flat.shape, 3))
     truth = Truth(xy, flat.xyz_mm, flat.normal_sys, uvw, np.broadcast_to(np.eye(3), (*flat.shape, 3, 3)), nothing)
     assert flat.uvw_mm is not None
@@ -249,14 +249,14 @@ def test_the_calibrations_part_of_a_rigid_motion_is_that_of_drawn_calibrations()
     points = np.column_stack([rng.uniform(-60.0, 60.0, (12, 2)), rng.uniform(-2.0, 2.0, 12)])
     motion = ("moved", (3.0, -2.0, 8.0), (1.0, -0.5, 2.0))
     predicted = steel_motion.calibration_covariance(volume, points, motion)
-    now = Rotation.from_rotvec(motion[2], degrees=True).apply(points) + np.array(motion[1])
+    current = Rotation.from_rotvec(motion[2], degrees=True).apply(points) + np.array(motion[1])
     drawn = []
     for _ in range(300):
         off = mixing @ rng.standard_normal(20)
-        before, after = (p + volume.slopes(p) @ off for p in (points, now))
+        before, after = (p + volume.slopes(p) @ off for p in (points, current))
         R, _ = Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))
         true = Rotation.from_rotvec(motion[2], degrees=True)
-        shift = (after - before).mean(axis=0) - (now - points).mean(axis=0)
+        shift = (after - before).mean(axis=0) - (current - points).mean(axis=0)
         arm, back = before - before.mean(axis=0), R.inv().apply(after - after.mean(axis=0))
         F = np.linalg.lstsq(arm[:, :2], back[:, :2], rcond=None)[0]
         e = 0.5 * (F @ F.T - np.eye(2))
