@@ -206,7 +206,7 @@ def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:
     at.get_by_text("Export and report").click()
     with at.context.expect_page(timeout=200_000) as opened:
         at.get_by_role("link", name="Open the report").click()
-        expect(at.get_by_text("The report is being made")).to_be_visible()
+        expect(at.get_by_text("The report is computed")).to_be_visible()
     report = opened.value
     expect(report.get_by_role("heading", name="plate <b>&", level=1)).to_be_visible(timeout=200_000)
     expect(report.get_by_role("cell", name="Room <7> & 8", exact=True)).to_be_visible()

@@ -233,7 +233,7 @@ def test_import_compare_accept_discard(page: Watched, client: httpx.Client, tmp_
     shown.go_back()
     shown.get_by_role("link", name="other.json").click()
     shown.get_by_role("button", name="Discard", exact=True).click()
-    shown.get_by_label("Why").fill("a trial")
+    shown.get_by_label("Reason").fill("a trial")
     shown.get_by_role("dialog").get_by_role("button", name="Discard").click()
     expect(shown.get_by_role("region", name="Verdict")).to_contain_text("discarded by local: a trial")
     shown.get_by_role("button", name="Delete …").click()

@@ -159,7 +159,7 @@ def test_steps_scales_and_images_are_chosen(page: Watched, bench: Bench) -> None
     at.get_by_label("Image", exact=True).select_option("reference")
     # a reference has no displacement, and a message states so
     at.get_by_role("button", name="Step before").click()
-    expect(at.get_by_text("it is the reference, from which displacements are counted")).to_be_visible()
+    expect(at.get_by_text("it is the reference of the displacements")).to_be_visible()
     at.get_by_role("button", name="Next step").click()
     drawn(at, "1 w_mm reference")
     for name in ("exx", "zncc:0", "epipolar_px", "sigma_w_mm", "status", "x_mm"):

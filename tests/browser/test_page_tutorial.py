@@ -37,7 +37,7 @@ STEP = re.compile(
 
 @dataclass(frozen=True)
 class Instruction:
-    """One thing that the tutorial asks for: ``kind`` is a group of `STEP`."""
+    """One thing that the tutorial asks for: ``kind`` is screen, click, field or text."""
 
     kind: str
     name: str
@@ -48,13 +48,12 @@ def instructions() -> list[Instruction]:
     """Read the numbered steps of the tutorial, in their order."""
     text = TUTORIAL.read_text(encoding="utf-8")
     steps = re.findall(r"^\d+\. (.*(?:\n {3}.*)*)", text, re.MULTILINE)
-    found = [
-        Instruction(str(match.lastgroup if match.lastgroup != "value" else "field"), name, match["value"] or "")
-        for step in steps
-        for match in STEP.finditer(" ".join(step.split()))
-        for name in [match["screen"] or match["click"] or match["field"] or match["text"]]
-    ]
     assert len(steps) == 13
+    found = []
+    for step in steps:
+        for screen, click, field, value, text in STEP.findall(" ".join(step.split())):
+            kind = "screen" if screen else "click" if click else "field" if field else "text"
+            found.append(Instruction(kind, screen or click or field or text, value))
     return found
 
 
@@ -69,12 +68,9 @@ class Operator:
     def do(self, asked: Instruction) -> None:
         """Click, fill in or wait, and check that the page has no complaint."""
         if asked.kind == "screen":
-            self.shown.get_by_role("navigation", name="Screens").get_by_role(
-                "link", name=asked.name, exact=True
-            ).click()
-            expect(self.shown.get_by_role("link", name=asked.name, exact=True)).to_have_attribute(
-                "aria-current", "page"
-            )
+            link = self.shown.get_by_role("navigation", name="Screens").get_by_role("link", name=asked.name, exact=True)
+            link.click()
+            expect(link).to_have_attribute("aria-current", "page")
             expect(self.main.get_by_role("heading", level=1)).to_be_visible()
         elif asked.kind == "field":
             self._fill(asked.name, asked.value)
@@ -95,7 +91,7 @@ class Operator:
 
     def _named(self, name: str) -> Locator:
         """Return the one button, link or heading to open that has exactly this name."""
-        button, link = (self.main.get_by_role(role, name=name, exact=True) for role in ("button", "link"))  # type: ignore[arg-type]
+        button, link = (self.main.get_by_role(role, name=name, exact=True) for role in ("button", "link"))
         summary = self.main.locator("summary").get_by_text(name, exact=True)
         expect(button.or_(link).or_(summary).first).to_be_visible(timeout=30_000)
         for kind in (button, link, summary):
