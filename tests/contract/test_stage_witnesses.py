@@ -343,6 +343,6 @@ def test_the_drivers_states_and_bits_are_hvl_ccbs() -> None:
         else:
             assert int(message.value, 16) not in _STATES
     for error in newport.NewportSMC100PP.MotorErrors:
-        ours = error.message.lower().replace("end of turn", "end of run").replace("timeout", "time out")
-        ours = ours.removesuffix(" detection").replace("80w", "80 w")
-        assert _POSITIONER_ERRORS[11 - error.value].lower() == ours
+        text = error.message.lower().replace("end of turn", "end of run").replace("timeout", "time out")
+        text = text.removesuffix(" detection").replace("80w", "80 w")
+        assert _POSITIONER_ERRORS[11 - error.value].lower() == text

@@ -19,11 +19,11 @@ from core.matching.fit import fit_motion
 from core.matching.options import MatchOptions
 from tests.support.matching_scene import paper_pair
 
-told = []
+compiled = []
 picture = np.random.default_rng(2).integers(0, 255, (80, 90)).astype(np.uint8)
-with report_compiling(lambda: told.append(True)):
+with report_compiling(lambda: compiled.append(True)):
     fit_motion(paper_pair(), *[picture] * 4, [[40.0, 40.0]], [[0.002, 0.0, 0.0]], None, MatchOptions(subset_px=15))
-print(len(told))
+print(len(compiled))
 """
 
 

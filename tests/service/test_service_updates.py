@@ -27,7 +27,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     for k, n in enumerate(STEPS):
         scene = bench.plate(0.3 * k, np.array([0.021, -0.013, 0.02]) * k)
-        for cam, image in zip(("cam1", "cam2"), bench.shoot(scene, seed=k), strict=True):
+        for cam, image in zip(("cam1", "cam2"), bench.capture(scene, seed=k), strict=True):
             write_image(folder / f"{cam}_{n}.tif", image)
     cameras = (bench.rig().pair.cam1, bench.rig().pair.cam2)
     document = {cam: c.paper_parameters() for cam, c in zip(("cam1", "cam2"), cameras, strict=True)}

@@ -1,6 +1,6 @@
 """A second rig, written apart from the product's code: formulas typed from the method's page, pictures from rays.
 
-It shares nothing with `core` or `sim`, so that what the command line finds in these pictures is judged from outside.
+It shares nothing with `core` or `sim`, so that what the command line finds in these pictures is checked independently.
 """
 
 from __future__ import annotations

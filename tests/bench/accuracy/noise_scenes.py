@@ -46,7 +46,7 @@ class Window:
     rig
         ``paper`` (60 degrees) or ``modern`` (25 degrees).
     look
-        One of LOOKS.
+        One of APPEARANCES.
     size_px
         Width and height.
     seed
