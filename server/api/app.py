@@ -17,12 +17,12 @@ from server.api.protocol.audit import AuditLog, Recorder
 from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
-from server.api.routes.analyses import analyses, exports, gauges, looks, picking, report, results
+from server.api.routes.analyses import analyses, exports, gauges, picking, previews, report, results
 from server.api.routes.calibrations import calibrations, noise, review
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import facts, tests, watch
+from server.api.routes.tests import metadata, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.service import Service
@@ -117,7 +117,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         calibration_exports,
         review,
         tests,
-        facts,
+        metadata,
         watch,
         analyses,
         picking,
@@ -126,7 +126,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         exports,
         report,
         jobs,
-        looks,
+        previews,
     ):
         app.include_router(module.router, prefix=PREFIX)
     app.include_router(trash_router, prefix=PREFIX)

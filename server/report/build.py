@@ -161,7 +161,7 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
 
     def stated(name: str, label: str, value: str | None) -> Item:
         known = Value(value, None, "as stated") if value else None
-        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/facts or facts.toml")
+        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/metadata or metadata.toml")
 
     taken = None
     if times:

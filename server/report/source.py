@@ -164,7 +164,9 @@ def find_source(
         steps=steps,
         calibration=loaded,
         calibration_file=file,
-        metadata=parse_metadata(test_record.facts, name="the metadata of the test") if metadata is None else metadata,
+        metadata=parse_metadata(test_record.metadata, name="the metadata of the test")
+        if metadata is None
+        else metadata,
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
     )

@@ -90,7 +90,7 @@ def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata
 
 
 def load_metadata(path: Path) -> TestMetadata:
-    """Read a facts.toml.
+    """Read a ``metadata.toml``.
 
     Raises
     ------

@@ -8,20 +8,27 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from server.base.models import Document, JobState
 from server.base.problem import JobProblem
 from server.formats.records import Record
 
+#: entry of ``test.json``; the second is its earlier name
+METADATA_NAMES = ("metadata", "facts")
+
 
 class Progress(Document):
     """Progress of a job."""
 
-    stage: str = Field(description="What it is doing.", examples=["views"])
-    done: int = Field(description="Units done in this stage.")
-    total: int = Field(description="Units in this stage; 0 while unknown.")
-    eta_s: float | None = Field(None, description="Seconds left in this stage; null while unknown.")
+    phase: str = Field(
+        description="Phase that it is in.",
+        examples=["views"],
+        validation_alias=AliasChoices("phase", "stage"),  # the second is its earlier name
+    )
+    done: int = Field(description="Units done in this phase.")
+    total: int = Field(description="Units in this phase; 0 while unknown.")
+    eta_s: float | None = Field(None, description="Seconds left in this phase; null while unknown.")
 
 
 class JobRecord(Document):
@@ -149,7 +156,7 @@ class TestRecord(Kept):
     notes: str | None = None
     calibration_id: str | None = None
     calibration_sha256: str | None = None
-    facts: object = None
+    metadata: object = Field(None, validation_alias=AliasChoices(*METADATA_NAMES))
     request: KeptRequest | None = None
 
 

@@ -22,7 +22,15 @@ from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.formats.results.settings import current_step, current_summary
-from server.store.documents import AnalysisJob, AnalysisRecord, StepOutcome, StepRecord, SummaryRecord, TestRecord
+from server.store.documents import (
+    METADATA_NAMES,
+    AnalysisJob,
+    AnalysisRecord,
+    StepOutcome,
+    StepRecord,
+    SummaryRecord,
+    TestRecord,
+)
 from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -133,7 +141,7 @@ class TestStore:
 
     def metadata(self, test_id: str) -> dict[str, object]:
         """Return a test's metadata; empty where nothing was stated."""
-        found = self.read(test_id).facts
+        found = self.read(test_id).metadata
         return found if isinstance(found, dict) else {}
 
     def put_metadata(
@@ -152,14 +160,15 @@ class TestStore:
             ``metadata_changed`` if they are not what was expected.
         """
         with self._lock:
-            document = read_json(self.path(test_id) / "test.json")
-            if expected is not None and document.get("facts", {}) != expected:
+            if expected is not None and self.metadata(test_id) != expected:
                 raise StateError(
                     f"The metadata of test {test_id} were changed meanwhile.",
                     code="metadata_changed",
                     remedy="Read them again, then send the change.",
                 )
-            write_json(self.path(test_id) / "test.json", document | {"facts": metadata})
+            path = self.path(test_id) / "test.json"
+            document = {name: value for name, value in read_json(path).items() if name not in METADATA_NAMES}
+            write_json(path, document | {"metadata": metadata})
 
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""

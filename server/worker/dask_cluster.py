@@ -123,7 +123,7 @@ class ClusterExecutor(TaskExecutor):
         said = event[1]
         future = self._running.get(said["task"])
         if future is not None and future.on_progress is not None:
-            future.on_progress(said["stage"], int(said["done"]), int(said["total"]))
+            future.on_progress(said["phase"], int(said["done"]), int(said["total"]))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> ClusterFuture:
         """Give a task to the cluster; everything must pickle, and the workers must have the program installed."""

@@ -44,17 +44,17 @@ class _Channel(TaskChannel):
         self._name = name
         self._tell = tell
         self._next = 0.0
-        self._stage = ""
+        self._phase = ""
 
     @property
     def cancelled(self) -> bool:
         return self._name in _stopped
 
-    def progress(self, stage: str, done: int, total: int) -> None:
+    def progress(self, phase: str, done: int, total: int) -> None:
         now = time.monotonic()
-        if stage != self._stage or now >= self._next:
-            self._stage, self._next = stage, now + _REPORT_S
-            self._tell({"task": self._name, "stage": stage, "done": done, "total": total})
+        if phase != self._phase or now >= self._next:
+            self._phase, self._next = phase, now + _REPORT_S
+            self._tell({"task": self._name, "phase": phase, "done": done, "total": total})
 
 
 def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args: Any) -> Any:

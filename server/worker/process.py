@@ -48,9 +48,9 @@ class TaskChannel:
         if self.cancelled:
             raise Cancelled("The computation was cancelled.")
 
-    def progress(self, stage: str, done: int, total: int) -> None:
+    def progress(self, phase: str, done: int, total: int) -> None:
         """Report progress."""
-        self._send(("progress", self._task_id, stage, done, total))
+        self._send(("progress", self._task_id, phase, done, total))
 
 
 def current_task() -> TaskChannel:

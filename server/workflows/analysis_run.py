@@ -147,10 +147,10 @@ class AnalysisRun:
     def _measure_one(self, job: Job, index: int, n: int) -> None:
         service, document, steps = self._service, self._document, self._document.steps
 
-        def progress(stage: str, found: int, of: int) -> None:
+        def progress(phase: str, found: int, of: int) -> None:
             # steps are the unit a user thinks in; within a step, the points found so far
             fraction = min(found / of, 1.0) if of > 0 else 0.0
-            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * len(steps))
+            job.progress(f"step {n}: {phase}", round(1000 * (index + fraction)), 1000 * len(steps))
 
         started = time.monotonic()
         try:
@@ -184,10 +184,10 @@ class AnalysisRun:
                     continue
                 yield n, lambda task=task: task  # type: ignore[misc]
 
-        def progress(n: int, stage: str, share: float) -> None:
+        def progress(n: int, phase: str, share: float) -> None:
             shares[n] = share
             done = len(self._summaries) + len(self._failed) + sum(shares.values())
-            text = f"step {n}: {stage}" if len(shares) < 2 else f"{len(shares)} steps at once"
+            text = f"step {n}: {phase}" if len(shares) < 2 else f"{len(shares)} steps at once"
             job.progress(text, round(1000 * min(done, len(steps))), 1000 * len(steps))
 
         def ended(n: int, future: Future[Any]) -> None:

@@ -57,7 +57,7 @@ def test_a_job_tells_stage_share_and_time_left(bench: Bench) -> None:
         time.sleep(0.005)
     document = bench.jobs.document(job.id).plain()
     assert document["state"] == "running"
-    assert document["progress"]["stage"] == "walking"
+    assert document["progress"]["phase"] == "walking"
     assert 0.2 < document["progress"]["eta_s"] < 3.0
     go.set()
     done = bench.end_of(job)

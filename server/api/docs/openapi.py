@@ -30,7 +30,7 @@ _TAGS = {
     "results": "Fields, points, gauges and files of an analysis.",
     "trash": "Deleting, restoring, and what goes by itself.",
     "jobs": "Whatever takes longer than a request.",
-    "looks": "Previews: 8-bit pictures, and maps over an image; nothing is measured in them.",
+    "previews": "Previews: 8-bit pictures, and maps over an image; nothing is measured in them.",
 }
 
 #: what a small simulated rig was asked and answered (tests/bench/documents/api_examples.py)

@@ -230,11 +230,11 @@ class _Runner:
     def _shower(self, n: int) -> Any:
         count = len(self._job.steps)
 
-        def show(stage: str, done: int, total: int) -> None:
+        def show(phase: str, done: int, total: int) -> None:
             share = done / total if total > 0 else 0.0
-            part = _SEEDS_SHARE * share if stage == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
+            part = _SEEDS_SHARE * share if phase == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
             self._done = max(self._done, (n + part) / count)
-            self._progress.show(f"step {n} of {count - 1}: {stage}", self._done)
+            self._progress.show(f"step {n} of {count - 1}: {phase}", self._done)
 
         return show
 

@@ -129,11 +129,11 @@ class _Teller:
     def __call__(self, text: str) -> None:
         self._line.note(text)
 
-    def progress(self, stage: str, done: int, total: int, eta_s: float | None) -> None:
+    def progress(self, phase: str, done: int, total: int, eta_s: float | None) -> None:
         """Show how far a job is."""
         left = "" if eta_s is None else f", about {duration(eta_s)} left"
         share = "" if total <= 0 else f" {100 * done / total:.0f} %"
-        self._line.status(f"{stage}{share}{left}")
+        self._line.status(f"{phase}{share}{left}")
 
 
 def find_config(name: str) -> Path:

@@ -17,7 +17,7 @@ from server.api.models import Region, Reply, Request
 from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
-from server.api.routes.analyses.looks import step_image
+from server.api.routes.analyses.previews import step_image
 from server.compute.seeds import distances_px, epipolar_line
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import decode_mask, read_image

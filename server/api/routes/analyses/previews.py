@@ -17,7 +17,7 @@ from server.formats.images import GrayImage, read_image
 from server.results.previews import MapKind, overlay, preview
 from server.workflows.service import Service
 
-router = APIRouter(tags=["looks"])
+router = APIRouter(tags=["previews"])
 Kind = Annotated[MapKind, Path(description="What the map shows.")]
 Index = Annotated[int, Path(ge=0, le=9999, description="Number of the position.")]
 Subset = Annotated[
