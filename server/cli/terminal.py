@@ -9,7 +9,7 @@ from typing import TextIO
 
 _REDRAW_S = 0.2
 _QUIET_S = 15.0
-_TELLING = 0.03  # of all the work must be done before an estimate means something
+_MIN_FRACTION = 0.03  # of all the work must be done before an estimate means something
 
 
 def duration(seconds: float) -> str:
@@ -58,7 +58,7 @@ class ProgressLine:
         self._last = now
         line = f"{text}, {100 * fraction:.0f} % of all"
         began, before = self._start
-        if fraction - before > _TELLING:
+        if fraction - before > _MIN_FRACTION:
             left = (now - began) * (1.0 - fraction) / (fraction - before)
             line += f", about {duration(max(1.0, left))} left"
         self._draw(line)

@@ -83,7 +83,7 @@ class Session:
         The rig file.
     out
         Folder for pictures and results.
-    say
+    note
         Prints a line.
     """
 
@@ -91,7 +91,7 @@ class Session:
     rig: SimRig
     config: Path
     out: Path
-    say: Callable[[str], None]
+    note: Callable[[str], None]
 
     def calibrate(self) -> Calibrated:
         """Calibrate before the grid; save the calibration's file."""

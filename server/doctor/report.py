@@ -49,13 +49,13 @@ class Notebook:
 
     Parameters
     ----------
-    tell
+    on_check
         Called with each check at once.
     """
 
-    def __init__(self, tell: Callable[[Check], None] | None = None) -> None:
+    def __init__(self, on_check: Callable[[Check], None] | None = None) -> None:
         self.checks: list[Check] = []
-        self._tell = tell
+        self._on_check = on_check
 
     def note(
         self,
@@ -81,8 +81,8 @@ class Notebook:
             figures={**(figures or {}), **more},
         )
         self.checks.append(check)
-        if self._tell is not None:
-            self._tell(check)
+        if self._on_check is not None:
+            self._on_check(check)
 
     def fail(self, part: str, name: str, error: StereorigError) -> None:
         """Write down what an error says."""

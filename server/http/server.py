@@ -55,7 +55,7 @@ class OrderlyServer(uvicorn.Server):
         self._notifier = notifier or Notifier({})
         self._announce = announce
         self._keeper = Connections(
-            limits or ConnectionLimits(most=service.config.service.connections),
+            limits or ConnectionLimits(max_open=service.config.service.connections),
             lambda why: service.metrics.connections_refused.labels(why).inc(),
         )
         self._ticks = 0

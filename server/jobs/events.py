@@ -70,13 +70,13 @@ class EventHub:
         """Number of the newest event."""
         return self._number
 
-    def after(self, number: int, most: int | None = None) -> list[Event]:
+    def after(self, number: int, limit: int | None = None) -> list[Event]:
         """Events still kept that are newer than ``number``, oldest first, at most so many."""
         with self._lock:
             kept = len(self._ring)
             # their numbers follow one another: the place of each is known
             first = 0 if kept == 0 else max(number + 1 - self._ring[0].number, 0)
-            last = kept if most is None else min(first + most, kept)
+            last = kept if limit is None else min(first + limit, kept)
             return [self._ring[index] for index in range(first, last)]
 
     def gap(self, number: int) -> Event | None:

@@ -247,9 +247,9 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     return [("", drawn), *((f"Step {shown.n}: {shown.why}", _maps(shown)) for shown in measured.shown)]
 
 
-def _status(field: Field, what: str) -> Picture:
-    data = pictures.status_map(field, f"States of the points, {what}")
-    return Picture(data, PNG, f"map of the points' states, {what}", f"States of the points, {what}")
+def _status(field: Field, subject: str) -> Picture:
+    data = pictures.status_map(field, f"States of the points, {subject}")
+    return Picture(data, PNG, f"map of the points' states, {subject}", f"States of the points, {subject}")
 
 
 def _maps(shown: Shown) -> list[Picture]:

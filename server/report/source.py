@@ -198,7 +198,7 @@ def _one_test(tests: Path, wanted: str | None) -> Path:
     there = {path.parent.name: path.parent for path in sorted(tests.glob("*/test.json"))}
     if wanted is not None:
         if wanted not in there:
-            raise NotFoundError(f"There is no test {wanted[:40]!r} in {tests.parent}.", what="test")
+            raise NotFoundError(f"There is no test {wanted[:40]!r} in {tests.parent}.", kind="test")
         return there[wanted]
     if len(there) != 1:
         raise InputError(
@@ -214,7 +214,7 @@ def _one_analysis(test: Path, wanted: str | None) -> Path:
     there = {path.parent.name: path.parent for path in sorted(test.glob("analyses/*/analysis.json"))}
     if wanted is not None:
         if wanted not in there:
-            raise NotFoundError(f"There is no analysis {wanted[:40]!r} in {test}.", what="analysis")
+            raise NotFoundError(f"There is no analysis {wanted[:40]!r} in {test}.", kind="analysis")
         return there[wanted]
     finished = [path for path in there.values() if results_in(path)]
     # `stereorig measure` puts its results beside the analyses

@@ -29,7 +29,7 @@ _STALE_DURING_CAPTURE_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class PairShot:
+class CapturedPair:
     """One captured pair, averaged over ``frames`` exposures.
 
     Attributes
@@ -135,7 +135,7 @@ class CameraPair:
         self._earlier, self._source = PairingAccount(**self.account()), self._make_source()
         self._source.start()
 
-    def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
+    def capture(self, frames: int = 1, check: Callable[[], None] | None = None) -> CapturedPair:
         """Capture ``frames`` pairs and average each camera's; ``check`` may raise between them.
 
         Raises
@@ -154,7 +154,7 @@ class CameraPair:
                 if not self._skew_is_set and motion is not None:
                     _check_skew(mean.skew_ms, motion)
                 last = mean.last
-                return PairShot(
+                return CapturedPair(
                     pixels={cam: mean.pixels(cam) for cam in CAMERAS},
                     bit_depth={cam: last[cam].bit_depth for cam in CAMERAS},
                     sequence={cam: last[cam].sequence for cam in CAMERAS},

@@ -164,8 +164,8 @@ def identity_of(description: CameraDescription) -> dict[str, str]:
     return {name: getattr(description, name) for name in CameraIdentity.__dataclass_fields__}
 
 
-def kept_camera(settings: CameraSettings, facts: CameraMetadata) -> CameraKept:
+def kept_camera(settings: CameraSettings, metadata: CameraMetadata) -> CameraKept:
     """Return what a step's record keeps of a camera; a fact that was not stated is not there."""
     has = asdict(settings)
-    stated = facts.model_dump(mode="json", exclude_none=True)
+    stated = metadata.model_dump(mode="json", exclude_none=True)
     return CameraKept.model_validate({**{name: has[name] for name in _KEPT_SETTINGS}, **stated})

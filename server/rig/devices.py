@@ -100,9 +100,9 @@ def held_by(rig: Rig) -> list[HeldDevice]:
 class _Search:
     """One driver's search, in a thread of its own."""
 
-    def __init__(self, name: str, look: Callable[[], list[FoundDevice]]) -> None:
+    def __init__(self, name: str, find: Callable[[], list[FoundDevice]]) -> None:
         self.name = name
-        self._look = look
+        self._find = find
         self._found: list[FoundDevice] = []
         self._error: Exception | None = None
         self.done = threading.Event()
@@ -112,7 +112,7 @@ class _Search:
 
     def _run(self) -> None:
         try:
-            self._found = list(self._look())
+            self._found = list(self._find())
         except Exception as error:  # noqa: BLE001  # whatever a driver brings up is its own part of the list
             self._error = error
         finally:
@@ -184,8 +184,8 @@ class DeviceFinder:
     def _search(self, name: str) -> _Search:
         running = self._searches.get(name)
         if running is None or running.done.is_set():
-            look = self._ports if name == SERIAL else lambda: self._discover(name)
-            running = self._searches[name] = _Search(name, look)
+            find = self._ports if name == SERIAL else lambda: self._discover(name)
+            running = self._searches[name] = _Search(name, find)
             running.start()
         return running
 

@@ -99,7 +99,7 @@ class TestStore:
         """
         path = self._folder.tests / test_id if is_id(test_id, "t") else None
         if path is None or not (path / "test.json").is_file():
-            raise NotFoundError(f"There is no test {test_id[:40]!r}.", what="test")
+            raise NotFoundError(f"There is no test {test_id[:40]!r}.", kind="test")
         return path
 
     def ids(self) -> list[str]:
@@ -278,7 +278,7 @@ class TestStore:
         """
         folder = self.path(test_id) / "steps" / f"{n:04d}"
         if not 0 <= n <= MAX_STEPS or not (folder / "step.json").is_file():
-            raise NotFoundError(f"Test {test_id} has no step {n}.", what="step")
+            raise NotFoundError(f"Test {test_id} has no step {n}.", kind="step")
         return StepFiles(read_record(StepRecord, folder / "step.json"), folder / "cam1.tif", folder / "cam2.tif")
 
     def update_step(self, test_id: str, n: int, changes: Mapping[str, object]) -> StepRecord:
@@ -314,7 +314,7 @@ class TestStore:
         """Folder of an existing analysis."""
         path = self.path(test_id) / "analyses" / analysis_id if is_id(analysis_id, "a") else None
         if path is None or not (path / "analysis.json").is_file():
-            raise NotFoundError(f"Test {test_id} has no analysis {analysis_id[:40]!r}.", what="analysis")
+            raise NotFoundError(f"Test {test_id} has no analysis {analysis_id[:40]!r}.", kind="analysis")
         return path
 
     def analysis_ids(self, test_id: str) -> list[str]:
@@ -401,7 +401,7 @@ class TestStore:
         """
         path = self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
         if not path.is_file():
-            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.", what="result")
+            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.", kind="result")
         recorded = recorded_sha256(path)
         if recorded is not None and known_sha256(path) != recorded:
             raise FileFormatError(

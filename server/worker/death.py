@@ -30,13 +30,13 @@ class MemoryWatch:
     @classmethod
     def now(cls) -> MemoryWatch:
         """Read the counts."""
-        places = [_PROC / "vmstat", *_own_cgroup_files()]
-        return cls({place: count for place in places if (count := _oom_kills(place)) is not None})
+        sources = [_PROC / "vmstat", *_own_cgroup_files()]
+        return cls({source: count for source in sources if (count := _oom_kills(source)) is not None})
 
     def killed_since(self) -> bool:
         """Return True if any count has grown."""
         later = MemoryWatch.now().kills
-        return any(later.get(place, count) > count for place, count in self.kills.items())
+        return any(later.get(source, count) > count for source, count in self.kills.items())
 
 
 def _own_cgroup_files() -> list[Path]:
@@ -48,8 +48,8 @@ def _own_cgroup_files() -> list[Path]:
     for line in lines:
         number, _, name = line.split(":", 2)
         if number == "0":
-            place = _CGROUPS / name.strip("/")
-            return [folder / "memory.events" for folder in (place, *place.parents) if folder.is_relative_to(_CGROUPS)]
+            group = _CGROUPS / name.strip("/")
+            return [folder / "memory.events" for folder in (group, *group.parents) if folder.is_relative_to(_CGROUPS)]
     return []
 
 

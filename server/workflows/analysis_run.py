@@ -115,9 +115,9 @@ class AnalysisRun:
                 if n in known:
                     self._summaries[n] = known[n]
         self._loaded = document
-        self._tell(job)
+        self._publish(job)
 
-    def _tell(self, job: Job) -> dict[str, object]:
+    def _publish(self, job: Job) -> dict[str, object]:
         """Put what is finished into the job's result, and return it."""
         finished = [self._summaries[n] for n in self._document.steps if n in self._summaries]
         found: dict[str, object] = {
@@ -219,7 +219,7 @@ class AnalysisRun:
         service.tests.put_step_summary(self._test_id, analysis_id, n, found)
         self._summaries[n] = StepOutcome.model_validate(found)
         self._done[n] = service.tests.step(self._test_id, n)
-        self._tell(job)
+        self._publish(job)
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
 
     def _check_cameras(self, n: int) -> None:
@@ -240,7 +240,7 @@ class AnalysisRun:
         return bool(new)
 
     def _result(self, job: Job) -> dict[str, object]:
-        found = self._tell(job)
+        found = self._publish(job)
         if self._failed:
             first = min(self._failed)
             found["steps_failed"] = {str(n): problem_of(error).plain() for n, error in self._failed.items()}

@@ -19,7 +19,7 @@ def calibrated_cameras(calibration: Path) -> Identities | None:
     return cameras if isinstance(cameras, dict) else None
 
 
-def check_same_cameras(calibration: Path, cameras: Identities | None, what: str) -> None:
+def check_same_cameras(calibration: Path, cameras: Identities | None, images: str) -> None:
     """Refuse images of other cameras than the calibration's.
 
     Parameters
@@ -28,7 +28,7 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, what: str)
         A calibration.json.
     cameras
         Who took the images; None where it is not known, as with imported files.
-    what
+    images
         The images, for the text: ``step 3``.
 
     Raises
@@ -46,7 +46,7 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, what: str)
     exchanged = serials["cam1"] == serials["cam2"][::-1]
     texts = [f"{cam} is {now}, calibrated was {then}" for cam, (then, now) in other.items()]
     raise CameraError(
-        f"{what} was not taken with the cameras that were calibrated: {'; '.join(texts)}."
+        f"{images} was not taken with the cameras that were calibrated: {'; '.join(texts)}."
         + (" The two are exchanged." if exchanged else ""),
         code="wrong_camera",
         remedy="Put the cameras back, or calibrate these and make a new test.",

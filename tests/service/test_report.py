@@ -519,7 +519,7 @@ def test_static_steps_are_also_known_by_their_labels(plate: Measurement, tmp_pat
     (test / "test.json").write_text(json.dumps({k: v for k, v in document.items() if k != "metadata"}))
     measured = read_steps(find_source(test))
     assert measured.static == [1, 3]
-    assert "by their labels" in measured.static_how
+    assert "by their labels" in measured.static_source
     assert measured.floor["W"].bias is not None
     assert [step.static for step in measured.steps] == [False, True, False, True, False, False]
 

@@ -1,4 +1,4 @@
-"""Metadata of a test: kept, replaced as a whole, guarded by If-Match; and what the rig file states of camera and lens."""
+"""Metadata of a test: kept, replaced as a whole, guarded by If-Match; metadata of camera and lens in the rig file."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Recorder:
             raise
         finally:
             took_s = (ended or time.monotonic()) - began
-            self._tell(scope, status, took_s, number)
+            self._record(scope, status, took_s, number)
             if scope["method"] not in _SAFE:
                 person = scope["state"].get("person")
                 self._log.write(
@@ -114,7 +114,7 @@ class Recorder:
                     request_id=number,
                 )
 
-    def _tell(self, scope: Scope, status: int, took_s: float, number: str) -> None:
+    def _record(self, scope: Scope, status: int, took_s: float, number: str) -> None:
         """Count and time a request, and write its line into the log."""
         # what a client made up is no label: each would be kept for ever
         method = scope["method"] if scope["method"] in _METHODS else "other"

@@ -31,7 +31,7 @@ _STOP = "/api/v1/stage/stop"
 # stopping must never fail for a right that is lacking; everybody may log in and out
 _FOR_EVERYBODY = frozenset({_STOP, "/api/v1/session"})
 _HALTS = frozenset({_STOP, "/api/v1/stage/abort"})
-_MOST_CLIENTS = 10_000
+_MAX_CLIENTS = 10_000
 
 
 class Sessions:
@@ -44,7 +44,7 @@ class Sessions:
         """Return a new cookie's value."""
         token = secrets.token_urlsafe(32)
         self._known[token] = person, time.monotonic() + SESSION_S
-        while len(self._known) > _MOST_CLIENTS:
+        while len(self._known) > _MAX_CLIENTS:
             self._known.popitem(last=False)
         return token
 
@@ -85,7 +85,7 @@ class RateLimit:
             return (1.0 - left) / self._per_s
         self._left[client] = left - 1.0, now
         self._left.move_to_end(client)
-        while len(self._left) > _MOST_CLIENTS:
+        while len(self._left) > _MAX_CLIENTS:
             self._left.popitem(last=False)
         return 0.0
 

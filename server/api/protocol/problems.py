@@ -133,10 +133,10 @@ def install(app: FastAPI) -> None:
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
         fields = []
         for item in error.errors()[:20]:
-            place = [str(part) for part in item["loc"]]
-            field = ".".join(place[1:] or place)[:200]
+            location = [str(part) for part in item["loc"]]
+            field = ".".join(location[1:] or location)[:200]
             fields.append(
-                {"field": field, "in": place[0], "problem": str(item["msg"]).removeprefix("Value error, ")[:300]}
+                {"field": field, "in": location[0], "problem": str(item["msg"]).removeprefix("Value error, ")[:300]}
             )
         first = fields[0]
         if all(item["type"] == "values_disagree" for item in error.errors()):

@@ -57,14 +57,14 @@ def default_config() -> Path:
     FileFormatError
         ``file_missing`` if there is none.
     """
-    places = [
+    folders = [
         Path(__file__).resolve().parents[3] / "config",
         Path.cwd() / "config",
         Path(sys.prefix) / "share" / "stereorig" / "config",
     ]
-    for place in places:
-        if (place / DEFAULT_CONFIG).is_file():
-            return place / DEFAULT_CONFIG
+    for folder in folders:
+        if (folder / DEFAULT_CONFIG).is_file():
+            return folder / DEFAULT_CONFIG
     raise FileFormatError(
         f"No config/{DEFAULT_CONFIG} was found.", code="file_missing", remedy="Name a rig file with --config."
     )

@@ -12,7 +12,8 @@ import pytest
 
 from core.settings import AnalysisSettings
 from server.formats.results.reading import read_field, read_head, read_measured
-from server.formats.results.settings import current_summary, stored_settings
+from server.formats.results.settings import current_entries, current_summary, stored_settings
+from server.formats.results.strain import read_strain
 from server.report.records import TestRecord as ReportedTest
 from server.results.gauges.request import GaugeRequest, ThreeTwoOneAlignment
 from server.results.provenance import calibration_of
@@ -99,3 +100,11 @@ def test_documents_of_the_store_are_read_by_their_earlier_names() -> None:
     job = JobRecord.model_validate_json((OLD / "store" / "job.json").read_text())
     assert (job.progress.phase, job.progress.done) == ("step 4: done", 5000)
     assert "stage" not in job.plain()["progress"]  # type: ignore[operator]
+
+
+def test_options_of_strain_are_read_by_their_earlier_names() -> None:
+    kept = {"least_share": 0.3, "most_amplification": 9.0, "window": 9, "tensor": "hencky"}
+    assert current_entries(kept) == {"min_share": 0.3, "max_amplification": 9.0, "window": 9, "tensor": "hencky"}
+    strain = read_strain(OLD / "updated" / "step_0003.nc")
+    assert strain is not None
+    assert (strain.options.min_share, strain.options.max_amplification) == (0.5, 12.0)

@@ -79,7 +79,7 @@ class SeedsRequest(Request):
     reference: Annotated[Whole, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
 
 
-class SeedPlace(Reply):
+class SeedPosition(Reply):
     """Where camera 2 may see a seed."""
 
     line_px: list[list[float]] = Field(description="Points along the epipolar line in camera 2; empty: unseen there.")
@@ -89,13 +89,13 @@ class SeedPlace(Reply):
 class SeedsReply(Reply):
     """Epipolar check of the seeds."""
 
-    seeds: list[SeedPlace] = Field(description="One each.")
+    seeds: list[SeedPosition] = Field(description="One each.")
 
 
 @router.post(
     "/steps/{n}/texture", summary="Speckle quality of a region for a subset size", responses=errors(404, 409, 422)
 )
-def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
+def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
     """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""
     if body.subset_px % 2 == 0:
         raise InputError(
@@ -119,7 +119,7 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
 
 
 @router.post("/seeds:check", summary="Where camera 2 may see a seed", responses=errors(404, 409, 422))
-def check_seed_places(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> SeedsReply:
+def check_seeds(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> SeedsReply:
     """Return each seed's epipolar line in camera 2, and how far the place named there lies from it."""
     two = [None] * len(body.seeds) if body.seeds_cam2 is None else body.seeds_cam2
     if len(two) != len(body.seeds):

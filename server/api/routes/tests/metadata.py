@@ -38,7 +38,7 @@ def put_metadata(
         str | None, Header(max_length=200, description="ETag of the state that is replaced; another one is refused.")
     ] = None,
 ) -> TestMetadata:
-    """Replace all metadata of the test: lens, light, pattern, specimen, static steps and the like; a report shows them."""
+    """Replace a test's metadata: lens, light, pattern, specimen, static steps and the like; a report shows them."""
     expected = None
     if if_match is not None and if_match.strip() != "*":
         expected = service.tests.metadata(test_id)

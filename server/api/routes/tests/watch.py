@@ -11,7 +11,7 @@ from server.api.models import ReadingReply, ReadingRequest, WatchReply, WatchReq
 from server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.problems import errors
-from server.api.routes.tests.tests import step_facts
+from server.api.routes.tests.tests import step_metadata
 from server.base.models import Ids
 from server.store.documents import WatchRecord
 from server.workflows.watch import Watches
@@ -88,7 +88,7 @@ def post_channels(
     sent = mark(f"tests/{test_id}/channels", key, body)
 
     def make() -> Ids:
-        outcome = watches.reading(test_id, step_facts(body, sent))
+        outcome = watches.reading(test_id, step_metadata(body, sent))
         values = {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
         return {name: value for name, value in values.items() if value is not None}
 
