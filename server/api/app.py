@@ -36,7 +36,7 @@ problem+json (RFC 9457) with a stable `code`, the cause in `detail` and a `remed
 `Idempotency-Key`. What GET answers, HEAD does without a body. Answers have an ETag; asked with it in `If-None-Match`,
 they come as 304 while nothing has changed, and changes with `If-Match` are refused where something has. Lists come in
 pages: `next_cursor` leads to the next one. Answers are compressed for those who accept gzip. Lengths are in
-millimetres in the calibration target's frame unless a name says otherwise."""
+millimetres in the calibration target's frame unless a name states another one."""
 
 
 def create_app(
@@ -53,7 +53,7 @@ def create_app(
     hosts
         Host names under which it may be addressed.
     keys_required
-        True if every request needs a key; left out, as the rig file says.
+        True if every request needs a key; left out, as the rig file demands.
     close_service
         Close the service when the app shuts down.
     """

@@ -51,7 +51,7 @@ class ProgressLine:
     def show(self, text: str, fraction: float) -> None:
         """Say where the work is; ``fraction`` of all of it is done."""
         now = time.monotonic()
-        if self._start is None:  # loading and checking before the first report says nothing about the pace
+        if self._start is None:  # loading and checking before the first report is no part of the pace
             self._start = (now, fraction)
         if now - self._last < (_REDRAW_S if self._live else _QUIET_S):
             return

@@ -1,4 +1,4 @@
-"""What the three experiments share: the running service, the rig's truth, the folder for what they find."""
+"""Common parts of the three experiments: the running service, the rig's truth, the folder for what they find."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Check:
 
 @dataclass
 class Outcome:
-    """What an experiment found.
+    """Outcome of an experiment.
 
     Attributes
     ----------

@@ -40,7 +40,7 @@ _Count = TypeVar("_Count", int, float)
 
 @dataclass
 class Watch:
-    """What was seen while pairs were captured one after the other."""
+    """Measurements while pairs were captured one after the other."""
 
     seconds: float = 0.0
     durations_ms: list[float] = field(default_factory=list)
@@ -57,14 +57,14 @@ class Watch:
         return len(self.durations_ms) / self.seconds if self.durations_ms and self.seconds > 0 else None
 
     def bytes_per_s(self, cam: CameraName) -> float:
-        """What came over the camera's link: as its driver counted, else as the images' size tells."""
+        """Bytes over the camera's link: as its driver counted, else by the images' size."""
         counted = self.link[cam].get("transferred_bytes")
         if counted is not None:
             return counted / self.seconds
         return 0.0 if self.last is None else self.announced(cam) * self.last.pixels[cam].nbytes / self.seconds
 
     def announced(self, cam: CameraName) -> int:
-        """How far the camera's counter went."""
+        """Advance of the camera's counter."""
         return sum(self.frames[cam][name] for name in ("delivered", "overrun", "dropped", "incomplete"))
 
 
@@ -288,7 +288,7 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
 
 
 def _state_of_share(bad: int, of: int) -> State:
-    """Judge a share: one may go wrong, or one in a hundred."""
+    """Return the state for a share of failures: one may fail, or one in a hundred."""
     return "ok" if bad == 0 else "warning" if bad <= max(1.0, _LOSS_SHARE * of) else "failed"
 
 

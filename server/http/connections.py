@@ -23,7 +23,7 @@ _log = logging.getLogger("stereorig.connections")
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """What a connection may take.
+    """Limits of a connection.
 
     Parameters
     ----------

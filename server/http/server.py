@@ -123,6 +123,6 @@ class OrderlyServer(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End: the stage, then streams, then requests, then the rest (the app's lifespan closes the service)."""
-        self._service.begin_end()  # nobody sends a signal to a server in a thread
+        self._service.begin_end()  # a server in a thread receives no signal
         self._service.stop_streams()  # or it would wait for them
         await super().shutdown(sockets=sockets)

@@ -1,6 +1,6 @@
-"""Who holds the hardware, and the one thread that talks to it.
+"""Exclusive hold on the hardware, and the one thread that drives it.
 
-Hardware is never queued: a second caller learns who has it. Stopping needs neither the hold nor the thread.
+Hardware is never queued: a second caller is given the holder. Stopping needs neither the hold nor the thread.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ T = TypeVar("T")
 
 
 class Holder(Document):
-    """What holds the hardware, so that nothing else can use it."""
+    """Job or request that holds the hardware; nothing else can use it."""
 
-    purpose: str = Field(description="In words.", examples=["a calibration"])
-    job_id: str | None = Field(None, description="Its job, where it is one.")
-    since_s: float = Field(description="For how long, seconds.")
+    purpose: str = Field(description="Purpose of the hold, in words.", examples=["a calibration"])
+    job_id: str | None = Field(None, description="Id of the job, if a job holds it.")
+    since_s: float = Field(description="Time since it took the hold, s.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class HardwareHold:
 
     @property
     def holder(self) -> Holder | None:
-        """Who holds the hardware."""
+        """Holder of the hardware; None while it is free."""
         with self._lock:
             hold = self._hold
         if hold is None:

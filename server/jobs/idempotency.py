@@ -44,7 +44,7 @@ class RequestMark:
         return {"request": {"scope": self.scope, "key": self.key, "body_sha256": self.body_sha256}}
 
     def made(self, ids: Ids) -> tuple[str, str, str, Ids] | None:
-        """Return the row of the catalogue that says what it made."""
+        """Return the row of the catalogue that names what it made."""
         return None if self.key is None else (self.scope, self.key, self.body_sha256, ids)
 
 

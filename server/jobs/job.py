@@ -22,7 +22,7 @@ ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase of a job: where it runs, and what; what ``run`` returns is merged into the job's result."""
+    """One phase of a job: its lane and its function; what ``run`` returns is merged into the job's result."""
 
     lane: Literal["hardware", "compute"]
     run: Callable[[Job], Mapping[str, object] | None]
@@ -34,7 +34,7 @@ class Waiting(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What a job does.
+    """Work of a job.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def new_record(job_id: str, kind: str, subject: Mapping[str, object]) -> JobReco
 
 
 class _Pace:
-    """How far a job is in its units, and how fast."""
+    """Progress of a job in its units, and its pace."""
 
     def __init__(self) -> None:
         self.reset()
@@ -175,7 +175,7 @@ class Job:
 
     @property
     def result(self) -> dict[str, object] | None:
-        """What it has found so far."""
+        """Result so far."""
         return self.record.result
 
     @result.setter
@@ -202,7 +202,7 @@ class Job:
         self._pace.reset()
 
     def begin(self) -> bool:
-        """Say that it runs; return False where an earlier phase did."""
+        """Set its state to running; return False where an earlier phase did."""
         if self.record.state != "queued":
             return False
         self._change(state="running", started_utc=now_utc())

@@ -1,4 +1,4 @@
-"""How fast the image moves, from two frames of one camera: what a skew costs in pixels follows from it."""
+"""Speed of the image, from two frames of one camera: the error of a skew in pixels follows from it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NOISE_PX = 0.02
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """How far the middle of a camera's image moved in a time."""
+    """Displacement of the middle of a camera's image in a time."""
 
     distance_px: float
     seconds: float

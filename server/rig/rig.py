@@ -115,7 +115,7 @@ class Rig:
         except StageError as error:
             if error.code != "stage_stopped":
                 raise
-            # somebody wants it to stand still, and the cameras to go on
+            # an operator may want it at rest while the cameras go on
             _log.warning("homing was stopped; the rig is open, and its axes are to be homed before they move")
 
     def close(self) -> None:
@@ -150,7 +150,7 @@ class Rig:
 
     @property
     def fault(self) -> JobProblem | None:
-        """Why the rig cannot be used, or None."""
+        """Fault that keeps the rig from being used, or None."""
         return self._fault
 
     def _ready(self) -> Devices:
@@ -207,11 +207,11 @@ class Rig:
         )
 
     def identities(self) -> dict[str, dict[str, str]]:
-        """Who each camera is, for the records of what they took."""
+        """Identity of each camera, for the records of their images."""
         return {cam: identity_of(self.pair.units[cam].description) for cam in CAMERAS}
 
     def record(self) -> RigKept:
-        """What a report wants to know of the rig that took a step."""
+        """Record of the rig that took a step, for a report."""
         section, units = self.config.rig, self.pair.units
         return RigKept(
             name=section.name,

@@ -1,4 +1,4 @@
-"""What users do with a stage besides moving it: motors, velocities, messages, abort, the configuration state."""
+"""Operations of a stage besides motion: motors, velocities, messages, abort, the configuration state."""
 
 from __future__ import annotations
 

@@ -38,14 +38,14 @@ class JobRecord(Document):
     kind: str = Field(
         description="`calibration`, `noise`, `analysis`, `burst`, `move`, `home`, `leave_configuration` or `reconnect`."
     )
-    state: JobState = Field(description="Where it is in its life.")
+    state: JobState = Field(description="State of the job.")
     subject: dict[str, object] = Field(description="Ids of what it works on.")
-    progress: Progress = Field(description="How far it is.")
-    created_utc: str = Field(description="When it was accepted.")
-    started_utc: str | None = Field(None, description="When it began.")
-    finished_utc: str | None = Field(None, description="When it ended.")
-    result: dict[str, object] | None = Field(None, description="What it found, when it succeeded.")
-    problem: JobProblem | None = Field(None, description="Why it has no result.")
+    progress: Progress = Field(description="Progress.")
+    created_utc: str = Field(description="Time at which it was accepted.")
+    started_utc: str | None = Field(None, description="Time at which it began.")
+    finished_utc: str | None = Field(None, description="Time at which it ended.")
+    result: dict[str, object] | None = Field(None, description="Result, when it succeeded.")
+    problem: JobProblem | None = Field(None, description="Problem that left no result.")
 
     def ended(self, state: JobState, finished_utc: str, problem: JobProblem | None) -> JobRecord:
         """Return the record of the job's end."""
@@ -266,14 +266,14 @@ class TrashEntry(Record, Document):
     """Something that was deleted and can be restored."""
 
     id: str = Field(description="Id in the trash.", examples=["x000001-3f09aa"])
-    kind: Literal["test", "step", "analysis", "calibration", "noise", "unknown"] = Field(description="What it was.")
+    kind: Literal["test", "step", "analysis", "calibration", "noise", "unknown"] = Field(description="Kind of thing.")
     test_id: str | None = Field(None, description="Its test, or itself.")
     n: int | None = Field(None, description="Number of a step.")
     analysis_id: str | None = Field(None, description="Id of an analysis.")
     calibration_id: str | None = Field(None, description="Id of a calibration.")
     noise_id: str | None = Field(None, description="Id of a noise measurement.")
     name: str = Field("", description="Its name, as users gave it.")
-    deleted_utc: str | None = Field(None, description="When it was deleted.")
+    deleted_utc: str | None = Field(None, description="Time at which it was deleted.")
     deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
     why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")
     size_bytes: int | None = Field(None, description="Room that emptying frees.")

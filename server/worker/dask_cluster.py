@@ -113,7 +113,7 @@ class ClusterExecutor(TaskExecutor):
 
     @property
     def width(self) -> int:
-        """How many tasks run at once: one a worker."""
+        """Number of tasks that run at once: one a worker."""
         if time.monotonic() > self._count_again:
             self._count_again = time.monotonic() + _COUNT_S
             self._workers = len(self._connected().scheduler_info(n_workers=-1)["workers"])
@@ -199,7 +199,7 @@ class ClusterExecutor(TaskExecutor):
         self._settle(future, error=Cancelled("The computation was cancelled."))
 
         def cancel_remote() -> None:
-            with contextlib.suppress(Exception):  # a cluster that is gone needs no telling
+            with contextlib.suppress(Exception):  # a cluster that is gone has nothing to stop
                 client.cancel([remote], asynchronous=False)
                 client.run(dask_task.stop, future.name, wait=False)
 

@@ -1,4 +1,4 @@
-"""What runs on a Dask worker: the same task functions as in the service's own worker, one at a time in a process.
+"""Tasks on a Dask worker: the same task functions as in the service's own worker, one at a time in a process.
 
 Where the worker shares no disk with the service, a step comes with the content of its files and its result goes back as
 content; here it lies in a folder of its own meanwhile.

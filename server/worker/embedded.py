@@ -87,7 +87,7 @@ class ComputeWorker(TaskExecutor):
 
     @property
     def width(self) -> int:
-        """How many tasks run at once."""
+        """Number of tasks that run at once."""
         return 1
 
     @property
@@ -108,7 +108,7 @@ class ComputeWorker(TaskExecutor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
-        """End the process; running and waiting tasks are cancelled, whatever ``cancel_futures`` says."""
+        """End the process; running and waiting tasks are cancelled, whatever the value of ``cancel_futures``."""
         with self._state_lock:
             self._closing.set()
             self._tasks.put(None)

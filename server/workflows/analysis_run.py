@@ -1,6 +1,6 @@
 """An analysis at work: one task a step in the worker, each step's file announced once it can be read.
 
-A run knows nothing that the folder does not: it begins anew, goes on where another one stopped, or follows a test, and
+A run keeps no state but the folder's: it begins anew, goes on where another one stopped, or follows a test, and
 measures each step from the same steps before it in any case.
 """
 

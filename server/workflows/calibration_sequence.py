@@ -28,7 +28,7 @@ SAME_POSITION_MM = 1e-6
 
 @dataclass(frozen=True)
 class CalibrationPlan:
-    """What to do.
+    """Plan of a calibration.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def fit(service: Service, job: Job, calibration_id: str) -> dict[str, object]:
 
 
 def rig_metadata(config: RigConfig) -> dict[str, Any]:
-    """What the fit needs of the rig file."""
+    """Entries of the rig file that the fit needs."""
     return {
         "name": config.rig.name,
         "target": config.target.model_dump(mode="json"),

@@ -1,4 +1,4 @@
-"""Whether images come from the cameras that were calibrated, as far as both records know their serial numbers."""
+"""Check that images come from the cameras that were calibrated, where both records hold serial numbers."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, images: st
     calibration
         A calibration.json.
     cameras
-        Who took the images; None where it is not known, as with imported files.
+        Cameras that took the images; None where not known, as with imported files.
     images
         The images, for the text: ``step 3``.
 
     Raises
     ------
     CameraError
-        ``wrong_camera``, which says so when the two were exchanged.
+        ``wrong_camera``, which states if the two were exchanged.
     """
     known = calibrated_cameras(calibration)
     if known is None or not cameras:

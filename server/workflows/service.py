@@ -95,7 +95,7 @@ class Service:
         self.abort_thread = ThreadPoolExecutor(max_workers=4, thread_name_prefix="abort")
         self.started_monotonic = time.monotonic()
         self.closing = False
-        #: held from the look at a thing to its change, where a client says which state it means
+        #: held from the look at a thing to its change, where a client names the state it means
         self.changes = threading.Lock()
         self.continuing = threading.Lock()
         self._effects = OneEffect(self.catalog)
@@ -198,7 +198,7 @@ class Service:
         """Stop the stage until a cancelled job has let the hardware go.
 
         A job that passed its last check just before it was cancelled may start a motion just after the first stop.
-        Once it has let go, the next motion is somebody else's and must not be touched.
+        Once it has let go, the next motion is another client's and must not be stopped.
         """
         for _ in range(100):
             time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""How answers travel: entity tags and 304, HEAD, gzip."""
+"""Delivery of answers: entity tags and 304, HEAD, gzip."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Page:
 
     @property
     def next_cursor(self) -> str | None:
-        """Where the next page begins; None after the last one."""
+        """Cursor of the next page; None after the last one."""
         return self._response.headers.get("X-Next-Cursor")
 
     def _is_after(self, key: str, newest_first: bool) -> bool:

@@ -80,7 +80,7 @@ class Problem(BaseModel):
     status: int = Field(description="HTTP status.")
     detail: str = Field(description="The cause, with the values that disagree.")
     code: str = Field(description="Stable snake_case code.")
-    remedy: str = Field(description="What the caller can do about it.")
+    remedy: str = Field(description="Remedy for the caller.")
 
 
 def status_of(error: StereorigError) -> int:
@@ -163,7 +163,7 @@ def install(app: FastAPI) -> None:
         code = codes.get(error.status_code, "http_error")
         headers = dict(error.headers) if error.headers else {}
         if error.status_code == 405:
-            # the router knows of the first route with this path only
+            # the router considers the first route with this path only
             headers["Allow"] = ", ".join(_methods_of(app, request.scope["path"]))
         return problem_response(
             status, code, f"{str(error.detail).rstrip('.')}.", "See /docs for the API.", headers=headers

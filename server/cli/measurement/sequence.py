@@ -171,7 +171,7 @@ class _Runner:
         self._index += 1
 
     def _write(self, k: int, result: Field, started: float, compute_s: float) -> dict[str, Any]:
-        """Write the file of a step, say so, return its summary."""
+        """Write the file of a step, print its line, return its summary."""
         step = self._job.steps[k]
         one, two = step.files
         about = {"cam1_file": str(one), "cam2_file": str(two)}
@@ -210,7 +210,7 @@ class _Runner:
         self._progress.note(f"note: {smoothing_note(result.smoothing, gauge[0], strain_window=gauge[1])}")
 
     def _note_patch(self, n: int, result: Field) -> None:
-        """Say what the patch was chosen for: of the shape, of the first step, and where it changes."""
+        """Print the reason for the patch: of the shape, of the first step, and where it changes."""
         choice = result.patch
         if choice is None:
             return
@@ -221,7 +221,7 @@ class _Runner:
             self._chosen = new
 
     def _note_reference(self, n: int, result: Field) -> None:
-        """Say where another reference took over."""
+        """Print where another reference took over."""
         matched = self._job.steps[0].n if result.references is None else result.references.step
         if n > 1 and matched != self._matched and self._job.settings.reference_update == "auto":
             self._progress.note(f"step {n}: step {self._matched} no longer serves as reference, step {matched} does")
@@ -239,7 +239,7 @@ class _Runner:
         return show
 
     def _doubt_noise(self, shape: Field) -> None:
-        """Say so where residuals and noise file disagree."""
+        """Print a note where residuals and noise file disagree."""
         options = self.sequence.options
         image = self.sequence.pair.image1.prepared(options.interpolation, None, options.blur)
         stated = image.noise_variance
@@ -248,7 +248,7 @@ class _Runner:
         found, expected = float(np.nanmedian(shape.noise_grey)), float(np.sqrt(stated))
         if not _MIN_OF_STATED < found / expected < _MAX_OF_STATED:
             self._progress.note(
-                f"note: residuals show a noise of {found:.2f} grey levels, the noise file says {expected:.2f}; "
+                f"note: residuals show a noise of {found:.2f} grey levels, the noise file states {expected:.2f}; "
                 "was it measured with these cameras' gain?"
             )
 

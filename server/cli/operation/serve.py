@@ -18,7 +18,7 @@ from server.http.access import KeyFile
 DEFAULT_CONFIG = "sim_paper.toml"
 DEFAULT_PORT = 8000
 _PLAIN = (
-    "keys and images travel unencrypted over plain http: anybody on the network can read them. Give --tls-cert and "
+    "keys and images travel unencrypted over plain http: any computer there can read them. Give --tls-cert and "
     "--tls-key, or put a proxy that speaks https in front."
 )
 # enough for a fast network at a short distance; more would only keep old pictures for slow readers
@@ -100,7 +100,7 @@ def check_host(host: str, keys: KeyFile) -> None:
     """
     if not is_loopback(host) and not keys.keys():
         raise InputError(
-            f"Listening on {host} would let anybody on the network move the stage: access keys are needed for that.",
+            f"Listening on {host} would let any computer there move the stage: access keys are needed for that.",
             code="bind_needs_keys",
             remedy="Make one: stereorig keys add NAME --role operator --data DATA. Or use --host 127.0.0.1.",
         )

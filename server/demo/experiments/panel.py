@@ -22,7 +22,7 @@ LIMIT_MM = 0.05  # the dimensional accuracy that the paper states for this set-u
 
 
 def _crack_px(session: Session, panel: CrackedPanel) -> NDArray[np.float64]:
-    """Where the calibrated camera 1 sees the crack: a user would click its ends in the image."""
+    """Crack in the image of the calibrated camera 1: a user would click its ends."""
     s = np.linspace(-panel.half_crack_mm, panel.half_crack_mm, 101)
     half = np.sqrt(0.5)  # the panel hangs upright, the grid's lines at 45 degrees
     line = np.stack([half * s, -half * s, np.full_like(s, -panel.bow_mm)], axis=-1)

@@ -143,7 +143,7 @@ def crests(at_mm: Float, height_mm: Float) -> list[Crest]:
 
 
 def plane_patch_error_mm(rig: SimRig, camera1: Camera, xy_px: Float, load_kn: float, subset_px: int) -> Float:
-    """What a plane patch does to the true w at places (n, 2): half its curvature times the subset's second moment.
+    """Error of a plane patch in the true w at positions (n, 2): half its curvature times the subset's second moment.
 
     The same as the mean of w over the subset less w in its middle, up to second order; so it is summed.
     """

@@ -31,7 +31,7 @@ _POLL_S = 0.05
 
 @dataclass(frozen=True)
 class _Drawn:
-    """How figures and films look."""
+    """Style of figures and films."""
 
     style: FigureStyle
     over_image: bool
@@ -167,7 +167,7 @@ async def _made(
 
 
 async def finished(request: Request, future: TaskFuture) -> Any:
-    """Wait for a task without holding anybody up; return its result. A client that goes away ends it."""
+    """Wait for a task without delaying other clients; return its result. A client that goes away ends it."""
     try:
         while not future.done():
             await asyncio.sleep(_POLL_S)

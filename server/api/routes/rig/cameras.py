@@ -190,7 +190,7 @@ async def get_stream(
                 except StereorigError as error:
                     if error.code == "camera_busy":  # a capture goes on, and nothing older is there to show
                         continue
-                    return  # the stream ends; GET /rig says why
+                    return  # the stream ends; GET /rig gives the reason
                 # by a timetable, since pauses are each a little too long; where there is no frame yet, it is not waited
                 # for a whole period, which would halve the rate
                 due += (0.25 if data is None else 1.0) / rate_hz

@@ -229,7 +229,7 @@ def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsen
     return Accepted.model_validate({"job": service.jobs.document(str(made["job_id"])).plain()})
 
 
-@router.get("/messages", summary="What the controller had to say")
+@router.get("/messages", summary="Messages of the controller")
 def get_messages(service: ServiceDep) -> StageMessages:
     """Empty the controller's error queue and return the last 200 messages with their texts; reading loses none."""
     return StageMessages(messages=service.rig.controls.messages())

@@ -126,7 +126,7 @@ async def create_step(
 
 
 def step_metadata(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepMetadata:
-    """What the client said of a step, as its document keeps it."""
+    """Metadata of a step as the client states them, in the form its document keeps."""
     stamp = None if body.timestamp_utc is None else utc_text(body.timestamp_utc)
     said = {"label": body.label, "load_n": body.load_n, "timestamp_utc": stamp, "channels": body.channels}
     return StepMetadata.model_validate({**said, **sent.document()})

@@ -54,7 +54,7 @@ def put_watch(
     return WatchReply.model_validate(tagged(response, watches.begin(test_id, body.model_dump(), allow).plain()))
 
 
-@router.get("/watch", summary="What is watched", responses=errors(404))
+@router.get("/watch", summary="The watch on a channel", responses=errors(404))
 def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> WatchReply:
     """Return channel and threshold, and the value that the next reading is compared with; ETag names this state."""
     return WatchReply.model_validate(tagged(response, watches.read(test_id).plain()))
