@@ -199,9 +199,9 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
     )
 
 
-def _not_static(what: str) -> ImageError:
+def _not_static(cause: str) -> ImageError:
     return ImageError(
-        f"the frames do not show a still scene: {what}.",
+        f"the frames do not show a still scene: {cause}.",
         code="frames_not_static",
         remedy="Take the frames in one go, with nothing loaded or touched, and a steady light.",
     )

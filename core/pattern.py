@@ -95,9 +95,9 @@ def _covariance(grey: NDArray[np.generic], chosen: Bool) -> tuple[Float, Float, 
     tiles = 0
     # a region that fills no tile is better than none
     shares = [float(chosen[r : r + height, c : c + width].mean()) for r, c in corners]
-    least = min(_MIN_SHARE, max(shares))
+    min_share = min(_MIN_SHARE, max(shares))
     for (r, c), share in zip(corners, shares, strict=True):
-        if share < least or share == 0.0:
+        if share < min_share or share == 0.0:
             continue
         weight = chosen[r : r + height, c : c + width].astype(np.float64)
         values = _flattened(grey[r : r + height, c : c + width].astype(np.float64), weight)

@@ -79,7 +79,9 @@ Pixel = Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=32767.0)]
 SubsetPx = Annotated[
     Whole, Field(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Subset size, odd.", json_schema_extra=ODD)
 ]
-SpacingPx = Annotated[Whole, Field(ge=SPACING_PX.low, le=SPACING_PX.high)]
+SpacingPx = Annotated[
+    Whole, Field(ge=SPACING_PX.low, le=SPACING_PX.high, description="Distance of neighbouring points, px.")
+]
 PixelPosition = tuple[Pixel, Pixel]
 Rectangle = tuple[Pixel, Pixel, Pixel, Pixel]
 
@@ -151,7 +153,6 @@ class AnalysisSettings(Settings):
     spacing_px: SpacingPx = Field(
         SPACING_PX.default,
         validation_alias=AliasChoices("spacing_px", "step_px"),  # the second is its earlier name
-        description="Distance of neighbouring points.",
     )
     patch: Annotated[PatchSetting, BeforeValidator(patch_name)] = Field(
         DEFAULT_PATCH,
@@ -218,18 +219,18 @@ class NoiseRecord(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
-    sha256: str
-    noise_id: str | None = None
+    sha256: str = Field(description="Checksum of the noise models.")
+    noise_id: str | None = Field(None, description="Id of the noise measurement; null where it came from a file.")
 
 
 class StoredRegion(Region):
     """A region as stored in results; checked against its image when it was made."""
 
-    rectangle: tuple[float, float, float, float] | None = None
-    polygon: list[tuple[float, float]] | None = None
-    cracks: list[list[tuple[float, float]]] = []
-    holes: list[list[tuple[float, float]]] = []
-    mask: str | None = None
+    rectangle: tuple[float, float, float, float] | None = Field(None, description="x0, y0, x1, y1; null: none.")
+    polygon: list[tuple[float, float]] | None = Field(None, description="Corners x, y; null: none.")
+    cracks: list[list[tuple[float, float]]] = Field(default=[], description="Lines of points x, y along cracks.")
+    holes: list[list[tuple[float, float]]] = Field(default=[], description="Polygons of corners x, y without points.")
+    mask: str | None = Field(None, description="Record of the mask; null: none.")
 
 
 class StoredSettings(AnalysisSettings):
@@ -237,6 +238,6 @@ class StoredSettings(AnalysisSettings):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    region: StoredRegion
-    reference: int = 0
-    noise: NoiseRecord | None = None
+    region: StoredRegion = Field(description="Region of interest.")
+    reference: int = Field(0, description="Reference step.")
+    noise: NoiseRecord | None = Field(None, description="Noise models that weighed the pixels; null: none.")

@@ -41,6 +41,6 @@ def average_roughness_mm(surface: Surface, *, half_size_mm: float = _PATCH_MM, n
     """Ra: mean departure from the best plane over the square |s|, |t| < ``half_size_mm``."""
     c = (np.arange(n) + 0.5) / n * 2.0 * half_size_mm - half_size_mm
     s, t = np.meshgrid(c, c)
-    z = surface.place(np.stack([s, t], axis=-1))[..., 2].ravel()
+    z = surface.positions(np.stack([s, t], axis=-1))[..., 2].ravel()
     design = np.column_stack([np.ones(z.size), s.ravel(), t.ravel()])
     return float(np.mean(np.abs(z - design @ np.linalg.lstsq(design, z, rcond=None)[0])))

@@ -55,7 +55,7 @@ class Surface:
     coarse: Float = field(default_factory=_NO_TABLE.copy)
     fine: Float = field(default_factory=_NO_TABLE.copy)
 
-    def place(self, st_mm: ArrayLike, lip: ArrayLike = 1.0) -> Float:
+    def positions(self, st_mm: ArrayLike, lip: ArrayLike = 1.0) -> Float:
         """Return body positions (..., 3) of material points (..., 2); ``lip`` +-1 picks a crack's lip."""
         return self._evaluated(st_mm, lip)[..., :3]
 

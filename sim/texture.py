@@ -174,7 +174,7 @@ def fill_discs(i: int, j: int, par: Float, discs: Float) -> None:
     cell, radius, rim, seed = par[0], par[1], par[2], np.uint64(np.int64(par[5]))
     spread = _RADIUS_SPREAD
     # a disc must not reach beyond the neighbouring cell
-    largest = cell - rim
+    max_radius = cell - rim
     for k in range(9):
         m = (k + 4) % 9
         ci = i + m % 3 - 1
@@ -183,7 +183,7 @@ def fill_discs(i: int, j: int, par: Float, discs: Float) -> None:
         discs[k, 0] = (ci + (np.float64(h & _MASK21) + 0.5) * _UNIT) * cell
         discs[k, 1] = (cj + (np.float64((h >> _S21) & _MASK21) + 0.5) * _UNIT) * cell
         r = radius * (1.0 + spread * (2.0 * np.float64((h >> _S42) & _MASK21) * _UNIT - 1.0))
-        discs[k, 2] = min(r, largest)
+        discs[k, 2] = min(r, max_radius)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

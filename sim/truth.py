@@ -62,7 +62,7 @@ def truth_at(reference: Scene, camera1: Camera, xy_px: ArrayLike, *, now: Scene 
     later = reference if now is None else now
     st, side = material_points(reference, camera1, xy_px)
     before, after = reference.sys_from_body, later.sys_from_body
-    xyz = before.apply(reference.surface.place(st, side))
+    xyz = before.apply(reference.surface.positions(st, side))
     tangents = before.rotation @ reference.surface.tangents(st, side)
     tangents_now = after.rotation @ later.surface.tangents(st, side)
     frame, metric = _frame(tangents)
@@ -78,7 +78,7 @@ def truth_at(reference: Scene, camera1: Camera, xy_px: ArrayLike, *, now: Scene 
         st_mm=st,
         xyz_mm=xyz,
         normal_sys=normal * away,
-        uvw_mm=after.apply(later.surface.place(st, side)) - xyz,
+        uvw_mm=after.apply(later.surface.positions(st, side)) - xyz,
         rotation=frame_now @ np.swapaxes(frame, -1, -2),
         stretch=e,
     )
@@ -143,7 +143,7 @@ def subset_planes(
     offset = np.stack(np.meshgrid(o, o), axis=-1).reshape(-1, 2)
     pixels = centre[:, None] + offset
     st, side = material_points(scene, camera1, pixels)
-    p = camera1.cam_from_sys.apply(scene.sys_from_body.apply(scene.surface.place(st, side)))
+    p = camera1.cam_from_sys.apply(scene.sys_from_body.apply(scene.surface.positions(st, side)))
     rays = camera1.rays_cam(pixels).xyz_mm[..., :2]
     ray0 = camera1.rays_cam(centre).xyz_mm
     design = np.concatenate([np.ones_like(rays[..., :1]), rays - ray0[:, None, :2]], axis=-1)

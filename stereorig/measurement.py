@@ -132,9 +132,9 @@ class Measurement:
             field_of=lambda n: self._fields[n],
         )
 
-    def _prepared(self, image1: Image, image2: Image, what: str) -> tuple[MeasureImage, MeasureImage]:
+    def _prepared(self, image1: Image, image2: Image, name: str) -> tuple[MeasureImage, MeasureImage]:
         one, two = (
-            MeasureImage(image, f"{cam}, {what}", noise=model)
+            MeasureImage(image, f"{cam}, {name}", noise=model)
             for cam, image, model in zip(("camera 1", "camera 2"), (image1, image2), self._noise, strict=True)
         )
         return one, two

@@ -161,9 +161,9 @@ def predict_or_refuse(
     travels = [max(v.dz_mm for v in own) - min(v.dz_mm for v in own) for own in fitted]
     for name, own, travel in zip(CAMERAS, fitted, travels, strict=True):
         if travel <= _SAME_POSITION_MM:
-            what = "only one view" if len(own) == 1 else f"{len(own)} views, all"
+            views_text = "only one view" if len(own) == 1 else f"{len(own)} views, all"
             raise CalibrationInputError(
-                f"{name} has {what} at {own[0].dz_mm:+.3f} mm to fit: predicted uncertainty {figure}.",
+                f"{name} has {views_text} at {own[0].dz_mm:+.3f} mm to fit: predicted uncertainty {figure}.",
                 code="calibration_one_position",
                 predicted_shape=relative,
                 camera=name,

@@ -167,8 +167,8 @@ def _deformation(r: Float, noise: Float, weight: Float) -> float:
     def over(extra: float) -> float:
         return float((q / (spread + extra)).sum()) - share
 
-    most = float(q.sum()) / share
-    return float(brentq(over, 0.0, most)) if most > 0.0 and over(0.0) > 0.0 else 0.0
+    upper = float(q.sum()) / share
+    return float(brentq(over, 0.0, upper)) if upper > 0.0 and over(0.0) > 0.0 else 0.0
 
 
 def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPixels) -> Field:

@@ -206,11 +206,11 @@ def check_coverage(table: PieceTable, good: Bool, cause: NDArray[np.str_], optio
     worst = int(np.argmax(per_line))
     na = table.counts[0]
     name = f"line {worst} of family a" if worst < na else f"line {worst - na} of family b"
-    what = "is glaring (saturated or without contrast)" if glare else "is covered, dirty or unsharp"
+    defect = "is glaring (saturated or without contrast)" if glare else "is covered, dirty or unsharp"
     raise TargetError(
         f"{np.count_nonzero(bad)} of {len(bad)} pieces of lines cannot be used (at most"
         f" {options.max_bad_fraction:.0%}), {per_line[worst]:.0%} of {name} (at most"
-        f" {options.max_bad_on_line:.0%}); most of it {what}",
+        f" {options.max_bad_on_line:.0%}); most of it {defect}",
         code="target_glare" if glare else "target_dirty",
         remedy="Take the reflection or the overexposure away: light the grid from behind, close the aperture."
         if glare

@@ -148,9 +148,9 @@ def dark_pixel_lines(
         coefficients[k] = inverse[k] @ g[mine].sum(axis=0)
     # the pixels' spread is the line's width, not noise: the residual of each piece's mean is noise
     left = (g - np.einsum("kij,kj->ki", M, coefficients[index]))[seen]
-    scatter = float(np.sum((left[:, 0] / N[seen, 0]) ** 2)) / max(int(seen.sum()) - 3 * n_line, 1)
+    variance = float(np.sum((left[:, 0] / N[seen, 0]) ** 2)) / max(int(seen.sum()) - 3 * n_line, 1)
     spread = np.zeros((n_line, 3, 3))
-    np.add.at(spread, index[seen], scatter * np.einsum("ki,kj->kij", N[seen, :3], N[seen, :3]))
+    np.add.at(spread, index[seen], variance * np.einsum("ki,kj->kij", N[seen, :3], N[seen, :3]))
     return Parabolas(steep, centre, coefficients, inverse @ spread @ inverse)
 
 

@@ -76,22 +76,22 @@ def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
     """
     best: Lattice | None = None
     best_seen = 0.0
-    most = (0, 0)
+    max_counts = (0, 0)
     for p in range(len(found.peaks_rad)):
         for q in range(p + 1, len(found.peaks_rad)):
             angle_rad = abs(found.peaks_rad[p] - found.peaks_rad[q])
             if min(angle_rad, np.pi - angle_rad) < _MIN_CROSSING_RAD:
                 continue
             lattice, seen, counts = _try_pair(picture, found, found.peaks_rad[p], found.peaks_rad[q])
-            most = max(most, counts, key=min)
+            max_counts = max(max_counts, counts, key=min)
             if lattice is not None and seen > best_seen:
                 best, best_seen = lattice, seen
     if best is None:
         raise not_found(
-            f"no two families of lines: {most[0]} and {most[1]} parallel lines at best, with a threshold of"
+            f"no two families of lines: {max_counts[0]} and {max_counts[1]} parallel lines at best, with a threshold of"
             f" {picture.threshold:.3g} grey levels over a noise of {picture.noise:.3g}",
-            found_a=most[0],
-            found_b=most[1],
+            found_a=max_counts[0],
+            found_b=max_counts[1],
         )
     return best
 

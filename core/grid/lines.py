@@ -291,8 +291,8 @@ def _straight_covariance(
                 rows[r, 2 * k + 1] = (straight[i, j] - origin[k]) @ direction[k]
                 rows[r, 2 * n_line :] = -normal[k] @ f[i, j]
             # offsets across both lines -> position, in image coordinates
-            to_place = np.linalg.inv(np.stack([normal[a], normal[b]])) @ rows
-            out[i, j] = to_place @ covariance @ to_place.T
+            to_position = np.linalg.inv(np.stack([normal[a], normal[b]])) @ rows
+            out[i, j] = to_position @ covariance @ to_position.T
     return out * distortion.scale_px**2
 
 

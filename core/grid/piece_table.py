@@ -145,8 +145,8 @@ def line_points(table: PieceTable, fits: Float) -> PiecePoints:
     f, r = fits[piece], table.rows[piece]
     var0, cov, var1 = f[:, OUT["var_c0"]], f[:, OUT["cov_c01"]], f[:, OUT["var_c1"]]
     at = np.clip(-cov / var1, -r[:, IN["half_length"]], r[:, IN["half_length"]])
-    least = np.maximum(var0 - cov**2 / var1, 1e-16)
-    distance = np.minimum(np.sqrt(least / var1), r[:, IN["half_length"]])
+    min_variance = np.maximum(var0 - cov**2 / var1, 1e-16)
+    distance = np.minimum(np.sqrt(min_variance / var1), r[:, IN["half_length"]])
     direction = r[:, [IN["dir_x"], IN["dir_y"]]]
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
     points, along = [], []
@@ -159,7 +159,7 @@ def line_points(table: PieceTable, fits: Float) -> PiecePoints:
         LinePoints(
             np.concatenate(points),
             np.tile(normal, (2, 1)),
-            np.tile(np.sqrt(2.0 * least), 2),
+            np.tile(np.sqrt(2.0 * min_variance), 2),
             np.tile(table.family[piece], 2),
             np.tile(table.line[piece], 2),
             np.concatenate(along),

@@ -112,13 +112,13 @@ def line_picture(grey: Float32, target: GridTarget, factor: float) -> LinePictur
         step = max(int(factor), 1)
         block = grey[: height // step * step, : width // step * step]
         size = (round(block.shape[1] / factor), round(block.shape[0] / factor))
-        how = cv2.INTER_AREA if factor > 1.0 else cv2.INTER_CUBIC
-        coarse = np.asarray(cv2.resize(block, size, interpolation=how), dtype=np.float32)
+        resampling = cv2.INTER_AREA if factor > 1.0 else cv2.INTER_CUBIC
+        coarse = np.asarray(cv2.resize(block, size, interpolation=resampling), dtype=np.float32)
     signed = coarse if target.dark_lines else -coarse
     smooth = cv2.GaussianBlur(signed, (0, 0), 0.8 / min(factor, 1.0))
     max_pitch = _max_pitch_px((width, height), target)
-    widest_line = (target.line_width_mm / target.pitch_mm * max_pitch + 3.0) / factor
-    k = 2 * int(np.ceil(widest_line)) + 1
+    max_line_px = (target.line_width_mm / target.pitch_mm * max_pitch + 3.0) / factor
+    k = 2 * int(np.ceil(max_line_px)) + 1
     ground = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
     depth = (ground - smooth).astype(np.float32)
     threshold = _otsu(depth)

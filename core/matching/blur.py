@@ -126,18 +126,18 @@ def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) ->
     nx, ny = under_noise(gx), under_noise(gy)
     # a fit is free in the grey levels' mean, so that only the gradients' deviations from their own mean count
     ax, ay, bx, by = mean(gx), mean(gy), mean(nx), mean(ny)
-    most = np.float32(shared.sum() ** 2)
+    max_ratio = np.float32(shared.sum() ** 2)
     xx, yy, xy = mean(gx * gx) - ax * ax, mean(gy * gy) - ay * ay, mean(gx * gy) - ax * ay
-    kxx = mean(gx * nx) - 2.0 * ax * bx + most * ax * ax
-    kyy = mean(gy * ny) - 2.0 * ay * by + most * ay * ay
-    kxy = mean(gx * ny) - ax * by - ay * bx + most * ax * ay
+    kxx = mean(gx * nx) - 2.0 * ax * bx + max_ratio * ax * ax
+    kyy = mean(gy * ny) - 2.0 * ay * by + max_ratio * ay * ay
+    kxy = mean(gx * ny) - ax * by - ay * bx + max_ratio * ax * ay
     det, trace = xx * yy - xy * xy, xx + yy
     # the adjugate of G is (yy, xx, -xy); its square
     coloured = (yy * yy + xy * xy) * kxx + (xx * xx + xy * xy) * kyy - 2.0 * xy * trace * kxy
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = coloured / (trace * det)
     # without texture, as for an even slope
-    return np.asarray(np.clip(np.where(np.isfinite(ratio), ratio, most), 0.02, most), dtype=np.float32)
+    return np.asarray(np.clip(np.where(np.isfinite(ratio), ratio, max_ratio), 0.02, max_ratio), dtype=np.float32)
 
 
 def fitted_share(

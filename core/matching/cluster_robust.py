@@ -73,9 +73,9 @@ def cluster_robust_covariance(
     unknown_g = None if G is None else starts_of("G", G, (n, 3), terms)
     offsets = own(np.broadcast_to(np.asarray(epipolar_px, dtype=np.float64), (n,)))
     given = given_to_kernels(pair, prepared, xy, unknown_w, options, visible, G=unknown_g, epipolar_px=offsets)
-    what, q = ("shape", 2) if G is None else ("motion", 5)
+    kind, q = ("shape", 2) if G is None else ("motion", 5)
     out = np.full((n, q * q), np.nan)
-    status, _ = run_kernel(cluster_robust_points[what][degree], cluster_robust_space[what][degree], given, out)
+    status, _ = run_kernel(cluster_robust_points[kind][degree], cluster_robust_space[kind][degree], given, out)
     known: Bool = status == 0
     out[~known] = np.nan
     return out.reshape(n, q, q), known

@@ -26,10 +26,10 @@ class StrainOptions:
     tensor
         ``green_lagrange`` 1/2 (C - I), ``infinitesimal`` (the symmetric gradient; not free of rotation), or ``hencky``
         1/2 log C.
-    least_share
+    min_share
         Share of the window's points that must be left where edges, holes or cuts take some away. At a half, windows
         on a straight edge are kept and those in a corner are not.
-    most_amplification
+    max_amplification
         Largest ratio of the noise of a cut window's strain to a whole window's; beyond it its points lie too much on
         one side.
 
@@ -42,8 +42,8 @@ class StrainOptions:
     window: int = STRAIN_WINDOW.default
     order: Literal[1, 2] = 1
     tensor: StrainTensor = "green_lagrange"
-    least_share: float = 0.5
-    most_amplification: float = 12.0
+    min_share: float = 0.5
+    max_amplification: float = 12.0
 
     @staticmethod
     def of(settings: StrainSettings | None) -> StrainOptions | None:
@@ -61,10 +61,10 @@ class StrainOptions:
             _refuse("order", self.order, "1 or 2")
         if self.tensor not in STRAIN_TENSORS:
             _refuse("tensor", self.tensor, ", ".join(STRAIN_TENSORS))
-        if not 0.0 < self.least_share <= 1.0:
-            _refuse("least_share", self.least_share, "above 0 and 1 at most")
-        if not (np.isfinite(self.most_amplification) and self.most_amplification >= 1.0):
-            _refuse("most_amplification", self.most_amplification, "1 or more")
+        if not 0.0 < self.min_share <= 1.0:
+            _refuse("min_share", self.min_share, "above 0 and 1 at most")
+        if not (np.isfinite(self.max_amplification) and self.max_amplification >= 1.0):
+            _refuse("max_amplification", self.max_amplification, "1 or more")
 
 
 def _refuse(name: str, value: object, allowed: str) -> None:

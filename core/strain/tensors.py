@@ -126,11 +126,11 @@ def _pulls(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
     if tensor == "infinitesimal":
         of_motion = frame
         # E^T dP with P's own basis changed by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
-        of_place = frame - frame @ _transposed(_transposed(frame) @ moved)
+        of_position = frame - frame @ _transposed(_transposed(frame) @ moved)
     else:
         of_motion = moved
-        of_place = moved - frame @ (_transposed(moved) @ moved)
-    return _transposed(np.concatenate([of_place, of_motion], axis=-2))
+        of_position = moved - frame @ (_transposed(moved) @ moved)
+    return _transposed(np.concatenate([of_position, of_motion], axis=-2))
 
 
 def _hencky_slope(hencky: Float) -> Float:

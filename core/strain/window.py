@@ -138,12 +138,12 @@ def _weights(seen: Bool, half: int, options: StrainOptions) -> tuple[np.ndarray,
     n, terms = A.shape
     count = seen.sum(axis=1)
     normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)
-    few = count < max(options.least_share * n, terms)
+    few = count < max(options.min_share * n, terms)
     firm = np.linalg.eigvalsh(normal)[:, 0] > 1e-9 * count
     normal = np.where((firm & ~few)[:, None, None], normal, np.eye(terms))
     inverse = np.linalg.inv(normal)
     noise = np.linalg.eigvalsh(inverse[:, 1:3, 1:3])[:, -1] * float((A[:, 1] ** 2).sum())
-    one_sided = ~firm | (noise > options.most_amplification**2)
+    one_sided = ~firm | (noise > options.max_amplification**2)
     status = np.where(few, StrainStatus.TOO_FEW, np.where(one_sided, StrainStatus.ONE_SIDED, StrainStatus.OK))
     weights = (inverse[:, 1:3].reshape(-1, terms) / half @ A.T).reshape(-1, 2, n)
     return status.astype(np.int8), np.where(seen[:, None, :], weights, 0.0)

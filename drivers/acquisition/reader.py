@@ -25,7 +25,7 @@ from drivers.cameras.protocol import Frame, FrameCounters, FrameGrabber, FrameSt
 _SLICE_S = 0.02
 _WATCHDOG_PERIODS = 3.0
 # A busy host stops for longer than three periods of a fast camera, which is no fault of the camera's
-_LEAST_PATIENCE_S = 0.4
+_MIN_PATIENCE_S = 0.4
 
 
 class CameraReader:
@@ -71,7 +71,7 @@ class CameraReader:
         self._grabber = grabber
         self._name = name
         latency_s = grabber.describe().latency_s
-        self._patience_s = max(_WATCHDOG_PERIODS * period_s, _LEAST_PATIENCE_S) + latency_s
+        self._patience_s = max(_WATCHDOG_PERIODS * period_s, _MIN_PATIENCE_S) + latency_s
         self._expects_frames = expects_frames
         self._sequence = sequence if sequence is not None else SequenceReader()
         self._compare_pixels = compare_pixels

@@ -157,7 +157,7 @@ def _lsb(rows: NDArray[np.uint8], bits: int, count: int) -> NDArray[np.uint16]:
     out = np.empty((len(groups), pixels), np.uint16)
     mask = np.uint16(2**bits - 1)
     for begin in range(0, len(groups), _BLOCK):
-        column = [groups[begin : begin + _BLOCK, place].astype(np.uint16) for place in range(size)]
+        column = [groups[begin : begin + _BLOCK, index].astype(np.uint16) for index in range(size)]
         for k in range(pixels):
             first, shift = divmod(k * bits, 8)
             value = column[first] >> np.uint16(shift)
@@ -174,7 +174,7 @@ def _msb(rows: NDArray[np.uint8], bit_depth: int, count: int) -> NDArray[np.uint
     mask = np.uint16(2 ** (bit_depth - 8) - 1)
     out = np.empty((len(groups), 2), np.uint16)
     for begin in range(0, len(groups), _BLOCK):
-        one, both, two = (groups[begin : begin + _BLOCK, place].astype(np.uint16) for place in range(3))
+        one, both, two = (groups[begin : begin + _BLOCK, index].astype(np.uint16) for index in range(3))
         out[begin : begin + _BLOCK, 0] = one << low | both & mask
         out[begin : begin + _BLOCK, 1] = two << low | both >> np.uint16(4) & mask
     return out.reshape(rows.shape[0], number * 2)[:, :count]

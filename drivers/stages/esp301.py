@@ -96,7 +96,7 @@ class ESP301Stage(SerialStage):
         self._home_mode = home_mode
         self._mm_per_unit: dict[int, float] = {}
         self._unit: dict[int, int] = {}
-        self._most: dict[int, tuple[float | None, float | None]] = {}
+        self._max_dynamics: dict[int, tuple[float | None, float | None]] = {}
         # axis -> how often the line had been lost when the axis was homed: one loss more, and it may have lost its zero
         self._homed_at: dict[int, int] = {}
 
@@ -116,7 +116,7 @@ class ESP301Stage(SerialStage):
                 )
             self._unit[axis] = unit
             scale = self._mm_per_unit[axis] = _MM_PER_UNIT[unit]
-            self._most[axis] = (self._ask_greatest(axis, "VU?", scale), self._ask_greatest(axis, "AU?", scale))
+            self._max_dynamics[axis] = (self._ask_greatest(axis, "VU?", scale), self._ask_greatest(axis, "AU?", scale))
             name, _, serial = (part.strip() for part in model.partition(","))
             axes.append(AxisIdentity(axis, name, serial, _UNIT_NAMES[unit]))
         self._homed_at = {axis: self._line.losses for axis, option in self._options.items() if option.assume_homed}
@@ -206,7 +206,7 @@ class ESP301Stage(SerialStage):
             )
 
     def _greatest(self, axis: int) -> tuple[float | None, float | None]:
-        return self._most[axis]
+        return self._max_dynamics[axis]
 
     def _ask_greatest(self, axis: int, word: str, scale: float) -> float | None:
         try:

@@ -29,7 +29,7 @@ def not_in_configuration(axis: int) -> StageError:
     )
 
 
-def check_dynamic(axis: int, what: str, value: object, most: float | None) -> None:
+def check_dynamic(axis: int, quantity: str, value: object, maximum: float | None) -> None:
     """Raise an error for a velocity or an acceleration that is no positive number or above the controller's greatest.
 
     Raises
@@ -38,11 +38,11 @@ def check_dynamic(axis: int, what: str, value: object, most: float | None) -> No
         ``out_of_range``.
     """
     fine = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
-    if fine and (most is None or value <= most):  # type: ignore[operator]
+    if fine and (maximum is None or value <= maximum):  # type: ignore[operator]
         return
-    limit = "" if most is None else f" up to {most:g}"
+    limit = "" if maximum is None else f" up to {maximum:g}"
     raise StageError(
-        f"Axis {axis} cannot have the {what} {value!r}: not a number above 0{limit} (mm, s).",
+        f"Axis {axis} cannot have the {quantity} {value!r}: not a number above 0{limit} (mm, s).",
         code="out_of_range",
         remedy="Give a value that the stage can do.",
         axis=axis,
@@ -64,10 +64,10 @@ def motor_off(axis: int) -> StageError:
     return StageError(f"The motor of axis {axis} is off.", code="motor_off", remedy="Enable the axis first.", axis=axis)
 
 
-def motion_fault(axis: int, what: str) -> StageError:
+def motion_fault(axis: int, failure: str) -> StageError:
     """Return the error of a motion that failed."""
     return StageError(
-        f"Axis {axis} {what}.",
+        f"Axis {axis} {failure}.",
         code="motion_fault",
         remedy="Check the stage for an obstacle or a limit switch, enable and home it, then move again.",
         axis=axis,

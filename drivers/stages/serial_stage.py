@@ -176,12 +176,12 @@ class SerialStage(ControllerCommands):
     ) -> AxisDynamics:
         """Set velocity, acceleration or both, and return the values that the controller took; homing keeps them."""
         known = self.dynamics(axis)
-        for what, value, most in (
+        for quantity, value, maximum in (
             ("velocity", velocity_mm_s, known.max_velocity_mm_s),
             ("acceleration", acceleration_mm_s2, known.max_acceleration_mm_s2),
         ):
             if value is not None:
-                check_dynamic(axis, what, value, most)
+                check_dynamic(axis, quantity, value, maximum)
         with self._motion_lock:
             self._check_settable(axis)
             before = self._options[axis]
@@ -393,15 +393,15 @@ class SerialStage(ControllerCommands):
     def _keep(self, messages: list[ControllerMessage]) -> None:
         self._messages = [*self._messages, *messages][-_MESSAGES:]
 
-    def _raise_refusal(self, axes: tuple[int, ...], what: str) -> None:
+    def _raise_refusal(self, axes: tuple[int, ...], request: str) -> None:
         bad = self._new_errors(axes)
         if bad:
-            raise self._refusal(bad[0].axis or axes[0], what, bad)
+            raise self._refusal(bad[0].axis or axes[0], request, bad)
 
-    def _refusal(self, axis: int, what: str, messages: list[ControllerMessage]) -> StageError:
+    def _refusal(self, axis: int, request: str, messages: list[ControllerMessage]) -> StageError:
         text = "; ".join(f"{message.text} ({message.code})" for message in messages)
         return StageError(
-            f"The controller refused for axis {axis} the {what}: {text}.",
+            f"The controller refused for axis {axis} the {request}: {text}.",
             code=next((code for message in messages if (code := self._code_of(message)) is not None), "stage_refused"),
             remedy="Correct what the controller names, then try again.",
             axis=axis,

@@ -17,12 +17,12 @@ from server.api.protocol.audit import AuditLog, Recorder
 from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
-from server.api.routes.analyses import analyses, exports, gauges, looks, picking, report, results
+from server.api.routes.analyses import analyses, exports, gauges, picking, previews, report, results
 from server.api.routes.calibrations import calibrations, noise, review
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import facts, tests, watch
+from server.api.routes.tests import metadata, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.service import Service
@@ -36,7 +36,7 @@ problem+json (RFC 9457) with a stable `code`, the cause in `detail` and a `remed
 `Idempotency-Key`. What GET answers, HEAD does without a body. Answers have an ETag; asked with it in `If-None-Match`,
 they come as 304 while nothing has changed, and changes with `If-Match` are refused where something has. Lists come in
 pages: `next_cursor` leads to the next one. Answers are compressed for those who accept gzip. Lengths are in
-millimetres in the calibration target's frame unless a name says otherwise."""
+millimetres in the calibration target's frame unless a name states another one."""
 
 
 def create_app(
@@ -53,7 +53,7 @@ def create_app(
     hosts
         Host names under which it may be addressed.
     keys_required
-        True if every request needs a key; left out, as the rig file says.
+        True if every request needs a key; left out, as the rig file demands.
     close_service
         Close the service when the app shuts down.
     """
@@ -117,7 +117,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         calibration_exports,
         review,
         tests,
-        facts,
+        metadata,
         watch,
         analyses,
         picking,
@@ -126,7 +126,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         exports,
         report,
         jobs,
-        looks,
+        previews,
     ):
         app.include_router(module.router, prefix=PREFIX)
     app.include_router(trash_router, prefix=PREFIX)

@@ -21,7 +21,7 @@ class BusyError(StateError):
     remedy = "Wait until the holder is done, or cancel its job."
 
     def __init__(self, holder: dict[str, object]) -> None:
-        super().__init__(f"The hardware is held by {holder.get('what', 'another task')}.", holder=holder)
+        super().__init__(f"The hardware is held by {holder.get('purpose', 'another task')}.", holder=holder)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (BusyError, (self.context["holder"],))

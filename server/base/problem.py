@@ -14,7 +14,7 @@ class JobProblem(Document):
 
     code: str = Field(description="Stable code.")
     cause: str = Field(description="The cause, with the values that disagree.")
-    remedy: str = Field(description="What can be done.")
+    remedy: str = Field(description="Remedy.")
     context: dict[str, object] = Field(default_factory=dict, description="Values that a program may want.")
 
 

@@ -9,7 +9,7 @@ from typing import TextIO
 
 _REDRAW_S = 0.2
 _QUIET_S = 15.0
-_TELLING = 0.03  # of all the work must be done before an estimate means something
+_MIN_FRACTION = 0.03  # of all the work must be done before an estimate means something
 
 
 def duration(seconds: float) -> str:
@@ -51,14 +51,14 @@ class ProgressLine:
     def show(self, text: str, fraction: float) -> None:
         """Say where the work is; ``fraction`` of all of it is done."""
         now = time.monotonic()
-        if self._start is None:  # loading and checking before the first report says nothing about the pace
+        if self._start is None:  # loading and checking before the first report is no part of the pace
             self._start = (now, fraction)
         if now - self._last < (_REDRAW_S if self._live else _QUIET_S):
             return
         self._last = now
         line = f"{text}, {100 * fraction:.0f} % of all"
         began, before = self._start
-        if fraction - before > _TELLING:
+        if fraction - before > _MIN_FRACTION:
             left = (now - began) * (1.0 - fraction) / (fraction - before)
             line += f", about {duration(max(1.0, left))} left"
         self._draw(line)

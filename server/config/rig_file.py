@@ -179,9 +179,11 @@ class StageSection(_Closed):
 
     driver: Literal["esp301", "smc100", "conex-cc"] = Field(description="Protocol of the controller.")
     url: str = Field(description="pyserial URL or port; `sim` starts a simulated controller.", min_length=1)
-    baudrate: int | None = Field(None, ge=300, le=4_000_000, description="Where it is not the controller's usual one.")
+    baudrate: int | None = Field(
+        None, ge=300, le=4_000_000, description="Baud rate, if it is not the controller's usual one."
+    )
     flow_control: Literal["hardware", "software", "none"] | None = Field(
-        None, description="Where it is not the controller's usual one."
+        None, description="Baud rate, if it is not the controller's usual one."
     )
     reply_timeout_ms: Annotated[float, Field(ge=50.0, le=10000.0)] = Field(
         500.0, description="Maximum wait for a reply; longer over a slow network."
@@ -200,7 +202,7 @@ class StageSection(_Closed):
     home_mode: Annotated[int, Field(ge=0, le=6)] | None = Field(None, description="ESP301: parameter of OR.")
     home_at_start: bool | None = Field(None, description="Home when opened; only simulated stages do if left out.")
     axes: dict[Annotated[int, Field(ge=1, le=31)], StageAxisSection] = Field(
-        default_factory=dict, description="What differs from axis to axis, by axis number."
+        default_factory=dict, description="Settings that differ from axis to axis, by axis number."
     )
 
     @model_validator(mode="after")
@@ -292,7 +294,7 @@ class ComputeSection(_Closed):
     )
     images: Literal["path", "scatter"] = Field(
         "path",
-        description="How a cluster's workers get images: by path, where they see the data folder under the same name, "
+        description="Way a cluster's workers get images: by path, where they see the data folder under the same name, "
         "or sent with each step.",
     )
     threads_per_worker: int = Field(1, ge=1, le=256, description="Kernel threads of each of the cluster's workers.")

@@ -45,7 +45,7 @@ class Calibrated:
 
 
 class _Progress(Record):
-    stage: str | None = None
+    phase: str | None = None
     done: int = 0
     total: int = 0
     eta_s: float | None = None
@@ -75,7 +75,7 @@ class ServiceClient:
     base_url
         ``http://127.0.0.1:port``.
     on_progress
-        Called with (stage, done, total, seconds left or None) while a job runs.
+        Called with (phase, done, total, seconds left or None) while a job runs.
     transport
         Carries the requests; the network when left out.
     """
@@ -191,7 +191,7 @@ class ServiceClient:
             job = Job.model_validate(self.get(f"/jobs/{job_id}"))
             at = job.progress
             if self._on_progress is not None:
-                self._on_progress(at.stage or job.state, at.done, at.total, at.eta_s)
+                self._on_progress(at.phase or job.state, at.done, at.total, at.eta_s)
             if job.state in _ENDED:
                 break
             time.sleep(_POLL_S)

@@ -81,13 +81,13 @@ def _await_health(process: subprocess.Popen[bytes], url: str, log: Path) -> None
                 return
         time.sleep(0.1)
     lines = log.read_text(errors="replace").strip().splitlines()
-    how = (
+    outcome = (
         f"ended with status {process.returncode}"
         if process.poll() is not None
         else f"did not answer in {_START_S:.0f} s"
     )
     raise StateError(
-        f"The service {how}: {lines[-1] if lines else 'its log is empty'}",
+        f"The service {outcome}: {lines[-1] if lines else 'its log is empty'}",
         code="service_not_started",
         remedy=f"Read {log}.",
     )

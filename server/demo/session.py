@@ -1,4 +1,4 @@
-"""What the three experiments share: the running service, the rig's truth, the folder for what they find."""
+"""Common parts of the three experiments: the running service, the rig's truth, the folder for what they find."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Check:
 
 @dataclass
 class Outcome:
-    """What an experiment found.
+    """Outcome of an experiment.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Session:
         The rig file.
     out
         Folder for pictures and results.
-    say
+    note
         Prints a line.
     """
 
@@ -91,7 +91,7 @@ class Session:
     rig: SimRig
     config: Path
     out: Path
-    say: Callable[[str], None]
+    note: Callable[[str], None]
 
     def calibrate(self) -> Calibrated:
         """Calibrate before the grid; save the calibration's file."""

@@ -15,7 +15,7 @@ from drivers.acquisition.unit import CameraUnit
 from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile
 from server.results.quality import image_quality
-from server.rig.cameras import CameraPair, PairShot
+from server.rig.cameras import CameraPair, CapturedPair
 
 #: relative difference of a setting that is the device's rounding; beyond it the device has another value
 _ROUNDING = 0.01
@@ -40,13 +40,13 @@ _Count = TypeVar("_Count", int, float)
 
 @dataclass
 class Watch:
-    """What was seen while pairs were captured one after the other."""
+    """Measurements while pairs were captured one after the other."""
 
     seconds: float = 0.0
     durations_ms: list[float] = field(default_factory=list)
     skews_ms: list[float] = field(default_factory=list)
     passing: dict[str, int] = field(default_factory=dict)
-    last: PairShot | None = None
+    last: CapturedPair | None = None
     frames: dict[CameraName, dict[str, int]] = field(default_factory=dict)
     account: dict[str, int] = field(default_factory=dict)
     link: dict[CameraName, dict[str, float]] = field(default_factory=dict)
@@ -57,14 +57,14 @@ class Watch:
         return len(self.durations_ms) / self.seconds if self.durations_ms and self.seconds > 0 else None
 
     def bytes_per_s(self, cam: CameraName) -> float:
-        """What came over the camera's link: as its driver counted, else as the images' size tells."""
+        """Bytes over the camera's link: as its driver counted, else by the images' size."""
         counted = self.link[cam].get("transferred_bytes")
         if counted is not None:
             return counted / self.seconds
         return 0.0 if self.last is None else self.announced(cam) * self.last.pixels[cam].nbytes / self.seconds
 
     def announced(self, cam: CameraName) -> int:
-        """How far the camera's counter went."""
+        """Advance of the camera's counter."""
         return sum(self.frames[cam][name] for name in ("delivered", "overrun", "dropped", "incomplete"))
 
 
@@ -139,7 +139,7 @@ def watch(pair: CameraPair, seconds: float) -> Watch:
     while not seen.durations_ms or time.monotonic() - begin < seconds:
         start = time.monotonic()
         try:
-            seen.last = pair.shoot(1)
+            seen.last = pair.capture(1)
         except CameraError as error:
             if error.code not in _PASSING or (not seen.durations_ms and start - begin > max(seconds, _NO_PAIR_S)):
                 raise
@@ -159,7 +159,7 @@ def watch(pair: CameraPair, seconds: float) -> Watch:
 def _warm_up(pair: CameraPair) -> None:
     """Take one pair that does not count: the first after arming is often late."""
     try:
-        pair.shoot(1)
+        pair.capture(1)
     except CameraError as error:
         if error.code not in _PASSING:
             raise
@@ -183,7 +183,7 @@ def check_frames(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
     book.note(
         cam,
         "losses",
-        _judged(lost, announced) if lost or not odd else "warning",
+        _state_of_share(lost, announced) if lost or not odd else "warning",
         f"{announced} frames, " + (", ".join(f"{n} {name}" for name, n in odd.items()) or "none lost or damaged"),
         limit=f"1 frame or {100 * _LOSS_SHARE:g} %",
         remedy="Check cable, packet size, socket buffers and the load of link and processors (docs/how_to/cameras.md).",
@@ -241,7 +241,7 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
         book.note(
             "pairs",
             "skew",
-            _judged(refused, max(len(seen.skews_ms), seen.account["paired"])),
+            _state_of_share(refused, max(len(seen.skews_ms), seen.account["paired"])),
             f"median {statistics.median(seen.skews_ms):.3f} ms, worst {worst:.3f} ms over {len(seen.skews_ms)} pairs, "
             + ("by the cameras' common clock" if common_clock(pair.units) else "by this machine's clock")
             + (f"; {refused} refused" if refused else ""),
@@ -261,7 +261,7 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
     book.note(
         "pairs",
         "account",
-        _judged(lost, count["triggered"]) if adds_up else "failed",
+        _state_of_share(lost, count["triggered"]) if adds_up else "failed",
         text if adds_up else f"does not add up: {text}",
         limit=f"1 or {100 * _LOSS_SHARE:g} % without a partner",
         remedy="Look at the losses above; check that one trigger reaches both cameras.",
@@ -287,8 +287,8 @@ def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig
         )
 
 
-def _judged(bad: int, of: int) -> State:
-    """Judge a share: one may go wrong, or one in a hundred."""
+def _state_of_share(bad: int, of: int) -> State:
+    """Return the state for a share of failures: one may fail, or one in a hundred."""
     return "ok" if bad == 0 else "warning" if bad <= max(1.0, _LOSS_SHARE * of) else "failed"
 
 

@@ -14,7 +14,7 @@ from server.doctor.report import Notebook, percentile
 from server.formats.files import storage_error, write_bytes
 
 _SECONDS = 1.5
-_MOST_FILES = 64
+_MAX_FILES = 64
 _FEW_PAIRS, _TOO_FEW_PAIRS = 1000, 20
 _MIB = 2**20
 
@@ -85,11 +85,11 @@ def _write(folder: Path, image_bytes: int) -> list[float]:
     data = os.urandom(image_bytes)  # so that no file system can pack it
     times: list[float] = []
     try:
-        with tempfile.TemporaryDirectory(prefix=".doctor-", dir=folder) as aside:
+        with tempfile.TemporaryDirectory(prefix=".doctor-", dir=folder) as temporary:
             end = time.monotonic() + _SECONDS
-            while len(times) < _MOST_FILES and (time.monotonic() < end or len(times) < 2):
+            while len(times) < _MAX_FILES and (time.monotonic() < end or len(times) < 2):
                 start = time.monotonic()
-                write_bytes(Path(aside) / f"image_{len(times) % 4}.bin", data)
+                write_bytes(Path(temporary) / f"image_{len(times) % 4}.bin", data)
                 times.append(time.monotonic() - start)
     except OSError as error:
         raise storage_error(error, folder) from error

@@ -128,7 +128,7 @@ def _check_buffers(book: Notebook, seen: Watch, proc: Path) -> None:
     room = _number(proc / "sys" / "net" / "core" / "rmem_max")
     frame = 0 if seen.last is None else max(pixels.nbytes for pixels in seen.last.pixels.values())
     if room is None:
-        book.note("network", "socket buffers", "not checked", "the system does not tell their size")
+        book.note("network", "socket buffers", "not checked", "the system does not report their size")
         return
     book.note(
         "network",

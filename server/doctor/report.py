@@ -1,4 +1,4 @@
-"""What the doctor finds: checks with a state, and the verdict over all of them."""
+"""Findings of the doctor: checks with a state, and the verdict over all of them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Check(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     part: str = Field(description="Part of the bench: `software`, `machine`, `disk`, `cam1`, `pairs`, `stage` ...")
-    name: str = Field(description="What was looked at.")
+    name: str = Field(description="Name of the check.")
     state: State = Field(description="`failed` makes the verdict bad; `warning` and `not checked` do not.")
     found: str = Field(description="The measured value, or the cause, in words.")
-    limit: str | None = Field(None, description="What it must be; null where there is no limit.")
-    remedy: str | None = Field(None, description="What to do about it, when it is not ok.")
+    limit: str | None = Field(None, description="Limit of the value; null where there is none.")
+    remedy: str | None = Field(None, description="Remedy, when it is not ok.")
     figures: dict[str, float | None] = Field(
         default_factory=dict, description="The measured values; units are in the names, null is unknown."
     )
@@ -38,7 +38,7 @@ class Report(BaseModel):
     version: str = Field(description="Version of this software.")
     rig: str | None = Field(description="Name of the rig; null if the rig file could not be read.")
     config: str = Field(description="The rig file.")
-    seconds: float = Field(description="How long the cameras were watched for at most.")
+    seconds: float = Field(description="Longest time that the cameras were watched for, s.")
     checks: list[Check] = Field(description="In the order in which they were made.")
     good: bool = Field(description="True if no check failed.")
     verdict: str = Field(description="The verdict in one line.")
@@ -49,13 +49,13 @@ class Notebook:
 
     Parameters
     ----------
-    tell
+    on_check
         Called with each check at once.
     """
 
-    def __init__(self, tell: Callable[[Check], None] | None = None) -> None:
+    def __init__(self, on_check: Callable[[Check], None] | None = None) -> None:
         self.checks: list[Check] = []
-        self._tell = tell
+        self._on_check = on_check
 
     def note(
         self,
@@ -81,11 +81,11 @@ class Notebook:
             figures={**(figures or {}), **more},
         )
         self.checks.append(check)
-        if self._tell is not None:
-            self._tell(check)
+        if self._on_check is not None:
+            self._on_check(check)
 
     def fail(self, part: str, name: str, error: StereorigError) -> None:
-        """Write down what an error says."""
+        """Record an error as a failed check."""
         self.note(part, name, "failed", f"{error.code}: {error.cause}", remedy=error.remedy)
 
     @contextmanager

@@ -29,7 +29,7 @@ def examine(
     move: bool = False,
     home: bool = False,
     record: Path | None = None,
-    tell: Callable[[Check], None] | None = None,
+    on_check: Callable[[Check], None] | None = None,
 ) -> Report:
     """Examine the bench that a rig file names.
 
@@ -45,10 +45,10 @@ def examine(
         Allow a small move of each axis, and the search for home; a simulated stage does both anyway.
     record
         File that gets a transcript of the stage's wire.
-    tell
+    on_check
         Called with each check as it is made.
     """
-    book = Notebook(tell)
+    book = Notebook(on_check)
     clock = ClockWatch()
     check_software(book)
     check_machine(book)
@@ -145,7 +145,7 @@ def _check_devices(
     try:
         devices = open_devices(config, settings, record=record)
     except StereorigError as error:
-        _check_apart(book, config, error, move=move, home=home, record=record)
+        _check_each(book, config, error, move=move, home=home, record=record)
         return
     with contextlib.closing(devices):
         _check_cameras(book, devices, config, seconds)
@@ -154,7 +154,7 @@ def _check_devices(
         check_stage(book, devices.stage, config, move=move or simulated, home=home or simulated)
 
 
-def _check_apart(
+def _check_each(
     book: Notebook, config: RigConfig, error: StereorigError, *, move: bool, home: bool, record: Path | None
 ) -> None:
     """Find out which devices are well when they cannot be opened all together."""

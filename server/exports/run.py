@@ -74,8 +74,8 @@ def export_packed(source: Source, request: ExportRequest, folder: Path) -> Path:
     packed = folder / f"{source.name}_{request.format}.zip"
     with zipfile.ZipFile(packed, "w", compression=zipfile.ZIP_DEFLATED, compresslevel=4) as archive:
         for path in itertools.chain((first, second), made):
-            how = zipfile.ZIP_STORED if path.suffix in _PACKED else None
-            archive.write(path, path.name, compress_type=how)
+            packing = zipfile.ZIP_STORED if path.suffix in _PACKED else None
+            archive.write(path, path.name, compress_type=packing)
             path.unlink()
     return packed
 

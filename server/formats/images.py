@@ -165,7 +165,7 @@ def decode_image(data: bytes, *, name: str = "the image") -> GrayImage:
     raise _unreadable(name, "it is none of TIFF, PNG, BMP, JPEG" if data else "it is empty")
 
 
-def read_file(path: Path, *, what: str = "image") -> bytes:
+def read_file(path: Path, *, kind: str = "image") -> bytes:
     """Read a whole input file, at most ``MAX_FILE_BYTES``.
 
     Raises
@@ -176,10 +176,10 @@ def read_file(path: Path, *, what: str = "image") -> bytes:
     try:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
-            raise _too_large(f"The {what} {path} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
+            raise _too_large(f"The {kind} {path} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise ImageError(f"The {what} {path} does not exist.", code="file_missing", remedy="Check the path.") from error
+        raise ImageError(f"The {kind} {path} does not exist.", code="file_missing", remedy="Check the path.") from error
     except OSError as error:
         raise _unreadable(str(path), error.strerror or str(error)) from error
 
@@ -208,7 +208,7 @@ def read_mask(path: str | Path) -> NDArray[np.bool_]:
     ImageError
         As :func:`read_image`; a mask may also be of one bit.
     """
-    data = read_file(Path(path), what="mask")
+    data = read_file(Path(path), kind="mask")
     return decode_mask(data, name=str(path))
 
 

@@ -1,6 +1,6 @@
-"""Who may do what: keys with a name and a role, stored as hashes in the data folder.
+"""Access rights: keys with a name and a role, stored as hashes in the data folder.
 
-A key is 256 random bits, so a plain SHA-256 of it tells nothing to a reader of the file; slow hashes are for passwords.
+A key is 256 random bits, so a plain SHA-256 of it is of no use to a reader of the file; slow hashes are for passwords.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class KeyFile:
         """Return whose key this is; None for an unknown key."""
         digest = _hash(key)
         found = None
-        for stored in self.keys():  # every one is compared, so that time tells nothing
+        for stored in self.keys():  # every one is compared, so that the time taken reveals nothing
             if hmac.compare_digest(stored.sha256, digest):
                 found = Person(stored.name, stored.role)
         return found

@@ -23,11 +23,11 @@ _log = logging.getLogger("stereorig.connections")
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """What a connection may take.
+    """Limits of a connection.
 
     Parameters
     ----------
-    most
+    max_open
         Connections at once.
     header_s
         Time for a request's headers, from the connection's beginning or the headers' first byte.
@@ -39,7 +39,7 @@ class ConnectionLimits:
         How long a client may take nothing of an answer that waits for it.
     """
 
-    most: int = 1000
+    max_open: int = 1000
     header_s: float = 15.0
     body_bytes_per_s: float = 1000.0
     body_s: float = 20.0
@@ -79,7 +79,7 @@ class Connections:
 
     def make_room(self, newcomer: LimitedProtocol, connections: set[Any]) -> bool:
         """Return whether ``newcomer`` may stay as any other; ends a connection that does nothing to that end."""
-        if len(connections) <= self.limits.most:
+        if len(connections) <= self.limits.max_open:
             return True
         others = [c for c in connections if isinstance(c, LimitedProtocol) and c is not newcomer and not c.ending]
         idle = [c for c in others if not c.busy]
@@ -119,7 +119,7 @@ class LimitedProtocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin; where there are too many, only a stop will be served."""
         super().connection_made(transport)
-        if len(self.connections) > 2 * self.keeper.limits.most:  # whoever floods does not get an answer
+        if len(self.connections) > 2 * self.keeper.limits.max_open:  # whoever floods does not get an answer
             self.end("too_many")
         elif not self.keeper.make_room(self, self.connections):
             self.keeper.refused("too_many")

@@ -55,7 +55,7 @@ class OrderlyServer(uvicorn.Server):
         self._notifier = notifier or Notifier({})
         self._announce = announce
         self._keeper = Connections(
-            limits or ConnectionLimits(most=service.config.service.connections),
+            limits or ConnectionLimits(max_open=service.config.service.connections),
             lambda why: service.metrics.connections_refused.labels(why).inc(),
         )
         self._ticks = 0
@@ -123,6 +123,6 @@ class OrderlyServer(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End: the stage, then streams, then requests, then the rest (the app's lifespan closes the service)."""
-        self._service.begin_end()  # nobody sends a signal to a server in a thread
+        self._service.begin_end()  # a server in a thread receives no signal
         self._service.stop_streams()  # or it would wait for them
         await super().shutdown(sockets=sockets)

@@ -1,4 +1,4 @@
-"""What systemd wants to hear from a service: that it is ready, that it lives, that it ends (sd_notify's datagrams)."""
+"""Notifications of a service to systemd: ready, alive, ending (sd_notify's datagrams)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens in the service, as a numbered stream that readers can resume.
+"""Events of the service, as a numbered stream that readers can resume.
 
 Events live in a bounded ring. A slow reader loses the oldest ones and gets an event ``gap``; it never holds up
 a writer. Numbers grow over restarts too, so that a reader which comes back after one learns what it missed.
@@ -70,17 +70,17 @@ class EventHub:
         """Number of the newest event."""
         return self._number
 
-    def after(self, number: int, most: int | None = None) -> list[Event]:
+    def after(self, number: int, limit: int | None = None) -> list[Event]:
         """Events still kept that are newer than ``number``, oldest first, at most so many."""
         with self._lock:
             kept = len(self._ring)
             # their numbers follow one another: the place of each is known
             first = 0 if kept == 0 else max(number + 1 - self._ring[0].number, 0)
-            last = kept if most is None else min(first + most, kept)
+            last = kept if limit is None else min(first + limit, kept)
             return [self._ring[index] for index in range(first, last)]
 
     def gap(self, number: int) -> Event | None:
-        """Return what tells a reader who saw ``number`` last that events are lost to it; None where none are.
+        """Return the event ``gap`` for a reader that had ``number`` last and lost some since; None where none are lost.
 
         Its own number is the one from which the reader can go on.
         """
@@ -93,7 +93,7 @@ class EventHub:
     async def follow(self, after: int) -> AsyncIterator[Event]:
         """Yield events newer than ``after``, then new ones as they come, until the hub is closed.
 
-        Where some are lost to the reader, an event ``gap`` comes first: what it knows is old, and can be asked for.
+        Where some are lost to the reader, an event ``gap`` comes first: its state is out of date, to be read again.
         """
         woken = asyncio.Event()
         with self._lock:

@@ -1,6 +1,6 @@
-"""Who holds the hardware, and the one thread that talks to it.
+"""Exclusive hold on the hardware, and the one thread that drives it.
 
-Hardware is never queued: a second caller learns who has it. Stopping needs neither the hold nor the thread.
+Hardware is never queued: a second caller is given the holder. Stopping needs neither the hold nor the thread.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ T = TypeVar("T")
 
 
 class Holder(Document):
-    """What holds the hardware, so that nothing else can use it."""
+    """Job or request that holds the hardware; nothing else can use it."""
 
-    what: str = Field(description="In words.", examples=["a calibration"])
-    job_id: str | None = Field(None, description="Its job, where it is one.")
-    since_s: float = Field(description="For how long, seconds.")
+    purpose: str = Field(description="Purpose of the hold, in words.", examples=["a calibration"])
+    job_id: str | None = Field(None, description="Id of the job, if a job holds it.")
+    since_s: float = Field(description="Time since it took the hold, s.")
 
 
 @dataclass(frozen=True, eq=False)
 class _Hold:
-    what: str
+    purpose: str
     #: ``job_id`` and ``kind`` of a job, ``test_id`` of a capture
     details: dict[str, str]
     since: float
 
 
-class HardwareGate:
+class HardwareHold:
     """Exclusive hold on cameras and stage, and their owner thread."""
 
     def __init__(self) -> None:
@@ -51,25 +51,25 @@ class HardwareGate:
 
     @property
     def holder(self) -> Holder | None:
-        """Who holds the hardware."""
+        """Holder of the hardware; None while it is free."""
         with self._lock:
             hold = self._hold
         if hold is None:
             return None
         since_s = round(time.monotonic() - hold.since, 3)
-        return Holder.model_validate({"what": hold.what, **hold.details, "since_s": since_s})
+        return Holder.model_validate({"purpose": hold.purpose, **hold.details, "since_s": since_s})
 
-    def claim(self, what: str, **details: str) -> object:
+    def claim(self, purpose: str, **details: str) -> object:
         """Take the hold, or raise :class:`BusyError` with the holder; returns the token for :meth:`release`."""
         with self._acting, self._lock:
             if self._shut:
                 raise StateError("The service is shutting down.", code="shutting_down", remedy="Start it again.")
             if self._hold is None:
-                self._hold = _Hold(what, details, time.monotonic())
+                self._hold = _Hold(purpose, details, time.monotonic())
                 return self._hold
         holder = self.holder
         if holder is None:  # released in between
-            return self.claim(what, **details)
+            return self.claim(purpose, **details)
         raise BusyError(holder.plain())
 
     def while_held_by(self, job_id: str, function: Callable[[], None]) -> bool:
@@ -93,9 +93,9 @@ class HardwareGate:
                 self._hold = None
 
     @contextmanager
-    def hold(self, what: str, **details: str) -> Iterator[None]:
+    def hold(self, purpose: str, **details: str) -> Iterator[None]:
         """Hold for a short operation."""
-        token = self.claim(what, **details)
+        token = self.claim(purpose, **details)
         try:
             yield
         finally:

@@ -44,7 +44,7 @@ class RequestMark:
         return {"request": {"scope": self.scope, "key": self.key, "body_sha256": self.body_sha256}}
 
     def made(self, ids: Ids) -> tuple[str, str, str, Ids] | None:
-        """Return the row of the catalogue that says what it made."""
+        """Return the row of the catalogue that names what it made."""
         return None if self.key is None else (self.scope, self.key, self.body_sha256, ids)
 
 
@@ -70,9 +70,9 @@ class OneEffect:
         """
         if mark.key is None:
             return make(), False
-        place = mark.scope, mark.key
-        with self._turn(place):
-            earlier = self._unwritten.get(place) or self._catalog.request(*place)
+        scoped_key = mark.scope, mark.key
+        with self._turn(scoped_key):
+            earlier = self._unwritten.get(scoped_key) or self._catalog.request(*scoped_key)
             if earlier is not None:
                 if earlier[0] != mark.body_sha256:
                     raise StateError(
@@ -96,10 +96,10 @@ class OneEffect:
             self._unwritten[mark.scope, mark.key] = mark.body_sha256, made
 
     @contextlib.contextmanager
-    def _turn(self, place: tuple[str, str]) -> Iterator[None]:
+    def _turn(self, scoped_key: tuple[str, str]) -> Iterator[None]:
         """One at a time for each key."""
         with self._guard:
-            lock, users = self._locks.setdefault(place, (threading.Lock(), [0]))
+            lock, users = self._locks.setdefault(scoped_key, (threading.Lock(), [0]))
             users[0] += 1
         try:
             with lock:
@@ -108,4 +108,4 @@ class OneEffect:
             with self._guard:
                 users[0] -= 1
                 if users[0] == 0:
-                    self._locks.pop(place, None)
+                    self._locks.pop(scoped_key, None)

@@ -22,7 +22,7 @@ ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase of a job: where it runs, and what; what ``run`` returns is merged into the job's result."""
+    """One phase of a job: its lane and its function; what ``run`` returns is merged into the job's result."""
 
     lane: Literal["hardware", "compute"]
     run: Callable[[Job], Mapping[str, object] | None]
@@ -34,7 +34,7 @@ class Waiting(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What a job does.
+    """Work of a job.
 
     Parameters
     ----------
@@ -74,24 +74,24 @@ def new_record(job_id: str, kind: str, subject: Mapping[str, object]) -> JobReco
 
 
 class _Pace:
-    """How far a job is in its units, and how fast."""
+    """Progress of a job in its units, and its pace."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Begin to wait."""
-        self._stage, self._done, self._total = "waiting", 0, 0
+        self._phase, self._done, self._total = "waiting", 0, 0
         self._from: tuple[float, int] | None = None
         self._last_shown = 0.0
 
-    def to(self, stage: str, done: int, total: int) -> bool:
+    def to(self, phase: str, done: int, total: int) -> bool:
         """Take what a phase reports; return whether readers should see it: they need it ten times a second."""
         now = time.monotonic()
-        changed = stage != self._stage
+        changed = phase != self._phase
         if total != self._total or done < self._done or self._from is None:
             self._from = (now, done)  # other units from here on
-        self._stage, self._done, self._total = stage, done, total
+        self._phase, self._done, self._total = phase, done, total
         if not changed and done < total and now - self._last_shown <= 0.1:
             return False
         self._last_shown = now
@@ -100,7 +100,7 @@ class _Pace:
     def progress(self, *, active: bool) -> Progress:
         """Return it as it is shown."""
         eta_s = self._eta_s() if active else None
-        return Progress(stage=self._stage, done=self._done, total=self._total, eta_s=eta_s)
+        return Progress(phase=self._phase, done=self._done, total=self._total, eta_s=eta_s)
 
     def _eta_s(self) -> float | None:
         """Seconds left in these units, from their own pace; None while there is nothing to go by."""
@@ -168,14 +168,14 @@ class Job:
         if self.cancelled:
             raise Cancelled(f"The {self.record.kind} was cancelled.")
 
-    def progress(self, stage: str, done: int, total: int) -> None:
+    def progress(self, phase: str, done: int, total: int) -> None:
         """Report progress (:class:`core.progress.Progress`)."""
-        if self._pace.to(stage, done, total):
+        if self._pace.to(phase, done, total):
             self._publish(self, "progress")
 
     @property
     def result(self) -> dict[str, object] | None:
-        """What it has found so far."""
+        """Result so far."""
         return self.record.result
 
     @result.setter
@@ -202,7 +202,7 @@ class Job:
         self._pace.reset()
 
     def begin(self) -> bool:
-        """Say that it runs; return False where an earlier phase did."""
+        """Set its state to running; return False where an earlier phase did."""
         if self.record.state != "queued":
             return False
         self._change(state="running", started_utc=now_utc())

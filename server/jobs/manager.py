@@ -20,7 +20,7 @@ from server.base.logs import about
 from server.base.models import Ids
 from server.base.problem import RESTART, problem_of
 from server.jobs.events import EventHub
-from server.jobs.hardware import HardwareGate
+from server.jobs.hardware import HardwareHold
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import ACTIVE, Job, Phase, State, Waiting, Work, new_record
 from server.store.catalog import Catalog
@@ -40,11 +40,11 @@ class JobManager:
     """
 
     def __init__(
-        self, catalog: Catalog, hub: EventHub, gate: HardwareGate, ids: IdMaker, *, queue_limit: int = 16
+        self, catalog: Catalog, hub: EventHub, hardware: HardwareHold, ids: IdMaker, *, queue_limit: int = 16
     ) -> None:
         self._catalog = catalog
         self._hub = hub
-        self._gate = gate
+        self._hardware = hardware
         self._ids = ids
         self.queue_limit = queue_limit
         self._lock = threading.Lock()
@@ -73,7 +73,7 @@ class JobManager:
     def submit(
         self,
         kind: str,
-        what: str,
+        purpose: str,
         subject: Mapping[str, object],
         phases: Sequence[Phase],
         *,
@@ -87,7 +87,7 @@ class JobManager:
 
         Parameters
         ----------
-        what
+        purpose
             The holder's name as a busy caller will read it.
         prepare
             Runs once it is certain that the job is accepted, before it starts; what it returns, ids of what it
@@ -111,14 +111,14 @@ class JobManager:
         token: object | None = None
         try:
             if phases[0].lane == "hardware":
-                token = self._gate.claim(what, job_id=job.id, kind=kind)
+                token = self._hardware.claim(purpose, job_id=job.id, kind=kind)
             made = prepare(job) if prepare is not None else {}
             job.made(made)
             row = None if request is None else request.made({**made, "job_id": job.id})
             self._catalog.put_job(job.document(), row)
         except BaseException:
             if token is not None:
-                self._gate.release(token)
+                self._hardware.release(token)
             if work.computes:
                 self._unreserve()
             raise
@@ -126,7 +126,7 @@ class JobManager:
             self._active[job.id] = job
         self._hub.publish("job", job.document().plain())
         if token is not None:
-            self._gate.start(lambda: self._run_hardware(job, token))
+            self._hardware.start(lambda: self._run_hardware(job, token))
         else:
             self._enqueue(job)
         return job
@@ -153,7 +153,7 @@ class JobManager:
             return ended
         found = self._catalog.job(job_id) if is_id(job_id, "j") else None
         if found is None:
-            raise NotFoundError(f"There is no job {job_id[:40]!r}.", what="job")
+            raise NotFoundError(f"There is no job {job_id[:40]!r}.", kind="job")
         return found
 
     def documents(self, limit: int, *, before: str | None = None) -> list[JobRecord]:
@@ -215,7 +215,7 @@ class JobManager:
             self._show(job, "state")
         return job.document()
 
-    def landed(self, test_id: str) -> None:
+    def step_committed(self, test_id: str) -> None:
         """Wake the jobs that follow a test."""
         with self._lock:
             followers = [job for job in self._active.values() if job.work.follows == test_id]
@@ -261,7 +261,7 @@ class JobManager:
 
     def cancel_hardware(self) -> str | None:
         """Cancel the job that holds the hardware, if one does; return its id."""
-        holder = self._gate.holder
+        holder = self._hardware.holder
         job_id = None if holder is None else holder.job_id
         if job_id is None:
             return None
@@ -285,12 +285,12 @@ class JobManager:
 
     def _run_hardware(self, job: Job, token: object) -> None:
         # who sees that it has ended may begin something else at once
-        job.let_go = lambda: self._gate.release(token)
+        job.let_go = lambda: self._hardware.release(token)
         try:
             with about(job_id=job.id):
                 finished = self._run_phase(job, 0)
         finally:
-            self._gate.release(token)
+            self._hardware.release(token)
         if not finished:
             if job.work.computes:
                 self._unreserve()
@@ -385,9 +385,9 @@ class JobManager:
         except StorageError:
             _log.exception("the state of job %s could not be written", job.id)
 
-    def _show(self, job: Job, what: str) -> None:
-        document = {**job.document().plain(), "change": what}
-        if what == "progress":
+    def _show(self, job: Job, change: str) -> None:
+        document = {**job.document().plain(), "change": change}
+        if change == "progress":
             del document["result"]  # it may hold thousands of steps, and progress comes ten times a second
         self._hub.publish("job", document)
 

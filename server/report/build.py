@@ -161,7 +161,7 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
 
     def stated(name: str, label: str, value: str | None) -> Item:
         known = Value(value, None, "as stated") if value else None
-        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/facts or facts.toml")
+        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/metadata or metadata.toml")
 
     taken = None
     if times:
@@ -247,9 +247,9 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     return [("", drawn), *((f"Step {shown.n}: {shown.why}", _maps(shown)) for shown in measured.shown)]
 
 
-def _status(field: Field, what: str) -> Picture:
-    data = pictures.status_map(field, f"States of the points, {what}")
-    return Picture(data, PNG, f"map of the points' states, {what}", f"States of the points, {what}")
+def _status(field: Field, subject: str) -> Picture:
+    data = pictures.status_map(field, f"States of the points, {subject}")
+    return Picture(data, PNG, f"map of the points' states, {subject}", f"States of the points, {subject}")
 
 
 def _maps(shown: Shown) -> list[Picture]:

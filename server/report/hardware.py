@@ -17,7 +17,7 @@ from server.report.records import CameraRecord
 from server.report.source import Source
 from server.report.steps import Measured
 
-_METADATA_SOURCE = "PUT /tests/{id}/facts or facts.toml"
+_METADATA_SOURCE = "PUT /tests/{id}/metadata or metadata.toml"
 _RIG_FILE = f"the rig file or {_METADATA_SOURCE}"
 _IN_FILE = "as stated (test or rig file)"
 _BY_SERVICE = "is recorded when the service captures"
@@ -119,8 +119,8 @@ def _lens_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> li
     if any(lens.note for lens in lenses.values()):  # most lenses have none: then the item is not listed as missing
         note = "Lens, accessories"
         items.append(each("lens.note", note, lambda cam: of_text(lenses[cam].note, _IN_FILE) or Value("none stated")))
-    how = "of the fitted camera; longer than the focal length, since the lens is focused near"
-    return [*items, each("lens.pinhole", "Pinhole distance", pinhole, _NEEDS_CALIBRATION, how)]
+    remark = "of the fitted camera; longer than the focal length, since the lens is focused near"
+    return [*items, each("lens.pinhole", "Pinhole distance", pinhole, _NEEDS_CALIBRATION, remark)]
 
 
 def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
@@ -263,16 +263,16 @@ def _synchronisation(source: Source, measured: Measured) -> Value | None:
 def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
     size, metadata = _pattern_size(source, measured), source.metadata
     feature, contrast, needs = None, None, "needs the reference image of camera 1"
-    how = (
+    remark = (
         "full width of the autocorrelation's peak at half of its height, over the measured region of camera 1's "
         "reference image; noise and slow changes of light taken out"
     )
     if size is not None:
         mm = "" if found is None else f" = {size.feature_px * found.views['cam1'].mean_scale_mm_per_px:.4g} mm"
         feature = Value(f"{size.feature_px:.2f} px{mm}", size.feature_px, MEASURED)
-        how += f" ({size.width_x_px:.2f} px along rows, {size.width_y_px:.2f} px down columns)"
+        remark += f" ({size.width_x_px:.2f} px along rows, {size.width_y_px:.2f} px down columns)"
         contrast = Value(f"{size.contrast_grey:.1f} grey levels", size.contrast_grey, MEASURED)
-    items = [one("pattern.size", "Pattern feature size", feature, needs, how)]
+    items = [one("pattern.size", "Pattern feature size", feature, needs, remark)]
     if metadata.pattern_feature_mm is not None:
         feature = of_number(metadata.pattern_feature_mm, "g", "mm", STATED)
         method = metadata.pattern_feature_method or "the method was not stated"

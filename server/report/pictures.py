@@ -46,10 +46,10 @@ def _cropped(data: bytes) -> bytes:
 def unit_for(values: Float, *, strain: bool = False) -> tuple[float, str]:
     """Factor and unit in which a length (mm) or a strain reads well."""
     finite = np.abs(values[np.isfinite(values)])
-    largest = float(np.percentile(finite, 99)) if finite.size else 0.0
+    max_value = float(np.percentile(finite, 99)) if finite.size else 0.0
     if strain:
-        return (1e6, "microstrain") if largest < 0.02 else (100.0, "%")
-    return (1e3, "\u00b5m") if largest < 0.5 else (1.0, "mm")
+        return (1e6, "microstrain") if max_value < 0.02 else (100.0, "%")
+    return (1e3, "\u00b5m") if max_value < 0.5 else (1.0, "mm")
 
 
 def field_map(

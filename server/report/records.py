@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from server.config.camera_metadata import LensMetadata
 from server.formats.calibrations.record import CameraIdentity
 from server.formats.records import Record
+from server.store.documents import METADATA_NAMES
 
 
 class CameraRecord(Record):
@@ -81,7 +82,7 @@ class TestRecord(Record):
     name: str = ""
     specimen: str = ""
     notes: str = ""
-    facts: dict[str, object] = Field(default={})
+    metadata: dict[str, object] = Field(default={}, validation_alias=AliasChoices(*METADATA_NAMES))
 
 
 class CalibrationFile(Record):

@@ -35,11 +35,11 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
     settings = source.settings
     scale = None if found is None else found.views["cam1"].mean_scale_mm_per_px
 
-    def length(px: float | None, what: str = "") -> Value | None:
+    def length(px: float | None, suffix: str = "") -> Value | None:
         if px is None:
             return None
         mm = "" if scale is None else f" = {px * scale:.4g} mm"
-        return Value(f"{px:g} px{mm}{what}", float(px), SETTINGS)
+        return Value(f"{px:g} px{mm}{suffix}", float(px), SETTINGS)
 
     needs = "the result files do not state it: measure again with this program"
     head = source.heads[max(source.heads)]
@@ -105,10 +105,10 @@ def _matched(measured: Measured) -> str:
 
 
 def _points(measured: Measured) -> str:
-    first, fewest = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary.valid)
+    first, min_valid = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary.valid)
     return (
         f"{first.points} in the region; valid in the reference {first.valid}, "
-        f"fewest {fewest.summary.valid} in step {fewest.n}"
+        f"fewest {min_valid.summary.valid} in step {min_valid.n}"
     )
 
 

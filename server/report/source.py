@@ -164,7 +164,9 @@ def find_source(
         steps=steps,
         calibration=loaded,
         calibration_file=file,
-        metadata=parse_metadata(test_record.facts, name="the metadata of the test") if metadata is None else metadata,
+        metadata=parse_metadata(test_record.metadata, name="the metadata of the test")
+        if metadata is None
+        else metadata,
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
     )
@@ -196,7 +198,7 @@ def _one_test(tests: Path, wanted: str | None) -> Path:
     there = {path.parent.name: path.parent for path in sorted(tests.glob("*/test.json"))}
     if wanted is not None:
         if wanted not in there:
-            raise NotFoundError(f"There is no test {wanted[:40]!r} in {tests.parent}.", what="test")
+            raise NotFoundError(f"There is no test {wanted[:40]!r} in {tests.parent}.", kind="test")
         return there[wanted]
     if len(there) != 1:
         raise InputError(
@@ -212,7 +214,7 @@ def _one_analysis(test: Path, wanted: str | None) -> Path:
     there = {path.parent.name: path.parent for path in sorted(test.glob("analyses/*/analysis.json"))}
     if wanted is not None:
         if wanted not in there:
-            raise NotFoundError(f"There is no analysis {wanted[:40]!r} in {test}.", what="analysis")
+            raise NotFoundError(f"There is no analysis {wanted[:40]!r} in {test}.", kind="analysis")
         return there[wanted]
     finished = [path for path in there.values() if results_in(path)]
     # `stereorig measure` puts its results beside the analyses

@@ -93,7 +93,7 @@ class Measured:
         Steps that are drawn: the peak and the last; of shapes, the last.
     floor
         By quantity; empty without static steps.
-    static, static_how, static_left_out
+    static, static_source, static_left_out
         Steps of the floor, the source that names them, and the steps that did not fit into memory.
     reported
         Median of the predicted standard deviations by quantity, of the first displacement or else of the shape.
@@ -106,7 +106,7 @@ class Measured:
     shown: list[Shown]
     floor: dict[str, Floor]
     static: list[int]
-    static_how: str
+    static_source: str
     static_left_out: list[int]
     reported: dict[str, float | None]
     noise_grey: float | None
@@ -145,7 +145,7 @@ class Measured:
 def read_steps(source: Source) -> Measured:
     """Read every result file once; at most three fields are held at a time, and the static steps' values."""
     labels = {n: _label(source, n) for n in source.files}
-    static, how = static_steps(source.metadata.static_steps, labels, source.reference)
+    static, static_source = static_steps(source.metadata.static_steps, labels, source.reference)
     rbe = None if source.calibration is None else rbe_of(source.calibration)
     keeper = FloorKeeper()
     figures: list[StepFigures] = []
@@ -187,7 +187,7 @@ def read_steps(source: Source) -> Measured:
         shown=shown,
         floor=keeper.result(),
         static=keeper.steps,
-        static_how=how,
+        static_source=static_source,
         static_left_out=keeper.left_out,
         reported=reported,
         noise_grey=float(np.median(grey)) if grey.size else None,

@@ -24,18 +24,20 @@ class TestMetadata(ClosedMetadata):
 
     __test__ = False
 
-    purpose: Text | None = Field(None, description="What the test is for.")
+    purpose: Text | None = Field(None, description="Purpose of the test.")
     laboratory: Text | None = Field(None, description="Laboratory, address.")
-    operator: Text | None = Field(None, description="Who ran it.")
+    operator: Text | None = Field(None, description="Operator who ran it.")
     specimen: Text | None = Field(None, description="The specimen; instead of the test's own field of that name.")
     material: Text | None = Field(None, description="Its material.", examples=["Aluminium 6061-T6"])
-    loading: Text | None = Field(None, description="How it is loaded: machine, rate, control, load cell.")
+    loading: Text | None = Field(None, description="Loading: machine, rate, control, load cell.")
     environment: Text | None = Field(None, description="Temperature, humidity, vibration.")
     lighting: Text | None = Field(
         None, description="Lamps, their arrangement, polarisation.", examples=["2 LED panels, 45 degrees, diffuse"]
     )
     pattern_technique: Text | None = Field(
-        None, description="How the pattern was applied.", examples=["matt white ground, black spray paint"]
+        None,
+        description="Technique by which the pattern was applied.",
+        examples=["matt white ground, black spray paint"],
     )
     pattern_feature_mm: Above | None = Field(
         None, description="Size of the pattern's features as stated by the operator; a report measures it besides."
@@ -90,7 +92,7 @@ def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata
 
 
 def load_metadata(path: Path) -> TestMetadata:
-    """Read a facts.toml.
+    """Read a ``metadata.toml``.
 
     Raises
     ------

@@ -43,19 +43,19 @@ def stale_inputs(
     if calibration is not None and calibration_sha256 is not None:
         found += _changed(calibration, calibration_sha256, f"{calibration.name}")
     for n, hashes in sorted(steps.items()):
-        what = f"the reference, step {n}," if n == reference else f"step {n}"
+        input_name = f"the reference, step {n}," if n == reference else f"step {n}"
         folder = test / "steps" / f"{n:04d}"
         mark = folder / "step.json"
         if not mark.is_file():
-            found.append(f"{what} is gone")
+            found.append(f"{input_name} is gone")
             continue
         recorded = _recorded(mark)
         for cam in CAMERAS:
             image = folder / f"{cam}.tif"
             if recorded is not None and cam in recorded and recorded[cam] != hashes.get(cam):
-                found.append(f"{cam} of {what} was replaced")
+                found.append(f"{cam} of {input_name} was replaced")
             elif recorded is None or not image.is_file() or _touched_after(image, mark):
-                found += _changed(image, hashes.get(cam), f"{cam} of {what}")
+                found += _changed(image, hashes.get(cam), f"{cam} of {input_name}")
     return found
 
 
@@ -112,10 +112,10 @@ def _images(inputs: Mapping[str, str]) -> dict[str, str | None]:
     return {cam: inputs.get(cam) for cam in CAMERAS}
 
 
-def _changed(path: Path, sha256: str | None, what: str) -> list[str]:
+def _changed(path: Path, sha256: str | None, input_name: str) -> list[str]:
     if not path.is_file():
-        return [f"{what} is gone"]
-    return [] if sha256 is None or known_sha256(path) == sha256 else [f"{what} was replaced"]
+        return [f"{input_name} is gone"]
+    return [] if sha256 is None or known_sha256(path) == sha256 else [f"{input_name} was replaced"]
 
 
 def _touched_after(image: Path, mark: Path) -> bool:

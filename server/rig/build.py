@@ -124,7 +124,7 @@ def open_devices(
 def make_unit(
     config: RigConfig, cam: CameraName, world: SimWorld | None = None, on_lost: OnLost | None = None
 ) -> CameraUnit:
-    """Make one camera as the rig file says, not yet opened; parameters as in :func:`open_devices`."""
+    """Make one camera as the rig file describes it, not yet opened; parameters as in :func:`open_devices`."""
     section = config.camera(cam)
     return CameraUnit(
         cam,
@@ -168,7 +168,7 @@ def open_configured_stage(
     record: Path | None = None,
     dynamics: Mapping[int, tuple[float | None, float | None]] | None = None,
 ) -> Stage:
-    """Open the stage alone, as the rig file says; parameters and errors as in :func:`open_devices`."""
+    """Open the stage alone, as the rig file describes it; parameters and errors as in :func:`open_devices`."""
     section = config.stage
     return open_stage(
         section.driver,
@@ -182,7 +182,7 @@ def open_configured_stage(
 
 
 class _PositionReader:
-    """Where a stage stands that is real though its cameras are simulated; where it last stood, when it cannot say."""
+    """Position of a real stage with simulated cameras; its last one while it does not answer."""
 
     def __init__(self) -> None:
         self.stage: Stage | None = None

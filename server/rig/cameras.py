@@ -1,7 +1,7 @@
 """Both cameras together: synchronised captures, averages, live frames, and their return after a loss.
 
 A capture takes the next pairs of the rig's `drivers.acquisition.sources.PairSource`. Live views use the same way when
-nobody captures, and otherwise show what the captures brought: recording comes first.
+nothing is captured, and otherwise show what the captures brought: recording comes first.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _STALE_DURING_CAPTURE_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class PairShot:
+class CapturedPair:
     """One captured pair, averaged over ``frames`` exposures.
 
     Attributes
@@ -37,11 +37,11 @@ class PairShot:
     pixels
         Camera name -> (rows, cols) uint8 or uint16; an average is rounded to 16 bit with ``scale`` counts a grey level.
     scale
-        What one grey level of the camera became in ``pixels`` (1 for a single frame).
+        Factor on the camera's grey levels in ``pixels`` (1 for a single frame).
     skew_ms
         Largest difference of the two exposures' beginnings.
     image_speed_px_s
-        How fast camera 1's image moved from the first to the last frame; None for a single frame, or where it cannot
+        Speed of camera 1's image from the first to the last frame; None for a single frame, or where it cannot
         be known.
     settings
         Exposure (ms) and gain (dB) of each camera, as read back.
@@ -85,7 +85,7 @@ class _Average:
 
     @property
     def scale(self) -> int:
-        """What one grey level becomes: a mean of 8 bit frames knows more than 8 bits."""
+        """Factor on a grey level: a mean of 8 bit frames resolves more than 8 bits."""
         return 1 if self.frames == 1 else 2 ** (16 - max(self.last[cam].bit_depth for cam in CAMERAS))
 
     def pixels(self, cam: CameraName) -> Pixels:
@@ -135,7 +135,7 @@ class CameraPair:
         self._earlier, self._source = PairingAccount(**self.account()), self._make_source()
         self._source.start()
 
-    def shoot(self, frames: int = 1, check: Callable[[], None] | None = None) -> PairShot:
+    def capture(self, frames: int = 1, check: Callable[[], None] | None = None) -> CapturedPair:
         """Capture ``frames`` pairs and average each camera's; ``check`` may raise between them.
 
         Raises
@@ -154,7 +154,7 @@ class CameraPair:
                 if not self._skew_is_set and motion is not None:
                     _check_skew(mean.skew_ms, motion)
                 last = mean.last
-                return PairShot(
+                return CapturedPair(
                     pixels={cam: mean.pixels(cam) for cam in CAMERAS},
                     bit_depth={cam: last[cam].bit_depth for cam in CAMERAS},
                     sequence={cam: last[cam].sequence for cam in CAMERAS},
@@ -193,7 +193,7 @@ class CameraPair:
                 return frame
             raise StateError("The cameras are capturing and have no live frame yet.", code="camera_busy")
         try:
-            if unit.latest is frame:  # else somebody else looked meanwhile
+            if unit.latest is frame:  # else another view took it meanwhile
                 self._source.refresh()
         finally:
             self._lock.release()

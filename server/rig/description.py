@@ -1,4 +1,4 @@
-"""What the rig, its cameras and its stage say of themselves: the API's replies, and what records keep of them.
+"""Descriptions of the rig, its cameras and its stage: the API's replies, and what records keep of them.
 
 A device's own fields are declared by its driver's classes (`drivers.cameras.protocol`, `drivers.stages.protocol`).
 """
@@ -56,28 +56,30 @@ class CameraReply(Reply):
 
     name: CameraName = Field(description="Which camera.")
     nominal: NominalCamera = Field(description="Nominal values from the rig file.")
-    device: CameraDevice | None = Field(description="What the device reports; null while it is not connected.")
+    device: CameraDevice | None = Field(
+        description="Properties that the device reports; null while it is not connected."
+    )
     settings: CameraSettingsReply | None = Field(description="Its settings as read back; null while not connected.")
-    fault: JobProblem | None = Field(None, description="Why it cannot be used now; null: it can.")
-    reconnections: int = Field(0, description="How often it was lost and connected again.")
+    fault: JobProblem | None = Field(None, description="Fault that keeps it from being used; null: none.")
+    reconnections: int = Field(0, description="Number of times that it was lost and connected again.")
 
 
 # stage -------------------------------------------------------------------------------------------------------------
 
 
 class AxisLimitsReply(Reported, AxisLimits):
-    """Where an axis may go."""
+    """Travel limits of an axis."""
 
 
 class DynamicsReply(Reply, AxisDynamics):
-    """How fast an axis moves, as read back from the controller."""
+    """Velocity and acceleration of an axis, as read back from the controller."""
 
 
 class AxisReply(Reported, AxisStatus):
     """One axis, as read from the controller."""
 
-    limits: AxisLimitsReply = Field(description="Where it may go.")
-    dynamics: DynamicsReply = Field(description="How fast it moves.")
+    limits: AxisLimitsReply = Field(description="Travel limits.")
+    dynamics: DynamicsReply = Field(description="Velocity and acceleration.")
     zero_mm: float = Field(description="Position of dZ = 0.")
     cameras: list[CameraName] = Field(description="Cameras that it moves.")
 
@@ -87,7 +89,7 @@ class AxisIdentityReply(Reported, AxisIdentity):
 
 
 class StageIdentityReply(Reported, StageIdentity):
-    """Who the motion controller is."""
+    """Identity of the motion controller."""
 
     axes: tuple[AxisIdentityReply, ...] = Field(description="The controller of each axis.")
 
@@ -96,17 +98,19 @@ class StageReply(Reply):
     """The stage."""
 
     driver: str = Field(description="Protocol of the controller.", examples=["esp301"])
-    identity: StageIdentityReply | None = Field(description="Who the controller is; null while it does not answer.")
+    identity: StageIdentityReply | None = Field(
+        description="Identity of the controller; null while it does not answer."
+    )
     axes: list[AxisReply] = Field(description="Every axis; empty while the controller does not answer.")
     zero_mm: float = Field(description="Position of dZ = 0 of axes that have none of their own.")
-    fault: JobProblem | None = Field(description="Why it cannot be used; null: it can.")
+    fault: JobProblem | None = Field(description="Fault that keeps it from being used; null: none.")
 
 
 class StageMessage(Reply, ControllerMessage):
     """Something that the controller had to say."""
 
     id: int = Field(description="Grows by one with each message.")
-    utc: str = Field(description="When it was read.")
+    utc: str = Field(description="Time at which it was read.")
 
 
 # the rig -----------------------------------------------------------------------------------------------------------
@@ -126,10 +130,10 @@ class RigReply(Reply):
     description: str = Field(description="Free text of the rig file.")
     sim: bool = Field(description="True if it is a simulated rig.")
     connected: bool = Field(description="True if cameras and stage are open.")
-    fault: JobProblem | None = Field(description="Why the rig cannot be used; null: it can.")
-    holder: Holder | None = Field(description="What holds the hardware now; null: nothing.")
-    scene: SceneReply | None = Field(description="What a simulated rig sees; null on a real one.")
-    trigger: Literal["free", "software", "hardware"] = Field(description="What starts the exposures.")
+    fault: JobProblem | None = Field(description="Fault that keeps the rig from being used; null: none.")
+    holder: Holder | None = Field(description="Holder of the hardware; null: it is free.")
+    scene: SceneReply | None = Field(description="Scene of a simulated rig; null on a real one.")
+    trigger: Literal["free", "software", "hardware"] = Field(description="Source that starts the exposures.")
     max_skew_ms: float = Field(description="A pair whose exposures began further apart is refused.")
     target: NominalTarget = Field(description="The grid.")
     calibration_plan: UsualPlan = Field(description="The usual plan of a calibration.")
@@ -148,7 +152,7 @@ class CameraKept(CameraMetadata, CameraSettings):
 
 
 class RigKept(Document):
-    """What a report wants to know of the rig that took a step: how it runs, and each camera's settings and lens."""
+    """Record of the rig that took a step, for a report: its operation, and each camera's settings and lens."""
 
     name: str
     simulated: bool
@@ -164,8 +168,8 @@ def identity_of(description: CameraDescription) -> dict[str, str]:
     return {name: getattr(description, name) for name in CameraIdentity.__dataclass_fields__}
 
 
-def kept_camera(settings: CameraSettings, facts: CameraMetadata) -> CameraKept:
+def kept_camera(settings: CameraSettings, metadata: CameraMetadata) -> CameraKept:
     """Return what a step's record keeps of a camera; a fact that was not stated is not there."""
     has = asdict(settings)
-    stated = facts.model_dump(mode="json", exclude_none=True)
+    stated = metadata.model_dump(mode="json", exclude_none=True)
     return CameraKept.model_validate({**{name: has[name] for name in _KEPT_SETTINGS}, **stated})

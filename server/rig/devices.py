@@ -1,7 +1,7 @@
-"""What is connected to this machine: cameras by every driver, serial ports, and what is wrong with each.
+"""Devices connected to this machine: cameras by every driver, serial ports, and the faults of each.
 
 Each driver looks in a thread of its own and within a time limit, so that one that hangs or misses a library spoils
-nothing but its own part of the list. Nothing is opened, and no byte goes to a serial port: a device that nobody named
+nothing but its own part of the list. Nothing is opened, and no byte goes to a serial port: a device that no file names
 may be anything.
 """
 
@@ -41,15 +41,15 @@ class ListedDevice(_Closed, FoundDevice):
 
 
 class DriverState(_Closed):
-    """How one driver's search went."""
+    """Outcome of one driver's search."""
 
     name: str = Field(description="Name of the driver; `serial` looks for serial ports.", examples=["aravis"])
     state: Literal["ok", "missing", "failed", "timeout"] = Field(
         description="`missing`: a library is not installed; `timeout`: no answer in time."
     )
-    found: int = Field(description="Devices it saw.")
-    problem: str | None = Field(description="What went wrong; null if nothing did.")
-    remedy: str | None = Field(description="What to do about it, such as what to install.")
+    found: int = Field(description="Number of devices found.")
+    problem: str | None = Field(description="Error of the search; null if there was none.")
+    remedy: str | None = Field(description="Remedy, such as what to install.")
 
 
 class DeviceListing(_Closed):
@@ -57,7 +57,7 @@ class DeviceListing(_Closed):
 
     cameras: list[ListedDevice] = Field(description="Cameras that a driver sees, and those that this service holds.")
     serial_ports: list[ListedDevice] = Field(description="Serial ports; none is opened or asked who it is.")
-    drivers: list[DriverState] = Field(description="How each driver's search went.")
+    drivers: list[DriverState] = Field(description="Outcome of each driver's search.")
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ def held_by(rig: Rig) -> list[HeldDevice]:
 class _Search:
     """One driver's search, in a thread of its own."""
 
-    def __init__(self, name: str, look: Callable[[], list[FoundDevice]]) -> None:
+    def __init__(self, name: str, find: Callable[[], list[FoundDevice]]) -> None:
         self.name = name
-        self._look = look
+        self._find = find
         self._found: list[FoundDevice] = []
         self._error: Exception | None = None
         self.done = threading.Event()
@@ -112,7 +112,7 @@ class _Search:
 
     def _run(self) -> None:
         try:
-            self._found = list(self._look())
+            self._found = list(self._find())
         except Exception as error:  # noqa: BLE001  # whatever a driver brings up is its own part of the list
             self._error = error
         finally:
@@ -184,8 +184,8 @@ class DeviceFinder:
     def _search(self, name: str) -> _Search:
         running = self._searches.get(name)
         if running is None or running.done.is_set():
-            look = self._ports if name == SERIAL else lambda: self._discover(name)
-            running = self._searches[name] = _Search(name, look)
+            find = self._ports if name == SERIAL else lambda: self._discover(name)
+            running = self._searches[name] = _Search(name, find)
             running.start()
         return running
 

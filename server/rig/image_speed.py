@@ -1,4 +1,4 @@
-"""How fast the image moves, from two frames of one camera: what a skew costs in pixels follows from it."""
+"""Speed of the image, from two frames of one camera: the error of a skew in pixels follows from it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.cameras.protocol import Frame, Pixels
 
 _WINDOW_PX = 512
 # Below it the peak of the correlation is one of many
-_LEAST_RESPONSE = 0.05
+_MIN_RESPONSE = 0.05
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-4)
 _BLUR_PX = 5
 _NOISE_PX = 0.02
@@ -20,7 +20,7 @@ _NOISE_PX = 0.02
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """How far the middle of a camera's image moved in a time."""
+    """Displacement of the middle of a camera's image in a time."""
 
     distance_px: float
     seconds: float
@@ -49,7 +49,7 @@ def image_motion(first: Frame, last: Frame) -> ImageMotion | None:
     one, two = _middle(first.pixels), _middle(last.pixels)
     window = cv2.createHanningWindow((one.shape[1], one.shape[0]), cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(one, two, window)
-    if not response > _LEAST_RESPONSE:
+    if not response > _MIN_RESPONSE:
         return None
     # the peak of a phase correlation is drawn towards whole pixels; alignment by gradients is not
     warp = np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]], dtype=np.float32)

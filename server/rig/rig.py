@@ -17,7 +17,7 @@ from drivers.cameras.protocol import CameraSettings
 from drivers.stages.protocol import MoveResult, Stage
 from server.base.problem import JobProblem, problem_of
 from server.config.rig_file import RigConfig
-from server.jobs.hardware import HardwareGate
+from server.jobs.hardware import HardwareHold
 from server.rig.build import Devices, first_settings, open_devices
 from server.rig.cameras import CameraPair
 from server.rig.description import (
@@ -43,7 +43,7 @@ from server.rig.stage_controls import StageControls
 _log = logging.getLogger("stereorig.rig")
 
 
-def _tell_nobody(_name: str, _data: Mapping[str, object]) -> None:
+def _no_announcement(_name: str, _data: Mapping[str, object]) -> None:
     """Stand in for an event hub."""
 
 
@@ -54,7 +54,7 @@ class Rig:
     ----------
     config
         The rig file.
-    gate
+    hardware
         Hold and owner thread, shared with the jobs.
     announce
         Called with ``camera`` and what happened when a camera is lost or comes back.
@@ -65,15 +65,15 @@ class Rig:
     def __init__(
         self,
         config: RigConfig,
-        gate: HardwareGate,
+        hardware: HardwareHold,
         announce: Callable[[str, Mapping[str, object]], None] | None = None,
         *,
         record: Path | None = None,
     ) -> None:
         self.config = config
         self._record = record
-        self.gate = gate
-        self._announce = announce if announce is not None else _tell_nobody
+        self.hardware = hardware
+        self._announce = announce if announce is not None else _no_announcement
         self._devices: Devices | None = None
         self._fault: JobProblem | None = JobProblem(
             code="not_connected", cause="The rig was not opened yet.", remedy="Wait until it is open."
@@ -115,7 +115,7 @@ class Rig:
         except StageError as error:
             if error.code != "stage_stopped":
                 raise
-            # somebody wants it to stand still, and the cameras to go on
+            # an operator may want it at rest while the cameras go on
             _log.warning("homing was stopped; the rig is open, and its axes are to be homed before they move")
 
     def close(self) -> None:
@@ -150,7 +150,7 @@ class Rig:
 
     @property
     def fault(self) -> JobProblem | None:
-        """Why the rig cannot be used, or None."""
+        """Fault that keeps the rig from being used, or None."""
         return self._fault
 
     def _ready(self) -> Devices:
@@ -180,7 +180,7 @@ class Rig:
             sim=config.rig.kind == "simulated",
             connected=self._devices is not None,
             fault=self._fault,
-            holder=self.gate.holder,
+            holder=self.hardware.holder,
             scene=self.scene,
             trigger=config.rig.trigger,
             max_skew_ms=config.rig.skew_bound_ms,
@@ -207,11 +207,11 @@ class Rig:
         )
 
     def identities(self) -> dict[str, dict[str, str]]:
-        """Who each camera is, for the records of what they took."""
+        """Identity of each camera, for the records of their images."""
         return {cam: identity_of(self.pair.units[cam].description) for cam in CAMERAS}
 
     def record(self) -> RigKept:
-        """What a report wants to know of the rig that took a step."""
+        """Record of the rig that took a step, for a report."""
         section, units = self.config.rig, self.pair.units
         return RigKept(
             name=section.name,
@@ -266,7 +266,7 @@ class Rig:
     def configure(self, cam: CameraName, settings: CameraSettings) -> CameraSettings:
         """Change settings on the owner thread; returns what the device really took."""
         pair = self.pair
-        taken = self.gate.call(lambda: pair.configure(cam, settings))
+        taken = self.hardware.call(lambda: pair.configure(cam, settings))
         self._settings[cam] = pair.units[cam].wanted
         return taken
 

@@ -1,4 +1,4 @@
-"""What users do with a stage besides moving it: motors, velocities, messages, abort, the configuration state."""
+"""Operations of a stage besides motion: motors, velocities, messages, abort, the configuration state."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ class StageControls:
         with self._collecting:
             for message in stage.errors(ask=ask):
                 _log.warning("stage, axis %s: %s (%s)", message.axis or "-", message.text, message.code)
-                said = {"id": self._next_message, "utc": now_utc(), **asdict(message)}
-                self._messages.append(StageMessage.model_validate(said))
+                entries = {"id": self._next_message, "utc": now_utc(), **asdict(message)}
+                self._messages.append(StageMessage.model_validate(entries))
                 self._next_message += 1
 
     def messages(self) -> list[StageMessage]:

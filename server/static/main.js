@@ -143,7 +143,7 @@ function showJobs() {
     jobText.hidden = true; // a link without a text is none
     return;
   }
-  const { stage, done, total } = job.progress ?? {};
+  const { phase: stage, done, total } = job.progress ?? {};
   const share = total ? ` ${Math.floor((100 * done) / total)} %` : "";
   jobText.hidden = false;
   replace(jobText, badge(`${job.kind}: ${stage ?? job.state}${share}${jobs.length > 1 ? ` (+${jobs.length - 1})` : ""}`, "busy"));

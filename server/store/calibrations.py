@@ -39,7 +39,7 @@ class CalibrationStore:
         """
         path = self._folder.calibrations / calibration_id if is_id(calibration_id, "c") else None
         if path is None or not (path / "plan.json").is_file():
-            raise NotFoundError(f"There is no calibration {calibration_id[:40]!r}.", what="calibration")
+            raise NotFoundError(f"There is no calibration {calibration_id[:40]!r}.", kind="calibration")
         return path
 
     def ids(self) -> list[str]:
@@ -118,7 +118,7 @@ class CalibrationStore:
         """Path of one stored view."""
         path = self.path(calibration_id) / "views" / f"{index:03d}_{cam}.tif"
         if not path.is_file():
-            raise NotFoundError(f"Calibration {calibration_id} has no view {index} of {cam}.", what="view")
+            raise NotFoundError(f"Calibration {calibration_id} has no view {index} of {cam}.", kind="view")
         taken = self.path(calibration_id) / "view.json"
         for view in read_json(taken)["views"] if taken.exists() else ():
             if view.get("file") == f"views/{path.name}" and known_sha256(path) != view.get("sha256"):

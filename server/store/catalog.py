@@ -258,12 +258,12 @@ class Catalog:
         if job_rows or request_rows:
             self.transact(write)
 
-    def count_up(self, name: str, at_least: int = 0) -> int:
-        """Return a number that is larger than every one returned before under this name, and not below ``at_least``."""
+    def count_up(self, name: str, minimum: int = 0) -> int:
+        """Return a number that is larger than every one returned before under this name, and not below ``minimum``."""
 
         def write(c: sqlite3.Connection) -> int:
             row = c.execute("SELECT value FROM counters WHERE name = ?", (name,)).fetchone()
-            value = max(at_least, 0 if row is None else int(row[0]) + 1)
+            value = max(minimum, 0 if row is None else int(row[0]) + 1)
             c.execute("INSERT OR REPLACE INTO counters VALUES (?, ?)", (name, value))
             return value
 

@@ -8,20 +8,27 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from server.base.models import Document, JobState
 from server.base.problem import JobProblem
 from server.formats.records import Record
 
+#: entry of ``test.json``; the second is its earlier name
+METADATA_NAMES = ("metadata", "facts")
+
 
 class Progress(Document):
     """Progress of a job."""
 
-    stage: str = Field(description="What it is doing.", examples=["views"])
-    done: int = Field(description="Units done in this stage.")
-    total: int = Field(description="Units in this stage; 0 while unknown.")
-    eta_s: float | None = Field(None, description="Seconds left in this stage; null while unknown.")
+    phase: str = Field(
+        description="Phase that it is in.",
+        examples=["views"],
+        validation_alias=AliasChoices("phase", "stage"),  # the second is its earlier name
+    )
+    done: int = Field(description="Units done in this phase.")
+    total: int = Field(description="Units in this phase; 0 while unknown.")
+    eta_s: float | None = Field(None, description="Seconds left in this phase; null while unknown.")
 
 
 class JobRecord(Document):
@@ -31,14 +38,14 @@ class JobRecord(Document):
     kind: str = Field(
         description="`calibration`, `noise`, `analysis`, `burst`, `move`, `home`, `leave_configuration` or `reconnect`."
     )
-    state: JobState = Field(description="Where it is in its life.")
+    state: JobState = Field(description="State of the job.")
     subject: dict[str, object] = Field(description="Ids of what it works on.")
-    progress: Progress = Field(description="How far it is.")
-    created_utc: str = Field(description="When it was accepted.")
-    started_utc: str | None = Field(None, description="When it began.")
-    finished_utc: str | None = Field(None, description="When it ended.")
-    result: dict[str, object] | None = Field(None, description="What it found, when it succeeded.")
-    problem: JobProblem | None = Field(None, description="Why it has no result.")
+    progress: Progress = Field(description="Progress.")
+    created_utc: str = Field(description="Time at which it was accepted.")
+    started_utc: str | None = Field(None, description="Time at which it began.")
+    finished_utc: str | None = Field(None, description="Time at which it ended.")
+    result: dict[str, object] | None = Field(None, description="Result, when it succeeded.")
+    problem: JobProblem | None = Field(None, description="Problem that left no result.")
 
     def ended(self, state: JobState, finished_utc: str, problem: JobProblem | None) -> JobRecord:
         """Return the record of the job's end."""
@@ -149,7 +156,7 @@ class TestRecord(Kept):
     notes: str | None = None
     calibration_id: str | None = None
     calibration_sha256: str | None = None
-    facts: object = None
+    metadata: object = Field(None, validation_alias=AliasChoices(*METADATA_NAMES))
     request: KeptRequest | None = None
 
 
@@ -259,14 +266,14 @@ class TrashEntry(Record, Document):
     """Something that was deleted and can be restored."""
 
     id: str = Field(description="Id in the trash.", examples=["x000001-3f09aa"])
-    kind: Literal["test", "step", "analysis", "calibration", "noise", "unknown"] = Field(description="What it was.")
+    kind: Literal["test", "step", "analysis", "calibration", "noise", "unknown"] = Field(description="Kind of thing.")
     test_id: str | None = Field(None, description="Its test, or itself.")
     n: int | None = Field(None, description="Number of a step.")
     analysis_id: str | None = Field(None, description="Id of an analysis.")
     calibration_id: str | None = Field(None, description="Id of a calibration.")
     noise_id: str | None = Field(None, description="Id of a noise measurement.")
     name: str = Field("", description="Its name, as users gave it.")
-    deleted_utc: str | None = Field(None, description="When it was deleted.")
+    deleted_utc: str | None = Field(None, description="Time at which it was deleted.")
     deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
     why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")
     size_bytes: int | None = Field(None, description="Room that emptying frees.")

@@ -62,11 +62,11 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
     """
     entries: list[Entry] = []
 
-    def take(what: str, read: Callable[[], Entry]) -> None:
+    def take(subject: str, read: Callable[[], Entry]) -> None:
         try:
             entries.append(read())
         except (FileFormatError, NotFoundError, KeyError, TypeError) as error:
-            trouble.append(f"{what}: {error}")
+            trouble.append(f"{subject}: {error}")
 
     def test() -> Entry:
         document = tests.read(test_id)

@@ -96,7 +96,7 @@ class LostJobs:
             kind=kind,
             state=state,
             subject=dict(subject),
-            progress=Progress(stage="done" if state == "succeeded" else "ended", done=0, total=0, eta_s=None),
+            progress=Progress(phase="done" if state == "succeeded" else "ended", done=0, total=0, eta_s=None),
             created_utc=created_utc,
             started_utc=None,
             finished_utc=None,

@@ -49,7 +49,7 @@ class NoiseStore:
         """
         path = self._root / noise_id if is_id(noise_id, "n") else None
         if path is None or not (path / "plan.json").is_file():
-            raise NotFoundError(f"There is no noise measurement {noise_id[:40]!r}.", what="noise")
+            raise NotFoundError(f"There is no noise measurement {noise_id[:40]!r}.", kind="noise")
         return path
 
     def ids(self) -> list[str]:

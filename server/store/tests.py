@@ -22,7 +22,15 @@ from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.formats.results.settings import current_step, current_summary
-from server.store.documents import AnalysisJob, AnalysisRecord, StepOutcome, StepRecord, SummaryRecord, TestRecord
+from server.store.documents import (
+    METADATA_NAMES,
+    AnalysisJob,
+    AnalysisRecord,
+    StepOutcome,
+    StepRecord,
+    SummaryRecord,
+    TestRecord,
+)
 from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -91,7 +99,7 @@ class TestStore:
         """
         path = self._folder.tests / test_id if is_id(test_id, "t") else None
         if path is None or not (path / "test.json").is_file():
-            raise NotFoundError(f"There is no test {test_id[:40]!r}.", what="test")
+            raise NotFoundError(f"There is no test {test_id[:40]!r}.", kind="test")
         return path
 
     def ids(self) -> list[str]:
@@ -133,7 +141,7 @@ class TestStore:
 
     def metadata(self, test_id: str) -> dict[str, object]:
         """Return a test's metadata; empty where nothing was stated."""
-        found = self.read(test_id).facts
+        found = self.read(test_id).metadata
         return found if isinstance(found, dict) else {}
 
     def put_metadata(
@@ -152,14 +160,15 @@ class TestStore:
             ``metadata_changed`` if they are not what was expected.
         """
         with self._lock:
-            document = read_json(self.path(test_id) / "test.json")
-            if expected is not None and document.get("facts", {}) != expected:
+            if expected is not None and self.metadata(test_id) != expected:
                 raise StateError(
                     f"The metadata of test {test_id} were changed meanwhile.",
                     code="metadata_changed",
                     remedy="Read them again, then send the change.",
                 )
-            write_json(self.path(test_id) / "test.json", document | {"facts": metadata})
+            path = self.path(test_id) / "test.json"
+            document = {name: value for name, value in read_json(path).items() if name not in METADATA_NAMES}
+            write_json(path, document | {"metadata": metadata})
 
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
@@ -269,7 +278,7 @@ class TestStore:
         """
         folder = self.path(test_id) / "steps" / f"{n:04d}"
         if not 0 <= n <= MAX_STEPS or not (folder / "step.json").is_file():
-            raise NotFoundError(f"Test {test_id} has no step {n}.", what="step")
+            raise NotFoundError(f"Test {test_id} has no step {n}.", kind="step")
         return StepFiles(read_record(StepRecord, folder / "step.json"), folder / "cam1.tif", folder / "cam2.tif")
 
     def update_step(self, test_id: str, n: int, changes: Mapping[str, object]) -> StepRecord:
@@ -305,7 +314,7 @@ class TestStore:
         """Folder of an existing analysis."""
         path = self.path(test_id) / "analyses" / analysis_id if is_id(analysis_id, "a") else None
         if path is None or not (path / "analysis.json").is_file():
-            raise NotFoundError(f"Test {test_id} has no analysis {analysis_id[:40]!r}.", what="analysis")
+            raise NotFoundError(f"Test {test_id} has no analysis {analysis_id[:40]!r}.", kind="analysis")
         return path
 
     def analysis_ids(self, test_id: str) -> list[str]:
@@ -392,7 +401,7 @@ class TestStore:
         """
         path = self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
         if not path.is_file():
-            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.", what="result")
+            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.", kind="result")
         recorded = recorded_sha256(path)
         if recorded is not None and known_sha256(path) != recorded:
             raise FileFormatError(

@@ -65,7 +65,7 @@ class Trash:
     def _document(self, trash_id: str) -> Mapping[str, object]:
         folder = self.root / trash_id if is_id(trash_id, "x") else None
         if folder is None or not (folder / _CONTENT).is_dir():
-            raise NotFoundError(f"There is nothing in the trash with the id {trash_id[:40]!r}.", what="trash")
+            raise NotFoundError(f"There is nothing in the trash with the id {trash_id[:40]!r}.", kind="trash")
         return read_json(folder / "trash.json")
 
     def entries(self) -> list[TrashEntry]:

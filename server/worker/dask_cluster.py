@@ -113,17 +113,17 @@ class ClusterExecutor(TaskExecutor):
 
     @property
     def width(self) -> int:
-        """How many tasks run at once: one a worker."""
+        """Number of tasks that run at once: one a worker."""
         if time.monotonic() > self._count_again:
             self._count_again = time.monotonic() + _COUNT_S
             self._workers = len(self._connected().scheduler_info(n_workers=-1)["workers"])
         return max(1, self._workers)
 
     def _on_event(self, event: tuple[Any, dict[str, Any]]) -> None:
-        said = event[1]
-        future = self._running.get(said["task"])
+        report = event[1]
+        future = self._running.get(report["task"])
         if future is not None and future.on_progress is not None:
-            future.on_progress(said["stage"], int(said["done"]), int(said["total"]))
+            future.on_progress(report["phase"], int(report["done"]), int(report["total"]))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> ClusterFuture:
         """Give a task to the cluster; everything must pickle, and the workers must have the program installed."""
@@ -198,13 +198,13 @@ class ClusterExecutor(TaskExecutor):
         client, remote = self._client, future.remote
         self._settle(future, error=Cancelled("The computation was cancelled."))
 
-        def tell() -> None:
-            with contextlib.suppress(Exception):  # a cluster that is gone needs no telling
+        def cancel_remote() -> None:
+            with contextlib.suppress(Exception):  # a cluster that is gone has nothing to stop
                 client.cancel([remote], asynchronous=False)
                 client.run(dask_task.stop, future.name, wait=False)
 
         if client is not None and remote is not None:
-            threading.Thread(target=tell, name="stop on the cluster", daemon=True).start()
+            threading.Thread(target=cancel_remote, name="stop on the cluster", daemon=True).start()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
         """Stop what runs and leave the cluster, which stays."""
@@ -226,6 +226,6 @@ def _content(client: Any, path: Path) -> Any:
 def _keep(folder: Path, answer: Any, written: dict[str, bytes]) -> Any:
     """Write what a worker without our disk has made; the result last, with its checksum."""
     for name, content in written.items():
-        with written_temporary(folder / name, checksum=name.endswith(".nc")) as aside:
-            aside.write_bytes(content)
+        with written_temporary(folder / name, checksum=name.endswith(".nc")) as temporary:
+            temporary.write_bytes(content)
     return answer

@@ -1,4 +1,4 @@
-"""What runs on a Dask worker: the same task functions as in the service's own worker, one at a time in a process.
+"""Tasks on a Dask worker: the same task functions as in the service's own worker, one at a time in a process.
 
 Where the worker shares no disk with the service, a step comes with the content of its files and its result goes back as
 content; here it lies in a folder of its own meanwhile.
@@ -23,7 +23,7 @@ from server.worker.process import TaskChannel
 from server.worker.tasks import StepTask
 
 _REPORT_S = 0.2
-_MOST_STOPPED = 10_000
+_MAX_STOPPED = 10_000
 _one_at_a_time = threading.Lock()  # kernels of numba's must not be called by two threads at once
 _stopped: OrderedDict[str, None] = OrderedDict()
 _ready = False
@@ -32,29 +32,29 @@ _ready = False
 def stop(name: str) -> None:
     """Let a task that runs here end; harmless where it does not."""
     _stopped[name] = None
-    while len(_stopped) > _MOST_STOPPED:
+    while len(_stopped) > _MAX_STOPPED:
         _stopped.popitem(last=False)
 
 
 class _Channel(TaskChannel):
     """Progress through the scheduler, a few times a second; cancellation by :func:`stop`."""
 
-    def __init__(self, name: str, tell: Callable[[dict[str, object]], None]) -> None:
+    def __init__(self, name: str, report_progress: Callable[[dict[str, object]], None]) -> None:
         super().__init__(lambda _: None, 0, None)
         self._name = name
-        self._tell = tell
+        self._report_progress = report_progress
         self._next = 0.0
-        self._stage = ""
+        self._phase = ""
 
     @property
     def cancelled(self) -> bool:
         return self._name in _stopped
 
-    def progress(self, stage: str, done: int, total: int) -> None:
+    def progress(self, phase: str, done: int, total: int) -> None:
         now = time.monotonic()
-        if stage != self._stage or now >= self._next:
-            self._stage, self._next = stage, now + _REPORT_S
-            self._tell({"task": self._name, "stage": stage, "done": done, "total": total})
+        if phase != self._phase or now >= self._next:
+            self._phase, self._next = phase, now + _REPORT_S
+            self._report_progress({"task": self._name, "phase": phase, "done": done, "total": total})
 
 
 def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args: Any) -> Any:
@@ -74,7 +74,7 @@ def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args
     worker = get_worker()
     with _one_at_a_time:
         _prepare(threads)
-        channel = _Channel(name, lambda said: worker.log_event(topic, said))
+        channel = _Channel(name, lambda report: worker.log_event(topic, report))
         worker_process._current = channel
         try:
             channel.check()
@@ -109,8 +109,8 @@ def run_with_files(
     contents
         By path on the service's machine, every file that the step reads.
     """
-    place = _folder() / hashlib.sha256(str(task.folder).encode()).hexdigest()[:24]
-    folder = place / "results"
+    root = _folder() / hashlib.sha256(str(task.folder).encode()).hexdigest()[:24]
+    folder = root / "results"
     folder.mkdir(parents=True, exist_ok=True)
     there = {}
     for path, content in contents.items():
@@ -119,12 +119,12 @@ def run_with_files(
             if path.parent == task.folder
             else f"{hashlib.sha256(str(path).encode()).hexdigest()[:16]}-{path.name}"
         )
-        target = there[path] = (folder if path.parent == task.folder else place) / name
+        target = there[path] = (folder if path.parent == task.folder else root) / name
         # the reference's files are the same each time: what is there is not written again
         if not target.exists() or target.stat().st_size != len(content) or target.read_bytes() != content:
-            aside = target.with_name(f".{target.name}.{os.getpid()}.part")
-            aside.write_bytes(content)
-            aside.replace(target)
+            temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+            temporary.write_bytes(content)
+            temporary.replace(target)
     moved = task.moved(folder, there)
     answer = run(name, topic, threads, function, moved)
     written = {}

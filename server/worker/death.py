@@ -1,4 +1,4 @@
-"""Why a process died: its signal in words, and whether the kernel ended it for want of memory."""
+"""Cause of a process's end: its signal in words, and whether the kernel ended it for want of memory."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ _MEANINGS = {
     signal.SIGABRT: "a library gave up",
     signal.SIGILL: "it met an instruction that this processor does not know",
     signal.SIGFPE: "an arithmetic fault",
-    signal.SIGTERM: "somebody asked it to end",
+    signal.SIGTERM: "it was asked to end",
     signal.SIGXCPU: "its limit of processor time was reached",
 }
 
 
 @dataclass(frozen=True)
 class MemoryWatch:
-    """Counts of the kernel's out-of-memory kills, by the file that tells them; taken before, compared after."""
+    """Counts of the kernel's out-of-memory kills, by the file that holds them; taken before, compared after."""
 
     kills: dict[Path, int]
 
     @classmethod
     def now(cls) -> MemoryWatch:
         """Read the counts."""
-        places = [_PROC / "vmstat", *_own_cgroup_files()]
-        return cls({place: count for place in places if (count := _oom_kills(place)) is not None})
+        sources = [_PROC / "vmstat", *_own_cgroup_files()]
+        return cls({source: count for source in sources if (count := _oom_kills(source)) is not None})
 
     def killed_since(self) -> bool:
         """Return True if any count has grown."""
         later = MemoryWatch.now().kills
-        return any(later.get(place, count) > count for place, count in self.kills.items())
+        return any(later.get(source, count) > count for source, count in self.kills.items())
 
 
 def _own_cgroup_files() -> list[Path]:
@@ -48,8 +48,8 @@ def _own_cgroup_files() -> list[Path]:
     for line in lines:
         number, _, name = line.split(":", 2)
         if number == "0":
-            place = _CGROUPS / name.strip("/")
-            return [folder / "memory.events" for folder in (place, *place.parents) if folder.is_relative_to(_CGROUPS)]
+            group = _CGROUPS / name.strip("/")
+            return [folder / "memory.events" for folder in (group, *group.parents) if folder.is_relative_to(_CGROUPS)]
     return []
 
 
@@ -85,7 +85,7 @@ def cause_of_death(exit_code: int | None, *, out_of_memory: bool, memory_mib: fl
         What it held when last looked at.
     """
     if exit_code is None:
-        return "in a way that the system does not tell"
+        return "in a way that the system does not report"
     if exit_code >= 0:
         return f"with exit code {exit_code}"
     number = -exit_code
@@ -97,6 +97,6 @@ def cause_of_death(exit_code: int | None, *, out_of_memory: bool, memory_mib: fl
     if known is signal.SIGKILL:
         if out_of_memory:
             return f"by signal 9 (SIGKILL): the kernel ended it because memory ran out.{held}"
-        return f"by signal 9 (SIGKILL): somebody killed it; the kernel counts no lack of memory.{held}"
+        return f"by signal 9 (SIGKILL): another process killed it; the kernel counts no lack of memory.{held}"
     meaning = _MEANINGS.get(known)
     return f"by signal {number} ({known.name})" + ("" if meaning is None else f": {meaning}.{held}")

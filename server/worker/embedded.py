@@ -28,7 +28,7 @@ from server.worker.process import serve
 _log = logging.getLogger("stereorig.worker")
 
 _RESTART_PAUSE_S = 5.0
-_LOOK_S = 0.05
+_POLL_S = 0.05
 _MEMORY_S = 0.5
 
 
@@ -87,7 +87,7 @@ class ComputeWorker(TaskExecutor):
 
     @property
     def width(self) -> int:
-        """How many tasks run at once."""
+        """Number of tasks that run at once."""
         return 1
 
     @property
@@ -108,7 +108,7 @@ class ComputeWorker(TaskExecutor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
-        """End the process; running and waiting tasks are cancelled, whatever ``cancel_futures`` says."""
+        """End the process; running and waiting tasks are cancelled, whatever the value of ``cancel_futures``."""
         with self._state_lock:
             self._closing.set()
             self._tasks.put(None)
@@ -213,7 +213,7 @@ class ComputeWorker(TaskExecutor):
         if not self._wait_ready(task, connection, process):
             return self._died(process)
         self._cancel.clear()
-        self._kills, look_at = MemoryWatch.now(), 0.0
+        self._kills, next_reading = MemoryWatch.now(), 0.0
         try:
             connection.send((task.id, task.function, task.args, task.kwargs))
         except (BrokenPipeError, ConnectionResetError):
@@ -226,11 +226,11 @@ class ComputeWorker(TaskExecutor):
             if stop_at is not None and time.monotonic() > stop_at:
                 self._end_process(at_once=True)
                 raise Cancelled("The computation was cancelled.")
-            if time.monotonic() > look_at and process.pid is not None:
-                look_at = time.monotonic() + _MEMORY_S
+            if time.monotonic() > next_reading and process.pid is not None:
+                next_reading = time.monotonic() + _MEMORY_S
                 self._held_mib = resident_mib(process.pid) or self._held_mib
             try:
-                if not connection.poll(_LOOK_S):
+                if not connection.poll(_POLL_S):
                     if not process.is_alive() and not connection.poll():
                         return self._died(process)
                     continue
@@ -256,7 +256,7 @@ class ComputeWorker(TaskExecutor):
             if task.future.stop_requested.is_set() or self._closing.is_set():
                 raise Cancelled("The computation was cancelled.")
             try:
-                if connection.poll(_LOOK_S):
+                if connection.poll(_POLL_S):
                     self._note(connection.recv())
                 elif not process.is_alive():
                     return False
@@ -268,11 +268,11 @@ class ComputeWorker(TaskExecutor):
         process.join(timeout=2.0)
         code, held_mib = process.exitcode, self._held_mib
         out_of_memory = self._kills.killed_since()
-        how = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=held_mib)
-        _log.error("the compute worker ended during a task, %s; starting it again", how.rstrip("."))
+        cause = cause_of_death(code, out_of_memory=out_of_memory, memory_mib=held_mib)
+        _log.error("the compute worker ended during a task, %s; starting it again", cause.rstrip("."))
         self._spawn()
         raise WorkerDiedError(
-            f"The compute process ended while it worked, {how}",
+            f"The compute process ended while it worked, {cause}",
             exit_code=code,
             signal=None if code is None or code >= 0 else -code,
             out_of_memory=out_of_memory,

@@ -54,7 +54,7 @@ class TaskExecutor(Executor):
     @property
     @abstractmethod
     def width(self) -> int:
-        """How many tasks run at once."""
+        """Number of tasks that run at once."""
 
     @abstractmethod
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> TaskFuture:

@@ -48,9 +48,9 @@ class TaskChannel:
         if self.cancelled:
             raise Cancelled("The computation was cancelled.")
 
-    def progress(self, stage: str, done: int, total: int) -> None:
+    def progress(self, phase: str, done: int, total: int) -> None:
         """Report progress."""
-        self._send(("progress", self._task_id, stage, done, total))
+        self._send(("progress", self._task_id, phase, done, total))
 
 
 def current_task() -> TaskChannel:
@@ -66,7 +66,7 @@ def pin_threads(threads: int) -> None:
 
 
 class LogHandler(logging.Handler):
-    """Sends log records to the service, which knows whose task it was and how lines are to look."""
+    """Sends log records to the service, which adds the task and formats the lines."""
 
     def __init__(self, send: Callable[[tuple[Any, ...]], None]) -> None:
         super().__init__()
@@ -102,16 +102,16 @@ def serve(
             connection.send(message)
 
     logging.getLogger().addHandler(LogHandler(send))
-    logging.getLogger().setLevel(max(log_level, logging.INFO))  # below it, others' libraries tell all they do
+    logging.getLogger().setLevel(max(log_level, logging.INFO))  # below it, libraries log every detail
     if warm_up is not None:
         module, name = warm_up.split(":")
         try:
             with report_compiling(lambda: send(("compiling",))):
                 getattr(importlib.import_module(module), name)(threads)
-        except Exception:  # noqa: BLE001 - the first task will say what is wrong to somebody who asked
+        except Exception:  # noqa: BLE001 - the first task will report the error to its caller
             _log.exception("warming up failed")
     settle()
-    lower_worker()  # not before: somebody waits for it to be ready
+    lower_worker()  # not before: the service waits for it to be ready
     send(("ready",))
     while True:
         try:

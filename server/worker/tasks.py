@@ -1,4 +1,4 @@
-"""What the compute worker can be asked to do: plain values in, plain values out.
+"""Tasks of the compute worker: plain values in, plain values out.
 
 The functions import the numerical modules when they are called, so that only the worker's process loads the kernels.
 """
@@ -35,7 +35,7 @@ class StepImages:
 
 
 def averages_of(step: Mapping[str, Any]) -> tuple[int, float]:
-    """How many frames a step's images are means of, and what their grey levels were multiplied by."""
+    """Number of frames that a step's images are means of, and the factor on their grey levels."""
     return int(step.get("frames") or 1), float(step.get("grey_scale") or 1.0)
 
 

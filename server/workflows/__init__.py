@@ -1,1 +1,1 @@
-"""What the service does on request: captures, sequences, calibrations, analyses, reviews."""
+"""Work of the service on request: captures, sequences, calibrations, analyses, reviews."""

@@ -1,6 +1,6 @@
 """An analysis at work: one task a step in the worker, each step's file announced once it can be read.
 
-A run knows nothing that the folder does not: it begins anew, goes on where another one stopped, or follows a test, and
+A run keeps no state but the folder's: it begins anew, goes on where another one stopped, or follows a test, and
 measures each step from the same steps before it in any case.
 """
 
@@ -115,9 +115,9 @@ class AnalysisRun:
                 if n in known:
                     self._summaries[n] = known[n]
         self._loaded = document
-        self._tell(job)
+        self._publish(job)
 
-    def _tell(self, job: Job) -> dict[str, object]:
+    def _publish(self, job: Job) -> dict[str, object]:
         """Put what is finished into the job's result, and return it."""
         finished = [self._summaries[n] for n in self._document.steps if n in self._summaries]
         found: dict[str, object] = {
@@ -147,10 +147,10 @@ class AnalysisRun:
     def _measure_one(self, job: Job, index: int, n: int) -> None:
         service, document, steps = self._service, self._document, self._document.steps
 
-        def progress(stage: str, found: int, of: int) -> None:
+        def progress(phase: str, found: int, of: int) -> None:
             # steps are the unit a user thinks in; within a step, the points found so far
             fraction = min(found / of, 1.0) if of > 0 else 0.0
-            job.progress(f"step {n}: {stage}", round(1000 * (index + fraction)), 1000 * len(steps))
+            job.progress(f"step {n}: {phase}", round(1000 * (index + fraction)), 1000 * len(steps))
 
         started = time.monotonic()
         try:
@@ -184,10 +184,10 @@ class AnalysisRun:
                     continue
                 yield n, lambda task=task: task  # type: ignore[misc]
 
-        def progress(n: int, stage: str, share: float) -> None:
+        def progress(n: int, phase: str, share: float) -> None:
             shares[n] = share
             done = len(self._summaries) + len(self._failed) + sum(shares.values())
-            text = f"step {n}: {stage}" if len(shares) < 2 else f"{len(shares)} steps at once"
+            text = f"step {n}: {phase}" if len(shares) < 2 else f"{len(shares)} steps at once"
             job.progress(text, round(1000 * min(done, len(steps))), 1000 * len(steps))
 
         def ended(n: int, future: Future[Any]) -> None:
@@ -219,7 +219,7 @@ class AnalysisRun:
         service.tests.put_step_summary(self._test_id, analysis_id, n, found)
         self._summaries[n] = StepOutcome.model_validate(found)
         self._done[n] = service.tests.step(self._test_id, n)
-        self._tell(job)
+        self._publish(job)
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
 
     def _check_cameras(self, n: int) -> None:
@@ -240,7 +240,7 @@ class AnalysisRun:
         return bool(new)
 
     def _result(self, job: Job) -> dict[str, object]:
-        found = self._tell(job)
+        found = self._publish(job)
         if self._failed:
             first = min(self._failed)
             found["steps_failed"] = {str(n): problem_of(error).plain() for n, error in self._failed.items()}

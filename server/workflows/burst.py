@@ -13,7 +13,7 @@ from server.store.documents import BurstIndex, StepMetadata, StepRecord
 from server.workflows.capture import commit_pair
 from server.workflows.service import Service
 
-_LOOK_S = 0.02
+_POLL_S = 0.02
 #: what one pair can suffer and the next be spared; anything else ends the burst
 _OF_THE_PAIR = frozenset({"skew_too_large", "pair_incomplete", "frame_incomplete"})
 
@@ -28,7 +28,7 @@ class BurstIncompleteError(MeasurementError):
 def start_burst(
     service: Service,
     test_id: str,
-    facts: StepMetadata,
+    metadata: StepMetadata,
     *,
     count: int,
     interval_ms: float,
@@ -49,14 +49,14 @@ def start_burst(
         "burst",
         f"a burst of {count} steps",
         {"test_id": test_id},
-        [Phase("hardware", lambda job: _run(service, job, test_id, facts, count, interval_ms, frames))],
+        [Phase("hardware", lambda job: _run(service, job, test_id, metadata, count, interval_ms, frames))],
         request=request,
     )
     return job.id
 
 
 def _run(
-    service: Service, job: Job, test_id: str, facts: StepMetadata, count: int, interval_ms: float, frames: int
+    service: Service, job: Job, test_id: str, metadata: StepMetadata, count: int, interval_ms: float, frames: int
 ) -> dict[str, object]:
     steps: list[dict[str, object]] = []
     failures: list[dict[str, object]] = []
@@ -68,9 +68,9 @@ def _run(
     for index in range(count):
         job.progress("steps", index, count)
         _wait_until(job, began + index * interval_ms / 1000.0)
-        place = BurstIndex(job_id=job.id, index=index, count=count, interval_ms=interval_ms, since_first_ms=0.0)
+        burst_index = BurstIndex(job_id=job.id, index=index, count=count, interval_ms=interval_ms, since_first_ms=0.0)
         try:
-            step = _take(service, job, test_id, facts, frames, place, first_ns)
+            step = _take(service, job, test_id, metadata, frames, burst_index, first_ns)
         except StereorigError as error:
             if error.code not in _OF_THE_PAIR:
                 raise
@@ -93,13 +93,19 @@ def _run(
 
 @timed_capture("capture")
 def _take(
-    service: Service, job: Job, test_id: str, facts: StepMetadata, frames: int, place: BurstIndex, first_ns: int | None
+    service: Service,
+    job: Job,
+    test_id: str,
+    metadata: StepMetadata,
+    frames: int,
+    burst_index: BurstIndex,
+    first_ns: int | None,
 ) -> StepRecord:
     service.require_room()
-    shot, positions_mm = service.rig.pair.shoot(frames, job.check), service.rig.positions_mm()
-    since_ns = 0 if first_ns is None else shot.host_ns - first_ns
-    burst = place.model_copy(update={"since_first_ms": round(since_ns / 1e6, 3)})
-    return commit_pair(service, test_id, facts.model_copy(update={"burst": burst}), shot, positions_mm)
+    captured, positions_mm = service.rig.pair.capture(frames, job.check), service.rig.positions_mm()
+    since_ns = 0 if first_ns is None else captured.host_ns - first_ns
+    burst = burst_index.model_copy(update={"since_first_ms": round(since_ns / 1e6, 3)})
+    return commit_pair(service, test_id, metadata.model_copy(update={"burst": burst}), captured, positions_mm)
 
 
 def _wait_until(job: Job, moment: float) -> None:
@@ -109,4 +115,4 @@ def _wait_until(job: Job, moment: float) -> None:
         left = moment - time.monotonic()
         if left <= 0.0:
             return
-        time.sleep(min(left, _LOOK_S))
+        time.sleep(min(left, _POLL_S))

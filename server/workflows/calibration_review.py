@@ -12,7 +12,7 @@ from core.target import GridTarget
 from server.compute.calibration_fit import nominals_of
 from server.store.folder import now_utc
 from server.store.index import calibration_entry
-from server.workflows.calibration_sequence import CalibrationPlan, check_plan, rig_facts, targets_of
+from server.workflows.calibration_sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
 from server.workflows.service import Service
 
 Decision = Literal["accepted", "discarded"]
@@ -31,7 +31,7 @@ def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None,
     check_plan(plan)
     if service.rig.config.stage is not None:
         targets_of(service, plan)
-    rig = rig_facts(service.config)
+    rig = rig_metadata(service.config)
     target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
     model: LineModel = "parabola"
     if plan.localiser == "profile":

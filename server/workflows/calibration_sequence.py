@@ -28,7 +28,7 @@ SAME_POSITION_MM = 1e-6
 
 @dataclass(frozen=True)
 class CalibrationPlan:
-    """What to do.
+    """Plan of a calibration.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
         job.progress("views", index, len(stops))
         moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)))
         job.check()
-        shot = rig.pair.shoot(plan.frames, job.check)
+        captured = rig.pair.capture(plan.frames, job.check)
         role = _role(plan, dz, last=index == len(stops) - 1)
         for cam in CAMERAS:
             axis = rig.config.camera(cam).stage_axis
@@ -146,11 +146,11 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
                 "dz_commanded_mm": dz,
                 "axis": axis,
                 "position_mm": moved[axis].position_mm,
-                "frames": shot.frames,
-                "full_scale": (2 ** shot.bit_depth[cam] - 1) * shot.scale,
-                "skew_ms": shot.skew_ms,
+                "frames": captured.frames,
+                "full_scale": (2 ** captured.bit_depth[cam] - 1) * captured.scale,
+                "skew_ms": captured.skew_ms,
             }
-            views.append(view | service.calibrations.put_view(calibration_id, index, cam, shot.pixels[cam]))
+            views.append(view | service.calibrations.put_view(calibration_id, index, cam, captured.pixels[cam]))
     service.calibrations.put_views_done(calibration_id, views)
     job.progress("views", len(stops), len(stops))
     return {"calibration_id": calibration_id, "views": len(views)}
@@ -172,8 +172,8 @@ def fit(service: Service, job: Job, calibration_id: str) -> dict[str, object]:
     return dict(run_task(service.worker, job, fit_calibration, task))
 
 
-def rig_facts(config: RigConfig) -> dict[str, Any]:
-    """What the fit needs of the rig file."""
+def rig_metadata(config: RigConfig) -> dict[str, Any]:
+    """Entries of the rig file that the fit needs."""
     return {
         "name": config.rig.name,
         "target": config.target.model_dump(mode="json"),
@@ -185,7 +185,7 @@ def rig_facts(config: RigConfig) -> dict[str, Any]:
 
 def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, object]:
     """``plan.json``."""
-    return {**asdict(plan), "rig": rig_facts(config)}
+    return {**asdict(plan), "rig": rig_metadata(config)}
 
 
 def close(service: Service, job: Job, calibration_id: str, state: str) -> None:

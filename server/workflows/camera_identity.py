@@ -1,4 +1,4 @@
-"""Whether images come from the cameras that were calibrated, as far as both records know their serial numbers."""
+"""Check that images come from the cameras that were calibrated, where both records hold serial numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def calibrated_cameras(calibration: Path) -> Identities | None:
     return cameras if isinstance(cameras, dict) else None
 
 
-def check_same_cameras(calibration: Path, cameras: Identities | None, what: str) -> None:
+def check_same_cameras(calibration: Path, cameras: Identities | None, images: str) -> None:
     """Refuse images of other cameras than the calibration's.
 
     Parameters
@@ -27,14 +27,14 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, what: str)
     calibration
         A calibration.json.
     cameras
-        Who took the images; None where it is not known, as with imported files.
-    what
+        Cameras that took the images; None where not known, as with imported files.
+    images
         The images, for the text: ``step 3``.
 
     Raises
     ------
     CameraError
-        ``wrong_camera``, which says so when the two were exchanged.
+        ``wrong_camera``, which states if the two were exchanged.
     """
     known = calibrated_cameras(calibration)
     if known is None or not cameras:
@@ -46,7 +46,7 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, what: str)
     exchanged = serials["cam1"] == serials["cam2"][::-1]
     texts = [f"{cam} is {now}, calibrated was {then}" for cam, (then, now) in other.items()]
     raise CameraError(
-        f"{what} was not taken with the cameras that were calibrated: {'; '.join(texts)}."
+        f"{images} was not taken with the cameras that were calibrated: {'; '.join(texts)}."
         + (" The two are exchanged." if exchanged else ""),
         code="wrong_camera",
         remedy="Put the cameras back, or calibrate these and make a new test.",

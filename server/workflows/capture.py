@@ -10,7 +10,7 @@ from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode_image, encode_tiff
 from server.results.quality import image_quality, pair_quality
-from server.rig.cameras import PairShot
+from server.rig.cameras import CapturedPair
 from server.store.documents import StepMetadata, StepRecord
 from server.store.folder import now_utc
 from server.store.index import step_entry
@@ -22,16 +22,18 @@ OFF_ZERO_MM = 0.01
 
 
 @timed_capture("capture")
-def capture_step(service: Service, test_id: str, facts: StepMetadata, *, frames: int) -> StepRecord:
+def capture_step(service: Service, test_id: str, metadata: StepMetadata, *, frames: int) -> StepRecord:
     """Capture a pair and commit it as the test's next step; returns ``step.json``."""
     service.require_room()
-    with service.gate.hold("the capture of a step", test_id=test_id):
-        shot, positions_mm = service.gate.call(lambda: (service.rig.pair.shoot(frames), service.rig.positions_mm()))
-        return commit_pair(service, test_id, facts, shot, positions_mm)
+    with service.hardware.hold("the capture of a step", test_id=test_id):
+        captured, positions_mm = service.hardware.call(
+            lambda: (service.rig.pair.capture(frames), service.rig.positions_mm())
+        )
+        return commit_pair(service, test_id, metadata, captured, positions_mm)
 
 
 def commit_pair(
-    service: Service, test_id: str, facts: StepMetadata, shot: PairShot, positions_mm: dict[int, float]
+    service: Service, test_id: str, metadata: StepMetadata, captured: CapturedPair, positions_mm: dict[int, float]
 ) -> StepRecord:
     """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
 
@@ -50,42 +52,42 @@ def commit_pair(
         It is not on disk.
     """
     rig = service.rig
-    sizes: dict[str, list[int]] = {cam: [*reversed(shot.pixels[cam].shape)] for cam in CAMERAS}
+    sizes: dict[str, list[int]] = {cam: [*reversed(captured.pixels[cam].shape)] for cam in CAMERAS}
     _check_sizes(service, test_id, sizes)
     if service.tests.is_calibrated(test_id):
         check_same_cameras(service.tests.calibration_file(test_id), rig.identities(), "The step")
-    depth = {cam: 16 if shot.scale > 1 else shot.bit_depth[cam] for cam in CAMERAS}
-    quality = pair_quality(*(image_quality(shot.pixels[cam], depth[cam]) for cam in CAMERAS))
+    depth = {cam: 16 if captured.scale > 1 else captured.bit_depth[cam] for cam in CAMERAS}
+    quality = pair_quality(*(image_quality(captured.pixels[cam], depth[cam]) for cam in CAMERAS))
     dz = {cam: rig.dz_of(cam, positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
     if quality["code"] == "ok" and max(abs(v) for v in dz.values()) > OFF_ZERO_MM:
         quality["code"] = "cameras_off_zero"
-    quality |= {"skew_ms": shot.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": shot.pair_counts}
+    quality |= {"skew_ms": captured.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": captured.pair_counts}
     for cam in CAMERAS:
-        quality[cam] |= shot.settings[cam] | {"frames": shot.frame_counts[cam]}
+        quality[cam] |= captured.settings[cam] | {"frames": captured.frame_counts[cam]}
     document = {
-        **facts.plain(),
+        **metadata.plain(),
         "source": "capture",
         "captured_utc": now_utc(),
-        "host_monotonic_ns": shot.host_ns,
-        "skew_ms": shot.skew_ms,
-        "image_speed_px_s": shot.image_speed_px_s,
+        "host_monotonic_ns": captured.host_ns,
+        "skew_ms": captured.skew_ms,
+        "image_speed_px_s": captured.image_speed_px_s,
         "cameras": rig.identities(),
         "rig": rig.record().plain(),
-        "frames": shot.frames,
-        "grey_scale": shot.scale,
-        "bit_depth": shot.bit_depth,
-        "frame_sequence": shot.sequence,
+        "frames": captured.frames,
+        "grey_scale": captured.scale,
+        "bit_depth": captured.bit_depth,
+        "frame_sequence": captured.sequence,
         "dz_mm": dz,
         "scene": None if rig.scene is None else rig.scene.model_dump(),
         "quality": quality,
         "image_size_px": sizes,
     }
-    images: dict[str, bytes] = {cam: encode_tiff(shot.pixels[cam]) for cam in CAMERAS}
+    images: dict[str, bytes] = {cam: encode_tiff(captured.pixels[cam]) for cam in CAMERAS}
     return _announce(service, test_id, service.tests.add_step(test_id, images, document))
 
 
 @timed_capture("import")
-def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: StepMetadata) -> StepRecord:
+def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata: StepMetadata) -> StepRecord:
     """Commit two image files as the test's next step; returns ``step.json``.
 
     Raises
@@ -101,7 +103,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], facts: S
     _check_content(images)
     depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
     document = {
-        **facts.plain(),
+        **metadata.plain(),
         "source": "import",
         "captured_utc": now_utc(),
         "skew_ms": None,
@@ -142,10 +144,10 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
         theirs = {"cam1": calibration.image_size1_px, "cam2": calibration.image_size2_px}
         known |= {cam: ("the test's calibration is for", [*wh]) for cam, wh in theirs.items() if wh is not None}
     for name, size in sizes.items():
-        what, other = known.get(name, ("", size))
+        origin, other = known.get(name, ("", size))
         if other != size:
             raise ImageError(
-                f"The image of {name} is {size[0]} x {size[1]} px, {what} {other[0]} x {other[1]} px.",
+                f"The image of {name} is {size[0]} x {size[1]} px, {origin} {other[0]} x {other[1]} px.",
                 code="image_size_mismatch",
                 remedy="Use images of the cameras that were calibrated, unscaled and uncropped.",
             )
@@ -156,5 +158,5 @@ def _announce(service: Service, test_id: str, step: StepRecord) -> StepRecord:
     service.catalog.put_entry("step", test_id, f"{step.n:04d}", entry)
     job = {} if step.burst is None else {"job_id": step.burst.job_id}
     service.hub.publish("step", {"test_id": test_id, **entry, **job})
-    service.jobs.landed(test_id)
+    service.jobs.step_committed(test_id)
     return step

@@ -87,17 +87,17 @@ def _name(service: Service, kind: Kind, ids: Ids) -> str:
 
 
 def _check_unused(service: Service, kind: Kind, ids: Ids) -> None:
-    what = {k: v for k, v in ids.items() if k != "n"}
+    named = {k: v for k, v in ids.items() if k != "n"}
 
     def uses(subject: Mapping[str, object]) -> bool:
-        return all(subject.get(name) == value for name, value in what.items())
+        return all(subject.get(name) == value for name, value in named.items())
 
     for job in service.catalog.jobs(states=ACTIVE):
         if service.jobs.is_active(job.id) and uses({**job.subject, **(job.result or {})}):
             raise _in_use(kind, f"by job {job.id} ({job.kind})", "Wait for the job or cancel it.", job_id=job.id)
-    holder = service.gate.holder
+    holder = service.hardware.holder
     if holder is not None and uses(holder.plain()):
-        raise _in_use(kind, f"by {holder.what}", "Try again when that is done.")
+        raise _in_use(kind, f"by {holder.purpose}", "Try again when that is done.")
 
 
 def _in_use(kind: str, by: str, remedy: str, **more: Any) -> StateError:

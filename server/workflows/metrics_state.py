@@ -54,7 +54,7 @@ class StateCollector(Collector):
         yield _gauge("uptime_seconds", "Time since the service began.", time.monotonic() - service.started_monotonic)
         yield _gauge("ready", "1 if it can capture and compute (/readyz).", not service.not_ready())
         yield _gauge("rig_fault", "1 if the rig could not be opened.", service.rig.fault is not None)
-        yield _gauge("hardware_held", "1 while a job holds the hardware.", service.gate.holder is not None)
+        yield _gauge("hardware_held", "1 while a job holds the hardware.", service.hardware.holder is not None)
 
     def _jobs(self) -> Iterator[Metric]:
         jobs = self._service.jobs
@@ -91,31 +91,31 @@ class StateCollector(Collector):
         faults = GaugeMetricFamily("stereorig_camera_fault", "1 if the camera is lost.", labels=["camera"])
         again = CounterMetricFamily("stereorig_camera_reconnections", "Times it came back.", labels=["camera"])
         for cam, unit in pair.units.items():
-            for what, number in unit.counters().items():
-                frames.add_metric([cam, what], number)
+            for name, number in unit.counters().items():
+                frames.add_metric([cam, name], number)
             faults.add_metric([cam], unit.fault is not None)
             again.add_metric([cam], unit.reconnections)
             try:
-                for what, figure in unit.statistics().items():
-                    own.add_metric([cam, what], figure)
+                for name, figure in unit.statistics().items():
+                    own.add_metric([cam, name], figure)
             except DeviceError as error:  # it was lost just now
                 _log.info("no figures of %s: %s", cam, error)
         pairs = CounterMetricFamily("stereorig_pairs", "Triggers by outcome.", labels=["what"])
-        for what, number in pair.account().items():
-            pairs.add_metric([what], number)
+        for name, number in pair.account().items():
+            pairs.add_metric([name], number)
         yield from (frames, own, faults, again, pairs)
 
     def _stage(self) -> Iterator[Metric]:
         answers = GaugeMetricFamily("stereorig_stage_up", "1 if the motion controller answers.")
-        places = GaugeMetricFamily("stereorig_axis_position_mm", "Position that was read back.", labels=["axis"])
+        positions = GaugeMetricFamily("stereorig_axis_position_mm", "Position that was read back.", labels=["axis"])
         states = GaugeMetricFamily("stereorig_axis_state", "1 for the state the axis is in.", labels=["axis", "state"])
         try:
             for axis in self._service.rig.describe_stage().axes:
                 number = str(axis.axis)
-                places.add_metric([number], axis.position_mm)
+                positions.add_metric([number], axis.position_mm)
                 for state in AxisState:
                     states.add_metric([number, state.value], axis.state is state)
             answers.add_metric([], self._service.rig.fault is None)
         except DeviceError:
             answers.add_metric([], 0)
-        yield from (answers, places, states)
+        yield from (answers, positions, states)

@@ -27,8 +27,8 @@ def begin(service: Service, frames: int, label: str, request: RequestMark) -> Id
     made: dict[str, str] = {}
 
     def prepare(job: Job) -> Ids:
-        facts = {"frames": frames, "label": label, "rig": service.config.rig.name}
-        made["noise_id"] = service.noise.create({**facts, **request.document(), "job_id": job.id})
+        entries = {"frames": frames, "label": label, "rig": service.config.rig.name}
+        made["noise_id"] = service.noise.create({**entries, **request.document(), "job_id": job.id})
         return dict(made)
 
     job = service.jobs.submit(
@@ -54,13 +54,13 @@ def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[
         job.check()
         service.require_room()
         job.progress("frames", index, frames)
-        shot = rig.pair.shoot(1, job.check)
-        taken += [service.noise.put_frame(noise_id, index, cam, shot.pixels[cam]) for cam in CAMERAS]
-    facts = {
-        "bit_depth": {cam: shot.bit_depth[cam] for cam in CAMERAS},
+        captured = rig.pair.capture(1, job.check)
+        taken += [service.noise.put_frame(noise_id, index, cam, captured.pixels[cam]) for cam in CAMERAS]
+    entries = {
+        "bit_depth": {cam: captured.bit_depth[cam] for cam in CAMERAS},
         "settings": {cam: asdict(rig.pair.units[cam].settings) for cam in CAMERAS},
     }
-    service.noise.put_frames_done(noise_id, taken, facts)
+    service.noise.put_frames_done(noise_id, taken, entries)
     job.progress("frames", frames, frames)
     return {"noise_id": noise_id, "frames": frames}
 

@@ -20,7 +20,7 @@ from server.base.streams import Streams
 from server.config.rig_file import RigConfig
 from server.exports.process import ExportProcess
 from server.jobs.events import EventHub
-from server.jobs.hardware import HardwareGate
+from server.jobs.hardware import HardwareHold
 from server.jobs.idempotency import OneEffect, RequestMark
 from server.jobs.job import Job
 from server.jobs.manager import JobManager
@@ -77,9 +77,9 @@ class Service:
         self.hub.listen(self.metrics.on_event)
         self.hub.listen(log_job_event)
         self.streams = Streams(live_view=config.service.live_views, events=config.service.event_streams)
-        self.gate = HardwareGate()
+        self.hardware = HardwareHold()
         self.jobs = JobManager(
-            self.catalog, self.hub, self.gate, self.folder.ids, queue_limit=config.service.compute_queue
+            self.catalog, self.hub, self.hardware, self.folder.ids, queue_limit=config.service.compute_queue
         )
         self.worker = worker or make_worker(config.service.kernel_threads)
         self.executor: TaskExecutor = self.worker  # of analyses
@@ -87,7 +87,7 @@ class Service:
             self.executor = ClusterExecutor(
                 config.compute.scheduler, images=config.compute.images, threads=config.compute.threads_per_worker
             )
-        self.rig = Rig(config, self.gate, self.hub.publish, record=record)
+        self.rig = Rig(config, self.hardware, self.hub.publish, record=record)
         self.finder = DeviceFinder()
         self.exports = ExportProcess(self.folder.root)
         # stopping must not wait behind forty slow requests
@@ -95,7 +95,7 @@ class Service:
         self.abort_thread = ThreadPoolExecutor(max_workers=4, thread_name_prefix="abort")
         self.started_monotonic = time.monotonic()
         self.closing = False
-        #: held from the look at a thing to its change, where a client says which state it means
+        #: held from the look at a thing to its change, where a client names the state it means
         self.changes = threading.Lock()
         self.continuing = threading.Lock()
         self._effects = OneEffect(self.catalog)
@@ -128,7 +128,7 @@ class Service:
             parts.callback(self.abort_thread.shutdown, wait=False)
             parts.callback(self.stop_thread.shutdown, wait=False)
             parts.callback(self.rig.close)
-            parts.callback(self.gate.close)
+            parts.callback(self.hardware.close)
             self.exports.clear()
             parts.callback(self.exports.close)
             self.worker.start()
@@ -154,16 +154,16 @@ class Service:
     def _open_rig(self) -> None:
         """Open the rig on its owner thread, so that the first request finds it; one that hangs is left to itself."""
         opened = threading.Event()
-        token = self.gate.claim("the opening of the rig")
+        token = self.hardware.claim("the opening of the rig")
 
         def open_rig() -> None:
             try:
                 self.rig.open()
             finally:
-                self.gate.release(token)
+                self.hardware.release(token)
                 opened.set()
 
-        self.gate.start(open_rig)
+        self.hardware.start(open_rig)
         opened.wait(timeout=_OPEN_WAIT_S)
 
     def require_room(self) -> None:
@@ -187,7 +187,7 @@ class Service:
 
     def stop_job(self, job: Job) -> None:
         """Stop the stage for a job that is being cancelled, if it holds the hardware."""
-        if self.rig.fault is None and self.gate.while_held_by(job.id, self.rig.stop):
+        if self.rig.fault is None and self.hardware.while_held_by(job.id, self.rig.stop):
             self.stop_until_released(job.id)
 
     def stop_until_released(self, job_id: str) -> None:
@@ -198,12 +198,12 @@ class Service:
         """Stop the stage until a cancelled job has let the hardware go.
 
         A job that passed its last check just before it was cancelled may start a motion just after the first stop.
-        Once it has let go, the next motion is somebody else's and must not be touched.
+        Once it has let go, the next motion is another client's and must not be stopped.
         """
         for _ in range(100):
             time.sleep(0.02)
             try:
-                if self.closing or not self.gate.while_held_by(job_id, self.rig.stop):
+                if self.closing or not self.hardware.while_held_by(job_id, self.rig.stop):
                     return
             except StereorigError as error:  # the job closes the rig just now, or the line was lost
                 _log.debug("stopping again failed: %s", error)
@@ -223,14 +223,14 @@ class Service:
     def _end_motion(self) -> None:
         """Allow no new motion, and stop the one that runs until its job has let the hardware go."""
         self.closing = True
-        self.gate.shut()
+        self.hardware.shut()
         self.jobs.begin_close()
         self.jobs.cancel_hardware()
         deadline = time.monotonic() + _END_MOTION_S
         try:
             while self.rig.fault is None:
                 self.rig.stop()
-                holder = self.gate.holder
+                holder = self.hardware.holder
                 if holder is None or holder.job_id is None or time.monotonic() > deadline:
                     return
                 time.sleep(0.02)

@@ -58,7 +58,7 @@ def run_side_by_side(
             future.request_stop()
 
     def shown(number: int) -> Progress:
-        return lambda stage, done, of: progress(number, stage, min(done / of, 1.0) if of > 0 else 0.0)
+        return lambda phase, done, of: progress(number, phase, min(done / of, 1.0) if of > 0 else 0.0)
 
     with job.waiting(stop):
         try:

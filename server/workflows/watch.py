@@ -91,7 +91,7 @@ class Watches:
         path = self._service.tests.path(test_id) / "watch.json"
         if not path.is_file():
             raise NotFoundError(
-                f"Nothing is watched in test {test_id}.", what="watch", remedy="PUT /tests/{id}/watch with a channel."
+                f"Nothing is watched in test {test_id}.", kind="watch", remedy="PUT /tests/{id}/watch with a channel."
             )
         return read_record(WatchRecord, path)
 
@@ -113,11 +113,11 @@ class Watches:
         mark = self._service.tests.steps_mark(test_id)
         known = self._known.get((test_id, channel))
         if known is None or known[0] != mark:
-            known = mark, self._look_up(test_id, channel)
+            known = mark, self._newest(test_id, channel)
             self._known[test_id, channel] = known
         return known[1]
 
-    def _look_up(self, test_id: str, channel: str) -> tuple[int, float] | None:
+    def _newest(self, test_id: str, channel: str) -> tuple[int, float] | None:
         tests = self._service.tests
         for n in reversed(tests.step_numbers(test_id)):
             value = value_of(tests.step(test_id, n).document, channel)
@@ -125,12 +125,12 @@ class Watches:
                 return n, value
         return None
 
-    def reading(self, test_id: str, facts: StepMetadata) -> Outcome:
+    def reading(self, test_id: str, metadata: StepMetadata) -> Outcome:
         """Take a step if the watched channel has changed enough.
 
         Parameters
         ----------
-        facts
+        metadata
             The reading as a step's document will hold it: ``label``, ``load_n``, ``channels``, ``timestamp_utc``.
 
         Raises
@@ -145,7 +145,7 @@ class Watches:
             try:
                 watch = self._record(test_id)
             except NotFoundError as error:
-                if error.context.get("what") != "watch":
+                if error.context.get("kind") != "watch":
                     raise
             if watch is None or not watch.active:
                 raise StateError(
@@ -154,7 +154,7 @@ class Watches:
                     remedy="PUT /tests/{id}/watch with a channel, or POST /tests/{id}/steps.",
                 )
             channel, threshold = watch.channel, watch.threshold
-            value, last = value_of(facts, channel), self._last(test_id, channel)
+            value, last = value_of(metadata, channel), self._last(test_id, channel)
             last_value = None if last is None else last[1]
             if value is None:
                 return Outcome("channel_absent", None, last_value)
@@ -162,6 +162,6 @@ class Watches:
             if change is not None and (change < threshold or change == 0.0):
                 return Outcome("below_threshold", value, last_value)
             why = Watched(channel=channel, value=value, last_value=last_value, threshold=threshold)
-            taken = facts.model_copy(update={"label": facts.label or watch.label or "", "watch": why})
+            taken = metadata.model_copy(update={"label": metadata.label or watch.label or "", "watch": why})
             step = capture_step(self._service, test_id, taken, frames=watch.frames)
             return Outcome("first" if last is None else "changed", value, last_value, step.n)

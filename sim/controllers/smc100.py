@@ -268,16 +268,16 @@ class SimSMC100(WireController):
             "SL": unit.stored_low_mm,
             "SR": unit.stored_high_mm,
             "VA": unit.max_velocity_mm_s,
-            **{word: value for word, value in unit.kept.items() if self._knows(word)},
+            **{word: value for word, value in unit.kept.items() if self._supports(word)},
         }
         lines = ["PW1", "IDSIM-TRA25CC", *(f"{word}{values[word]:g}" for word in sorted(values)), "PW0"]
         return "".join(f"{address}{line}\r\n" for line in lines).encode("ascii")
 
-    def _knows(self, word: str) -> bool:
+    def _supports(self, word: str) -> bool:
         return self.model == "SMC100PP" or word not in _STEPPERS_ONLY
 
     def _keep(self, unit: _Unit, word: str, parameter: str) -> str | None:
-        if not self._knows(word):
+        if not self._supports(word):
             raise _Refusal("X")
         if parameter == "?":
             return f"{unit.kept[word]:g}"

@@ -101,7 +101,7 @@ class WireAxis:
         return cls(motor, low_mm, high_mm, 4 * velocity, 10 * acceleration)
 
 
-_MOST_RECEIVED = 200_000
+_MAX_RECEIVED = 200_000
 
 
 @dataclass(frozen=True)
@@ -129,8 +129,8 @@ class WireController(ABC):
             return b""
         text = line.decode("ascii", errors="replace").strip("\r\n")
         with self._lock:
-            if len(self.received) >= _MOST_RECEIVED:  # in a service it receives commands for weeks
-                del self.received[: _MOST_RECEIVED // 2]
+            if len(self.received) >= _MAX_RECEIVED:  # in a service it receives commands for weeks
+                del self.received[: _MAX_RECEIVED // 2]
             self.received.append(Received(time.monotonic(), text))
             reply = self.line_faults.apply(self._execute(text))
         if reply and self.line_faults.delay_s > 0:

@@ -153,7 +153,7 @@ def test_steps_scales_and_images_are_chosen(page: Watched, bench: Bench) -> None
     for cam in ("cam1", "cam2"):
         at.get_by_label("Image", exact=True).select_option(cam)
         drawn(at, f"1 w_mm {cam}")
-        positions = np.array(bench.client.get(f"{bench.path()}/steps/1/places/{cam}").json()["values"], dtype=float)
+        positions = np.array(bench.client.get(f"{bench.path()}/steps/1/positions/{cam}").json()["values"], dtype=float)
         x, y = positions[5, 6]
         assert pixel(at, round(x), round(y))[3] == 255
     at.get_by_label("Image", exact=True).select_option("reference")
@@ -172,7 +172,7 @@ def test_places_are_those_of_the_images(bench: Bench) -> None:
     """Camera 1 sees the reference's points where they were put, and camera 2 by its own pinhole formula."""
     calibration = load_calibration(bench.service.tests.calibration_file(bench.test_id))
     expected = {
-        cam: np.array(bench.client.get(f"{bench.path()}/steps/0/places/{cam}").json()["values"], dtype=float)
+        cam: np.array(bench.client.get(f"{bench.path()}/steps/0/positions/{cam}").json()["values"], dtype=float)
         for cam in ("cam1", "cam2")
     }
     x, y = bench.field(0, "x_px"), bench.field(0, "y_px")
@@ -194,9 +194,9 @@ def test_places_are_those_of_the_images(bench: Bench) -> None:
         axis=-1,
     )
     assert np.abs(seen - ideal).max() < 0.2 + np.abs(content["kappa_per_px2"] * r2[..., None] * ideal).max()
-    missing = bench.client.get(f"{bench.path(bench.cut_id)}/steps/1/places/cam1").json()["values"]
+    missing = bench.client.get(f"{bench.path(bench.cut_id)}/steps/1/positions/cam1").json()["values"]
     assert missing[4][5] == [None, None]
-    assert bench.client.get(f"{bench.path()}/steps/1/places/cam3").status_code == 422
+    assert bench.client.get(f"{bench.path()}/steps/1/positions/cam3").status_code == 422
 
 
 def drag(at: Page, a: tuple[float, float], b: tuple[float, float]) -> None:

@@ -141,7 +141,7 @@ def test_where_keys_are_needed_the_page_asks_for_one(chromium: Browser, service:
         dialog = page.page.get_by_role("dialog", name="Log in")
         dialog.get_by_label("Key").fill("sr_wrong")
         dialog.get_by_role("button", name="Log in").click()
-        expect(dialog.get_by_text("This key is nobody's.")).to_be_visible()
+        expect(dialog.get_by_text("No user has this key.")).to_be_visible()
         dialog.get_by_label("Key").fill(key)
         dialog.get_by_role("button", name="Log in").click()
         expect(page.page.get_by_text("page-operator (operator)")).to_be_visible()

@@ -75,7 +75,7 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
     camera.get_by_label("Focal length").fill("50")
     shown.get_by_role("button", name="Save the metadata").click()
     expect(shown.get_by_text("The metadata are saved.")).to_be_visible()
-    assert client.get(f"{API}/tests/{test_id}/facts").json() == {
+    assert client.get(f"{API}/tests/{test_id}/metadata").json() == {
         "operator": "A. Smith",
         "cam2": {"lens": {"focal_length_mm": 50.0}},
     }

@@ -33,7 +33,7 @@ def test_a_kill_for_want_of_memory_is_told_from_any_other() -> None:
     killed = cause_of_death(-9, out_of_memory=True, memory_mib=3210.4)
     assert "memory ran out" in killed
     assert "3210 MiB" in killed
-    assert "somebody killed it" in cause_of_death(-9, out_of_memory=False, memory_mib=None)
+    assert "another process killed it" in cause_of_death(-9, out_of_memory=False, memory_mib=None)
 
 
 @pytest.mark.parametrize("counter", ["vmstat", "own group", "group above", "none"])

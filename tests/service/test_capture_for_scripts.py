@@ -189,7 +189,7 @@ def test_a_burst_is_cancelled_within_a_second_and_keeps_its_steps(client: httpx.
     assert time.monotonic() - asked < limit
     assert done["state"] == "cancelled"
     assert [s["n"] for s in done["result"]["steps"]] == [0] == steps_of(client, test_id)
-    assert service.gate.holder is None
+    assert service.hardware.holder is None
 
 
 # watches --------------------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ def test_a_reading_that_met_an_error_asks_again(client: httpx.Client, service: S
     url = f"{API}/tests/{test_id}"
     client.put(f"{url}/watch", json={"channel": "force_n", "threshold": 1.0})
     key = {"Idempotency-Key": f"reading {test_id}"}
-    with service.gate.hold("somebody else"):
+    with service.hardware.hold("somebody else"):
         busy = client.post(f"{url}/channels", json={"channels": {"force_n": 7.0}}, headers=key)
         refused(busy, 409, "hardware_busy")
     first = client.post(f"{url}/channels", json={"channels": {"force_n": 7.0}}, headers=key)

@@ -21,7 +21,7 @@ from server.workflows.service import Service
 from tests.support.service_rig import tiny_config, wait_for_rig
 
 API = "/api/v1"
-LIMITS = ConnectionLimits(most=12, header_s=1.0, body_bytes_per_s=1000.0, body_s=1.0, unread_s=2.0)
+LIMITS = ConnectionLimits(max_open=12, header_s=1.0, body_bytes_per_s=1000.0, body_s=1.0, unread_s=2.0)
 END_S = 30.0  # a second would do on a machine that does nothing else
 
 
@@ -161,7 +161,7 @@ def test_an_answer_that_nobody_reads_ends_the_connection_and_holds_little(own: S
 
 def test_idle_connections_give_way_to_new_ones(own: Service, port: int) -> None:
     idle = []
-    for _ in range(LIMITS.most):
+    for _ in range(LIMITS.max_open):
         idle.append(dial(port))
         idle[-1].sendall(request("GET", "/healthz"))
         assert idle[-1].recv(65536).startswith(b"HTTP/1.1 200")
@@ -184,7 +184,7 @@ def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(own: Servic
         return connection
 
     view = opened(f"{API}/cameras/cam1/stream.mjpg?rate_hz=1")
-    busy = [opened(f"{API}/events") for _ in range(LIMITS.most - 1)]
+    busy = [opened(f"{API}/events") for _ in range(LIMITS.max_open - 1)]
     try:
         with dial(port) as newcomer:
             newcomer.sendall(request("GET", "/healthz"))
@@ -202,10 +202,10 @@ def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(own: Servic
 def test_where_all_work_a_newcomer_is_refused_in_words(own: Service, port: int) -> None:
     busy = []
     try:
-        for _ in range(LIMITS.most + 1):
+        for _ in range(LIMITS.max_open + 1):
             busy.append(dial(port))
             busy[-1].sendall(request("GET", f"{API}/events"))
-            if len(busy) <= LIMITS.most:
+            if len(busy) <= LIMITS.max_open:
                 assert busy[-1].recv(64).startswith(b"HTTP/1.1 200")
         answer = b"".join(iter(lambda: busy[-1].recv(65536), b""))  # and it is closed
         assert answer.startswith(b"HTTP/1.1 503"), answer
@@ -247,6 +247,6 @@ def test_settings_are_kept_to(tmp_path: Path) -> None:
     made = Service(tiny_config(compute_queue="compute_queue = 2\nconnections = 40"), tmp_path / "data").start()
     try:
         server = OrderlyServer(create_app(made, close_service=False), made)
-        assert server._keeper.limits.most == 40
+        assert server._keeper.limits.max_open == 40
     finally:
         made.close()

@@ -210,7 +210,7 @@ def growing(host: Host, taken: Path) -> str:
 
 def state_of(client: httpx.Client, job: dict[str, Any]) -> tuple[str, str]:
     document = client.get(f"{API}/jobs/{job['id']}").json()
-    return document["state"], document["progress"]["stage"]
+    return document["state"], document["progress"]["phase"]
 
 
 def wait_until_it_waits(client: httpx.Client, job: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ import httpx
 import pytest
 
 from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, current_ids
-from server.jobs.hardware import HardwareGate
+from server.jobs.hardware import HardwareHold
 from server.worker.embedded import ComputeWorker
 from server.workflows.service import Service
 from tests.support.requirements import ROOT
@@ -86,13 +86,13 @@ def test_a_text_line_stays_one_line_whatever_a_client_sends() -> None:
 
 
 def test_the_hardware_thread_knows_whose_work_it_does() -> None:
-    gate = HardwareGate()
+    hardware = HardwareHold()
     try:
         with about(request_id="r2"):
-            assert gate.call(current_ids) == {"request_id": "r2"}
-        assert gate.call(current_ids) == {}
+            assert hardware.call(current_ids) == {"request_id": "r2"}
+        assert hardware.call(current_ids) == {}
     finally:
-        gate.close()
+        hardware.close()
 
 
 def test_the_workers_lines_reach_the_service_and_name_the_job(as_json: Lines) -> None:

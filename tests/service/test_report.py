@@ -177,7 +177,7 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Measurement]:
             accepted = client.post(f"{API}/tests/{test_id}/analyses", json=body).json()
             done = wait_for_job(client, accepted["job"], 240.0)
             assert done["state"] == "succeeded", done["problem"]
-            assert client.put(f"{API}/tests/{test_id}/facts", json=METADATA).status_code == 200
+            assert client.put(f"{API}/tests/{test_id}/metadata", json=METADATA).status_code == 200
             yield Measurement(client, service, test_id, accepted["analysis_id"])
     finally:
         service.close()
@@ -516,10 +516,10 @@ def test_static_steps_are_also_known_by_their_labels(plate: Measurement, tmp_pat
         mark = test / "steps" / f"{n:04d}" / "step.json"
         mark.write_text(json.dumps(json.loads(mark.read_text()) | {"label": "Static, before loading"}))
     document = json.loads((test / "test.json").read_text())
-    (test / "test.json").write_text(json.dumps({k: v for k, v in document.items() if k != "facts"}))
+    (test / "test.json").write_text(json.dumps({k: v for k, v in document.items() if k != "metadata"}))
     measured = read_steps(find_source(test))
     assert measured.static == [1, 3]
-    assert "by their labels" in measured.static_how
+    assert "by their labels" in measured.static_source
     assert measured.floor["W"].bias is not None
     assert [step.static for step in measured.steps] == [False, True, False, True, False, False]
 

@@ -19,7 +19,7 @@ import pytest
 
 from core.errors import Cancelled, FileFormatError, StateError, StorageError
 from server.base.errors import BusyError, QueueFullError
-from server.jobs.hardware import HardwareGate
+from server.jobs.hardware import HardwareHold
 from server.jobs.job import Job, Phase
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
@@ -57,7 +57,7 @@ def test_a_job_tells_stage_share_and_time_left(bench: Bench) -> None:
         time.sleep(0.005)
     document = bench.jobs.document(job.id).plain()
     assert document["state"] == "running"
-    assert document["progress"]["stage"] == "walking"
+    assert document["progress"]["phase"] == "walking"
     assert 0.2 < document["progress"]["eta_s"] < 3.0
     go.set()
     done = bench.end_of(job)
@@ -77,14 +77,14 @@ def test_hardware_jobs_exclude_each_other_and_name_the_holder(bench: Bench) -> N
     assert caught.value.context["holder"]["job_id"] == job.id
     go.set()
     assert bench.end_of(job)["state"] == "succeeded"
-    assert bench.gate.holder is None
+    assert bench.hardware.holder is None
 
 
 @pytest.mark.fault(28)
 def test_what_is_done_to_a_holder_never_meets_the_next_one() -> None:
     """A cancelled job is stopped again until it has let go; the next holder of the hardware must not be stopped."""
-    gate = HardwareGate()
-    first = gate.claim("a move", job_id="j1")
+    hardware = HardwareHold()
+    first = hardware.claim("a move", job_id="j1")
     stopping, stopped, order = threading.Event(), threading.Event(), []
 
     def stop() -> None:
@@ -92,15 +92,15 @@ def test_what_is_done_to_a_holder_never_meets_the_next_one() -> None:
         assert stopped.wait(10.0)
         order.append("stopped")
 
-    stopper = threading.Thread(target=lambda: gate.while_held_by("j1", stop))
+    stopper = threading.Thread(target=lambda: hardware.while_held_by("j1", stop))
     stopper.start()
     assert stopping.wait(10.0)
-    assert gate.holder is not None  # looking waits for nothing
-    gate.release(first)  # nor does letting go
-    assert gate.holder is None
+    assert hardware.holder is not None  # looking waits for nothing
+    hardware.release(first)  # nor does letting go
+    assert hardware.holder is None
 
     def next_one() -> None:
-        gate.claim("another move", job_id="j2")
+        hardware.claim("another move", job_id="j2")
         order.append("claimed")
 
     other = threading.Thread(target=next_one)
@@ -111,18 +111,18 @@ def test_what_is_done_to_a_holder_never_meets_the_next_one() -> None:
     stopper.join(10.0)
     other.join(10.0)
     assert order == ["stopped", "claimed"]
-    assert not gate.while_held_by("j1", lambda: order.append("too late"))
+    assert not hardware.while_held_by("j1", lambda: order.append("too late"))
     assert order == ["stopped", "claimed"]
-    gate.close()
+    hardware.close()
 
 
 def test_hardware_is_free_while_the_second_phase_computes(bench: Bench) -> None:
     go = threading.Event()
     phases = [Phase("hardware", lambda _: {"a": 1}), Phase("compute", lambda _: go.wait(10) and {"b": 2})]
     job = bench.jobs.submit("calibration", "a calibration", {}, phases)
-    while bench.gate.holder is not None:
+    while bench.hardware.holder is not None:
         time.sleep(0.005)
-    with bench.gate.hold("somebody else"):
+    with bench.hardware.hold("somebody else"):
         go.set()
         assert bench.end_of(job)["result"] == {"a": 1, "b": 2}
 

@@ -182,7 +182,7 @@ def test_who_sees_that_a_job_has_ended_may_move_at_once(homed: StageService) -> 
 
     def note_holder(name: str, data: dict[str, object]) -> None:
         if name == "job" and data["state"] in ("cancelled", "succeeded"):
-            seen[str(data["id"])] = homed.service.gate.holder
+            seen[str(data["id"])] = homed.service.hardware.holder
 
     homed.service.hub.listen(note_holder)
     homed.axis(1).velocity_mm_s = 0.2
@@ -275,7 +275,7 @@ def test_many_clients_at_once_start_one_move(homed: StageService) -> None:
         assert sorted(statuses) == [202, *[409] * 11]
         wait_until(lambda: len(homed.controller.commands("1PA")) > before)
         homed.post("/stage/stop")
-        wait_until(lambda: homed.service.gate.holder is None)
+        wait_until(lambda: homed.service.hardware.holder is None)
         assert len(homed.controller.commands("1PA")) == before + 1
     finally:
         homed.axis(1).velocity_mm_s = 10.0
@@ -343,7 +343,7 @@ def test_an_axis_in_configuration_state_is_left_with_consent_only(tmp_path_facto
 
 
 def test_a_rig_with_a_stuck_axis_opens_and_homes_the_other(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from server.jobs.hardware import HardwareGate
+    from server.jobs.hardware import HardwareHold
     from server.rig import Rig
     from sim.controllers.registry import make_controller
     from sim.controllers.server import ControllerServer
@@ -352,7 +352,7 @@ def test_a_rig_with_a_stuck_axis_opens_and_homes_the_other(tmp_path_factory: pyt
     controller = make_controller("smc100", (1, 2), time_scale=50.0)
     controller.take_line(b"2PW1")
     with ControllerServer(controller) as server:
-        opened = Rig(rig(driver='"smc100"', url=f'"{server.url}"', home_at_start="true"), HardwareGate())
+        opened = Rig(rig(driver='"smc100"', url=f'"{server.url}"', home_at_start="true"), HardwareHold())
         opened.open()
         try:
             assert opened.fault is None
@@ -360,7 +360,7 @@ def test_a_rig_with_a_stuck_axis_opens_and_homes_the_other(tmp_path_factory: pyt
             assert controller.flash_writes(2) == 0
         finally:
             opened.close()
-            opened.gate.close()
+            opened.hardware.close()
 
 
 @pytest.mark.fault(26)

@@ -121,7 +121,7 @@ def test_what_a_job_or_a_capture_uses_is_not_deleted(service: Service, client: h
         go.set()
     while service.jobs.active_count():
         pass
-    with service.gate.hold("the capture of a step", test_id=test_id):
+    with service.hardware.hold("the capture of a step", test_id=test_id):
         assert_problem(client.delete(f"{API}/tests/{test_id}"), 409, "in_use")
     gone = delete(client, f"/tests/{test_id}/analyses/{analysis_id}")
     assert_problem(client.get(f"{API}/tests/{test_id}/analyses/{analysis_id}"), 404, "not_found")

@@ -281,7 +281,7 @@ def everything_else(client: httpx.Client) -> None:
     calibration = client.get(f"{API}/calibrations").json()["calibrations"][0]["id"]
     decision = {"decision": "accepted", "note": "good"}
     client.put(f"{API}/calibrations/{calibration}/review", json=decision).raise_for_status()
-    client.put(f"{test}/facts", json={"operator": "A. Smith"}).raise_for_status()
+    client.put(f"{test}/metadata", json={"operator": "A. Smith"}).raise_for_status()
     client.put(f"{test}/watch", json={"channel": "load_n", "threshold": 1.0}).raise_for_status()
     analysis = client.get(test).json()["analyses"][0]["id"]
     client.get(f"{test}/analyses/{analysis}/export", params={"format": "csv"}).raise_for_status()

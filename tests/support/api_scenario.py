@@ -274,8 +274,8 @@ def _test(session: Session, calibration: str) -> str:
     call("post_channels", test, summary="What the load frame reads now", body=reading)
     call("post_channels", test, body={"load_n": 1811.0})
     call("end_watch", test)
-    call("judge_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
-    call("check_seed_places", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
+    call("rate_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
+    call("check_seeds", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
     call("delete_step", test, imported)
     return test
 

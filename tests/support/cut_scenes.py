@@ -52,7 +52,7 @@ def _side_of(motion: Motion, camera: Camera, side: Side, shape: tuple[int, int],
     x, y = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
     st, lip = material_points(bench.scene("block", 1.0, motion), camera, np.stack([x, y], axis=-1))
     before = bench.scene("block", 1.0, STILL)
-    seen = bench.pair().cam1.project(before.sys_from_body.apply(before.surface.place(st, lip))).xy
+    seen = bench.pair().cam1.project(before.sys_from_body.apply(before.surface.positions(st, lip))).xy
     return np.where(np.isfinite(seen).all(axis=-1), side(np.nan_to_num(seen)), outside)
 
 

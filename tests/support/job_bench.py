@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from server.jobs.events import EventHub
-from server.jobs.hardware import HardwareGate
+from server.jobs.hardware import HardwareHold
 from server.jobs.job import Job
 from server.jobs.manager import JobManager
 from server.store.catalog import Catalog
@@ -19,14 +19,14 @@ class Bench:
 
     def __init__(self, folder: Path, queue_limit: int = 2) -> None:
         self.catalog = Catalog(folder / "catalog.sqlite").open()
-        self.gate = HardwareGate()
+        self.hardware = HardwareHold()
         self.hub = EventHub()
-        self.jobs = JobManager(self.catalog, self.hub, self.gate, IdMaker(), queue_limit=queue_limit)
+        self.jobs = JobManager(self.catalog, self.hub, self.hardware, IdMaker(), queue_limit=queue_limit)
         self.jobs.start()
 
     def close(self) -> None:
         self.jobs.close()
-        self.gate.close()
+        self.hardware.close()
         self.catalog.close()
 
     def end_of(self, job: Job, seconds: float = 20.0) -> dict[str, Any]:

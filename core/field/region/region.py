@@ -263,9 +263,9 @@ def check_subset(subset_px: int) -> None:
         )
 
 
-def _finite(what: str, values: ArrayLike) -> None:
+def _finite(name: str, values: ArrayLike) -> None:
     if not np.isfinite(np.asarray(values, dtype=np.float64)).all():
-        raise RegionError(f"the {what} holds a number that is not finite: {np.asarray(values).tolist()}.")
+        raise RegionError(f"the {name} holds a number that is not finite: {np.asarray(values).tolist()}.")
 
 
 def _step(spacing_px: float) -> None:

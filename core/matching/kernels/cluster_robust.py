@@ -71,8 +71,8 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
 
     def work_space(subset: int) -> ClusterRobustSpace:
         across = blocks_across(subset)
-        widest = -(-subset // across) + 1
-        width = (widest * widest + LANES - 1) // LANES * LANES + LANES
+        max_side = -(-subset // across) + 1
+        width = (max_side * max_side + LANES - 1) // LANES * LANES + LANES
         return ClusterRobustSpace(
             fit=make_space(subset),
             part=np.zeros((N_ROWS, width), np.float32),

@@ -72,7 +72,7 @@ _FITS = {"shape": {1: make_shape(1), 2: make_shape(2)}, "motion": {1: make_motio
 
 
 def _by_fit(of: Callable[[str, FitKernels], Any]) -> dict[str, dict[int, Any]]:
-    return {what: {d: of(f"{what}_{d}", kernels) for d, kernels in fits.items()} for what, fits in _FITS.items()}
+    return {kind: {d: of(f"{kind}_{d}", kernels) for d, kernels in fits.items()} for kind, fits in _FITS.items()}
 
 
 run_points = _by_fit(lambda name, kernels: _entry(f"run_{name}", kernels.point, _STAMP))

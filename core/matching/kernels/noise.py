@@ -80,10 +80,10 @@ def noise_from_residuals(levels, images, n, unknowns):
     which affect the solution less than noise does.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
-    smallest = np.inf
+    min_variance = np.inf
     for k in range(images):
-        smallest = min(smallest, _one_variance(levels, k))
-    limit = smallest * (1.0 + ALIKE_SD * math.sqrt(2.0 / freedom))
+        min_variance = min(min_variance, _one_variance(levels, k))
+    limit = min_variance * (1.0 + ALIKE_SD * math.sqrt(2.0 / freedom))
     total, count = 0.0, 0
     for k in range(images):
         one = _one_variance(levels, k)
@@ -114,12 +114,12 @@ def unlike_noise(levels, images, n, unknowns):
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
     best = best_correlation(levels, images)
-    smallest, largest = np.inf, 0.0
+    min_variance, max_variance = np.inf, 0.0
     for k in range(images):
         one = _one_variance(levels, k)
-        smallest = min(smallest, one)
-        largest = max(largest, one * (best / max(levels[k, ZNCC], MIN_CORRELATION)) ** 2)
-    return max(largest - UNLIKE * smallest, 0.0) / freedom
+        min_variance = min(min_variance, one)
+        max_variance = max(max_variance, one * (best / max(levels[k, ZNCC], MIN_CORRELATION)) ** 2)
+    return max(max_variance - UNLIKE * min_variance, 0.0) / freedom
 
 
 @inner

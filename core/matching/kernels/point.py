@@ -349,7 +349,7 @@ def make_point(degree: int, images: int) -> PointKernels:
 
         The sum of the coefficients' sizes bounds it.
         """
-        largest = 0.0
+        max_squared = 0.0
         for k in range(images):
             x, y = 0.0, 0.0
             for j in range(few):
@@ -360,8 +360,8 @@ def make_point(degree: int, images: int) -> PointKernels:
                 moves[k, j], moves[k, few + j] = a, b
                 x += abs(a)
                 y += abs(b)
-            largest = max(largest, x * x + y * y)
-        return math.sqrt(largest)
+            max_squared = max(max_squared, x * x + y * y)
+        return math.sqrt(max_squared)
 
     @kernel(made_for)
     def predict(moves, rhs, gram, f2, levels):

@@ -26,11 +26,11 @@ class ArrivalClock:
     ) -> None:
         self._wall_ns = wall_ns
         self._steady_ns = steady_ns
-        self._difference = self._look()
+        self._difference = self._measure()
         self._doubtful = 0
         self._stepped = False
 
-    def _look(self) -> int:
+    def _measure(self) -> int:
         # the thread may be put aside between both looks: the quickest of three counts
         readings = []
         for _ in range(3):
@@ -42,7 +42,7 @@ class ArrivalClock:
 
     def watch(self) -> None:
         """Look at the clocks; to be called often."""
-        difference = self._look()
+        difference = self._measure()
         if abs(difference - self._difference) > _STEP_NS:
             self._stepped = True
         self._difference = difference

@@ -23,8 +23,8 @@ def describe(device: Device, features: Features, control: CameraControl) -> Came
     formats = control.formats()
     firmware = features.first(*_FIRMWARE)
     return CameraDescription(
-        model=device.say("get_model_name"),
-        serial=device.say("get_device_serial_number"),
+        model=device.text_of("get_model_name"),
+        serial=device.text_of("get_device_serial_number"),
         image_size_px=control.full_size_px(),
         bit_depths=tuple(dict.fromkeys(known.bit_depth for known in formats)),
         trigger_modes=control.trigger_modes(),
@@ -43,7 +43,7 @@ def describe(device: Device, features: Features, control: CameraControl) -> Came
 
 
 def _extra(device: Device, features: Features) -> dict[str, str]:
-    extra = {"vendor": device.say("get_vendor_name"), "protocol": device.protocol}
+    extra = {"vendor": device.text_of("get_vendor_name"), "protocol": device.protocol}
     if device.is_gige:
         extra["address"] = device.address()
         extra["packet_size_bytes"] = str(device.ask_camera("gv_get_packet_size"))

@@ -124,7 +124,7 @@ class Device:
             except glib_error():  # it is not there, or not under control any more
                 return
 
-    def say(self, method: str) -> str:
+    def text_of(self, method: str) -> str:
         """Return a text about the camera, empty where it has none."""
         self._check()
         try:

@@ -77,14 +77,14 @@ class CameraControl:
         size = []
         for axis, offset in (("Width", "OffsetX"), ("Height", "OffsetY")):
             features = self._features
-            largest = features.bounds(axis).high
+            max_size = features.bounds(axis).high
             whole, sensor = features.first(f"{axis}Max"), features.first(f"Sensor{axis}")
             if whole is not None:
-                largest = max(largest, features.read_number(whole))
+                max_size = max(max_size, features.read_number(whole))
             elif sensor is not None and features.has(offset):
                 # the limit of the width is the whole less the present offset
-                largest = max(largest, min(features.read_number(sensor), largest + features.read_number(offset)))
-            size.append(int(largest))
+                max_size = max(max_size, min(features.read_number(sensor), max_size + features.read_number(offset)))
+            size.append(int(max_size))
         return size[0], size[1]
 
     def trigger_modes(self) -> tuple[TriggerMode, ...]:

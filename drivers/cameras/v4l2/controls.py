@@ -295,9 +295,9 @@ class Controls:
             "Leave it out, or switch off what sets it by itself first.",
         )
 
-    def _not_taken(self, control: Control, what: str, remedy: str) -> CameraError:
+    def _not_taken(self, control: Control, failure: str, remedy: str) -> CameraError:
         return CameraError(
-            f"{self._device.path} {what}.",
+            f"{self._device.path} {failure}.",
             code="setting_not_taken",
             remedy=remedy,
             device=self._device.path,

@@ -134,9 +134,9 @@ class Device:
             )
         return self.fault(error, "be opened")
 
-    def fault(self, error: OSError, what: str) -> CameraError:
-        """Return the error, in the project's words, for a request ``what`` that the device refused."""
-        text = f"{self.path} cannot {what} ({error.strerror}, {errno.errorcode.get(error.errno or 0, error.errno)})"
+    def fault(self, error: OSError, action: str) -> CameraError:
+        """Return the error, in the project's words, for a request ``action`` that the device refused."""
+        text = f"{self.path} cannot {action} ({error.strerror}, {errno.errorcode.get(error.errno or 0, error.errno)})"
         if error.errno in _GONE:
             return CameraError(
                 f"{text}: it is gone or broken.",

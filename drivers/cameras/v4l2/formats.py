@@ -116,8 +116,8 @@ def _joined(high: Bytes, shift: int, low: list[NDArray[np.uint8]]) -> NDArray[np
     out = np.empty(high.shape, np.uint16)
     out[...] = high
     out <<= np.uint16(shift)
-    for place, bits in enumerate(low):
-        out[..., place] |= bits
+    for index, bits in enumerate(low):
+        out[..., index] |= bits
     return out.reshape(high.shape[0], -1)
 
 

@@ -95,11 +95,11 @@ class Picture:
         """Read the present format."""
         return self._layout(self._format(v.VIDIOC_G_FMT, v.Format(type=self.buffer_type), "say its format"))
 
-    def _format(self, request: int, wanted: v.Format, what: str) -> v.Format:
+    def _format(self, request: int, wanted: v.Format, action: str) -> v.Format:
         try:
             self._device.ioctl(request, wanted)
         except OSError as error:
-            raise self._device.fault(error, what) from error
+            raise self._device.fault(error, action) from error
         return wanted
 
     def _layout(self, answer: v.Format) -> Layout:
@@ -278,11 +278,11 @@ class Picture:
                 remedy="Switch the camera or its input to a progressive mode.",
                 device=path,
             )
-        least = gray.row_bytes(layout.width)
-        if 0 < layout.stride < least:
+        min_stride = gray.row_bytes(layout.width)
+        if 0 < layout.stride < min_stride:
             raise CameraError(
                 f"{path} says that a line of {layout.width} px in {gray.name.strip()} has {layout.stride} bytes; "
-                f"it needs {least}.",
+                f"it needs {min_stride}.",
                 code="frame_format",
                 remedy="Choose another pixel_format or a width that is a multiple of 50 px.",
                 device=path,

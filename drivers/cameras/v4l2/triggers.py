@@ -58,13 +58,13 @@ class Triggers:
 
     def mode(self) -> TriggerMode | None:
         """Return the mode whose controls have the values of its features; of several, the one that names most."""
-        standing: list[tuple[int, bool, TriggerMode]] = []
+        candidates: list[tuple[int, bool, TriggerMode]] = []
         for mode in self.modes:
             wanted = [self._controls.check(name, value) for name, value in self._features_of(mode).items()]
             wanted = [(control, raw) for control, raw in wanted if not control.is_button]
             if all(self._controls.get(control) == raw for control, raw in wanted):
-                standing.append((len(wanted), mode == self._asked, mode))
-        return max(standing, key=lambda one: one[:2])[2] if standing else None
+                candidates.append((len(wanted), mode == self._asked, mode))
+        return max(candidates, key=lambda one: one[:2])[2] if candidates else None
 
     def settle(self, mode: TriggerMode) -> None:
         """Check the controls of a mode after they were set; code ``setting_not_taken`` when they have other values."""

@@ -1,4 +1,4 @@
-"""The description of the API (OpenAPI 3.1), as a product: what it says is checked in and tested."""
+"""The description of the API (OpenAPI 3.1), as a product: its text is checked in and tested."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _BOUNDS = {"ge": "minimum", "le": "maximum", "gt": "exclusiveMinimum", "lt": "ex
 _ETAG = {"description": "Names this state of it, for If-None-Match and If-Match.", "schema": {"type": "string"}}
 _TAGS = {
     "system": "Health, figures, events.",
-    "access": "Who asks: keys and the page's cookie.",
+    "access": "Authentication: keys and the page's cookie.",
     "rig": "Cameras, live views, devices, the simulated scene.",
-    "stage": "Where the axes are, moves, homing, stop.",
+    "stage": "Positions of the axes, moves, homing, stop.",
     "noise": "The cameras' noise, measured.",
     "calibrations": "Calibrations: made on the rig, or imported.",
     "tests": "Tests and their load steps.",
     "analyses": "Shape and displacement, computed over a test's steps.",
     "results": "Fields, points, gauges and files of an analysis.",
-    "trash": "Deleting, restoring, and what goes by itself.",
-    "jobs": "Whatever takes longer than a request.",
-    "looks": "Previews: 8-bit pictures, and maps over an image; nothing is measured in them.",
+    "trash": "Deleting, restoring, deletion by age.",
+    "jobs": "Anything that takes longer than a request.",
+    "previews": "Previews: 8-bit pictures, and maps over an image; nothing is measured in them.",
 }
 
 #: what a small simulated rig was asked and answered (tests/bench/documents/api_examples.py)
@@ -64,7 +64,7 @@ Part = dict[str, Any]
 
 
 class Examples(TypedDict, total=False):
-    """What an operation was asked, by media type and summary, and what it answered, by status and media type."""
+    """Requests of an operation by media type and summary, and its answers by status and media type."""
 
     requests: dict[str, dict[str, object]]
     replies: dict[str, dict[str, object]]
@@ -163,7 +163,7 @@ def _exemplify(operation: Part, examples: Examples) -> None:
         if not status.startswith("2"):
             continue
         for media, content in response.get("content", {}).items():
-            # of a stream of events each reader makes objects of its own: its example says what comes
+            # of a stream of events each reader makes objects of its own: its example shows the contents
             if media not in ("application/json", "text/event-stream") and not content.get("schema"):
                 text = media.startswith("text/") or media.endswith("xml")
                 content["schema"] = {"type": "string"} if text else dict(_BYTES)

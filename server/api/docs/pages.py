@@ -14,7 +14,7 @@ router = APIRouter(include_in_schema=False)
 _SWAGGER = """
 <form id="log-in" hidden><p>This service asks for a key.</p>
 <label>Key <input name="key" type="password" autocomplete="off" required></label> <button>Log in</button>
-<p id="refused" hidden>This key is nobody's.</p></form>
+<p id="refused" hidden>No user has this key.</p></form>
 <div id="api"></div>
 <noscript><p>This page needs JavaScript; <a href="/docs/operations">another</a> does without.</p></noscript>
 <script src="/static/vendor/swagger-ui/swagger-ui-bundle.js"></script>

@@ -66,7 +66,7 @@ def one_problem(request: Request, code: str) -> Response:
     """Return what a problem's ``type`` points to."""
     problem = known_problems().get(code)
     if problem is None:
-        raise NotFoundError(f"There is no problem {code[:60]!r}.", what="problem", remedy="See /problems.")
+        raise NotFoundError(f"There is no problem {code[:60]!r}.", kind="problem", remedy="See /problems.")
     if _wants_json(request):
         return JSONResponse({"code": code, **problem})
     text = f"{_table({code: problem})}<p><a href='/problems#{code}'>All problems</a></p>"

@@ -24,7 +24,7 @@ from server.results.gauges.request import GaugeRequest
 
 
 class Region(settings.Region):
-    """Where points may lie: one of rectangle and polygon, a mask if wanted, cracks and holes.
+    """Region of interest: one of rectangle and polygon, a mask if wanted, cracks and holes.
 
     No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
     """
@@ -51,12 +51,12 @@ class StrainRequest(settings.StrainSettings):
 
 
 class AnalysisRequest(settings.AnalysisSettings):
-    """What to compute over a test's steps."""
+    """Analysis over a test's steps."""
 
     kind: Literal["profile", "displacement"] = Field(
         "displacement", description="Shape only, or shape and displacement."
     )
-    region: Region = Field(description="Where points may lie.")
+    region: Region = Field(description="Region of interest.")
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None, description="Noise measurement that weighs the pixels; without it, residuals give the noise."
     )
@@ -87,7 +87,7 @@ class AnalysisRequest(settings.AnalysisSettings):
 
 
 class ContinueRequest(Request):
-    """How to go on with an analysis."""
+    """Continuation of an analysis."""
 
     other_version: Switch = Field(
         False, description="Go on although another version of the program began it: its steps might not agree."
@@ -104,7 +104,7 @@ class StepFigures(Reply):
     """A field in a few numbers; `status`, `strain`, `patch` and further figures as in summary.json."""
 
     n: int = Field(description="Number of the step.")
-    kind: Literal["shape", "displacement"] | None = Field(None, description="What was measured.")
+    kind: Literal["shape", "displacement"] | None = Field(None, description="Kind of measurement.")
     points: int | None = Field(None, description="Points in the region.")
     valid: int | None = Field(None, description="Points with values.")
     valid_fraction: float | None = Field(None, description="Their share.")
@@ -113,9 +113,9 @@ class StepFigures(Reply):
 
 
 class AnalysisSummary(Reply):
-    """What an analysis found; as summary.json."""
+    """Summary of an analysis; as summary.json."""
 
-    state: JobState = Field("interrupted", description="How its job ended.")
+    state: JobState = Field("interrupted", description="Final state of its job.")
     steps: list[StepFigures] = Field(default_factory=list, description="An entry a finished step, in their order.")
 
 
@@ -124,7 +124,7 @@ class AnalysisReply(Reply):
 
     id: str = Field(description="Id.")
     test_id: str = Field(description="Its test.")
-    kind: Literal["profile", "displacement"] = Field(description="What it computes.")
+    kind: Literal["profile", "displacement"] = Field(description="Kind of computation.")
     state: JobState = Field(description="State of its job.")
     job_id: str | None = Field(None, description="Its job; the last one, where it was continued.")
     follow: bool = Field(False, description="True if it goes on with each step that lands.")
@@ -135,13 +135,13 @@ class AnalysisReply(Reply):
     stale: bool = Field(
         False, description="True if steps, the reference or the calibration are gone or were replaced since."
     )
-    stale_reasons: list[str] = Field(default_factory=list, description="What is gone or was replaced.")
+    stale_reasons: list[str] = Field(default_factory=list, description="Inputs that are gone or were replaced.")
 
 
 class AnalysisList(Listing):
     """A test's analyses, oldest first."""
 
-    analyses: list[AnalysisEntry] = Field(description="What there is to know of each in short.")
+    analyses: list[AnalysisEntry] = Field(description="Short entry of each.")
 
 
 class FieldVariable(Reply):
@@ -196,7 +196,7 @@ class ProbeReply(Reply):
 
 
 class GaugeStep(Reply):
-    """What the gauges read in one step."""
+    """Gauge readings of one step."""
 
     n: int = Field(description="Number of the step.")
     kind: str = Field(description="`shape` or `displacement`.")
@@ -209,7 +209,7 @@ class GaugeStep(Reply):
     extensometers: list[ExtensometerReading] = Field(default_factory=list, description="Lengths, elongations, strains.")
     lines: list[LineReading] = Field(default_factory=list, description="Values along lines; null where missing.")
     areas: list[AreaReading] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
-    problem: JobProblem | None = Field(None, description="Why the step has no readings.")
+    problem: JobProblem | None = Field(None, description="Problem that left the step without readings.")
 
 
 class GaugesReply(Reply):
@@ -219,7 +219,7 @@ class GaugesReply(Reply):
     settings: GaugeRequest = Field(description="The request, with its defaults.")
     inputs_sha256: dict[str, str] = Field(description="Checksum of each result file.")
     stale: bool = Field(False, description="True if inputs or results are gone or were replaced since.")
-    stale_reasons: list[str] = Field(default_factory=list, description="What is gone or was replaced.")
+    stale_reasons: list[str] = Field(default_factory=list, description="Inputs that are gone or were replaced.")
     frame: str = Field(description="Frame of all positions and displacements.")
     subset_px: float = Field(description="Subset of the measurement; determines which pixels neighbours share.")
     smoothing_window: int | None = Field(None, description="Points over which displacements were smoothed.")

@@ -59,7 +59,7 @@ class ExpectedNumber(Reply):
 
 
 class ExpectedPoint(Reply):
-    """What the parameters' uncertainty does to a point."""
+    """Uncertainty of a point that comes from the parameters."""
 
     name: str = Field(description="`middle`, or the corner of the target's volume.", examples=["middle"])
     xyz_mm: list[float] = Field(description="The point, system frame.", examples=[[0.0, 0.0, 0.0]])
@@ -69,18 +69,18 @@ class ExpectedPoint(Reply):
 
 
 class Assumed(Reply):
-    """What an expectation rests on."""
+    """Assumptions of an expectation."""
 
     noise_px: float = Field(description="Standard deviation of an intersection's coordinate.", examples=[0.005])
-    line_model: str = Field(description="How lines are localised.", examples=["straight"])
+    line_model: str = Field(description="Localiser of the lines.", examples=["straight"])
     roll_deg: float = Field(description="Turn of the target about the optical axis.", examples=[0.0])
     text: str = Field(description="The same in a sentence.")
 
 
 class ExpectReply(Reply):
-    """What a plan may be expected to leave uncertain."""
+    """Expected uncertainty of a plan."""
 
-    assumed: Assumed = Field(description="What was assumed.")
+    assumed: Assumed = Field(description="Assumptions.")
     parameters: dict[str, ExpectedNumber] = Field(description="Each parameter, as `cam1.phd_px`.")
     points: list[ExpectedPoint] = Field(description="The middle and the corners of the target's volume.")
     shape_rms_mm: float = Field(description="Rms error of shape over the volume, rigid motion taken out.")
@@ -89,7 +89,7 @@ class ExpectReply(Reply):
     standoff_relative: float = Field(description="Largest standard deviation of a standoff, relative.")
     seen_share: dict[str, float] = Field(description="Share of the intersections seen at the worst position.")
     refused: bool = Field(description="True if views at these positions would be refused.")
-    reasons: list[str] = Field(description="Why.")
+    reasons: list[str] = Field(description="Reasons.")
 
 
 class ReviewRequest(Request):
@@ -98,16 +98,16 @@ class ReviewRequest(Request):
     decision: Literal["accepted", "discarded"] | None = Field(
         description="`accepted`: to measure with by default; `discarded`: no test may be made with it; null: neither."
     )
-    note: Label = Field("", description="Why.")
+    note: Label = Field("", description="Reason.")
 
 
 class Review(Reply):
     """An operator's decision on a calibration."""
 
     decision: Literal["accepted", "discarded"] = Field(description="The decision.")
-    note: str = Field("", description="Why.")
+    note: str = Field("", description="Reason.")
     by: str = Field("", description="Name of the key, or `local`.")
-    decided_utc: str = Field(description="When.")
+    decided_utc: str = Field(description="Time of the decision.")
 
 
 class CameraIdentity(Reply):
@@ -142,7 +142,7 @@ class ViewList(Reply):
 
 
 class ViewResiduals(Reply):
-    """What the model leaves in one view."""
+    """Residuals of one view."""
 
     name: str = Field(description="Name of the view.", examples=["cam1 dZ 5.000 mm"])
     camera: int | str = Field(description="Which camera.")
@@ -165,15 +165,15 @@ class ResidualsReply(Reply):
 
 @with_config(extra="allow")
 class PlanReply(TypedDict, total=False):
-    """What was asked for; of an imported calibration its source instead of positions."""
+    """Plan of a calibration; of an imported one its source instead of positions."""
 
-    created_utc: Annotated[str, Field(description="When it was begun or imported.")]
+    created_utc: Annotated[str, Field(description="Time at which it was begun or imported.")]
     label: Annotated[str, Field(description="Free text.")]
     positions_mm: Annotated[list[float], Field(description="Travels that are fitted.")]
     held_out_mm: Annotated[list[float], Field(description="Travels that are kept for the check.")]
     frames: Annotated[int, Field(description="Frames averaged at each position.")]
-    localiser: Annotated[Literal["profile", "paper"], Field(description="How lines are localised.")]
-    source: Annotated[str | None, Field(description="What an imported calibration was read as.")]
+    localiser: Annotated[Literal["profile", "paper"], Field(description="Localiser of the lines.")]
+    source: Annotated[str | None, Field(description="Format that an imported calibration was read as.")]
     job_id: Annotated[str | None, Field(description="The job that takes or took it.")]
 
 
@@ -184,7 +184,7 @@ class CalibrationReply(Reply):
     state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")
     plan: PlanReply = Field(description="Positions, frames and localiser asked for.")
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
-    problem: JobProblem | None = Field(None, description="Why there is no calibration.")
+    problem: JobProblem | None = Field(None, description="Problem that left no calibration.")
     review: Review | None = Field(None, description="The operator's decision; null: none yet.")
 
 
@@ -200,19 +200,19 @@ class CalibrationFile(Reply):
 
 
 class VerdictReply(Reply):
-    """What the program states of a calibration's quality."""
+    """Verdict on a calibration's quality."""
 
     level: Literal["good", "warning", "failed"] = Field(description="The verdict.")
-    reasons: list[str] = Field(description="What it rests on.")
+    reasons: list[str] = Field(description="Reasons of the verdict.")
 
 
 class CalibrationEntry(Reply):
-    """What a list shows of a calibration."""
+    """Entry of a calibration in a list."""
 
     id: str = Field(description="Id.", examples=["c000001-5b02aa"])
     state: str = Field(description="`unfinished`, `failed` or `complete`.")
     label: str = Field(description="Free text.")
-    created_utc: str = Field(description="When it was begun or imported.")
+    created_utc: str = Field(description="Time at which it was begun or imported.")
     verdict: VerdictReply | None = Field(description="Its verdict; null: none, as of most imported ones.")
     decision: str | None = Field(None, description="`accepted`, `discarded`; null: no decision.")
 
@@ -220,15 +220,15 @@ class CalibrationEntry(Reply):
 class CalibrationList(Listing):
     """Calibrations, oldest first."""
 
-    calibrations: list[CalibrationEntry] = Field(description="What there is to know of each in short.")
+    calibrations: list[CalibrationEntry] = Field(description="Short entry of each.")
 
 
 class ConversionReply(Reply):
-    """What becomes of a calibration in another program's form."""
+    """Losses of a calibration in another program's form."""
 
     format: str = Field(description="The form.", examples=["vic3d"])
     software: str = Field(description="This program and its version.")
-    source: str = Field(description="What it was read as.", examples=["calibration_json"])
+    source: str = Field(description="Format that it was read as.", examples=["calibration_json"])
     source_sha256: str = Field(description="Checksum of calibration.json.")
     units: str = Field(description="Of the numbers.")
     frame: Literal["target", "camera 1"] = Field(description="System frame of the file.")
@@ -239,7 +239,7 @@ class ConversionReply(Reply):
         examples=[{"cam1": {"rms_px": 0.016, "max_px": 0.065}, "cam2": {"rms_px": 0.013, "max_px": 0.051}}],
     )
     read_back: dict[str, float | int | None] = Field(
-        description="What the written file makes of points that both cameras see: epipolar residual, error in space.",
+        description="Errors of the written file at points that both cameras see: epipolar residual, error in space.",
         examples=[{"points": 370, "rms_px": 2e-12, "max_px": 5e-12, "rms_mm": 5e-13, "max_mm": 2e-12}],
     )
-    notes: list[str] = Field(description="What was assumed.")
+    notes: list[str] = Field(description="Assumptions.")

@@ -13,7 +13,7 @@ from server.base.models import Label, Listing, Reply, Request
 
 
 class NoiseRequest(Request):
-    """How to measure the cameras' noise."""
+    """Measurement of the cameras' noise."""
 
     frames: Annotated[Whole, Field(ge=2, le=200)] = Field(16, description="Pairs of frames; the scene must be at rest.")
     label: Label = Field("", description="Free text.")
@@ -46,9 +46,9 @@ class NoiseFile(Reply):
 
 @with_config(extra="allow")
 class NoisePlanReply(TypedDict, total=False):
-    """What was asked for."""
+    """Plan of a noise measurement."""
 
-    created_utc: Annotated[str, Field(description="When it was begun.")]
+    created_utc: Annotated[str, Field(description="Time at which it was begun.")]
     label: Annotated[str, Field(description="Free text.")]
     frames: Annotated[int, Field(description="Frames taken.")]
     rig: Annotated[str, Field(description="Name of the rig.")]
@@ -59,9 +59,9 @@ class NoiseReply(Reply):
     """A noise measurement."""
 
     id: str = Field(description="Id.")
-    state: Literal["unfinished", "failed", "complete"] = Field(description="Where it is in its life.")
-    plan: NoisePlanReply = Field(description="What was asked for.")
-    problem: JobProblem | None = Field(None, description="Why it has no models.")
+    state: Literal["unfinished", "failed", "complete"] = Field(description="State of the measurement.")
+    plan: NoisePlanReply = Field(description="Plan.")
+    problem: JobProblem | None = Field(None, description="Problem that left no models.")
     cam1: NoiseModelReply | None = Field(None, description="Camera 1's model.")
     cam2: NoiseModelReply | None = Field(None, description="Camera 2's model.")
 

@@ -30,7 +30,7 @@ class SettingsPatch(Request):
 
 
 class MoveRequest(Request):
-    """Where to move: axes by number, or cameras by their travel dZ."""
+    """Targets of a move: axes by number, or cameras by their travel dZ."""
 
     model_config = ConfigDict(json_schema_extra=one_of("positions_mm", "by_mm", "dz_mm"))
 
@@ -66,7 +66,7 @@ class AxesRequest(Request):
 
 
 class DynamicsPatch(Request):
-    """How fast an axis moves; what is left out stays."""
+    """Velocity and acceleration of an axis; what is left out stays."""
 
     model_config = ConfigDict(json_schema_extra=any_of("velocity_mm_s", "acceleration_mm_s2"))
 
@@ -130,7 +130,7 @@ class CamerasReply(Reply):
 
 
 class CameraSet(Reply):
-    """What a camera took."""
+    """Settings that a camera accepted."""
 
     name: CameraName = Field(description="Which camera.")
     settings: CameraSettingsReply = Field(description="Every setting, as read back.")
@@ -145,7 +145,7 @@ class PairCounts(Reported, PairingAccount):
 
 
 class FrameQuality(Reply):
-    """What one image is worth."""
+    """Quality of one image."""
 
     code: str = Field(description="`ok`, `saturated`, `dark`, `blank`, `low_texture` or `blurred`.", examples=["ok"])
     mean_grey: float = Field(description="Mean grey level, counts.")
@@ -153,7 +153,7 @@ class FrameQuality(Reply):
     saturated_share: float = Field(description="Share of pixels at full scale.")
     contrast_grey: float = Field(description="Standard deviation of the grey levels, counts.")
     texture_grey_per_px: float = Field(description="Median over tiles of the rms gradient, counts per pixel.")
-    focus: float = Field(description="How much of the gradient survives at the scale of a pixel; below 0.12 blurred.")
+    focus: float = Field(description="Share of the gradient that remains at the scale of a pixel; below 0.12 blurred.")
 
 
 class CameraStats(Reply):

@@ -37,7 +37,7 @@ class TestPatch(Request):
 
 
 class TestEntry(Reply):
-    """What a list shows of a test."""
+    """Entry of a test in a list."""
 
     __test__ = False
 
@@ -45,11 +45,11 @@ class TestEntry(Reply):
     name: str = Field(description="Name.")
     specimen: str | None = Field(None, description="The specimen.")
     calibration_id: str | None = Field(None, description="Calibration it measures with.")
-    created_utc: str | None = Field(None, description="When it was made.")
+    created_utc: str | None = Field(None, description="Time at which it was made.")
 
 
 class StepEntry(Reply):
-    """What a list shows of a step."""
+    """Entry of a step in a list."""
 
     n: int = Field(description="Number; 0 is the reference.")
     label: str | None = Field(None, description="Free text.")
@@ -62,12 +62,12 @@ class StepEntry(Reply):
 
 
 class AnalysisEntry(Reply):
-    """What a list shows of an analysis."""
+    """Entry of an analysis in a list."""
 
     id: str = Field(description="Id.", examples=["a000001-77d0b3"])
     kind: str | None = Field(None, description="`profile` or `displacement`.")
     label: str | None = Field(None, description="Free text.")
-    created_utc: str | None = Field(None, description="When it was begun.")
+    created_utc: str | None = Field(None, description="Time at which it was begun.")
     job_id: str | None = Field(None, description="Its job.")
 
 
@@ -81,7 +81,7 @@ class TestReply(Reply):
     specimen: str = Field(description="The specimen.")
     notes: str = Field(description="Free text.")
     calibration_id: str | None = Field(None, description="Calibration it measures with.")
-    created_utc: str = Field(description="When it was made.")
+    created_utc: str = Field(description="Time at which it was made.")
     steps: list[StepEntry] = Field(default_factory=list, description="Its complete steps.")
     incomplete_steps: list[int] = Field(default_factory=list, description="Step folders without their commit mark.")
     analyses: list[AnalysisEntry] = Field(default_factory=list, description="Its analyses.")
@@ -92,13 +92,13 @@ class TestList(Listing):
 
     __test__ = False
 
-    tests: list[TestEntry] = Field(description="What there is to know of each in short.")
+    tests: list[TestEntry] = Field(description="Short entry of each.")
 
 
 class StepList(Listing):
     """Complete steps, in order."""
 
-    steps: list[StepEntry] = Field(description="What there is to know of each in short.")
+    steps: list[StepEntry] = Field(description="Short entry of each.")
 
 
 class StepPatch(Request):
@@ -134,7 +134,7 @@ class StepRequest(Request):
 
 
 class CameraQuality(Reply):
-    """What one camera's image is worth, before anyone relies on it."""
+    """Quality of one camera's image."""
 
     code: str = Field(description="`ok`, `saturated`, `dark`, `blank`, `low_texture` or `blurred`.", examples=["ok"])
     mean_grey: float = Field(description="Mean grey level, counts.", examples=[118.4])
@@ -145,7 +145,7 @@ class CameraQuality(Reply):
         description="Median over tiles of the rms gradient, counts per pixel.", examples=[12.7]
     )
     focus: float = Field(
-        description="How much of the gradient survives at the scale of a pixel; below 0.12 blurred.", examples=[0.31]
+        description="Share of the gradient that remains at the scale of a pixel; below 0.12 blurred.", examples=[0.31]
     )
     exposure_ms: float | None = Field(None, description="Exposure as read back; null for files.", examples=[10.0])
     gain_db: float | None = Field(None, description="Gain as read back; null where there is none.", examples=[0.0])
@@ -157,13 +157,13 @@ class CameraQuality(Reply):
 
 
 class StepQuality(Reply):
-    """What a pair is worth."""
+    """Quality of a pair."""
 
     code: str | None = Field(
-        None, description="`ok`, or the first thing that is wrong; `cameras_off_zero` off their calibrated place."
+        None, description="`ok`, or the first thing that is wrong; `cameras_off_zero` off their calibrated position."
     )
     skew_ms: float | None = Field(None, description="Difference of the exposures' beginnings.", examples=[0.02])
-    max_skew_ms: float | None = Field(None, description="What the rig allows.", examples=[1.0])
+    max_skew_ms: float | None = Field(None, description="Largest skew that the rig allows, ms.", examples=[1.0])
     pairs: dict[str, int] | None = Field(
         None,
         description="Counters of the triggers during the capture: triggered = paired + unpaired + incomplete + "
@@ -193,7 +193,7 @@ class StepReply(Reply):
     load_n: float | None = Field(None, description="Load in newton.")
     timestamp_utc: str | None = Field(None, description="The client's own time, if it gave one.")
     channels: dict[str, float] = Field(default_factory=dict, description="Scalar readings, as sent.")
-    source: Literal["capture", "import"] = Field(description="Where the images come from.")
+    source: Literal["capture", "import"] = Field(description="Source of the images.")
     captured_utc: str = Field(description="Time of the capture or import, by the service's clock.")
     skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
     quality: StepQuality = Field(description="`code` (`ok` or what is wrong), and figures of each camera.")
@@ -221,15 +221,15 @@ class WatchRequest(Request):
 
 
 class WatchReply(Reply):
-    """What is watched."""
+    """Watch on a channel."""
 
     active: bool = Field(description="True if readings take steps.")
     channel: str = Field(description="The channel.")
     threshold: float = Field(description="Difference that makes a step.")
     frames: int = Field(description="Frames averaged in each step.")
     label: str = Field(description="Label of steps whose reading brings none.")
-    since_utc: str = Field(description="When the watch began.")
-    last_value: float | None = Field(None, description="What the next reading is compared with; null: nothing yet.")
+    since_utc: str = Field(description="Time at which the watch began.")
+    last_value: float | None = Field(None, description="Value that the next reading is compared with; null: none yet.")
     last_step: int | None = Field(None, description="Step that it is from.")
 
 
@@ -250,7 +250,9 @@ class ReadingReply(Reply):
     """Outcome of a reading."""
 
     taken: bool = Field(description="True if it took a step.")
-    reason: Literal["first", "changed", "below_threshold", "channel_absent"] = Field(description="Why, or why not.")
+    reason: Literal["first", "changed", "below_threshold", "channel_absent"] = Field(
+        description="Reason why a step was or was not taken."
+    )
     value: float | None = Field(None, description="Value of the watched channel; null where it was absent.")
     last_value: float | None = Field(None, description="Value that it was compared with; null: there was none.")
     step: StepReply | None = Field(None, description="The step, durable on disk.")

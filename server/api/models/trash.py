@@ -14,11 +14,11 @@ from server.store.documents import TrashEntry
 class TrashList(Listing):
     """The trash, oldest first."""
 
-    trash: list[TrashEntry] = Field(description="What lies there.")
+    trash: list[TrashEntry] = Field(description="Entries of the trash.")
 
 
 class ExportedRequest(Request):
-    """What the copy of a test that lies elsewhere holds."""
+    """Contents of a test's copy elsewhere."""
 
     steps: Annotated[Whole, Field(ge=0, le=10000)] = Field(
         description="Number of complete steps in the copy.", examples=[120]
@@ -31,7 +31,7 @@ class ExportedRequest(Request):
 class ExportedReply(Reply):
     """That the test was copied elsewhere."""
 
-    utc: str = Field(description="When that was acknowledged.")
+    utc: str = Field(description="Time of the acknowledgement.")
     by: str = Field(description="Whose key it was.")
     steps: int = Field(description="Number of complete steps.")
     results: int = Field(description="Number of result files.")

@@ -1,1 +1,1 @@
-"""How requests are let in and answered: keys, guards, entity tags, pages, problems."""
+"""Protocol of requests and answers: keys, guards, entity tags, pages, problems."""

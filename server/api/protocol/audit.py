@@ -33,7 +33,7 @@ _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _STREAMS = ("text/event-stream", "multipart/x-mixed-replace")
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 
-#: the page needs nothing from elsewhere, and nobody may put it into a frame
+#: the page needs nothing from elsewhere, and no other site may put it into a frame
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -78,7 +78,7 @@ class Recorder:
         given = dict(scope["headers"]).get(b"x-request-id", b"").decode("latin-1")
         number = given if _ID.fullmatch(given) else secrets.token_hex(8)
         scope.setdefault("state", {})["request_id"] = number
-        status = _LEFT  # until somebody says another one
+        status = _LEFT  # until another one is set
         began, ended = time.monotonic(), None
 
         async def noted(message: Message) -> None:
@@ -90,7 +90,7 @@ class Recorder:
                 for name, value in SECURITY_HEADERS.items():
                     headers.setdefault(name, value)
                 if headers.get("content-type", "").startswith(_STREAMS):
-                    ended = time.monotonic()  # how long somebody looked says nothing
+                    ended = time.monotonic()  # the length of a view is no measure of speed
             await send(message)
 
         try:
@@ -101,7 +101,7 @@ class Recorder:
             raise
         finally:
             took_s = (ended or time.monotonic()) - began
-            self._tell(scope, status, took_s, number)
+            self._record(scope, status, took_s, number)
             if scope["method"] not in _SAFE:
                 person = scope["state"].get("person")
                 self._log.write(
@@ -114,7 +114,7 @@ class Recorder:
                     request_id=number,
                 )
 
-    def _tell(self, scope: Scope, status: int, took_s: float, number: str) -> None:
+    def _record(self, scope: Scope, status: int, took_s: float, number: str) -> None:
         """Count and time a request, and write its line into the log."""
         # what a client made up is no label: each would be kept for ever
         method = scope["method"] if scope["method"] in _METHODS else "other"

@@ -1,6 +1,6 @@
-"""Who asks, and whether they may: bearer keys for scripts, a cookie for the page, limits on how often.
+"""Authentication and rights: bearer keys for scripts, a cookie for the page, limits on the rate.
 
-On loopback nobody is asked unless the rig file says so; what is presented there is checked all the same.
+On loopback no key is required unless the rig file demands one; what is presented there is checked all the same.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ COOKIE = "stereorig_session"
 SESSION_S = 12 * 3600.0
 LOCAL = Person("local", "admin")
 
-#: what anybody may read: whether the service lives, and the page, which holds nothing of its own
+#: readable without a key: whether the service runs, and the page, which holds nothing of its own
 _OPEN = frozenset({"/", "/docs", "/healthz", "/readyz", "/api/v1/healthz", "/api/v1/readyz", "/api/v1/session"})
-# the page's own files and what the program's source says too, the same for everybody; without them nobody could log in
+# the page's own files and what is public in the program's source; without them no operator could log in
 _PAGES = ("/static/", "/docs/", "/problems")
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _STOP = "/api/v1/stage/stop"
-# stopping must never fail for a right that is lacking; everybody may log in and out
+# stopping must never fail for a right that is lacking; every client may log in and out
 _FOR_EVERYBODY = frozenset({_STOP, "/api/v1/session"})
 _HALTS = frozenset({_STOP, "/api/v1/stage/abort"})
-_MOST_CLIENTS = 10_000
+_MAX_CLIENTS = 10_000
 
 
 class Sessions:
@@ -44,7 +44,7 @@ class Sessions:
         """Return a new cookie's value."""
         token = secrets.token_urlsafe(32)
         self._known[token] = person, time.monotonic() + SESSION_S
-        while len(self._known) > _MOST_CLIENTS:
+        while len(self._known) > _MAX_CLIENTS:
             self._known.popitem(last=False)
         return token
 
@@ -85,14 +85,14 @@ class RateLimit:
             return (1.0 - left) / self._per_s
         self._left[client] = left - 1.0, now
         self._left.move_to_end(client)
-        while len(self._left) > _MOST_CLIENTS:
+        while len(self._left) > _MAX_CLIENTS:
             self._left.popitem(last=False)
         return 0.0
 
 
 @dataclass(frozen=True)
 class AccessRules:
-    """How strict the door is.
+    """Rules of access.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class Door:
         client = (scope.get("client") or ("unknown", 0))[0]
         if scope.get("state", {}).get("crowded") and path not in _HALTS:
             return _crowded()
-        # keys have 256 bits: nobody finds one by trying, so wrong ones are not counted apart
+        # keys have 256 bits and cannot be found by trying, so wrong ones are not counted separately
         wait = 0.0 if path == _STOP else self._calls.wait_s(client)
         if wait > 0.0:
             return _too_many(wait)
@@ -148,7 +148,7 @@ class Door:
         except StereorigError as error:
             return problem_response(503, error.code, error.cause, error.remedy)
         if person is None and b"authorization" in headers:
-            return _unknown("key_wrong", "This key is nobody's.")
+            return _unknown("key_wrong", "No user has this key.")
         if person is None and self._rules.required and path not in _OPEN and not path.startswith(_PAGES):
             return _unknown("key_missing", "This service asks for a key.")
         person = person or (LOCAL if not self._rules.required else None)
@@ -184,7 +184,11 @@ def _unknown(code: str, cause: str) -> ASGIApp:
 def _too_many(wait_s: float) -> ASGIApp:
     wait = {"Retry-After": str(max(1, math.ceil(wait_s)))}
     return problem_response(
-        429, "too_many_requests", "Too many requests from this address.", "Wait as Retry-After says.", headers=wait
+        429,
+        "too_many_requests",
+        "Too many requests from this address.",
+        "Wait for the time in Retry-After.",
+        headers=wait,
     )
 
 
@@ -193,6 +197,6 @@ def _crowded() -> ASGIApp:
         503,
         "too_many_connections",
         "There are too many connections.",
-        "Close some, or wait as Retry-After says.",
+        "Close some, or wait for the time in Retry-After.",
         headers={"Retry-After": "5", "Connection": "close"},
     )

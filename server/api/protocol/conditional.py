@@ -57,7 +57,7 @@ def tags_in(header: str) -> list[str]:
     return [tag.strip().removeprefix("W/") for tag in header.split(",")]
 
 
-def require_match(header: str | None, etag: str, what: str, *, required: bool = True) -> None:
+def require_match(header: str | None, etag: str, subject: str, *, required: bool = True) -> None:
     """Refuse a change that was meant for another state.
 
     Raises
@@ -69,7 +69,7 @@ def require_match(header: str | None, etag: str, what: str, *, required: bool = 
     """
     if header is None:
         if required:
-            raise PreconditionRequiredError(f"A change of {what} needs If-Match.")
+            raise PreconditionRequiredError(f"A change of {subject} needs If-Match.")
         return
     if header.strip() != "*" and etag not in tags_in(header):
-        raise PreconditionFailedError(f"The state of {what} is not the one that If-Match names.", etag=etag)
+        raise PreconditionFailedError(f"The state of {subject} is not the one that If-Match names.", etag=etag)

@@ -1,4 +1,4 @@
-"""How answers travel: entity tags and 304, HEAD, gzip."""
+"""Delivery of answers: entity tags and 304, HEAD, gzip."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.protocol.conditional import tags_in
 
-_SMALLEST = 1024
+_MIN_BYTES = 1024
 _IN_THREAD = 64 * 1024  # more than this takes longer than the event loop may be held up
 _LEVEL = 4
 _COMPRESSIBLE = ("application/json", "application/problem+json", "text/", "image/svg+xml", "application/javascript")
@@ -143,7 +143,7 @@ class _Answer:
         if not fits or start["status"] == 206:
             return body
         headers.add_vary_header("Accept-Encoding")
-        if not self._gzip or (not more and len(body) < _SMALLEST):
+        if not self._gzip or (not more and len(body) < _MIN_BYTES):
             return body
         if more:
             self._compressor = zlib.compressobj(_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)

@@ -1,4 +1,4 @@
-"""What routes ask for: the service, the Idempotency-Key, ids in paths."""
+"""Parameters of routes: the service, the Idempotency-Key, ids in paths."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ UPLOAD_LIMIT = 1024 * 2**20
 
 
 #: a scheme only where it is an origin; a name or an address, and a port: nothing that two readers may read in two ways
-_PLACE = re.compile(r"(?:[a-z][a-z0-9+.-]*://)?(\[[0-9a-f:.%]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?", re.IGNORECASE)
+_HOST = re.compile(r"(?:[a-z][a-z0-9+.-]*://)?(\[[0-9a-f:.%]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?", re.IGNORECASE)
 
 
 def host_name(value: str) -> str | None:
     """Return the host of a Host header or an origin, without port; None if it is not one."""
-    found = _PLACE.fullmatch(value)
+    found = _HOST.fullmatch(value)
     return None if found is None else found[1].strip("[]").lower()
 
 

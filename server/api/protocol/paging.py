@@ -11,7 +11,7 @@ from fastapi import Depends, Query, Request, Response
 
 from core.errors import InputError
 
-MOST = 1000
+MAX_LIMIT = 1000
 
 
 class Page:
@@ -44,7 +44,7 @@ class Page:
 
     @property
     def next_cursor(self) -> str | None:
-        """Where the next page begins; None after the last one."""
+        """Cursor of the next page; None after the last one."""
         return self._response.headers.get("X-Next-Cursor")
 
     def _is_after(self, key: str, newest_first: bool) -> bool:
@@ -72,7 +72,7 @@ def _position(cursor: str | None) -> str | None:
         ) from error
 
 
-Limit = Annotated[int, Query(ge=1, le=MOST, description="Most things in the answer.")]
+Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Most things in the answer.")]
 Cursor = Annotated[
     str | None,
     Query(
@@ -83,7 +83,7 @@ Cursor = Annotated[
 ]
 
 
-def _page(request: Request, response: Response, limit: Limit = MOST, cursor: Cursor = None) -> Page:
+def _page(request: Request, response: Response, limit: Limit = MAX_LIMIT, cursor: Cursor = None) -> Page:
     return Page(request, response, limit, _position(cursor))
 
 

@@ -80,7 +80,7 @@ class Problem(BaseModel):
     status: int = Field(description="HTTP status.")
     detail: str = Field(description="The cause, with the values that disagree.")
     code: str = Field(description="Stable snake_case code.")
-    remedy: str = Field(description="What the caller can do about it.")
+    remedy: str = Field(description="Remedy for the caller.")
 
 
 def status_of(error: StereorigError) -> int:
@@ -133,10 +133,10 @@ def install(app: FastAPI) -> None:
     async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
         fields = []
         for item in error.errors()[:20]:
-            place = [str(part) for part in item["loc"]]
-            field = ".".join(place[1:] or place)[:200]
+            location = [str(part) for part in item["loc"]]
+            field = ".".join(location[1:] or location)[:200]
             fields.append(
-                {"field": field, "in": place[0], "problem": str(item["msg"]).removeprefix("Value error, ")[:300]}
+                {"field": field, "in": location[0], "problem": str(item["msg"]).removeprefix("Value error, ")[:300]}
             )
         first = fields[0]
         if all(item["type"] == "values_disagree" for item in error.errors()):
@@ -163,7 +163,7 @@ def install(app: FastAPI) -> None:
         code = codes.get(error.status_code, "http_error")
         headers = dict(error.headers) if error.headers else {}
         if error.status_code == 405:
-            # the router knows of the first route with this path only
+            # the router considers the first route with this path only
             headers["Allow"] = ", ".join(_methods_of(app, request.scope["path"]))
         return problem_response(
             status, code, f"{str(error.detail).rstrip('.')}.", "See /docs for the API.", headers=headers

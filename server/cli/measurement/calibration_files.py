@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None) -> EpipolarComparison:
-    places = [folder, folder / "exports" / "measure", *sorted((folder / "analyses").glob("*"))]
-    files = first_results(folder, places)
+    folders = [folder, folder / "exports" / "measure", *sorted((folder / "analyses").glob("*"))]
+    files = first_results(folder, folders)
     if measured_with is None:
         measured_with = files[0].absolute().parent.parent.parent / "calibration.json"
         if not measured_with.is_file():

@@ -156,10 +156,10 @@ def _request(args: argparse.Namespace) -> GaugeRequest:
         return GaugeRequest.model_validate(body)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"] if part != "function-after")
+        location = ".".join(str(part) for part in first["loc"] if part != "function-after")
         text = str(first["msg"]).removeprefix("Value error, ")
         raise InputError(
-            f"{place + ': ' if place else ''}{text}.", code="gauge_unusable", remedy="See stereorig gauge --help."
+            f"{location + ': ' if location else ''}{text}.", code="gauge_unusable", remedy="See stereorig gauge --help."
         ) from error
 
 
@@ -169,14 +169,14 @@ def _align(args: argparse.Namespace) -> dict[str, object]:
             {} if args.x_direction is None else {"x_direction": _numbers("--x-direction", args.x_direction, (3,))}
         )
         return {"kind": "plane", **direction}
-    kind, _, places = args.align.partition(":")
+    kind, _, positions = args.align.partition(":")
     if kind != "3-2-1":
         raise InputError(
             f"--align {args.align} is neither plane nor 3-2-1:X,Y,...",
             code="gauge_unusable",
             remedy="Give --align plane, or 3-2-1: and the six places' twelve numbers.",
         )
-    return {"kind": "3-2-1", "positions_px": _pairs(_numbers("--align 3-2-1", places, (12,)))}
+    return {"kind": "3-2-1", "positions_px": _pairs(_numbers("--align 3-2-1", positions, (12,)))}
 
 
 def _named(

@@ -117,7 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=REFERENCE_UPDATES,
         default=DEFAULT_REFERENCE_UPDATE,
         help="never: match every step against the first (total); always: against the step before (incremental); auto: "
-        "against the first, or a later reference where that fails, and says so; displacements are totals in any case "
+        "against the first, or a later reference where that fails, with a note; displacements are totals in any case "
         f"({DEFAULT_REFERENCE_UPDATE})",
     )
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
@@ -267,7 +267,7 @@ def _check_cameras(pair: ImagePair, calibration_file: Path) -> None:
 
 
 def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(rows, cols) of both cameras' images, which the calibration must agree with where it says."""
+    """(rows, cols) of both cameras' images, which the calibration must agree with where it states a size."""
     shapes = []
     for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
         rows, cols = decode_image(read_file(path), name=str(path)).shape

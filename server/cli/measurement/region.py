@@ -55,22 +55,22 @@ def parse_rectangle(text: str) -> Rectangle:
     return x0, y0, x1, y1
 
 
-def parse_line(option: str, text: str, fewest: int) -> Line:
-    """Read ``X0,Y0,X1,Y1,...`` of ``fewest`` points or more; returns [x, y] each.
+def parse_line(option: str, text: str, min_points: int) -> Line:
+    """Read ``X0,Y0,X1,Y1,...`` of ``min_points`` points or more; returns [x, y] each.
 
     Raises
     ------
     RegionError
         ``cut_invalid``.
     """
-    form = ",".join(f"X{k},Y{k}" for k in range(fewest))
+    form = ",".join(f"X{k},Y{k}" for k in range(min_points))
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) < 2 * fewest or len(numbers) % 2 or not all(math.isfinite(v) for v in numbers):
+    if len(numbers) < 2 * min_points or len(numbers) % 2 or not all(math.isfinite(v) for v in numbers):
         raise RegionError(
-            f"{option} {text!r} is no list of {fewest} points or more.",
+            f"{option} {text!r} is no list of {min_points} points or more.",
             code="cut_invalid",
             remedy=f"Give {option} {form},... in pixels of camera 1's first image.",
         )

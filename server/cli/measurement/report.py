@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--analysis", metavar="ID", help="which analysis of a test (the newest with results)")
     add("--calibration", metavar="FILE", type=Path, help="the calibration, where it is not beside the results")
     add(
+        "--metadata",
         "--facts",
         metavar="TOML",
         type=Path,
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
             code="output_unusable",
             remedy="Give file.html; a browser prints it as PDF.",
         )
-    metadata = None if args.facts is None else load_metadata(args.facts)
+    metadata = None if args.metadata is None else load_metadata(args.metadata)
     source = find_source(
         args.place, test=args.test, analysis=args.analysis, calibration=args.calibration, metadata=metadata
     )

@@ -35,7 +35,7 @@ from server.worker.tasks import StepImages
 if TYPE_CHECKING:
     from server.compute.sequence import Pair
 
-_LEAST_OF_STATED, _MOST_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
+_MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
 _RESULT = re.compile(r"step_\d{4}\.nc")
 
@@ -148,7 +148,7 @@ class _Runner:
         self._matched = job.steps[0].n
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
-        self._told_smoothing = False
+        self._smoothing_noted = False
         self._done = 0.0
 
     def measure(self, images: Pair | None) -> None:
@@ -171,7 +171,7 @@ class _Runner:
         self._index += 1
 
     def _write(self, k: int, result: Field, started: float, compute_s: float) -> dict[str, Any]:
-        """Write the file of a step, say so, return its summary."""
+        """Write the file of a step, print its line, return its summary."""
         step = self._job.steps[k]
         one, two = step.files
         about = {"cam1_file": str(one), "cam2_file": str(two)}
@@ -192,25 +192,25 @@ class _Runner:
             f"step {k} of {len(self._job.steps) - 1}: {summary['valid']} of {summary['points']} points, "
             f"{residual}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
-        self._say_choice(k, finished.field)
-        self._say_reference(k, finished.field)
-        self._say_smoothing(finished.field, summary["strain"])
+        self._note_patch(k, finished.field)
+        self._note_reference(k, finished.field)
+        self._note_smoothing(finished.field, summary["strain"])
         check = summary["epipolar_check"]
         if check is not None and check["level"] != self._checked:
             self._checked = check["level"]
             self._progress.note(f"{check['level']}: step {k}: {check['reason']}")
         return summary
 
-    def _say_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
+    def _note_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
         """Print once what smoothing leaves distinguishable."""
-        if result.smoothing is None or self._told_smoothing:
+        if result.smoothing is None or self._smoothing_noted:
             return
-        self._told_smoothing = True
+        self._smoothing_noted = True
         gauge = (None, None) if strain is None else (strain["gauge_px"], strain["window"])
         self._progress.note(f"note: {smoothing_note(result.smoothing, gauge[0], strain_window=gauge[1])}")
 
-    def _say_choice(self, n: int, result: Field) -> None:
-        """Say what the patch was chosen for: of the shape, of the first step, and where it changes."""
+    def _note_patch(self, n: int, result: Field) -> None:
+        """Print the reason for the patch: of the shape, of the first step, and where it changes."""
         choice = result.patch
         if choice is None:
             return
@@ -220,8 +220,8 @@ class _Runner:
         if n > 0:
             self._chosen = new
 
-    def _say_reference(self, n: int, result: Field) -> None:
-        """Say where another reference took over."""
+    def _note_reference(self, n: int, result: Field) -> None:
+        """Print where another reference took over."""
         matched = self._job.steps[0].n if result.references is None else result.references.step
         if n > 1 and matched != self._matched and self._job.settings.reference_update == "auto":
             self._progress.note(f"step {n}: step {self._matched} no longer serves as reference, step {matched} does")
@@ -230,25 +230,25 @@ class _Runner:
     def _shower(self, n: int) -> Any:
         count = len(self._job.steps)
 
-        def show(stage: str, done: int, total: int) -> None:
+        def show(phase: str, done: int, total: int) -> None:
             share = done / total if total > 0 else 0.0
-            part = _SEEDS_SHARE * share if stage == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
+            part = _SEEDS_SHARE * share if phase == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
             self._done = max(self._done, (n + part) / count)
-            self._progress.show(f"step {n} of {count - 1}: {stage}", self._done)
+            self._progress.show(f"step {n} of {count - 1}: {phase}", self._done)
 
         return show
 
     def _doubt_noise(self, shape: Field) -> None:
-        """Say so where residuals and noise file disagree."""
+        """Print a note where residuals and noise file disagree."""
         options = self.sequence.options
         image = self.sequence.pair.image1.prepared(options.interpolation, None, options.blur)
         stated = image.noise_variance
         if stated is None:
             return
         found, expected = float(np.nanmedian(shape.noise_grey)), float(np.sqrt(stated))
-        if not _LEAST_OF_STATED < found / expected < _MOST_OF_STATED:
+        if not _MIN_OF_STATED < found / expected < _MAX_OF_STATED:
             self._progress.note(
-                f"note: residuals show a noise of {found:.2f} grey levels, the noise file says {expected:.2f}; "
+                f"note: residuals show a noise of {found:.2f} grey levels, the noise file states {expected:.2f}; "
                 "was it measured with these cameras' gain?"
             )
 

@@ -44,17 +44,17 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out or f"demo_{args.experiment}").absolute()
     make_folder(out)
     progress = ProgressLine()
-    say = _Teller(progress)
+    note = _Notes(progress)
     started = time.monotonic()
-    say(f"stereorig {software_version()} demo: {title}")
+    note(f"stereorig {software_version()} demo: {title}")
     log = out / "service.log"
     log.unlink(missing_ok=True)
     with _terminated_like_interrupted(), contextlib.closing(progress):
-        say("starting the service (the first start on a machine compiles kernels, half a minute or so) ...")
+        note("starting the service (the first start on a machine compiles kernels, half a minute or so) ...")
         with running_service(config, out / "data", log) as url:
-            say(f"service: {url}, log: {log}")
-            with ServiceClient(url, on_progress=say.progress) as client:
-                outcome = _experiment(Session(client, _true_rig(config), config, out, say), module)
+            note(f"service: {url}, log: {log}")
+            with ServiceClient(url, on_progress=note.progress) as client:
+                outcome = _experiment(Session(client, _true_rig(config), config, out, note), module)
     seconds = time.monotonic() - started
     return _finish(out, args.experiment, title, outcome, seconds)
 
@@ -69,12 +69,12 @@ def _experiment(session: Session, module: str) -> Outcome:
     from server.demo import calibration
     from server.demo.drawing import fields
 
-    session.say("calibrating: both stages move, the grid is imaged ...")
+    session.note("calibrating: both stages move, the grid is imaged ...")
     made = session.calibrate()
     report = calibration.describe(session, made)
     for line in report.lines:
-        session.say(line)
-    session.say("")
+        session.note(line)
+    session.note("")
     outcome: Outcome = importlib.import_module(module).run(session, made.id)
     outcome.checks = report.checks + outcome.checks
     outcome.pictures = fields.calibration(session.out, report.views) | outcome.pictures
@@ -103,8 +103,8 @@ def _finish(out: Path, experiment: str, title: str, outcome: Outcome, seconds: f
     print()
     print("\n".join(outcome.lines))
     print()
-    for name, what in outcome.pictures.items():
-        print(f"  {out / name}: {what}")
+    for name, caption in outcome.pictures.items():
+        print(f"  {out / name}: {caption}")
     print()
     met = len(outcome.checks) - len(missed)
     print(f"{met} of {len(outcome.checks)} figures within their limits, in {duration(seconds)}")
@@ -120,7 +120,7 @@ def _as_dict(check: Check) -> dict[str, object]:
     return asdict(check) | {"error_unit": check.error_unit or check.unit, "passed": check.passed}
 
 
-class _Teller:
+class _Notes:
     """Prints lines, and the progress of the job that runs."""
 
     def __init__(self, line: ProgressLine) -> None:
@@ -129,11 +129,11 @@ class _Teller:
     def __call__(self, text: str) -> None:
         self._line.note(text)
 
-    def progress(self, stage: str, done: int, total: int, eta_s: float | None) -> None:
+    def progress(self, phase: str, done: int, total: int, eta_s: float | None) -> None:
         """Show how far a job is."""
         left = "" if eta_s is None else f", about {duration(eta_s)} left"
         share = "" if total <= 0 else f" {100 * done / total:.0f} %"
-        self._line.status(f"{stage}{share}{left}")
+        self._line.status(f"{phase}{share}{left}")
 
 
 def find_config(name: str) -> Path:
@@ -144,10 +144,10 @@ def find_config(name: str) -> Path:
     FileFormatError
         ``file_missing``.
     """
-    places = [Path(__file__).resolve().parents[3], Path.cwd(), Path(sys.prefix) / "share" / "stereorig"]
-    for place in places:
-        if (place / "config" / name).is_file():
-            return place / "config" / name
+    folders = [Path(__file__).resolve().parents[3], Path.cwd(), Path(sys.prefix) / "share" / "stereorig"]
+    for folder in folders:
+        if (folder / "config" / name).is_file():
+            return folder / "config" / name
     raise FileFormatError(
         f"The rig file config/{name} was not found.", code="file_missing", remedy="Run this from the project's folder."
     )

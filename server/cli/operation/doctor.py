@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     if args.record is not None:
         check_record(args.record)
 
-    def tell(check: Check) -> None:
+    def on_check(check: Check) -> None:
         print(line_of(check), flush=True)
 
     path = args.config or default_config()
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         move=args.move,
         home=args.home,
         record=args.record,
-        tell=None if args.json else tell,
+        on_check=None if args.json else on_check,
     )
     print(report.model_dump_json(indent=1) if args.json else f"\n{report.verdict}")
     return 0 if report.good else 1

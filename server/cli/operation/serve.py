@@ -18,7 +18,7 @@ from server.http.access import KeyFile
 DEFAULT_CONFIG = "sim_paper.toml"
 DEFAULT_PORT = 8000
 _PLAIN = (
-    "keys and images travel unencrypted over plain http: anybody on the network can read them. Give --tls-cert and "
+    "keys and images travel unencrypted over plain http: any computer there can read them. Give --tls-cert and "
     "--tls-key, or put a proxy that speaks https in front."
 )
 # enough for a fast network at a short distance; more would only keep old pictures for slow readers
@@ -57,14 +57,14 @@ def default_config() -> Path:
     FileFormatError
         ``file_missing`` if there is none.
     """
-    places = [
+    folders = [
         Path(__file__).resolve().parents[3] / "config",
         Path.cwd() / "config",
         Path(sys.prefix) / "share" / "stereorig" / "config",
     ]
-    for place in places:
-        if (place / DEFAULT_CONFIG).is_file():
-            return place / DEFAULT_CONFIG
+    for folder in folders:
+        if (folder / DEFAULT_CONFIG).is_file():
+            return folder / DEFAULT_CONFIG
     raise FileFormatError(
         f"No config/{DEFAULT_CONFIG} was found.", code="file_missing", remedy="Name a rig file with --config."
     )
@@ -100,7 +100,7 @@ def check_host(host: str, keys: KeyFile) -> None:
     """
     if not is_loopback(host) and not keys.keys():
         raise InputError(
-            f"Listening on {host} would let anybody on the network move the stage: access keys are needed for that.",
+            f"Listening on {host} would let any computer there move the stage: access keys are needed for that.",
             code="bind_needs_keys",
             remedy="Make one: stereorig keys add NAME --role operator --data DATA. Or use --host 127.0.0.1.",
         )

@@ -62,7 +62,7 @@ def _restore(data: Path, ids: list[str]) -> int:
     try:
         trash = Trash(folder.root)
         for trash_id in ids:
-            print(f"restored {_what(trash.restore(trash_id))}")
+            print(f"restored {_description(trash.restore(trash_id))}")
         catalog = Catalog(folder.root / "catalog.sqlite").open()
         try:
             noise = NoiseStore(folder)
@@ -96,7 +96,7 @@ def _deleted_before(entry: TrashEntry, moment: datetime) -> bool:
         return False  # when is not known
 
 
-def _what(entry: TrashEntry) -> str:
+def _description(entry: TrashEntry) -> str:
     ids = filter(None, (entry.test_id, entry.analysis_id, entry.calibration_id, entry.noise_id))
     number = f" step {entry.n}" if entry.n is not None else ""
     return f"{entry.kind} {' '.join(ids)}{number}"
@@ -105,4 +105,4 @@ def _what(entry: TrashEntry) -> str:
 def _line(entry: TrashEntry) -> str:
     size_mib = (entry.size_bytes or 0) / 2**20
     when = f"deleted {entry.deleted_utc} by {entry.deleted_by} ({entry.why})"
-    return f"{entry.id}  {_what(entry)}  {size_mib:.1f} MiB  {when}  {entry.name}".rstrip()
+    return f"{entry.id}  {_description(entry)}  {size_mib:.1f} MiB  {when}  {entry.name}".rstrip()

@@ -26,7 +26,7 @@ def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm:
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 3, figsize=(13.0, 4.2), layout="constrained")
         colours = plt.get_cmap("viridis")(np.linspace(0.0, 0.85, len(loads_kn)))
-        x = found.place * half_crack_mm
+        x = found.position * half_crack_mm
         inner = np.linspace(-half_crack_mm, half_crack_mm, 201)
         for k, (load, colour) in enumerate(zip(loads_kn, colours, strict=True)):
             axes[0].errorbar(x, 1e3 * found.found[k], 1e3 * found.sigma[k], label=f"{load:g} kN", color=colour, **_DOTS)
@@ -79,11 +79,11 @@ def buckle(out: Path, up: Slice, across: Slice, loads_kn: Sequence[float]) -> di
         for k, (line, title) in enumerate(zip((up, across), titles, strict=True)):
             order = np.argsort(line.at_mm)
             at = line.at_mm[order]
-            parted = np.flatnonzero((at[:-1] < 0.0) & (at[1:] >= 0.0) & (k == 0)) + 1
+            gaps = np.flatnonzero((at[:-1] < 0.0) & (at[1:] >= 0.0) & (k == 0)) + 1
             for i, (load, colour) in enumerate(zip(loads_kn, colours, strict=True)):
                 # the crack parts the line: nothing is drawn over it
-                true = np.insert(line.true[i][order], parted, np.nan)
-                axes[0, k].plot(np.insert(at, parted, 0.0), true, "-", color="black", linewidth=0.7)
+                true = np.insert(line.true[i][order], gaps, np.nan)
+                axes[0, k].plot(np.insert(at, gaps, 0.0), true, "-", color="black", linewidth=0.7)
                 axes[0, k].plot(at, line.found[i][order], ".", color=colour, markersize=4, label=f"{load:g} kN")
                 off, sd = 1e3 * (line.found[i] - line.true[i])[order], 1e3 * line.sigma[i][order]
                 axes[1, k].plot(at, off, ".-", color=colour, markersize=3, linewidth=0.6)

@@ -22,7 +22,7 @@ LIMIT_MM = 0.05  # the dimensional accuracy that the paper states for this set-u
 
 
 def _crack_px(session: Session, panel: CrackedPanel) -> NDArray[np.float64]:
-    """Where the calibrated camera 1 sees the crack: a user would click its ends in the image."""
+    """Crack in the image of the calibrated camera 1: a user would click its ends."""
     s = np.linspace(-panel.half_crack_mm, panel.half_crack_mm, 101)
     half = np.sqrt(0.5)  # the panel hangs upright, the grid's lines at 45 degrees
     line = np.stack([half * s, -half * s, np.full_like(s, -panel.bow_mm)], axis=-1)
@@ -40,14 +40,14 @@ def run(session: Session, calibration_id: str) -> Outcome:
     for load in [0.0, *loads]:
         client.set_scene("panel", load=load)
         client.capture(test, f"{load:g} kN", load_n=1e3 * load)
-    session.say(f"captured {len(loads) + 1} steps")
+    session.note(f"captured {len(loads) + 1} steps")
     crack = _crack_px(session, panel)
     # drawn as a line: both lips are measured up to it
     region = {"rectangle": list(roi), "cracks": [crack.tolist()]}
     analysis = client.analyse(test, "displacement", region, subset_px=SUBSET_PX, spacing_px=SPACING_PX)
     shape, *fields = session.fetch(analysis, range(len(loads) + 1))
     comparisons = [compare_motion(f, session.rig, "panel", load) for f, load in zip(fields, loads, strict=True)]
-    outcome = _judge(shape, fields, comparisons, loads, session)
+    outcome = _outcome(shape, fields, comparisons, loads, session)
     image = session.reference_image(test)
     outcome.pictures = pictures.panel(session.out, image, roi, fields, comparisons, loads)
     _gauge(outcome, session, analysis, fields, comparisons, loads, crack)
@@ -72,20 +72,20 @@ def _gauge(
     above = np.where(up.at_mm < 0.0, up.found[-1], np.nan)
     crest = float(up.xy_px[int(np.nanargmax(above)), 1])
     across = panel_gauges.read_slice(session, analysis, np.array([[x[0], crest], [x[-1], crest]]), loads, 0)
-    panel_gauges.judge(outcome, opening, up, loads, session.rig, SUBSET_PX)
+    panel_gauges.add_checks(outcome, opening, up, loads, session.rig, SUBSET_PX)
     strains = fetched_strain(session, range(1, len(loads) + 1))
-    most = np.max(opening.found, axis=1)
+    max_opening = np.max(opening.found, axis=1)
     found = [
         panel_strain.panel_strain(f, s, c, float(wide))
-        for f, s, c, wide in zip(fields, strains, comparisons, most, strict=True)
+        for f, s, c, wide in zip(fields, strains, comparisons, max_opening, strict=True)
     ]
-    panel_strain.judge(outcome, found, strains[-1], loads)
+    panel_strain.add_checks(outcome, found, strains[-1], loads)
     outcome.pictures |= gauges.opening(session.out, opening, loads, panel.half_crack_mm)
     outcome.pictures |= gauges.buckle(session.out, up, across, loads)
     outcome.pictures |= gauges.strain(session.out, last, found[-1], strains[-1], loads[-1], crack)
 
 
-def _judge(
+def _outcome(
     shape: Field, fields: list[Field], comparisons: list[MotionComparison], loads: list[float], session: Session
 ) -> Outcome:
     outcome = Outcome()

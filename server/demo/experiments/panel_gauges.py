@@ -31,7 +31,7 @@ class Opening:
 
     Attributes
     ----------
-    place
+    position
         (n,) along the crack, of its half length; beyond +-1 ahead of the tips.
     found, sigma
         (steps, n) elongation, mm; NaN where it is missing.
@@ -43,7 +43,7 @@ class Opening:
         (steps, n) by how much the ends part out of the plane.
     """
 
-    place: Float
+    position: Float
     found: Float
     sigma: Float
     true: Float
@@ -84,9 +84,9 @@ def read_opening(
     session: Session, analysis: AnalysisHandle, crack_px: Float, panel: CrackedPanel, loads_kn: Sequence[float]
 ) -> Opening:
     """Lay extensometers across the crack and read them over HTTP."""
-    place = np.array([BEYOND[0], *ACROSS, BEYOND[1]])
+    position = np.array([BEYOND[0], *ACROSS, BEYOND[1]])
     middle, half = 0.5 * (crack_px[0] + crack_px[-1]), 0.5 * (crack_px[-1] - crack_px[0])
-    on = middle + place[:, None] * half
+    on = middle + position[:, None] * half
     reach = np.array([0.0, ENDS_PX])  # the load runs down in the images
     ends = np.stack([on - reach, on + reach], axis=1)
     gauges = [{"a_px": a.tolist(), "b_px": b.tolist()} for a, b in ends]
@@ -103,7 +103,7 @@ def read_opening(
     lens = np.sqrt(np.clip(panel.half_crack_mm**2 - s_mm**2, 0.0, None))
     lips = [4.0 * panel.stress_mpa(load) * lens / panel.youngs_modulus_mpa for load in loads_kn]
     return Opening(
-        place=place,
+        position=position,
         found=found,
         sigma=sigma,
         true=np.array([_elongation(t) for t in truths]),
@@ -143,7 +143,7 @@ def crests(at_mm: Float, height_mm: Float) -> list[Crest]:
 
 
 def plane_patch_error_mm(rig: SimRig, camera1: Camera, xy_px: Float, load_kn: float, subset_px: int) -> Float:
-    """What a plane patch does to the true w at places (n, 2): half its curvature times the subset's second moment.
+    """Error of a plane patch in the true w at positions (n, 2): half its curvature times the subset's second moment.
 
     The same as the mean of w over the subset less w in its middle, up to second order; so it is summed.
     """
@@ -155,12 +155,12 @@ def plane_patch_error_mm(rig: SimRig, camera1: Camera, xy_px: Float, load_kn: fl
     return np.asarray(w.mean(axis=1) - w[:, len(offset) // 2])
 
 
-def judge(
+def add_checks(
     outcome: Outcome, opening: Opening, up: Slice, loads_kn: Sequence[float], rig: SimRig, subset_px: int
 ) -> None:
     """Add the opening's and the buckle's tables, figures and limits to the experiment's outcome."""
     open_rows, crest_rows = [], []
-    middle = len(opening.place) // 2
+    middle = len(opening.position) // 2
     crest_data = []
     for k, load in enumerate(loads_kn):
         off = (opening.found - opening.true)[k]
@@ -206,7 +206,7 @@ def judge(
             if k == len(loads_kn) - 1:
                 name = f"{side} crest of the buckle at {load:g} kN"
                 outcome.checks.append(Check(name, "mm", f.height_mm, t.height_mm, off_mm, limit))
-    inside, last = np.abs(opening.place) < 1.0, loads_kn[-1]
+    inside, last = np.abs(opening.position) < 1.0, loads_kn[-1]
     worst = np.nanmax(np.abs(opening.found - opening.true)[-1]) if np.isfinite(opening.found).all() else np.nan
     sigma = float(np.max(opening.sigma[-1]))
     outcome.checks += [
@@ -229,7 +229,7 @@ def judge(
     ]
     outcome.lines += [
         "",
-        f"extensometers over the crack, ends {ENDS_PX:g} px off it; in its middle and all {len(opening.place)}:",
+        f"extensometers over the crack, ends {ENDS_PX:g} px off it; in its middle and all {len(opening.position)}:",
         *table(["kN", "opening um", "true", "lips", "rms off", "chi", "parts by um", "true", "chi"], open_rows),
         "",
         "crests of the buckle on the line along the load through the crack's middle, w towards the cameras:",
@@ -237,7 +237,7 @@ def judge(
     ]
     outcome.data["opening"] = {
         name: (1e3 * getattr(opening, name)).tolist() for name in ("found", "sigma", "true", "lips", "parting")
-    } | {"place": opening.place.tolist(), "unit": "um"}
+    } | {"position": opening.position.tolist(), "unit": "um"}
     off = up.found - up.true
     outcome.data["buckle"] = {
         "crests": crest_data,

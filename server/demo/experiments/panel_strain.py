@@ -72,7 +72,7 @@ def panel_strain(result: Field, strain: StrainField, comparison: MotionCompariso
     )
 
 
-def judge(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainField, loads_kn: Sequence[float]) -> None:
+def add_checks(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainField, loads_kn: Sequence[float]) -> None:
     """Add the strain's table, figures and limits to the experiment's outcome."""
     rows = [
         [

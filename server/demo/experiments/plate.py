@@ -89,14 +89,14 @@ def run(session: Session, calibration_id: str) -> Outcome:
     for pressure in [0.0, *pressures]:
         client.set_scene("plate", load=pressure)
         client.capture(test, f"{pressure:g} kPa")
-    session.say(f"captured {len(pressures) + 1} steps")
+    session.note(f"captured {len(pressures) + 1} steps")
     analysis = client.analyse(
         test, "displacement", {"rectangle": list(ROI_PX)}, subset_px=SUBSET_PX, spacing_px=SPACING_PX
     )
     shape, *fields = session.fetch(analysis, range(len(pressures) + 1))
     comparisons = [compare_motion(f, session.rig, "plate", q) for f, q in zip(fields, pressures, strict=True)]
     fit = fit_plate(fields, pressures, plate)
-    outcome = _judge(shape, fields, comparisons, pressures, plate, fit, session)
+    outcome = _outcome(shape, fields, comparisons, pressures, plate, fit, session)
     image = session.reference_image(test)
     outcome.pictures |= pictures.plate(session.out, image, ROI_PX, fields, comparisons, pressures, plate, fit)
     strains = fetched_strain(session, range(1, len(pressures) + 1))
@@ -104,7 +104,7 @@ def run(session: Session, calibration_id: str) -> Outcome:
         plate_strain.plate_strain(f, s, c, q, plate, fit.centre_mm)
         for f, s, c, q in zip(fields, strains, comparisons, pressures, strict=True)
     ]
-    plate_strain.judge(outcome, found, strains, pressures, plate, _strain_in_the_centre(session, analysis, fit))
+    plate_strain.add_checks(outcome, found, strains, pressures, plate, _strain_in_the_centre(session, analysis, fit))
     outcome.pictures |= strain_pictures.plate(session.out, fields, strains, found, pressures, plate)
     return outcome
 
@@ -124,7 +124,7 @@ def _strain_in_the_centre(session: Session, analysis: AnalysisHandle, fit: Plate
     return found
 
 
-def _judge(
+def _outcome(
     shape: Field,
     fields: list[Field],
     comparisons: list[MotionComparison],

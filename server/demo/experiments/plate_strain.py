@@ -81,13 +81,13 @@ def plate_strain(
 def gauge_effect(strain: StrainField, pressure_kpa: float, plate: CircularPlate) -> float:
     """Return by how much the gauge's width lowers the plate's bending strain."""
     half = strain.options.window // 2
-    place = np.arange(-half, half + 1) * strain.gauge_mm * strain.spacing_px / strain.gauge_px
-    m2, m4 = np.mean(place**2), np.mean(place**4)
+    position = np.arange(-half, half + 1) * strain.gauge_mm * strain.spacing_px / strain.gauge_px
+    m2, m4 = np.mean(position**2), np.mean(position**4)
     at_centre = float(plate.bending_strain(0.0, pressure_kpa)[0])
     return float(at_centre * (m4 / m2 + m2) / plate.radius_mm**2)
 
 
-def judge(
+def add_checks(
     outcome: Outcome,
     found: Sequence[PlateStrain],
     strains: Sequence[StrainField],

@@ -27,7 +27,7 @@ def run(session: Session, calibration_id: str) -> Outcome:
     for n in range(CAPTURES):
         client.capture(test, "the pair" if n == 0 else f"once more, for the noise ({n})")
     steel_motion.capture(session, test)
-    session.say(f"captured {CAPTURES} pairs of the plate at rest, {len(steel_motion.MOTIONS)} of it moved")
+    session.note(f"captured {CAPTURES} pairs of the plate at rest, {len(steel_motion.MOTIONS)} of it moved")
     # plane patches: the truth below is the surface as a plane of the subset's size sees it
     analysis = client.analyse(
         test,
@@ -94,6 +94,6 @@ def run(session: Session, calibration_id: str) -> Outcome:
         subset_px=SUBSET_PX,
         spacing_px=MOTION_STEP_PX,
     )
-    steel_motion.judge(outcome, moved, strains)
+    steel_motion.add_checks(outcome, moved, strains)
     outcome.pictures |= gauges.moved(session.out, moved_fields, strains, moved)
     return outcome

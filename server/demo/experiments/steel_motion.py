@@ -115,8 +115,8 @@ def measure(
     volume = volume_of(load_calibration(session.out / "calibration.json"))
     moved = []
     for motion, step, field, strain in zip(MOTIONS, read, fields, strains, strict=True):
-        places = field.xyz_mm[field.valid][::FEW]
-        calibration = np.zeros((9, 9)) if volume is None else calibration_covariance(volume, places, motion)
+        points = field.xyz_mm[field.valid][::FEW]
+        calibration = np.zeros((9, 9)) if volume is None else calibration_covariance(volume, points, motion)
         moved.append(_moved(motion, step, strain, calibration))
     return moved, fields, strains
 
@@ -154,8 +154,8 @@ def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField
     middle = np.array(rigid.centre_mm)
     true = np.concatenate([turn.as_rotvec(), turn.apply(middle) + np.array(shift) - middle])
     values = [
-        rigid.values[f"{what}_{axis}_{unit}"]
-        for what, unit in (("rotation", "rad"), ("translation", "mm"))
+        rigid.values[f"{quantity}_{axis}_{unit}"]
+        for quantity, unit in (("rotation", "rad"), ("translation", "mm"))
         for axis in "xyz"
     ]
     elongation = [e.values["elongation_mm"] for e in step.extensometers]
@@ -182,17 +182,17 @@ def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField
     )
 
 
-def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> None:
+def add_checks(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> None:
     """Add the motions' tables, figures and limits to the experiment's outcome."""
     rows, false_rows = [], []
     for one in moved:
         off = one.found - one.true
-        for part, what, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
+        for part, quantity, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
             both = scale * np.stack([off[part], one.sigma[part], one.sigma_calibration[part]], axis=-1)
             rows.append(
                 [
                     one.name,
-                    what,
+                    quantity,
                     unit,
                     *(f"{scale * v:.2f}" for v in one.true[part]),
                     *(f"{v:+.2f} +- {s:.2f} +- {c:.2f}" for v, s, c in both),
@@ -271,11 +271,11 @@ def judge(outcome: Outcome, moved: list[Moved], strains: list[StrainField]) -> N
 
 def _checks(one: Moved, strain: StrainField) -> list[Check]:
     checks = []
-    for part, what, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
+    for part, quantity, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
         found, true = (scale * float(np.linalg.norm(v[part])) for v in (one.found, one.true))
         off = scale * float(np.max(np.abs(one.found - one.true)[part]))
         limit = OF_MANY * scale * float(np.max(np.hypot(one.sigma, one.sigma_calibration)[part]))
-        checks.append(Check(f"the plate {one.name}: {what}, worst component", unit, found, true, off, limit))
+        checks.append(Check(f"the plate {one.name}: {quantity}, worst component", unit, found, true, off, limit))
     change = np.abs(one.elongation_mm) / one.elongation_sigma_mm
     k = int(np.argmax(change))
     elongation, worst = 1e3 * float(one.elongation_mm[k]), int(np.argmax(np.abs(one.false_mean)))

@@ -36,7 +36,7 @@ _DISTORTION = ("K1", "K2", "K3", "P1", "P2")
 _NOT_CARRIED = ("FS", "K4", "K5", "K6", "S1", "S2", "S3", "S4", "T1", "T2")
 
 
-def looks_like_dice(data: bytes) -> bool:
+def is_dice(data: bytes) -> bool:
     """Return True if the bytes are an XML file of DICe's kind."""
     return b"<ParameterList" in data[:4096] and b"CAMERA" in data
 
@@ -68,13 +68,13 @@ def _number(name: str, where: str, key: str, values: dict[str, str], default: fl
     return number
 
 
-def _row(name: str, what: str, text: str, count: int) -> list[float]:
+def _row(name: str, entry: str, text: str, count: int) -> list[float]:
     try:
         numbers = [float(part) for part in text.strip().strip("{}").split(",")]
     except ValueError as error:
-        raise unreadable(name, f"{what} is {text!r}, not a row of numbers") from error
+        raise unreadable(name, f"{entry} is {text!r}, not a row of numbers") from error
     if len(numbers) != count:
-        raise unreadable(name, f"{what} has {len(numbers)} numbers, not {count}")
+        raise unreadable(name, f"{entry} has {len(numbers)} numbers, not {count}")
     return numbers
 
 

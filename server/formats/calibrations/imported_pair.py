@@ -46,16 +46,16 @@ def invalid(name: str, why: str) -> FileFormatError:
     )
 
 
-def proper_rotation(name: str, what: str, values: ArrayLike) -> NDArray[np.float64]:
+def proper_rotation(name: str, entry: str, values: ArrayLike) -> NDArray[np.float64]:
     """Return the nearest rotation to a (3, 3) matrix, after checking that it is one to the digits of a text file."""
     R = np.asarray(values, dtype=np.float64)
     if R.shape != (3, 3):
-        raise unreadable(name, f"{what} has the shape {R.shape}, not (3, 3)")
+        raise unreadable(name, f"{entry} has the shape {R.shape}, not (3, 3)")
     if not np.isfinite(R).all():
-        raise invalid(name, f"{what} holds a number that is not finite")
+        raise invalid(name, f"{entry} holds a number that is not finite")
     off = float(np.abs(R @ R.T - np.eye(3)).max())
     if off > _ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
-        raise invalid(name, f"{what} is not a rotation (R R^T is off by {off:.2g}, det {np.linalg.det(R):+.3f})")
+        raise invalid(name, f"{entry} is not a rotation (R R^T is off by {off:.2g}, det {np.linalg.det(R):+.3f})")
     u, _, vt = np.linalg.svd(R)
     return np.asarray(u @ vt)
 

@@ -42,7 +42,7 @@ _POSE = ("Tx [mm]", "Ty [mm]", "Tz [mm]", "Theta [deg]", "Phi [deg]", "Psi [deg]
 _LINE = re.compile(r"\s*([^;=:]+?)\s*[;=:]\s*(\S+)\s*")
 
 
-def looks_like_caldat(data: bytes) -> bool:
+def is_caldat(data: bytes) -> bool:
     """Return True if the bytes are lines of MatchID's kind."""
     return re.search(rb"^\s*Cam\d_F[xy]\b", data[:65536], re.MULTILINE | re.IGNORECASE) is not None
 

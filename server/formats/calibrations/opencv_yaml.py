@@ -26,7 +26,7 @@ _MAX_NUMBERS = 100
 _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
 
 
-def looks_like_opencv(data: bytes) -> bool:
+def is_opencv(data: bytes) -> bool:
     """Return True if the bytes name OpenCV's stereo parameters."""
     return b"cameraMatrix1" in data[:_MAX_BYTES]
 

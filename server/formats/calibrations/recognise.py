@@ -16,12 +16,12 @@ from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from core.names import CAMERAS
-from server.formats.calibrations.dice_xml import looks_like_dice, parse_dice_xml
+from server.formats.calibrations.dice_xml import is_dice, parse_dice_xml
 from server.formats.calibrations.imported_pair import invalid, unreadable
-from server.formats.calibrations.matchid_caldat import looks_like_caldat, parse_caldat
-from server.formats.calibrations.opencv_yaml import looks_like_opencv, parse_opencv
+from server.formats.calibrations.matchid_caldat import is_caldat, parse_caldat
+from server.formats.calibrations.opencv_yaml import is_opencv, parse_opencv
 from server.formats.calibrations.record import CalibrationRecord
-from server.formats.calibrations.vic3d_xml import looks_like_vic3d, parse_vic3d
+from server.formats.calibrations.vic3d_xml import is_vic3d, parse_vic3d
 
 _MAX_BYTES = 64 << 20
 _MIN_BASELINE = 1e-6  # of the stand-off
@@ -146,9 +146,7 @@ def _unwrapped(data: bytes, digest: str, name: str) -> LoadedCalibration:
 
 
 def _of_another(data: bytes) -> bool:
-    return any(
-        recognises(data) for recognises in (looks_like_dice, looks_like_opencv, looks_like_caldat, looks_like_vic3d)
-    )
+    return any(recognises(data) for recognises in (is_dice, is_opencv, is_caldat, is_vic3d))
 
 
 def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
@@ -156,16 +154,16 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     digest = hashlib.sha256(data).hexdigest()
     if _wraps_another(data):
         return _unwrapped(data, digest, name)
-    if looks_like_dice(data):
+    if is_dice(data):
         pair, size1, size2 = parse_dice_xml(data, name=name)
         return LoadedCalibration(pair, size1, size2, "dice_xml", digest, {})
-    if looks_like_opencv(data):
+    if is_opencv(data):
         pair, size = parse_opencv(data, name=name)
         return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {})
-    if looks_like_vic3d(data):
+    if is_vic3d(data):
         pair, size = parse_vic3d(data, name=name)
         return LoadedCalibration(pair, size, size, "vic3d_xml", digest, {})
-    if looks_like_caldat(data):
+    if is_caldat(data):
         return LoadedCalibration(parse_caldat(data, name=name), None, None, "matchid_caldat", digest, {})
     try:
         content = json.loads(data)

@@ -34,7 +34,7 @@ class NominalRig:
     axis_tilt_sigma_rad: float = 0.0
 
 
-def load_toml(path: Path, *, what: str) -> dict[str, object]:
+def load_toml(path: Path, *, kind: str) -> dict[str, object]:
     """Read a TOML file.
 
     Raises
@@ -44,16 +44,16 @@ def load_toml(path: Path, *, what: str) -> dict[str, object]:
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise _malformed(path, what, f"it has {path.stat().st_size} bytes")
+            raise _malformed(path, kind, f"it has {path.stat().st_size} bytes")
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise FileFormatError(
-            f"The {what} {path} does not exist.", code="file_missing", remedy="Check the path."
+            f"The {kind} {path} does not exist.", code="file_missing", remedy="Check the path."
         ) from error
     except OSError as error:
-        raise _malformed(path, what, error.strerror or str(error)) from error
+        raise _malformed(path, kind, error.strerror or str(error)) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise _malformed(path, what, f"it is no valid TOML ({error})") from error
+        raise _malformed(path, kind, f"it is no valid TOML ({error})") from error
 
 
 def read_target(path: Path) -> GridTarget:
@@ -64,7 +64,7 @@ def read_target(path: Path) -> GridTarget:
     FileFormatError
         ``file_missing``, ``toml_malformed``, or ``field_invalid`` naming the field.
     """
-    content = load_toml(path, what="target description")
+    content = load_toml(path, kind="target description")
     table = content.get("target", content)
     where = f"{path}, [target]" if "target" in content else str(path)
     if not isinstance(table, Mapping):
@@ -100,7 +100,7 @@ def read_rig(path: Path) -> NominalRig:
     FileFormatError
         ``file_missing``, ``toml_malformed``, or ``field_invalid`` naming the field.
     """
-    content = load_toml(path, what="rig description")
+    content = load_toml(path, kind="rig description")
     cameras = []
     for name in CAMERAS:
         table = content.get(name)
@@ -149,9 +149,9 @@ def _number(
     return float(value)
 
 
-def _malformed(path: Path, what: str, why: str) -> FileFormatError:
+def _malformed(path: Path, kind: str, why: str) -> FileFormatError:
     return FileFormatError(
-        f"The {what} {path} cannot be read: {why}.", code="toml_malformed", remedy="Correct the file named above."
+        f"The {kind} {path} cannot be read: {why}.", code="toml_malformed", remedy="Correct the file named above."
     )
 
 

@@ -35,7 +35,7 @@ _INTRINSICS = ("cx", "cy", "fx", "fy", "skew")
 _DISTORTION = ("k1", "k2", "k3")
 
 
-def looks_like_vic3d(data: bytes) -> bool:
+def is_vic3d(data: bytes) -> bool:
     """Return True if the bytes are XML with VIC-3D's calibration."""
     return b"<calibration" in data and b"<camera" in data and b"<orientation" in data
 
@@ -74,13 +74,13 @@ def parse_vic3d(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
     return pair_of(name, lens1, lens2, relative.rotation, relative.translation_mm), _image_size(root)
 
 
-def _numbers(text: str | None, what: str, name: str) -> list[float]:
+def _numbers(text: str | None, entry: str, name: str) -> list[float]:
     try:
         numbers = [float(part) for part in (text or "").split()]
     except ValueError as error:
-        raise unreadable(name, f"{what} holds {text!r}, not numbers") from error
+        raise unreadable(name, f"{entry} holds {text!r}, not numbers") from error
     if not np.isfinite(numbers).all():
-        raise invalid(name, f"{what} holds a number that is not finite")
+        raise invalid(name, f"{entry} holds a number that is not finite")
     return numbers
 
 

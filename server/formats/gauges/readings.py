@@ -4,71 +4,82 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Annotated
+
+from pydantic import Field
 
 
 @dataclass(frozen=True)
 class Number:
     """A number with its standard deviation."""
 
-    value: float | None
-    sigma: float | None
-    units: str
+    value: Annotated[float | None, Field(description="The value; null where it is missing.")]
+    sigma: Annotated[float | None, Field(description="Standard uncertainty; null where it is not known.")]
+    units: Annotated[str, Field(description="Unit; `1` of a number without one.")]
 
 
 @dataclass(frozen=True)
 class PointReading:
     """Variables at a position of camera 1's reference image."""
 
-    name: str | None
-    xy_px: tuple[float, float]
-    missing: str
-    values: Mapping[str, Number]
+    name: Annotated[str | None, Field(description="Name of the point, if it has one.")]
+    xy_px: Annotated[tuple[float, float], Field(description="Position in camera 1's reference image.")]
+    missing: Annotated[str, Field(description="Reason why there are no values; empty if there are.")]
+    values: Annotated[Mapping[str, Number], Field(description="Values by variable.")]
 
 
 @dataclass(frozen=True)
 class ExtensometerReading:
     """Lengths and strains between two positions."""
 
-    name: str | None
-    a_px: tuple[float, float]
-    b_px: tuple[float, float]
-    missing: str
-    values: Mapping[str, Number]
+    name: Annotated[str | None, Field(description="Name of the extensometer, if it has one.")]
+    a_px: Annotated[tuple[float, float], Field(description="First end in camera 1's reference image.")]
+    b_px: Annotated[tuple[float, float], Field(description="Second end in camera 1's reference image.")]
+    missing: Annotated[str, Field(description="Reason why there are no values; empty if there are.")]
+    values: Annotated[Mapping[str, Number], Field(description="Lengths, elongation and strains by name.")]
 
 
 @dataclass(frozen=True)
 class Numbers:
     """One number for each position of a line."""
 
-    value: Sequence[float | None]
-    sigma: Sequence[float | None]
-    units: str
+    value: Annotated[Sequence[float | None], Field(description="Value at each position; null where it is missing.")]
+    sigma: Annotated[
+        Sequence[float | None], Field(description="Standard uncertainty at each position; null where it is not known.")
+    ]
+    units: Annotated[str, Field(description="Unit; `1` of numbers without one.")]
 
 
 @dataclass(frozen=True)
 class LineReading:
     """Variables at positions along a line; ``missing`` gives for each of them the reason why there is none."""
 
-    name: str | None
-    x_px: Sequence[float]
-    y_px: Sequence[float]
-    distance_px: Sequence[float]
-    missing: Sequence[str]
-    values: Mapping[str, Numbers]
+    name: Annotated[str | None, Field(description="Name of the line, if it has one.")]
+    x_px: Annotated[Sequence[float], Field(description="Column of each position in camera 1's reference image.")]
+    y_px: Annotated[Sequence[float], Field(description="Row of each position in camera 1's reference image.")]
+    distance_px: Annotated[
+        Sequence[float], Field(description="Distance of each position from the start, along the line.")
+    ]
+    missing: Annotated[
+        Sequence[str], Field(description="Reason for each position without values; empty if it has them.")
+    ]
+    values: Annotated[Mapping[str, Numbers], Field(description="Values along the line by variable.")]
 
 
 @dataclass(frozen=True)
 class AreaStatistics:
     """A variable over the points of an area."""
 
-    units: str
-    count: int
-    mean: float | None
-    mean_sigma: float | None
-    sd: float | None
-    rms: float | None
-    min: float | None
-    max: float | None
+    units: Annotated[str, Field(description="Unit; `1` of a variable without one.")]
+    count: Annotated[int, Field(description="Number of values.")]
+    mean: Annotated[float | None, Field(description="Mean.")]
+    mean_sigma: Annotated[
+        float | None, Field(description="Standard uncertainty of the mean; null where it is not known.")
+    ]
+    sd: Annotated[float | None, Field(description="Standard deviation over the area.")]
+    rms: Annotated[float | None, Field(description="Root of the mean square.")]
+    min: Annotated[float | None, Field(description="Smallest value.")]
+    max: Annotated[float | None, Field(description="Largest value.")]
 
     @property
     def mean_number(self) -> Number:
@@ -80,35 +91,40 @@ class AreaStatistics:
 class AreaReading:
     """Variables over an area, which has so many points, so many of them valid."""
 
-    name: str | None
-    points: int
-    valid: int
-    missing: str
-    values: Mapping[str, AreaStatistics]
+    name: Annotated[str | None, Field(description="Name of the area, if it has one.")]
+    points: Annotated[int, Field(description="Points in the area.")]
+    valid: Annotated[int, Field(description="Valid ones among them.")]
+    missing: Annotated[str, Field(description="Reason why there are no values; empty if there are.")]
+    values: Annotated[Mapping[str, AreaStatistics], Field(description="Statistics by variable.")]
 
 
 @dataclass(frozen=True)
 class FrameReading:
     """The frame that was laid through the surface: X_frame = rotation (X_sys - origin)."""
 
-    rotation: Sequence[Sequence[float]]
-    origin_mm: Sequence[float]
-    sigma_rad: Sequence[float]
-    sigma_origin_mm: Sequence[float]
-    residual_rms_mm: float
-    points: int
+    rotation: Annotated[Sequence[Sequence[float]], Field(description="Rotation matrix, row by row.")]
+    origin_mm: Annotated[Sequence[float], Field(description="Origin in the system frame.")]
+    sigma_rad: Annotated[Sequence[float], Field(description="Standard uncertainty of the rotation about each axis.")]
+    sigma_origin_mm: Annotated[
+        Sequence[float], Field(description="Standard uncertainty of the origin along each axis.")
+    ]
+    residual_rms_mm: Annotated[float, Field(description="Root mean square distance of the points from the fit.")]
+    points: Annotated[int, Field(description="Points that it was laid through.")]
 
 
 @dataclass(frozen=True)
 class RigidMotionReading:
     """The rigid motion that was taken out of a step."""
 
-    values: Mapping[str, Number]
-    centre_mm: Sequence[float]
-    covariance: Sequence[Sequence[float]]
-    points: int
-    residual_rms_mm: float
-    noise_ratio: float
+    values: Annotated[Mapping[str, Number], Field(description="Rotation and translation by component.")]
+    centre_mm: Annotated[Sequence[float], Field(description="Centre of the rotation.")]
+    covariance: Annotated[
+        Sequence[Sequence[float]],
+        Field(description="Joint covariance of the three rotations (rad) and the three translations (mm)."),
+    ]
+    points: Annotated[int, Field(description="Points that it was fitted to.")]
+    residual_rms_mm: Annotated[float, Field(description="Root mean square of the displacements that remain.")]
+    noise_ratio: Annotated[float, Field(description="Residual over that expected from the uncertainty of the points.")]
 
 
 @dataclass(frozen=True)

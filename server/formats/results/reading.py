@@ -177,13 +177,13 @@ def _references_of(dataset: Any) -> References | None:
         return None
     steps = np.asarray(variables["reference_step"][...], dtype=np.int32)
     values: dict[str, NDArray[np.float64]] = {}
-    for what in PROPAGATED_FROM:
-        values[what] = np.full((*steps.shape, 2, 2), np.nan)
+    for origin in PROPAGATED_FROM:
+        values[origin] = np.full((*steps.shape, 2, 2), np.nan)
         for name, (i, j) in ENTRIES.items():
             read = np.asarray(
-                variables[variable_name(f"propagated_{what}_{name}_px2", variables)][...], dtype=np.float64
+                variables[variable_name(f"propagated_{origin}_{name}_px2", variables)][...], dtype=np.float64
             )
-            values[what][..., i, j] = values[what][..., j, i] = read
+            values[origin][..., i, j] = values[origin][..., j, i] = read
     return References(int(dataset.reference_step), steps, values["noise"], values["pattern"])
 
 

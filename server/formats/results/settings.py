@@ -21,7 +21,13 @@ _CUTS_AND_MASK = ("cracks", "holes", "mask")
 _BEFORE = {"reference_update": "never", "strain": None}
 
 
-_ENTRIES = {"step_px": "spacing_px", "curved_noise_mm": "quadratic_noise_mm", "curved_advised": "quadratic_advised"}
+_ENTRIES = {
+    "step_px": "spacing_px",
+    "curved_noise_mm": "quadratic_noise_mm",
+    "curved_advised": "quadratic_advised",
+    "least_share": "min_share",
+    "most_amplification": "max_amplification",
+}
 _COMPARISONS = {
     "cam1_t0__cam2_t0": "cam1_ref__cam2_ref",
     "cam1_t0__cam1_t": "cam1_ref__cam1_cur",

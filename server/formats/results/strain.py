@@ -31,8 +31,8 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
     tensor = _TENSOR[strain.options.tensor]
     principal, sigma, sigma_principal = strain.principal, strain.sigma, strain.sigma_principal
     found: list[tuple[str, Any, str, str]] = []
-    for k, (name, what) in enumerate(_COMPONENTS):
-        found.append((name, strain.strain[..., k], "1", f"{tensor}, {what}"))
+    for k, (name, component) in enumerate(_COMPONENTS):
+        found.append((name, strain.strain[..., k], "1", f"{tensor}, {component}"))
         found.append((f"sigma_{name}", sigma[..., k], "1", f"standard deviation of {name}"))
     for k, which in enumerate(("larger", "smaller")):
         found.append((f"e{k + 1}", principal[..., k], "1", f"{tensor}, {which} principal value"))
@@ -47,13 +47,13 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
             {"gauge_px": strain.gauge_px, "gauge_mm": strain.gauge_mm, "window_points": np.int32(strain.options.window)}
         )
     if strain.patch is not None:
-        for k, (name, what) in enumerate(_COMPONENTS):
+        for k, (name, component) in enumerate(_COMPONENTS):
             _variable(
                 dataset,
                 f"{name}_patch",
                 strain.patch[..., k],
                 "1",
-                f"{tensor} of the patch itself, {what}",
+                f"{tensor} of the patch itself, {component}",
                 sparse=sparse,
             ).setncatts({"gauge_px": float(strain.subset_px)})
     _variable(

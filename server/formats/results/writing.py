@@ -222,12 +222,12 @@ def _put_references(dataset: Any, references: References) -> None:
         long_name="step that the point was matched against; without numbers, the newest such step that shows it",
         sparse=True,
     )
-    for what, cause in PROPAGATED_FROM.items():
-        values = getattr(references, f"{what}_px2")
+    for origin, cause in PROPAGATED_FROM.items():
+        values = getattr(references, f"{origin}_px2")
         for name, (i, j) in ENTRIES.items():
             _put(
                 dataset,
-                f"propagated_{what}_{name}_px2",
+                f"propagated_{origin}_{name}_px2",
                 values[..., i, j],
                 ("row", "col"),
                 units="pixel2",

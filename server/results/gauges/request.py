@@ -27,7 +27,7 @@ class PointGauge(_Named):
     model_config = ConfigDict(json_schema_extra=one_of("xy_px", "xy_mm"))
 
     xy_px: PositionPx | None = Field(
-        None, description="Where, in camera 1's reference image.", examples=[[210.0, 180.5]]
+        None, description="Position in camera 1's reference image.", examples=[[210.0, 180.5]]
     )
     xy_mm: PositionMm | None = Field(
         None, description="Position, as X and Y of the reference in the frame asked for; instead of xy_px."

@@ -225,7 +225,7 @@ function run(rig, ends, done) {
     replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}/cancel`), { kind: "danger" })));
     try {
       const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
-        const { stage, done: ready, total } = now.progress ?? {};
+        const { phase: stage, done: ready, total } = now.progress ?? {};
         if (total) bar.value = ready / total;
         text.textContent = now.state === "queued" ? "waiting" : `${PHASES[stage ?? ""] ?? stage ?? ""} ${total ? `${ready} of ${total}` : ""}`;
       } });

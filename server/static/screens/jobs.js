@@ -19,7 +19,7 @@ export async function open(root) {
 
   /** @param {Job} job */
   function note(job) {
-    const { stage, done, total } = job.progress ?? {};
+    const { phase: stage, done, total } = job.progress ?? {};
     const line = `${new Date().toLocaleTimeString()}  ${job.state}  ${stage ?? ""} ${total ? `${done}/${total}` : ""}`.trim();
     const lines = log.get(job.id) ?? [];
     const key = `${job.state} ${stage}`;
@@ -42,7 +42,7 @@ export async function open(root) {
 
   /** @param {Job} job */
   function progress(job) {
-    const { stage, done, total, eta_s: eta } = job.progress ?? {};
+    const { phase: stage, done, total, eta_s: eta } = job.progress ?? {};
     if (["succeeded", "failed", "cancelled", "interrupted"].includes(job.state)) return job.finished_utc && job.started_utc ? quantity((Date.parse(job.finished_utc) - Date.parse(job.started_utc)) / 1000, "s", 3) : "";
     return h("div", h("progress", { value: total ? done : null, max: total || 1, "aria-label": `Progress of ${job.kind}` }),
       h("small", `${stage ?? ""} ${total ? `${num(100 * done / total, 3)} %` : ""}${eta ? `, ${num(eta, 2)} s left` : ""}`));

@@ -83,7 +83,7 @@ def _share(job: dict[str, Any]) -> float:
     share = shown["done"] / shown["total"] if shown["total"] else 0.0
     if job["kind"] == "analysis":
         return float(share)
-    return 0.5 * share if shown["stage"] in ("views", "frames", "waiting") else 0.5 + 0.5 * share
+    return 0.5 * share if shown["phase"] in ("views", "frames", "waiting") else 0.5 + 0.5 * share
 
 
 @dataclass

@@ -436,7 +436,7 @@ def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path, capsys:
         )
         == 0
     )
-    assert "the noise file says 3.46" in capsys.readouterr().err
+    assert "the noise file states 3.46" in capsys.readouterr().err
 
 
 def test_a_prefilter_is_recorded_and_silly_ones_are_refused(

@@ -167,7 +167,7 @@ def test_a_problem_comes_back_with_its_code_and_remedy() -> None:
 
 def test_jobs_are_followed_to_their_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "sleep", lambda _: None)
-    job = {"id": "j1", "kind": "analysis", "progress": {"stage": "grow", "done": 1, "total": 4, "eta_s": 2.0}}
+    job = {"id": "j1", "kind": "analysis", "progress": {"phase": "grow", "done": 1, "total": 4, "eta_s": 2.0}}
     states = [{**job, "state": s} for s in ("queued", "running", "succeeded")]
     seen: list[str] = []
     with client_of(

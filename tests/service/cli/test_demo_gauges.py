@@ -49,7 +49,7 @@ def plate_field(pressure_kpa: float, noise_mm: float = 0.0) -> tuple[Field, Trut
     """The face of the bending plate, every point where the formulas put it, and its truth."""
     flat = field_of(lambda x, y: 0.0 * x, noise_mm=noise_mm)
     xy = flat.xyz_mm[..., :2]
-    current = CircularPlate().surface(pressure_kpa).place(xy)
+    current = CircularPlate().surface(pressure_kpa).positions(xy)
     uvw = current - flat.xyz_mm
     nothing = np.zeros((*flat.shape, 3))
     truth = Truth(xy, flat.xyz_mm, flat.normal_sys, uvw, np.broadcast_to(np.eye(3), (*flat.shape, 3, 3)), nothing)
@@ -164,7 +164,7 @@ def test_the_cracks_opening_is_read_over_it_and_missing_readings_stay_missing(tm
     kept = np.delete(found.found - found.true, 3, axis=1)
     np.testing.assert_allclose(kept, 0.001, atol=1e-12)
     np.testing.assert_allclose(found.parting, found.parting_true, atol=1e-12)
-    middle = len(found.place) // 2
+    middle = len(found.position) // 2
     np.testing.assert_allclose(
         found.lips[:, middle], [4 * panel.stress_mpa(q) * 50.8 / 73.1e3 for q in loads], rtol=1e-3
     )
@@ -232,12 +232,12 @@ def test_a_rigid_motions_truth_is_told_about_the_points_middle() -> None:
     np.testing.assert_allclose(one.found - one.true, [1e-6] * 3 + [-1e-4] * 3, rtol=1e-9)
     np.testing.assert_allclose(one.false_mean, 2.0)
     outcome = Outcome()
-    steel_motion.judge(outcome, [one], [strain])
+    steel_motion.add_checks(outcome, [one], [strain])
     assert all(check.passed for check in outcome.checks)
     stretched = dataclasses.replace(strain, strain=strain.strain + 3e-5)
     outcome = Outcome()
     far = dataclasses.replace(one, found=one.found + 1e-3, elongation_mm=np.array([5e-4]))
-    steel_motion.judge(outcome, [dataclasses.replace(far, false_mean=np.full(3, 30.0))], [stretched])
+    steel_motion.add_checks(outcome, [dataclasses.replace(far, false_mean=np.full(3, 30.0))], [stretched])
     assert [check.passed for check in outcome.checks] == [False, False, False, False, True]
 
 
@@ -282,14 +282,14 @@ def test_pictures_of_gauges_are_drawn_with_readings_missing(tmp_path: Path) -> N
         strains.append(strain)
         found.append(plate_strain.plate_strain(field, strain, comparison, q, plate, (0.0, 0.0)))
     outcome = Outcome()
-    plate_strain.judge(outcome, found, strains, pressures, plate, [(5e-4, 2e-5), (9.8e-4, 2e-5)])
+    plate_strain.add_checks(outcome, found, strains, pressures, plate, [(5e-4, 2e-5), (9.8e-4, 2e-5)])
     assert [check.passed for check in outcome.checks] == [True] * 5
     drawn = strain_pictures.plate(tmp_path, fields, strains, found, pressures, plate)
-    position = np.array([-1.35, -0.5, 0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.35])
+    positions = np.array([-1.35, -0.5, 0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.35])
     some = np.full((2, 9), 0.1)
     some[0, 3] = np.nan
-    drawn |= gauge_pictures.opening(tmp_path, Opening(position, *[some] * 7), [1.0, 2.0], 50.8)
-    line = Slice(np.zeros((9, 2)), 40.0 * position, some, some, some)
+    drawn |= gauge_pictures.opening(tmp_path, Opening(positions, *[some] * 7), [1.0, 2.0], 50.8)
+    line = Slice(np.zeros((9, 2)), 40.0 * positions, some, some, some)
     drawn |= gauge_pictures.buckle(tmp_path, line, line, [1.0, 2.0])
     motion = steel_motion.Moved("shifted", *[np.zeros(6)] * 4, 1.0, *[np.zeros(1)] * 2, *[np.zeros(3)] * 5, 1.0, {})
     drawn |= gauge_pictures.moved(tmp_path, fields, strains, [motion, motion])

@@ -251,7 +251,7 @@ def test_islands_have_no_strain():
     field = make_field(plane, lambda p: p @ F_SMALL.T)
     lost = np.ones(field.shape, bool)
     lost[10, :] = False
-    found = _strain(_without(field, lost), window=3, least_share=0.3)
+    found = _strain(_without(field, lost), window=3, min_share=0.3)
     assert set(np.unique(found.status)) == {StrainStatus.NO_POINT, StrainStatus.TOO_FEW, StrainStatus.ONE_SIDED}
     assert np.isnan(found.strain).all()
     assert np.isnan(found.gauge_mm)
@@ -268,8 +268,8 @@ def test_islands_have_no_strain():
         ({"window": 1}, "strain_window_invalid"),
         ({"order": 3}, "option_out_of_range"),
         ({"tensor": "almansi"}, "option_out_of_range"),
-        ({"least_share": 0.0}, "option_out_of_range"),
-        ({"most_amplification": 0.5}, "option_out_of_range"),
+        ({"min_share": 0.0}, "option_out_of_range"),
+        ({"max_amplification": 0.5}, "option_out_of_range"),
     ],
 )
 def test_refused_options(options, code):

@@ -12,7 +12,7 @@ import pytest
 from server.doctor.cameras import Watch
 from server.doctor.link import check_link, check_network, interface_of
 from server.doctor.report import Check, Notebook
-from server.rig.cameras import PairShot
+from server.rig.cameras import CapturedPair
 
 # /proc/net/route: addresses in hex as a little-endian machine stores them
 ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
@@ -63,7 +63,7 @@ def watched(mb_per_s: float, side: int = 512) -> Watch:
     seen = Watch(seconds=2.0)
     seen.link = {cam: {"transferred_bytes": 2.0e6 * mb_per_s} for cam in ("cam1", "cam2")}
     image = np.zeros((side, side), np.uint8)
-    seen.last = PairShot({"cam1": image, "cam2": image}, {"cam1": 8, "cam2": 8}, {}, 1, 1, 0.0, 0)
+    seen.last = CapturedPair({"cam1": image, "cam2": image}, {"cam1": 8, "cam2": 8}, {}, 1, 1, 0.0, 0)
     return seen
 
 

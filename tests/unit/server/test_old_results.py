@@ -12,10 +12,13 @@ import pytest
 
 from core.settings import AnalysisSettings
 from server.formats.results.reading import read_field, read_head, read_measured
-from server.formats.results.settings import current_summary, stored_settings
+from server.formats.results.settings import current_entries, current_summary, stored_settings
+from server.formats.results.strain import read_strain
+from server.report.records import TestRecord as ReportedTest
 from server.results.gauges.request import GaugeRequest, ThreeTwoOneAlignment
 from server.results.provenance import calibration_of
 from server.results.steps import read_step
+from server.store.documents import JobRecord, TestRecord
 from tests.support.requirements import ROOT
 
 OLD = ROOT / "tests" / "support" / "old_results"
@@ -88,3 +91,20 @@ def test_earlier_names_of_parameters_are_accepted() -> None:
     frame = GaugeRequest.model_validate(asked).align
     assert isinstance(frame, ThreeTwoOneAlignment)
     assert frame.positions_px[1] == (1.0, 0.0)
+
+
+def test_documents_of_the_store_are_read_by_their_earlier_names() -> None:
+    kept = json.loads((OLD / "store" / "test.json").read_text())
+    assert TestRecord.model_validate(kept).metadata == {"operator": "A. Smith", "cam1": {"lens": {"f_number": 8.0}}}
+    assert ReportedTest.model_validate(kept).metadata == kept["facts"]
+    job = JobRecord.model_validate_json((OLD / "store" / "job.json").read_text())
+    assert (job.progress.phase, job.progress.done) == ("step 4: done", 5000)
+    assert "stage" not in job.plain()["progress"]  # type: ignore[operator]
+
+
+def test_options_of_strain_are_read_by_their_earlier_names() -> None:
+    kept = {"least_share": 0.3, "most_amplification": 9.0, "window": 9, "tensor": "hencky"}
+    assert current_entries(kept) == {"min_share": 0.3, "max_amplification": 9.0, "window": 9, "tensor": "hencky"}
+    strain = read_strain(OLD / "updated" / "step_0003.nc")
+    assert strain is not None
+    assert (strain.options.min_share, strain.options.max_amplification) == (0.5, 12.0)

@@ -56,15 +56,15 @@ def test_a_record_keeps_settings_that_were_not_had_and_no_fact_that_nobody_told(
 
 
 def test_a_rig_that_is_not_open_yet_says_so() -> None:
-    from server.jobs.hardware import HardwareGate
+    from server.jobs.hardware import HardwareHold
     from server.rig import Rig
 
-    gate = HardwareGate()
-    rig = Rig(tiny_config(), gate)
+    hardware = HardwareHold()
+    rig = Rig(tiny_config(), hardware)
     try:
         shown = rig.describe().model_dump(exclude_unset=True)
     finally:
-        gate.close()
+        hardware.close()
     assert shown["connected"] is False
     assert shown["fault"]["code"] == shown["stage"]["fault"]["code"] == "not_connected"
     assert shown["fault"]["remedy"]

@@ -24,7 +24,7 @@ def balanced(account: dict[str, int]) -> bool:
 @pytest.mark.parametrize(("trigger", "rate_hz"), [("software", None), ("free", 25.0)])
 def test_a_capture_averages_whole_pairs(trigger: str, rate_hz: float | None) -> None:
     with rig_bench(trigger, rate_hz=rate_hz, max_skew_ms=25.0) as bench:  # type: ignore[arg-type]
-        shot = bench.pair.shoot(4)
+        shot = bench.pair.capture(4)
         assert shot.frames == 4
         assert shot.pixels["cam1"].dtype == np.uint16
         assert shot.pixels["cam2"].shape == (SIZE[1], SIZE[0])
@@ -34,10 +34,10 @@ def test_a_capture_averages_whole_pairs(trigger: str, rate_hz: float | None) -> 
 
 def test_in_free_run_a_capture_begins_after_it_was_asked_for() -> None:
     with rig_bench("free", rate_hz=25.0, max_skew_ms=25.0) as bench:
-        bench.pair.shoot(1)
+        bench.pair.capture(1)
         for _ in range(3):
             asked = time.monotonic_ns()
-            shot = bench.pair.shoot(1)
+            shot = bench.pair.capture(1)
             assert shot.host_ns > asked + 1e9 / 25.0
 
 
@@ -45,11 +45,11 @@ def test_in_free_run_a_capture_begins_after_it_was_asked_for() -> None:
 @pytest.mark.parametrize("cam", ["cam1", "cam2"])
 def test_a_dropped_frame_under_software_triggers_is_asked_for_again_and_counted(cam: str) -> None:
     with rig_bench() as bench:
-        bench.pair.shoot(1)
+        bench.pair.capture(1)
         bench.line.faults_of(cam).drop = 1
-        shot = bench.pair.shoot(1)
+        shot = bench.pair.capture(1)
         assert shot.skew_ms == 0.0
-        assert bench.pair.shoot(2).skew_ms == 0.0
+        assert bench.pair.capture(2).skew_ms == 0.0
         bench.pair.close()
         account = bench.pair.account()
         assert balanced(account)
@@ -60,9 +60,9 @@ def test_a_dropped_frame_under_software_triggers_is_asked_for_again_and_counted(
 @pytest.mark.fault(13)
 def test_a_trigger_that_neither_camera_answered_is_dropped() -> None:
     with rig_bench() as bench:
-        bench.pair.shoot(1)
+        bench.pair.capture(1)
         bench.line.faults_of("cam1").drop = bench.line.faults_of("cam2").drop = 1
-        bench.pair.shoot(1)
+        bench.pair.capture(1)
         bench.pair.close()
         account = bench.pair.account()
         assert balanced(account)
@@ -73,9 +73,9 @@ def test_a_trigger_that_neither_camera_answered_is_dropped() -> None:
 @pytest.mark.parametrize("by", ["time", "frame"])
 def test_a_dropped_frame_on_a_pulse_line_leaves_its_partner_unpaired(by: str) -> None:
     with rig_bench("hardware", rate_hz=25.0, by=by, max_skew_ms=1.0) as bench, bench.pulses(25.0):
-        bench.pair.shoot(3)
+        bench.pair.capture(3)
         bench.line.faults_of("cam2").drop = 1
-        assert bench.pair.shoot(8).skew_ms == 0.0
+        assert bench.pair.capture(8).skew_ms == 0.0
         bench.pair.close()
         account = bench.pair.account()
         assert balanced(account)
@@ -89,11 +89,11 @@ def test_a_camera_that_missed_a_pulse_never_gives_a_pair_of_two_pulses(by: str) 
     # a pulse that the camera did not see is no gap in its count: by number alone every later pair would be wrong
     with rig_bench("hardware", rate_hz=25.0, by=by, max_skew_ms=1000.0) as bench:
         with bench.pulses(25.0):
-            bench.pair.shoot(3)
+            bench.pair.capture(3)
         bench.line.pulse(missed_by="cam2")
         with bench.pulses(25.0):
             for _ in range(6):
-                assert bench.pair.shoot(1).skew_ms == 0.0
+                assert bench.pair.capture(1).skew_ms == 0.0
         bench.pair.close()
         assert balanced(bench.pair.account())
 
@@ -104,7 +104,7 @@ def test_pulses_that_come_when_they_like_are_waited_for() -> None:
         assert not bench.pair.lost()  # silence means nothing here
         timer = threading.Timer(0.3, bench.line.pulse)
         timer.start()
-        shot = bench.pair.shoot(1)
+        shot = bench.pair.capture(1)
         assert shot.skew_ms == 0.0
         timer.join()
 
@@ -112,7 +112,7 @@ def test_pulses_that_come_when_they_like_are_waited_for() -> None:
 def test_a_pulse_that_never_comes_is_named() -> None:
     with rig_bench("hardware", capture_timeout_s=0.3) as bench:
         with pytest.raises(CameraError) as caught:
-            bench.pair.shoot(1)
+            bench.pair.capture(1)
         assert caught.value.code == "no_frames"
 
 
@@ -121,20 +121,20 @@ def test_a_skew_that_moves_the_image_too_far_is_refused_with_both_figures() -> N
     with rig_bench(speed_px_s=20.0, skew_is_set=False) as bench:
         bench.line.faults_of("cam2").skew_ms = 2.0  # below the 5 ms of the rig, but 0.04 px
         with pytest.raises(CameraError) as caught:
-            bench.pair.shoot(4)
+            bench.pair.capture(4)
         assert caught.value.code == "skew_too_large"
         assert caught.value.context["skew_ms"] == pytest.approx(2.0)
         assert caught.value.context["image_speed_px_s"] == pytest.approx(20.0, rel=0.25)
         bench.world.speed_px_s = 0.0
-        bench.pair.shoot(4)
+        bench.pair.capture(4)
     with rig_bench(speed_px_s=20.0, skew_is_set=True) as bench:
         bench.line.faults_of("cam2").skew_ms = 2.0
-        assert bench.pair.shoot(4).image_speed_px_s == pytest.approx(20.0, rel=0.25)
+        assert bench.pair.capture(4).image_speed_px_s == pytest.approx(20.0, rel=0.25)
 
 
 def shoot_on(pair: CameraPair) -> None:
     while True:
-        pair.shoot(1)
+        pair.capture(1)
 
 
 @pytest.mark.fault(11)
@@ -148,7 +148,7 @@ def test_a_lost_camera_comes_back_with_its_settings(trigger: str, rate_hz: float
         watch.start()
         try:
             bench.pair.configure("cam2", CameraSettings(exposure_ms=7.0, gain_db=3.0))
-            bench.pair.shoot(1)
+            bench.pair.capture(1)
             setattr(bench.line.faults_of("cam2"), how, True)
             began = time.monotonic()
             with pytest.raises(CameraError) as caught:
@@ -166,7 +166,7 @@ def test_a_lost_camera_comes_back_with_its_settings(trigger: str, rate_hz: float
             while shot is None:  # one that was opened again while still silent is lost once more before it is back
                 seconds_until(lambda: not bench.pair.lost(), 3.0)
                 with contextlib.suppress(CameraError) if how == "silent" else contextlib.nullcontext():
-                    shot = bench.pair.shoot(1)
+                    shot = bench.pair.capture(1)
                 assert time.monotonic() - returned < 3.0
             assert set(shot.pixels) == {"cam1", "cam2"}
             settings = bench.units["cam2"].settings
@@ -201,7 +201,7 @@ def test_a_camera_that_comes_back_without_its_settings_is_not_used(monkeypatch: 
         assert caught.value.code == "settings_not_restored"
         assert "gain_db was 6.0" in caught.value.cause
         with pytest.raises(CameraError):
-            bench.pair.shoot(1)
+            bench.pair.capture(1)
 
 
 @pytest.mark.fault(17)

@@ -76,9 +76,9 @@ def test_plate_bends_as_equation_18_says() -> None:
     np.testing.assert_allclose(
         plate.deflection_mm(r, 275.6), 0.2756 * (13.385**2 - r**2) ** 2 / (64 * D), rtol=1e-12, atol=1e-15
     )
-    z = plate.surface(275.6).place(np.stack([r, 0 * r], -1))[:, 2]
+    z = plate.surface(275.6).positions(np.stack([r, 0 * r], -1))[:, 2]
     np.testing.assert_allclose(z, -plate.deflection_mm(r, 275.6), atol=1e-15)
-    assert (plate.surface(275.6).place([[14.0, 3.0]]) == [[14.0, 3.0, 0.0]]).all()
+    assert (plate.surface(275.6).positions([[14.0, 3.0]]) == [[14.0, 3.0, 0.0]]).all()
 
 
 @pytest.mark.parametrize("large", [False, True])
@@ -90,7 +90,7 @@ def test_the_plates_face_strains_as_its_places_move(large: bool) -> None:
         out, round_ = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
         at = r[:, None] * out
         # the metric of the face by differences of its positions
-        along = [(surface.place(at + h * d) - surface.place(at - h * d)) / (2 * h) for d in (out, round_)]
+        along = [(surface.positions(at + h * d) - surface.positions(at - h * d)) / (2 * h) for d in (out, round_)]
         radial, hoop = plate.face_strain(r, 551.2)
         np.testing.assert_allclose(radial, 0.5 * ((along[0] ** 2).sum(-1) - 1.0), atol=2e-9)
         np.testing.assert_allclose(hoop, 0.5 * ((along[1] ** 2).sum(-1) - 1.0), atol=2e-9)
@@ -112,7 +112,7 @@ def test_plate_stiffens_as_timoshenko_says() -> None:
     assert ratio == pytest.approx(1 - 0.012, abs=0.0015)  # EQUATIONS.md: membrane stiffening is near 1.2 %
     assert stiff.centre_deflection_mm(-689.0) == -stiff.centre_deflection_mm(689.0)
     # the held edge does not move
-    edge = stiff.surface(689.0).place([[13.385 * (1 - 1e-9), 0.0]])
+    edge = stiff.surface(689.0).positions([[13.385 * (1 - 1e-9), 0.0]])
     np.testing.assert_allclose(edge, [[13.385, 0.0, 0.0]], atol=1e-7)
 
 
@@ -120,7 +120,7 @@ def test_panel_opens_straightens_and_buckles() -> None:
     panel = CrackedPanel()
     x = np.linspace(-50, 50, 21)
     for load in PAPER_LOADS_KN:
-        lips = [panel.surface(load).place(np.stack([x, 0 * x], -1), lip) for lip in (1.0, -1.0)]
+        lips = [panel.surface(load).positions(np.stack([x, 0 * x], -1), lip) for lip in (1.0, -1.0)]
         opening = 4 * panel.stress_mpa(load) * np.sqrt(50.8**2 - x**2) / panel.youngs_modulus_mpa
         np.testing.assert_allclose(lips[0][:, 1] - lips[1][:, 1], opening, rtol=1e-9)
     # far away: uniaxial tension
@@ -129,13 +129,13 @@ def test_panel_opens_straightens_and_buckles() -> None:
     assert far[1, 1] - 1 == pytest.approx(strain, rel=1e-3)
     assert far[0, 0] - 1 == pytest.approx(-panel.poisson * strain, rel=2e-3)
     # at no load: the bow alone, no motion in the plane
-    at_rest = panel.surface(0.0).place([[20.0, 30.0]])[0]
+    at_rest = panel.surface(0.0).positions([[20.0, 30.0]])[0]
     np.testing.assert_allclose(at_rest[:2], [20.0, 30.0], atol=1e-12)
     assert panel.bow_at_mm(0.0) > 1.5 * panel.bow_at_mm(4.45) > 3 * panel.bow_at_mm(44.5)
     # buckling: next to nothing below its load, then growing
     assert panel.buckle_at_mm(4.45) < 0.05 < 0.5 < panel.buckle_at_mm(35.6) < panel.buckle_at_mm(48.95)
     y = np.linspace(2, 80, 79)
-    out = -panel.surface(48.95).place(np.stack([0 * y, y], -1))[:, 2]
+    out = -panel.surface(48.95).positions(np.stack([0 * y, y], -1))[:, 2]
     assert 15 < y[np.argmax(out)] < 40  # the crest is off the crack
 
 
@@ -148,7 +148,7 @@ def test_tangents_match_differences(name: str) -> None:
     h = 1e-5
     for axis in range(2):
         step = np.eye(2)[axis] * h
-        difference = (surface.place(st + step, lip) - surface.place(st - step, lip)) / (2 * h)
+        difference = (surface.positions(st + step, lip) - surface.positions(st - step, lip)) / (2 * h)
         np.testing.assert_allclose(surface.tangents(st, lip)[..., axis], difference, atol=1e-7)
 
 
@@ -160,7 +160,7 @@ def test_pixels_see_the_point_that_projects_onto_them(name: str) -> None:
         xy = pixels(rig)
         st, lip = material_points(scene, camera, xy)
         assert np.isfinite(st).all()
-        back = camera.project(scene.sys_from_body.apply(scene.surface.place(st, lip)))
+        back = camera.project(scene.sys_from_body.apply(scene.surface.positions(st, lip)))
         np.testing.assert_allclose(back.xy, xy, atol=1e-6)
 
 
@@ -229,7 +229,7 @@ def test_crack_shows_as_a_gap_that_grows() -> None:
     dark = []
     for load in (0.0, 4.45, 48.95):
         scene = make_scene(rig, "panel", load=load)
-        lips = scene.sys_from_body.apply(scene.surface.place([[0.0, 0.0], [0.0, 0.0]], [1.0, -1.0]))
+        lips = scene.sys_from_body.apply(scene.surface.positions([[0.0, 0.0], [0.0, 0.0]], [1.0, -1.0]))
         base = Camera.from_paper(**p)
         middle = base.project(lips).xy.mean(0)
         camera = Camera.from_paper(**{**p, "cx_px": p["cx_px"] + 30 - middle[0], "cy_px": p["cy_px"] + 30 - middle[1]})

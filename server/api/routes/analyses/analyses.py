@@ -85,7 +85,7 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
             job = service.jobs.document(str(job_id))
             state, problem = job.state, job.problem
         except NotFoundError:
-            job_id = None  # the catalogue was lost with its jobs; the files tell the rest
+            job_id = None  # the catalogue was lost with its jobs; the files hold the rest
     stale = analysis_start.stale_reasons(service, test_id, document)
     reply = {
         **document.shown(),

@@ -31,7 +31,7 @@ _POLL_S = 0.05
 
 @dataclass(frozen=True)
 class _Drawn:
-    """How figures and films look."""
+    """Style of figures and films."""
 
     style: FigureStyle
     over_image: bool
@@ -130,10 +130,10 @@ async def export(
             files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
         )
     names = None if variables is None else variables.split(",")
-    wish = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps)
+    export_request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
-        made = Path(await _made(request, service, files, wish, folder))
+        made = Path(await _made(request, service, files, export_request, folder))
         file = made.open("rb")
     finally:
         # the opened file stays until it is sent, whatever becomes of the client or the service
@@ -159,13 +159,15 @@ def _prepared(
     return files, {"X-Stale": "; ".join(stale)} if stale else {}
 
 
-async def _made(request: Request, service: Service, files: list[Path], wish: ExportRequest, folder: Path) -> str:
+async def _made(
+    request: Request, service: Service, files: list[Path], export_request: ExportRequest, folder: Path
+) -> str:
     service.require_room()
-    return str(await finished(request, service.exports.submit(files[0].parent, files, wish, folder)))
+    return str(await finished(request, service.exports.submit(files[0].parent, files, export_request, folder)))
 
 
 async def finished(request: Request, future: TaskFuture) -> Any:
-    """Wait for a task without holding anybody up; return its result. A client that goes away ends it."""
+    """Wait for a task without delaying other clients; return its result. A client that goes away ends it."""
     try:
         while not future.done():
             await asyncio.sleep(_POLL_S)

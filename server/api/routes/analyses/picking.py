@@ -17,7 +17,7 @@ from server.api.models import Region, Reply, Request
 from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
-from server.api.routes.analyses.looks import step_image
+from server.api.routes.analyses.previews import step_image
 from server.compute.seeds import distances_px, epipolar_line
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import decode_mask, read_image
@@ -30,7 +30,7 @@ router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 class TextureRequest(Request):
     """A region of camera 1's image, and the subsets that are to lie in it."""
 
-    region: Region = Field(description="Where points may lie.")
+    region: Region = Field(description="Region of interest.")
     subset_px: SubsetPx = SUBSET_PX.default
     spacing_px: SpacingPx = SPACING_PX.default
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
@@ -42,7 +42,7 @@ class TextureRequest(Request):
 
 
 class TextureSize(Reply):
-    """What subsets of another width would give."""
+    """Speckle quality with subsets of another width."""
 
     subset_px: int = Field(description="Width.", examples=[27])
     good_share: float = Field(description="Share of subsets with an expected error up to `good_px`.", examples=[0.97])
@@ -68,34 +68,34 @@ class TextureReply(Reply):
 
 
 class SeedsRequest(Request):
-    """Places of seeds."""
+    """Positions of seeds."""
 
     seeds: Annotated[list[tuple[Pixel, Pixel]], Field(min_length=1, max_length=100)] = Field(
-        description="Places in camera 1's reference image.", examples=[[[250, 240]]]
+        description="Positions in camera 1's reference image.", examples=[[[250, 240]]]
     )
     seeds_cam2: Annotated[list[tuple[Pixel, Pixel] | None], Field(max_length=100)] | None = Field(
-        None, description="The same points in camera 2's, where known: as many, null where not."
+        None, description="The same points in camera 2's image: as many, null where not known."
     )
     reference: Annotated[Whole, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
 
 
-class SeedPlace(Reply):
-    """Where camera 2 may see a seed."""
+class SeedPosition(Reply):
+    """Possible positions of a seed in camera 2."""
 
     line_px: list[list[float]] = Field(description="Points along the epipolar line in camera 2; empty: unseen there.")
-    distance_px: float | None = Field(None, description="Distance of the place in camera 2 from that line.")
+    distance_px: float | None = Field(None, description="Distance of the position in camera 2 from that line.")
 
 
 class SeedsReply(Reply):
     """Epipolar check of the seeds."""
 
-    seeds: list[SeedPlace] = Field(description="One each.")
+    seeds: list[SeedPosition] = Field(description="One each.")
 
 
 @router.post(
     "/steps/{n}/texture", summary="Speckle quality of a region for a subset size", responses=errors(404, 409, 422)
 )
-def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
+def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
     """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""
     if body.subset_px % 2 == 0:
         raise InputError(
@@ -118,15 +118,15 @@ def judge_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Tex
     )
 
 
-@router.post("/seeds:check", summary="Where camera 2 may see a seed", responses=errors(404, 409, 422))
-def check_seed_places(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> SeedsReply:
-    """Return each seed's epipolar line in camera 2, and how far the place named there lies from it."""
+@router.post("/seeds:check", summary="Possible positions of seeds in camera 2", responses=errors(404, 409, 422))
+def check_seeds(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> SeedsReply:
+    """Return each seed's epipolar line in camera 2, and the distance of the position given there from it."""
     two = [None] * len(body.seeds) if body.seeds_cam2 is None else body.seeds_cam2
     if len(two) != len(body.seeds):
         raise InputError(
-            f"There are {len(body.seeds)} seeds, but {len(two)} places in camera 2.",
+            f"There are {len(body.seeds)} seeds, but {len(two)} positions in camera 2.",
             code="seeds_do_not_match",
-            remedy="Give as many, null where a place is not known.",
+            remedy="Give as many, null where a position is not known.",
         )
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
     rows, cols = read_image(service.tests.step(test_id, body.reference).cam2).shape

@@ -34,7 +34,7 @@ router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["resu
 async def get_report(request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> Response:
     """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
 
-    What no device knows comes from `PUT /tests/{test_id}/facts`; what is not stated is listed as such.
+    What no device reports comes from `PUT /tests/{test_id}/metadata`; what is not stated is listed as such.
     """
     results, stale = await run_in_threadpool(_prepared, service, test_id, analysis_id)
     service.require_room()

@@ -107,9 +107,10 @@ def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n
     )
 
 
+@router.get("/steps/{n}/places/{cam}", include_in_schema=False, response_model=FieldReply)  # its earlier address
 @router.get(
-    "/steps/{n}/places/{cam}",
-    summary="Where the points lie in a step's image",
+    "/steps/{n}/positions/{cam}",
+    summary="Positions of the points in a step's image",
     response_model=FieldReply,
     responses=errors(404, 409, 422) | {200: {"content": {"application/x-npy": {}}}},
 )
@@ -123,18 +124,18 @@ def get_positions(
 ) -> Response:
     """Return column and row of each point, where it is at that step, by the calibration; null where it has none."""
     result = service.tests.result_file(test_id, analysis_id, n)
-    places = image_positions(result, service.tests.calibration_file(test_id), cam)
+    positions = image_positions(result, service.tests.calibration_file(test_id), cam)
     if format == "npy":
         buffer = io.BytesIO()
-        np.save(buffer, places, allow_pickle=False)
+        np.save(buffer, positions, allow_pickle=False)
         return Response(buffer.getvalue(), media_type="application/x-npy", headers={"X-Units": "pixel"})
     return _json(
         {
             "name": cam,
             "units": "pixel",
             "long_name": f"column and row of the point in {cam}'s image of step {n}",
-            "shape": list(places.shape),
-            "values": nested(places),
+            "shape": list(positions.shape),
+            "values": nested(positions),
         }
     )
 

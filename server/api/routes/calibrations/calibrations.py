@@ -156,7 +156,7 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> Residua
         complete(service, calibration_id)
     path /= "residuals.nc"
     if not path.is_file():
-        raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", what="residuals")
+        raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", kind="residuals")
     return ResidualsReply.model_validate({"views": [asdict(view) for view in read_residuals(path)]})
 
 

@@ -63,7 +63,7 @@ def export_calibration(service: ServiceDep, calibration_id: CalibrationId, forma
 
 
 @router.get(
-    "/export/report", summary="What a calibration loses in another program's form", responses=errors(404, 409, 422)
+    "/export/report", summary="Losses of a calibration in another program's form", responses=errors(404, 409, 422)
 )
 def report_conversion(service: ServiceDep, calibration_id: CalibrationId, format: Form) -> ConversionReply:  # noqa: A002
     """Return the residual of each lens' fit, and what the written file makes of points that both cameras see."""

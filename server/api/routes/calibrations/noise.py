@@ -42,7 +42,7 @@ def list_noise(service: ServiceDep, page: PageDep) -> NoiseList:
     """Return every noise measurement that was begun, with its state."""
     found = []
     for noise_id in page.of(service.noise.ids(), str):
-        with contextlib.suppress(FileFormatError):  # what is damaged says so when it is asked for
+        with contextlib.suppress(FileFormatError):  # a damaged one is reported when it is read
             found.append(_shown(service.noise.read(noise_id)))
     return NoiseList.model_validate({"noise": found, "next_cursor": page.next_cursor})
 

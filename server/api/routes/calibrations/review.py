@@ -15,7 +15,7 @@ from server.workflows.calibration_sequence import CalibrationPlan
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 
-@router.post(":expect", summary="What a plan may be expected to leave uncertain", responses=errors(409, 422, 503))
+@router.post(":expect", summary="Expected uncertainty of a plan", responses=errors(409, 422, 503))
 def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> ExpectReply:
     """Predict each parameter's standard deviation, and what they do to points; nothing moves, nothing is kept.
 

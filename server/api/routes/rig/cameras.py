@@ -73,7 +73,7 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
 )
 def put_scene(service: ServiceDep, body: SceneRequest) -> SceneReply:
     """Put the grid, a plate, a panel ... before the cameras; only on simulated rigs."""
-    with service.gate.hold("a change of the scene"):
+    with service.hardware.hold("a change of the scene"):
         scene = service.rig.set_scene(body.scene, load=body.load, params=body.params)
     service.hub.publish("scene", scene.model_dump())
     return scene
@@ -96,7 +96,7 @@ def patch_camera(
     service: ServiceDep, cam: Camera, body: SettingsPatch, response: Response, if_match: IfMatch = None
 ) -> CameraSet:
     """Set what is given; the answer holds every setting as read back. If-Match refuses if others changed them."""
-    with service.gate.hold(f"new settings of {cam}"):
+    with service.hardware.hold(f"new settings of {cam}"):
         require_match(if_match, etag_of(service.rig.describe_camera(cam)), f"the settings of {cam}", required=False)
         taken = service.rig.configure(cam, CameraSettings(**body.model_dump()))
         response.headers["ETag"] = etag_of(service.rig.describe_camera(cam))
@@ -190,7 +190,7 @@ async def get_stream(
                 except StereorigError as error:
                     if error.code == "camera_busy":  # a capture goes on, and nothing older is there to show
                         continue
-                    return  # the stream ends; GET /rig says why
+                    return  # the stream ends; GET /rig gives the reason
                 # by a timetable, since pauses are each a little too long; where there is no frame yet, it is not waited
                 # for a whole period, which would halve the rate
                 due += (0.25 if data is None else 1.0) / rate_hz

@@ -1,4 +1,4 @@
-"""What is connected to the machine that the service runs on."""
+"""Devices connected to the machine that the service runs on."""
 
 from __future__ import annotations
 

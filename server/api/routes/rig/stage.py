@@ -121,8 +121,12 @@ def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> 
     return str(made["job_id"])
 
 
-def _motion(service: Service, sent: RequestMark, kind: str, what: str, subject: Mapping[str, object], run: Run) -> str:
-    job = service.jobs.submit(kind, what, subject, [Phase("hardware", run)], on_cancel=service.stop_job, request=sent)
+def _motion(
+    service: Service, sent: RequestMark, kind: str, purpose: str, subject: Mapping[str, object], run: Run
+) -> str:
+    job = service.jobs.submit(
+        kind, purpose, subject, [Phase("hardware", run)], on_cancel=service.stop_job, request=sent
+    )
     return job.id
 
 
@@ -171,8 +175,8 @@ def disable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
 def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> StageReply:
     axes = tuple(body.axes) if body is not None and body.axes else service.config.axes
     service.rig.check_axes(axes)
-    with service.gate.hold(f"the switching of motors {list(axes)}"):
-        service.gate.call(lambda: service.rig.controls.switch(axes, on=on))
+    with service.hardware.hold(f"the switching of motors {list(axes)}"):
+        service.hardware.call(lambda: service.rig.controls.switch(axes, on=on))
     return service.rig.describe_stage()
 
 
@@ -193,11 +197,11 @@ def patch_axis(
     """
     controls = service.rig.controls
     service.rig.check_axes((axis,))
-    with service.gate.hold(f"a new velocity of axis {axis}"):
+    with service.hardware.hold(f"a new velocity of axis {axis}"):
         if if_match is not None:
-            now = etag_of(service.gate.call(lambda: controls.read_dynamics(axis)))
+            now = etag_of(service.hardware.call(lambda: controls.read_dynamics(axis)))
             require_match(if_match, now, f"axis {axis}")
-        taken = service.gate.call(lambda: controls.set_dynamics(axis, body.velocity_mm_s, body.acceleration_mm_s2))
+        taken = service.hardware.call(lambda: controls.set_dynamics(axis, body.velocity_mm_s, body.acceleration_mm_s2))
         return tagged(response, taken)
 
 
@@ -217,15 +221,15 @@ def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsen
 
     def make() -> Ids:
         service.rig.check_axes((axis,))
-        what = f"the leaving of the configuration state of axis {axis}"
-        return {"job_id": _motion(service, request, "leave_configuration", what, {"axis": axis}, run)}
+        purpose = f"the leaving of the configuration state of axis {axis}"
+        return {"job_id": _motion(service, request, "leave_configuration", purpose, {"axis": axis}, run)}
 
     request = mark(f"leave-configuration/{axis}", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return Accepted.model_validate({"job": service.jobs.document(str(made["job_id"])).plain()})
 
 
-@router.get("/messages", summary="What the controller had to say")
+@router.get("/messages", summary="Messages of the controller")
 def get_messages(service: ServiceDep) -> StageMessages:
     """Empty the controller's error queue and return the last 200 messages with their texts; reading loses none."""
     return StageMessages(messages=service.rig.controls.messages())

@@ -92,7 +92,7 @@ async def job_events(
 
 
 def _of_job(event: Event, job_id: str) -> bool:
-    """Return True if an event is the job's own, or tells what it made."""
+    """Return True if an event is the job's own, or names what it made."""
     return bool(event.data.get("id" if event.name == "job" else "job_id") == job_id)
 
 

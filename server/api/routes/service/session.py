@@ -15,13 +15,13 @@ router = APIRouter(tags=["access"])
 
 
 class PersonReply(BaseModel):
-    """Who asks."""
+    """User of a session."""
 
     name: str = Field(description="Name of the key; `local` where none is asked for.", examples=["lab-page"])
-    role: Role = Field(description="What they may do.")
+    role: Role = Field(description="Role, which sets the rights.")
 
 
-@router.get("/session", summary="Who am I?", response_model=PersonReply, responses=errors(401))
+@router.get("/session", summary="User of this session", response_model=PersonReply, responses=errors(401))
 def get_session(request: Request) -> object:
     """Return the name and role that the key or the cookie belongs to."""
     person = request.state.person

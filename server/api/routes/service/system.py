@@ -31,7 +31,7 @@ class ReadyReply(BaseModel):
 
 
 class HealthReply(BaseModel):
-    """What is well, and what is not."""
+    """State of the service's parts."""
 
     status: Literal["ok"] = Field(description="The service answers.")
     version: str = Field(description="Version of the program.")
@@ -44,7 +44,7 @@ class HealthReply(BaseModel):
 
 @router.get("/healthz", summary="Liveness")
 def healthz(service: ServiceDep) -> HealthReply:
-    """Answer quickly, whatever else is going on; says what is not well."""
+    """Answer quickly, whatever else is going on, with the parts that are not well."""
     return HealthReply.model_validate(
         {
             "status": "ok",
@@ -66,7 +66,7 @@ def readyz(service: ServiceDep) -> object:
         503,
         "not_ready",
         " ".join(reason["cause"] for reason in reasons),
-        "Wait where something is starting; else see what GET /rig says, and the room on the disk.",
+        "Wait where something is starting; else see GET /rig, and the room on the disk.",
         headers={"Retry-After": str(RETRY_AFTER_S)},
         ready=False,
         reasons=reasons,

@@ -125,8 +125,8 @@ async def create_step(
     return await run_in_threadpool(_capture, service, test_id, body, key)
 
 
-def step_facts(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepMetadata:
-    """What the client said of a step, as its document keeps it."""
+def step_metadata(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepMetadata:
+    """Metadata of a step as the client states them, in the form its document keeps."""
     stamp = None if body.timestamp_utc is None else utc_text(body.timestamp_utc)
     said = {"label": body.label, "load_n": body.load_n, "timestamp_utc": stamp, "channels": body.channels}
     return StepMetadata.model_validate({**said, **sent.document()})
@@ -137,7 +137,7 @@ def _capture(service: Service, test_id: str, body: StepRequest, key: str | None)
     sent = mark(f"tests/{test_id}/steps", key, body)
 
     def make() -> Ids:
-        return {"n": capture_step(service, test_id, step_facts(body, sent), frames=body.frames).n}
+        return {"n": capture_step(service, test_id, step_metadata(body, sent), frames=body.frames).n}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
     return StepReply.model_validate(step_reply(service, test_id, int(made["n"])))
@@ -151,7 +151,7 @@ def _start_burst(service: Service, test_id: str, body: StepRequest, key: str | N
         job_id = start_burst(
             service,
             test_id,
-            step_facts(body, sent),
+            step_metadata(body, sent),
             count=body.count,
             interval_ms=body.interval_ms,
             frames=body.frames,
@@ -169,9 +169,9 @@ def _readings(text: str | None) -> dict[str, float] | None:
         return None if text is None else _CHANNELS.validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        location = ".".join(str(part) for part in first["loc"])
         raise InputError(
-            f"channels{place and '.'}{place}: {first['msg']}.",
+            f"channels{location and '.'}{location}: {first['msg']}.",
             code="channels_unreadable",
             remedy='Send a JSON object of numbers, as in {"stroke_mm": 0.42}.',
         ) from error

@@ -56,7 +56,7 @@ def delete_noise(service: ServiceDep, request: Request, noise_id: NoiseId) -> Tr
     return _delete(service, request, "noise", noise_id=noise_id)
 
 
-@router.get("/trash", summary="What was deleted, oldest first", responses=errors(422))
+@router.get("/trash", summary="Contents of the trash, oldest first", responses=errors(422))
 def list_trash(service: ServiceDep, page: PageDep) -> TrashList:
     """Return what lies in the trash, with the room that it takes."""
     trash = page.of(sorted(service.trash.entries(), key=lambda entry: entry.id), lambda entry: entry.id)

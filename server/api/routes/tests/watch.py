@@ -11,7 +11,7 @@ from server.api.models import ReadingReply, ReadingRequest, WatchReply, WatchReq
 from server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.problems import errors
-from server.api.routes.tests.tests import step_facts
+from server.api.routes.tests.tests import step_metadata
 from server.base.models import Ids
 from server.store.documents import WatchRecord
 from server.workflows.watch import Watches
@@ -54,7 +54,7 @@ def put_watch(
     return WatchReply.model_validate(tagged(response, watches.begin(test_id, body.model_dump(), allow).plain()))
 
 
-@router.get("/watch", summary="What is watched", responses=errors(404))
+@router.get("/watch", summary="The watch on a channel", responses=errors(404))
 def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> WatchReply:
     """Return channel and threshold, and the value that the next reading is compared with; ETag names this state."""
     return WatchReply.model_validate(tagged(response, watches.read(test_id).plain()))
@@ -88,7 +88,7 @@ def post_channels(
     sent = mark(f"tests/{test_id}/channels", key, body)
 
     def make() -> Ids:
-        outcome = watches.reading(test_id, step_facts(body, sent))
+        outcome = watches.reading(test_id, step_metadata(body, sent))
         values = {"n": outcome.n, "reason": outcome.reason, "value": outcome.value, "last_value": outcome.last_value}
         return {name: value for name, value in values.items() if value is not None}
 

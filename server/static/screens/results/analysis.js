@@ -164,7 +164,7 @@ export class Result {
    */
   positions(n, cam) {
     return this.#keep(`${n}/${cam}`, async () => {
-      const got = await api.npy(`${this.path}/steps/${n}/places/${cam}`, { format: "npy" });
+      const got = await api.npy(`${this.path}/steps/${n}/positions/${cam}`, { format: "npy" });
       return { ...got, bytes: got.data.byteLength };
     });
   }

@@ -26,7 +26,7 @@ export function metadataPanel(id) {
 
   async function load() {
     try {
-      const { value, etag } = await api.getTagged(`/tests/${id}/facts`);
+      const { value, etag } = await api.getTagged(`/tests/${id}/metadata`);
       draw(value, etag);
     } catch (error) {
       replace(body, problemText(error));
@@ -74,7 +74,7 @@ export function metadataPanel(id) {
       const steps = still.value.split(/[\s,;]+/).filter(Boolean).map(Number);
       if (steps.length) out.static_steps = steps;
       if (notes.value.trim()) out.notes = notes.value;
-      await api.put(`/tests/${id}/facts`, /** @type {Metadata} */ (out), etag === null ? {} : { "If-Match": etag });
+      await api.put(`/tests/${id}/metadata`, /** @type {Metadata} */ (out), etag === null ? {} : { "If-Match": etag });
       notify("The metadata are saved.", "good");
       await load();
     }, { kind: "primary" });

@@ -17,8 +17,8 @@ from server.formats.images import GrayImage, read_image
 from server.results.previews import MapKind, overlay, preview
 from server.workflows.service import Service
 
-router = APIRouter(tags=["looks"])
-Kind = Annotated[MapKind, Path(description="What the map shows.")]
+router = APIRouter(tags=["previews"])
+Kind = Annotated[MapKind, Path(description="Kind of map.")]
 Index = Annotated[int, Path(ge=0, le=9999, description="Number of the position.")]
 Subset = Annotated[
     int,
@@ -117,8 +117,8 @@ def get_step_pixels(
     cam: Camera,
     x_px: Annotated[int, Query(ge=0, le=32767, description="First column.")],
     y_px: Annotated[int, Query(ge=0, le=32767, description="First row.")],
-    columns: Annotated[int, Query(ge=1, le=256, description="How many; fewer come where the image ends.")] = 1,
-    rows: Annotated[int, Query(ge=1, le=256, description="How many; fewer come where the image ends.")] = 1,
+    columns: Annotated[int, Query(ge=1, le=256, description="Number of them; fewer come where the image ends.")] = 1,
+    rows: Annotated[int, Query(ge=1, le=256, description="Number of them; fewer come where the image ends.")] = 1,
 ) -> PixelsReply:
     """Return them to the bit, however the image is looked at."""
     pixels, full_scale = step_image(service, test_id, n, cam)

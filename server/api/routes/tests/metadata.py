@@ -12,18 +12,20 @@ from server.api.protocol.dependencies import ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.results.metadata import TestMetadata
 
-router = APIRouter(prefix="/tests/{test_id}/facts", tags=["tests"])
+router = APIRouter(prefix="/tests/{test_id}", tags=["tests"])
 
 
-@router.get("", summary="Metadata of a test", response_model_exclude_none=True, responses=errors(404))
+@router.get("/facts", include_in_schema=False, response_model_exclude_none=True)  # its earlier address
+@router.get("/metadata", summary="Metadata of a test", response_model_exclude_none=True, responses=errors(404))
 def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> TestMetadata:
-    """Return the facts, empty where nothing was stated; the header ETag names this state of them."""
+    """Return the metadata, empty where nothing was stated; the header ETag names this state of them."""
     return TestMetadata.model_validate(tagged(response, service.tests.metadata(test_id)))
 
 
+@router.put("/facts", include_in_schema=False, response_model_exclude_none=True)  # its earlier address
 @router.put(
-    "",
-    summary="Tell what no device can say about a test",
+    "/metadata",
+    summary="State the metadata of a test",
     response_model_exclude_none=True,
     responses=errors(404, 412, 422, 507),
 )
@@ -36,13 +38,13 @@ def put_metadata(
         str | None, Header(max_length=200, description="ETag of the state that is replaced; another one is refused.")
     ] = None,
 ) -> TestMetadata:
-    """Replace all facts of the test: lens, light, pattern, specimen, static steps and the like; a report shows them."""
+    """Replace a test's metadata: lens, light, pattern, specimen, static steps and the like; a report shows them."""
     expected = None
     if if_match is not None and if_match.strip() != "*":
         expected = service.tests.metadata(test_id)
         if etag_of(expected) not in [tag.strip() for tag in if_match.split(",")]:
             raise StateError(
-                f"The facts of test {test_id} are not those that If-Match names.",
+                f"The metadata of test {test_id} are not those that If-Match names.",
                 code="metadata_changed",
                 remedy="Read them again, then send the change.",
                 etag=etag_of(expected),

@@ -1,4 +1,4 @@
-"""Metadata of a test: kept, replaced as a whole, guarded by If-Match; and those of camera and lens in the rig file."""
+"""Metadata of a test: kept, replaced as a whole, guarded by If-Match; metadata of camera and lens in the rig file."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ METADATA = {
 }
 
 
-def test_facts_are_kept_in_the_tests_own_folder(client: httpx.Client, service: Service) -> None:
+def test_metadata_are_kept_in_the_tests_own_folder(client: httpx.Client, service: Service) -> None:
     test_id = new_test(client)
-    url = f"{API}/tests/{test_id}/facts"
+    url = f"{API}/tests/{test_id}/metadata"
     empty = client.get(url)
     assert (empty.status_code, empty.json()) == (200, {})
     put = client.put(url, json=METADATA)
@@ -38,7 +38,14 @@ def test_facts_are_kept_in_the_tests_own_folder(client: httpx.Client, service: S
     assert again.json() == put.json()
     assert again.headers["etag"] == put.headers["etag"] != empty.headers["etag"]
     document = json.loads((service.tests.path(test_id) / "test.json").read_text())
-    assert document["facts"]["operator"] == "Jörg <b>"
+    assert document["metadata"]["operator"] == "Jörg <b>"
+    # an earlier version's document and address
+    document["facts"] = document.pop("metadata")
+    (service.tests.path(test_id) / "test.json").write_text(json.dumps(document))
+    assert client.get(f"{API}/tests/{test_id}/facts").json() == again.json()
+    earlier = {"If-Match": again.headers["etag"]}
+    assert client.put(f"{API}/tests/{test_id}/facts", json=METADATA, headers=earlier).json() == again.json()
+    assert json.loads((service.tests.path(test_id) / "test.json").read_text()).keys().isdisjoint({"facts"})
     assert verify(service.folder.root).sound
     # the test's other fields are changed apart from them
     assert client.patch(f"{API}/tests/{test_id}", json={"notes": "n"}, headers={"If-Match": "*"}).status_code == 200
@@ -46,7 +53,7 @@ def test_facts_are_kept_in_the_tests_own_folder(client: httpx.Client, service: S
 
 
 def test_a_change_of_another_state_is_refused(client: httpx.Client) -> None:
-    url = f"{API}/tests/{new_test(client)}/facts"
+    url = f"{API}/tests/{new_test(client)}/metadata"
     first = client.get(url).headers["etag"]
     assert client.put(url, json={"operator": "a"}, headers={"If-Match": first}).status_code == 200
     refused = client.put(url, json={"operator": "b"}, headers={"If-Match": first})
@@ -76,15 +83,15 @@ def test_a_change_of_another_state_is_refused(client: httpx.Client) -> None:
         [],
     ],
 )
-def test_facts_that_cannot_be_are_refused(client: httpx.Client, body: object) -> None:
-    answer = client.put(f"{API}/tests/{new_test(client)}/facts", json=body)
+def test_metadata_that_cannot_be_are_refused(client: httpx.Client, body: object) -> None:
+    answer = client.put(f"{API}/tests/{new_test(client)}/metadata", json=body)
     assert answer.status_code == 422, answer.text
     assert answer.json()["code"] == "invalid_request"
 
 
 def test_no_facts_of_no_test(client: httpx.Client) -> None:
-    assert client.get(f"{API}/tests/t000099-000000/facts").status_code == 404
-    assert client.put(f"{API}/tests/t000099-000000/facts", json={}).status_code == 404
+    assert client.get(f"{API}/tests/t000099-000000/metadata").status_code == 404
+    assert client.put(f"{API}/tests/t000099-000000/metadata", json={}).status_code == 404
 
 
 def test_a_file_of_facts(tmp_path: Path) -> None:
