@@ -181,7 +181,7 @@ class CameraDescription(CameraIdentity):
     gain_range_db: Annotated[Range | None, Field(description="Least and greatest gain.")]
     frame_rate_range_hz: Annotated[Range | None, Field(description="Lowest and highest rate of a free run.")]
     driver: Annotated[str, Field(description="Driver that reaches it.", examples=["aravis"])]
-    firmware: Annotated[str, Field(description="Firmware; empty where it does not tell.")] = ""
+    firmware: Annotated[str, Field(description="Firmware; empty where it does not report it.")] = ""
     latency_s: Annotated[float, Field(description="What a frame may take beyond its period before it arrives.")] = 0.0
     clock: Annotated[
         str, Field(description="Clock of its times; two cameras' may be compared where both name the same one.")

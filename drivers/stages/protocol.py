@@ -73,7 +73,7 @@ class AxisIdentity:
 
     axis: Annotated[int, Field(description="Axis number.")]
     model: Annotated[str, Field(description="Model of the actuator.")]
-    serial: Annotated[str, Field(description="Serial number; empty where it does not tell.")] = ""
+    serial: Annotated[str, Field(description="Serial number; empty where it does not report it.")] = ""
     units: Annotated[str, Field(description="Unit of the controller's own numbers.")] = "mm"
 
 
@@ -106,11 +106,11 @@ class AxisDynamics:
     velocity_mm_s: Annotated[float, Field(description="Velocity of moves.")]
     acceleration_mm_s2: Annotated[float, Field(description="Acceleration of moves.")]
     max_velocity_mm_s: Annotated[
-        float | None, Field(description="The greatest; null where the controller does not tell.")
+        float | None, Field(description="The greatest; null where the controller does not report it.")
     ] = None
-    max_acceleration_mm_s2: Annotated[float | None, Field(description="The greatest; null where it does not tell.")] = (
-        None
-    )
+    max_acceleration_mm_s2: Annotated[
+        float | None, Field(description="The greatest; null where it does not report it.")
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "noise": ("server.cli.measurement.noise", "measure the cameras' noise from repeated frames"),
     "measure": ("server.cli.measurement.measure", "measure shape and displacement from image files"),
     "report": ("server.cli.measurement.report", "write a report of results: one HTML file that a lab can file"),
-    "verify": ("server.cli.operation.verify", "look through a data folder: damage, leftovers, checksums"),
+    "verify": ("server.cli.operation.verify", "check a data folder: damage, leftovers, checksums"),
     "repair": ("server.cli.operation.repair", "put a data folder in order after a crash"),
     "trash": ("server.cli.operation.trash", "what was deleted: list, restore, remove for good"),
     "gauge": ("server.cli.measurement.gauge", "read extensometers, lines and areas off measured results"),

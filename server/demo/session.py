@@ -119,7 +119,7 @@ class Session:
 
 
 def pixels_of(result: Field) -> NDArray[np.float64]:
-    """Return the points' places (r, c, 2) in camera 1's reference image."""
+    """Return the points' positions (r, c, 2) in camera 1's reference image."""
     return np.stack([result.x_px, result.y_px], axis=-1)
 
 

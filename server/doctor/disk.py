@@ -20,7 +20,7 @@ _MIB = 2**20
 
 
 def check_disk(book: Notebook, root: Path, *, image_bytes: int, pairs_per_s: float | None) -> None:
-    """Write images as the service does (aside, fsync, rename, fsync of the folder) and look at the room left.
+    """Write images as the service does (temporary file, fsync, rename, fsync of the folder) and check the room left.
 
     Parameters
     ----------

@@ -117,7 +117,7 @@ def _check_interface(
         limit=None if load is None else f"{100 * _LOAD:.0f} %",
         remedy="Give each camera a link of its own, or lower rate, region or bit depth."
         if crowded
-        else f"Switch jumbo frames on: ip link set {name} mtu 9000 (cameras and switch must know them too).",
+        else f"Switch jumbo frames on: ip link set {name} mtu 9000 (cameras and switch must support them too).",
         mib_per_s=mib_per_s,
         load=load,
         mtu=mtu,

@@ -15,7 +15,7 @@ State = Literal["ok", "warning", "failed", "not checked"]
 
 
 class Check(BaseModel):
-    """One thing that was looked at."""
+    """One check."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -31,7 +31,7 @@ class Check(BaseModel):
 
 
 class Report(BaseModel):
-    """Everything that was looked at."""
+    """All checks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -102,9 +102,9 @@ def _check_drivers(book: Notebook, config: RigConfig) -> None:
                 driver.problem or f"sees {driver.found} cameras",
                 remedy=driver.remedy,
             )
-    looked = {driver.name for driver in listing.drivers if driver.state == "ok"}
+    searched = {driver.name for driver in listing.drivers if driver.state == "ok"}
     for cam in CAMERAS:
-        if config.camera(cam).driver in looked:
+        if config.camera(cam).driver in searched:
             _check_found(book, cam, config, listing)
 
 

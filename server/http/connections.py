@@ -83,7 +83,7 @@ class Connections:
             return True
         others = [c for c in connections if isinstance(c, LimitedProtocol) and c is not newcomer and not c.ending]
         idle = [c for c in others if not c.busy]
-        # what only looks gives way to what works
+        # views give way to requests that change something
         weakest = idle or [c for c in others if c.is_live_view]
         if weakest:
             min(weakest, key=lambda c: c.since).end("too_many")

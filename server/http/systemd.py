@@ -15,7 +15,7 @@ class Notifier:
     Parameters
     ----------
     environment
-        Where ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are looked up.
+        Variables among which ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are read.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:

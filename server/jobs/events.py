@@ -74,7 +74,7 @@ class EventHub:
         """Events still kept that are newer than ``number``, oldest first, at most so many."""
         with self._lock:
             kept = len(self._ring)
-            # their numbers follow one another: the place of each is known
+            # their numbers are consecutive, which gives the index of each
             first = 0 if kept == 0 else max(number + 1 - self._ring[0].number, 0)
             last = kept if limit is None else min(first + limit, kept)
             return [self._ring[index] for index in range(first, last)]

@@ -252,7 +252,7 @@ class JobManager:
                 self._wake.notify()
 
     def _park(self, job: Job) -> bool:
-        """Set a job aside until it is woken; False where it was woken or is to end, and should go on."""
+        """Suspend a job until it is woken; False where it was woken or is to end, and should go on."""
         with self._wake:
             if job.woken.is_set() or job.cancelled or self._closing:
                 return False
@@ -284,7 +284,7 @@ class JobManager:
         self._end(job, "interrupted", RESTART)
 
     def _run_hardware(self, job: Job, token: object) -> None:
-        # who sees that it has ended may begin something else at once
+        # a client that reads of its end may begin something else at once
         job.let_go = lambda: self._hardware.release(token)
         try:
             with about(job_id=job.id):

@@ -23,7 +23,7 @@ from drivers.cameras.protocol import CameraSettings, Frame, Pixels
 from server.config.rig_file import SKEW_PX
 from server.rig.image_speed import ImageMotion, image_motion
 
-#: where there is nothing older to show, a look waits this long behind another one or a capture
+#: where there is nothing older to show, a live view waits this long behind another one or a capture
 _FIRST_FRAME_S = 5.0
 _STALE_DURING_CAPTURE_S = 0.5
 
@@ -179,7 +179,7 @@ class CameraPair:
         """Return a frame for looking at, at most ``max_age_s`` old where recording allows it.
 
         ``after`` is the number of the frame that the caller has: it is given another one, unless a capture goes on or
-        the camera made none since. Those who look at the same time share a frame.
+        the camera made none since. Views at the same time share a frame.
         """
         unit = self.units[cam]
         frame = unit.latest

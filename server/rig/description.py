@@ -124,7 +124,7 @@ class SceneReply(Reply):
 
 
 class RigReply(Reply):
-    """Everything that a client wants to know before it does anything."""
+    """State of the rig, its target, cameras and stage."""
 
     name: str = Field(description="Name of the rig.")
     description: str = Field(description="Free text of the rig file.")

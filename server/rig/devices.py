@@ -43,7 +43,7 @@ class ListedDevice(_Closed, FoundDevice):
 class DriverState(_Closed):
     """Outcome of one driver's search."""
 
-    name: str = Field(description="Name of the driver; `serial` looks for serial ports.", examples=["aravis"])
+    name: str = Field(description="Name of the driver; `serial` searches for serial ports.", examples=["aravis"])
     state: Literal["ok", "missing", "failed", "timeout"] = Field(
         description="`missing`: a library is not installed; `timeout`: no answer in time."
     )
@@ -55,7 +55,7 @@ class DriverState(_Closed):
 class DeviceListing(_Closed):
     """Everything that was found."""
 
-    cameras: list[ListedDevice] = Field(description="Cameras that a driver sees, and those that this service holds.")
+    cameras: list[ListedDevice] = Field(description="Cameras that a driver finds, and those that this service holds.")
     serial_ports: list[ListedDevice] = Field(description="Serial ports; none is opened or asked who it is.")
     drivers: list[DriverState] = Field(description="Outcome of each driver's search.")
 
@@ -148,7 +148,7 @@ class DeviceFinder:
     drivers
         Names of the camera drivers; all that there are when left out.
     discover, ports
-        What looks for cameras of one driver, and for serial ports.
+        Search for cameras of one driver, and for serial ports.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ def _same_path(one: str, two: str) -> bool:
 
 
 def _listed(found: FoundDevice, holder: HeldDevice | None) -> ListedDevice:
-    # a driver that sees the camera in use cannot know that it is we who use it
+    # a driver that finds the camera in use cannot tell this service from another program
     problem = found.problem if holder is None else holder.problem
     in_use_by = None if holder is None else holder.name
     return ListedDevice.model_validate(vars(found) | {"problem": problem, "in_use_by": in_use_by})

@@ -54,7 +54,7 @@ def image_motion(first: Frame, last: Frame) -> ImageMotion | None:
     # the peak of a phase correlation is drawn towards whole pixels; alignment by gradients is not
     warp = np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]], dtype=np.float32)
     try:
-        # its stubs know no empty mask
+        # its stubs have no empty mask
         cv2.findTransformECC(one, two, warp, cv2.MOTION_TRANSLATION, _STOP, None, _BLUR_PX)  # type: ignore[call-overload]
     except cv2.error:
         return None

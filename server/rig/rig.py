@@ -172,7 +172,7 @@ class Rig:
     # description ------------------------------------------------------------------------------------------------
 
     def describe(self) -> RigReply:
-        """Return everything a client wants to know before it does anything."""
+        """Return the state of the rig, its target, cameras and stage."""
         config = self.config
         return RigReply(
             name=config.rig.name,
@@ -295,7 +295,7 @@ class Rig:
         Raises
         ------
         InputError
-            ``axis_conflict`` if one axis moves both cameras and they are asked for different places.
+            ``axis_conflict`` if one axis moves both cameras and different positions are asked for.
         """
         targets: dict[int, float] = {}
         for cam, dz in dz_mm.items():
@@ -303,7 +303,7 @@ class Rig:
             position = self.config.stage.of_axis(section.stage_axis).zero_mm + section.stage_sign * dz
             if abs(targets.setdefault(section.stage_axis, position) - position) > 1e-9:
                 raise InputError(
-                    f"Axis {section.stage_axis} moves both cameras, and they are sent to different places.",
+                    f"Axis {section.stage_axis} moves both cameras, and they are sent to different positions.",
                     code="axis_conflict",
                     remedy="Ask for the same dZ for both.",
                 )

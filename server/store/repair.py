@@ -72,7 +72,7 @@ def _tidy(root: Path, tests: TestStore) -> list[str]:
         path = tests.path(test_id)
         for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
             if step.is_dir() and step.name.isdigit() and not (step / "step.json").is_file():
-                done.append(f"set {step.relative_to(root)} aside as {quarantine(step).name}: it has no step.json")
+                done.append(f"quarantined {step.relative_to(root)} as {quarantine(step).name}: it has no step.json")
         for analysis_id in tests.analysis_ids(test_id):
             for beside in tests.drop_half_written(test_id, analysis_id):
                 done.append(f"removed {beside.relative_to(root)}: its result was never announced")

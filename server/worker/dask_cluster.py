@@ -47,7 +47,7 @@ class ClusterFuture(TaskFuture):
         self._stop = stop
 
     def request_stop(self) -> None:
-        """End it: at once for whoever waits, and on its worker at its next look."""
+        """End it: at once for whoever waits, and on its worker at its next check."""
         if not self.stop_requested.is_set():
             self.stop_requested.set()
             self._stop(self)

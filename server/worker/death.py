@@ -14,7 +14,7 @@ _MEANINGS = {
     signal.SIGSEGV: "it reached for memory that is not its own",
     signal.SIGBUS: "it reached for memory that is not there, as when a mapped file was cut short or a disk failed",
     signal.SIGABRT: "a library gave up",
-    signal.SIGILL: "it met an instruction that this processor does not know",
+    signal.SIGILL: "it met an instruction that this processor does not support",
     signal.SIGFPE: "an arithmetic fault",
     signal.SIGTERM: "it was asked to end",
     signal.SIGXCPU: "its limit of processor time was reached",
@@ -82,7 +82,7 @@ def cause_of_death(exit_code: int | None, *, out_of_memory: bool, memory_mib: fl
     out_of_memory
         True if the kernel killed for want of memory meanwhile.
     memory_mib
-        What it held when last looked at.
+        Memory that it held at the last reading.
     """
     if exit_code is None:
         return "in a way that the system does not report"

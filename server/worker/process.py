@@ -89,7 +89,7 @@ def serve(
     """Run tasks from ``connection`` one after another until it closes."""
     global _current
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to handle
-    faulthandler.enable()  # a fault in compiled code leaves its place on the terminal
+    faulthandler.enable()  # a fault in compiled code leaves its traceback on the terminal
     end_with_parent()
     pin_threads(threads)
     import cv2

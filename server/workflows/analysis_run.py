@@ -69,7 +69,7 @@ class AnalysisRun:
         self._summaries: dict[int, StepOutcome] = {}  # of the steps that are finished
         self._failed: dict[int, StereorigError] = {}  # in this run
         self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from
-        self._next = 0  # place of that step
+        self._next = 0  # index of that step
 
     def __call__(self, job: Job) -> dict[str, object]:
         """Measure what is not measured yet: a step that fails does not take the others with it.
@@ -87,7 +87,7 @@ class AnalysisRun:
             self._measure(job)
             if job.work.follows is None:
                 break
-            finishing = job.finishing.is_set()  # asked before looking: what landed before it is measured
+            finishing = job.finishing.is_set()  # read first: steps committed before it are measured
             if self._take_new_steps():
                 continue
             if finishing:
@@ -230,7 +230,7 @@ class AnalysisRun:
         check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.cameras, f"Step {n}")
 
     def _take_new_steps(self) -> bool:
-        """Make the steps that have landed since part of the analysis; whether there are any."""
+        """Add the steps committed since to the analysis; return True if there are any."""
         tests, steps = self._service.tests, self._document.steps
         known = set(steps)
         new = [n for n in tests.step_numbers(self._test_id) if n > steps[0] and n not in known]

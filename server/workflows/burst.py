@@ -109,7 +109,7 @@ def _take(
 
 
 def _wait_until(job: Job, moment: float) -> None:
-    """Wait, and look every 20 ms whether the burst is to end; one that is late goes on at once."""
+    """Wait, and check every 20 ms for the burst's end; one that is late goes on at once."""
     while True:
         job.check()
         left = moment - time.monotonic()

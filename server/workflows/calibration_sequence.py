@@ -45,7 +45,7 @@ class CalibrationPlan:
     label: str = ""
 
     def stops_mm(self) -> list[float]:
-        """All dZ, ascending, with zero among them: the grid is looked at there first and last."""
+        """All dZ, ascending, with zero among them: the grid is imaged there first and last."""
         return sorted({0.0, *self.positions_mm, *self.held_out_mm})
 
 

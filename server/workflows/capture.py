@@ -17,7 +17,7 @@ from server.store.index import step_entry
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 
-#: a camera further from its calibrated place than this is off: 10 um of 400 mm change the scale by 2.5e-5
+#: a camera further from its calibrated position than this is off: 10 um of 400 mm change the scale by 2.5e-5
 OFF_ZERO_MM = 0.01
 
 

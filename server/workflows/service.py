@@ -95,7 +95,7 @@ class Service:
         self.abort_thread = ThreadPoolExecutor(max_workers=4, thread_name_prefix="abort")
         self.started_monotonic = time.monotonic()
         self.closing = False
-        #: held from the look at a thing to its change, where a client names the state it means
+        #: held from the reading of a thing to its change, where a client names the state it means
         self.changes = threading.Lock()
         self.continuing = threading.Lock()
         self._effects = OneEffect(self.catalog)

@@ -109,7 +109,7 @@ class Watches:
         return watch.model_copy(update={"last_value": value, "last_step": n})
 
     def _last(self, test_id: str, channel: str) -> tuple[int, float] | None:
-        """Newest step that bears a channel, and its value; looked up once until there are other steps."""
+        """Newest step that bears a channel, and its value; read once until there are other steps."""
         mark = self._service.tests.steps_mark(test_id)
         known = self._known.get((test_id, channel))
         if known is None or known[0] != mark:

@@ -202,7 +202,7 @@ def test_incomplete_steps_are_set_aside_and_the_numbers_stay(data: Path) -> None
     orphan.unlink()
     assert ("incomplete", f"tests/{test.name}/steps/0001") in found_in(data)
     outcome = repair(data)
-    assert len([line for line in outcome.done if "aside as incomplete-1-0001" in line]) == 1
+    assert len([line for line in outcome.done if "quarantined" in line and "as incomplete-1-0001" in line]) == 1
     assert (test / "steps" / "incomplete-1-0001" / "cam1.tif").is_file()
     assert not half.exists()
     assert outcome.after.findings == ()

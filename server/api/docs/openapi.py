@@ -82,7 +82,7 @@ def _without_titles(node: Any) -> Any:
     if not isinstance(node, dict):
         return node
     if node.get("type") in ("integer", "number"):
-        # bounds that stand around a validator come by pydantic's names, which JSON Schema does not know
+        # bounds that stand around a validator come by pydantic's names, which JSON Schema lacks
         node = {_BOUNDS.get(name, name): value for name, value in node.items()}
     return {
         name: value if name in ("example", "examples", "default") else _without_titles(value)
@@ -177,7 +177,7 @@ def _complete(method: str, operation: Part) -> None:
     responses = operation["responses"]
     for parameter in operation.get("parameters", ()):
         parameter["schema"] = _sendable(parameter["schema"])
-    statuses = [401, 403, 429, 503]  # the door's, before any operation sees the request
+    statuses = [401, 403, 429, 503]  # the door's, before any operation gets the request
     if "requestBody" in operation and method in _BODY_METHODS:
         statuses.append(413)
     if "422" in responses:

@@ -205,7 +205,7 @@ class GaugeStep(Reply):
     rigid_motion: RigidMotionReading | None = Field(
         None, description="The motion that was taken out, with its covariance."
     )
-    points: list[PointReading] = Field(default_factory=list, description="Values at places.")
+    points: list[PointReading] = Field(default_factory=list, description="Values at positions.")
     extensometers: list[ExtensometerReading] = Field(default_factory=list, description="Lengths, elongations, strains.")
     lines: list[LineReading] = Field(default_factory=list, description="Values along lines; null where missing.")
     areas: list[AreaReading] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")

@@ -52,9 +52,9 @@ class AuditLog:
             data / AUDIT_FILE, maxBytes=_FILE_BYTES, backupCount=_FILES, encoding="utf-8", delay=True
         )
 
-    def write(self, **facts: object) -> None:
+    def write(self, **entries: object) -> None:
         """Write one line."""
-        text = json.dumps({"utc": now_utc(), **facts}, ensure_ascii=False)
+        text = json.dumps({"utc": now_utc(), **entries}, ensure_ascii=False)
         self._handler.emit(logging.LogRecord("audit", logging.INFO, "", 0, text, None, None))
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ class Recorder:
         if _log.isEnabledFor(level):
             with about(request_id=number):
                 person = scope["state"].get("person")
-                facts = {
+                entries = {
                     "method": scope["method"],
                     "path": scope["path"],
                     "status": status,
@@ -133,7 +133,7 @@ class Recorder:
                     "who": None if person is None else person.name,
                     "address": (scope.get("client") or (None, 0))[0],
                 }
-                _log.log(level, "%s %s %d", scope["method"], scope["path"], status, extra=facts)
+                _log.log(level, "%s %s %d", scope["method"], scope["path"], status, extra=entries)
 
 
 def _route(scope: Scope) -> str:

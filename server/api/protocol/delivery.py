@@ -40,7 +40,7 @@ class Delivery:
             else:
                 await self._app(answer.scope, receive, answer.forward)
         finally:
-            # which operation it was: whoever counts requests looks for it in the scope that was handed in
+            # which operation it was: the counter of requests reads it from the scope that it was given
             if "route" in answer.scope:
                 scope["route"] = answer.scope["route"]
 

@@ -1,4 +1,4 @@
-"""``stereorig calibration``: calibration files in other programs' forms, and a look at whether they make sense."""
+"""``stereorig calibration``: calibration files in other programs' forms, and a check of their plausibility."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--points",
             metavar="FOLDER",
             type=Path,
-            help="results of stereorig measure or of an analysis: their points are looked at too",
+            help="results of stereorig measure or of an analysis: their points are checked too",
         )
         action.add_argument(
             "--measured-with", metavar="FILE", type=Path, help="the calibration of those results (that of their test)"
@@ -87,12 +87,12 @@ def _print_conversion(report: ConversionReport) -> None:
         print(f"{cam}: lens {'exact' if report.exact else left}")
     back = report.read_back
     if back.points:
-        print(f"read back: {_said(back)}; in space {back.rms_mm:.3g} mm rms, {back.max_mm:.3g} mm at most")
+        print(f"read back: {_format_residual(back)}; in space {back.rms_mm:.3g} mm rms, {back.max_mm:.3g} mm at most")
     for note in report.notes:
         print(f"note: {note}")
 
 
-def _said(residual: Residual) -> str:
+def _format_residual(residual: Residual) -> str:
     if not residual.points:
         return "no points"
     return f"{residual.points} points, epipolar residual {residual.rms_px:.3g} px rms, {residual.max_px:.3g} px at most"
@@ -100,11 +100,11 @@ def _said(residual: Residual) -> str:
 
 def _print_check(checked: CalibrationCheck, points: EpipolarComparison | None) -> None:
     print(f"baseline {checked.baseline_mm:.6g} mm, stereo angle {checked.stereo_angle_deg:.4g} degrees")
-    print(f"volume that both cameras see: {_said(checked.volume)}")
+    print(f"volume that both cameras see: {_format_residual(checked.volume)}")
     if points is not None:
         print(
-            f"measured points of {points.results}: {_said(points.this_calibration)}; as they were measured: "
-            f"{_said(points.measured_with)}"
+            f"measured points of {points.results}: {_format_residual(points.this_calibration)}; as they were measured: "
+            f"{_format_residual(points.measured_with)}"
         )
     for warning in checked.warnings:
         print(f"warning: {warning}")

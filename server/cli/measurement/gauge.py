@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="X,Y",
-        help="values at a place; repeatable, as all gauges; places are px of camera "
+        help="values at a position; repeatable, as all gauges; positions are px of camera "
         "1's reference image; NAME= in front names a gauge",
     )
     add(
@@ -47,21 +47,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="X,Y",
-        help="a place by X and Y of the reference, in the frame asked for",
+        help="a position by X and Y of the reference, in the frame asked for",
     )
     add(
         "--extensometer-mm",
         action="append",
         default=[],
         metavar="X0,Y0,X1,Y1",
-        help="an extensometer between two such places",
+        help="an extensometer between two such positions",
     )
     add(
         "--line",
         action="append",
         default=[],
         metavar="X0,Y0,X1,Y1[,N]",
-        help="values at N places along a line (one a grid step)",
+        help="values at N positions along a line (one a grid step)",
     )
     add(
         "--area",
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--align",
         metavar="plane|3-2-1:X,Y,...",
-        help="frame: best-fit plane of the reference, or six places: three "
+        help="frame: best-fit plane of the reference, or six positions: three "
         "on the plane, two on the X axis, one at X = 0",
     )
     add("--x-direction", metavar="X,Y,Z", help="of --align plane, system frame (1,0,0)")
@@ -174,7 +174,7 @@ def _align(args: argparse.Namespace) -> dict[str, object]:
         raise InputError(
             f"--align {args.align} is neither plane nor 3-2-1:X,Y,...",
             code="gauge_unusable",
-            remedy="Give --align plane, or 3-2-1: and the six places' twelve numbers.",
+            remedy="Give --align plane, or 3-2-1: and the six positions' twelve numbers.",
         )
     return {"kind": "3-2-1", "positions_px": _pairs(_numbers("--align 3-2-1", positions, (12,)))}
 
@@ -254,7 +254,7 @@ def report(readings: GaugeReadings) -> list[str]:
         areas = [(s, s.areas[k]) for s in steps]
         lines += _table([(s, {n: v.mean_number for n, v in a.values.items()}, a.missing) for s, a in areas])
     for k, line in enumerate(steps[0].lines):
-        lines.append(f"line {line.name}, {len(line.x_px)} places")
+        lines.append(f"line {line.name}, {len(line.x_px)} positions")
         lines += [_line_summary(s.n, s.lines[k]) for s in steps]
     return lines
 

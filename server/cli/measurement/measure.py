@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="X0,Y0,X1,Y1[,...]",
-        help="a line over which nothing reaches, through these places of camera 1's first image",
+        help="a line over which nothing reaches, through these positions in camera 1's first image",
     )
     add(
         "--hole",

@@ -140,7 +140,7 @@ def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] |
     x0, y0, x1, y1 = rectangle
     seeds = []
     for text in texts:
-        # with four numbers, the last two are the place in camera 2
+        # with four numbers, the last two are the position in camera 2
         count = 4 if text.count(",") == 3 else 2
         x, y, *other = _numbers("--seed", text, count, "X,Y or X,Y,X2,Y2")
         if not (x0 <= x <= x1 and y0 <= y <= y1):

@@ -1,4 +1,4 @@
-"""``stereorig report``: one HTML file with everything that a reader of the results must know."""
+"""``stereorig report``: one HTML file with results, settings and uncertainty."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
     add(
-        "place",
+        "folder",
         metavar="DATA_OR_RESULTS",
         type=Path,
         help="a data folder, a test's, an analysis', or what stereorig measure --out wrote",
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         )
     metadata = None if args.metadata is None else load_metadata(args.metadata)
     source = find_source(
-        args.place, test=args.test, analysis=args.analysis, calibration=args.calibration, metadata=metadata
+        args.folder, test=args.test, analysis=args.analysis, calibration=args.calibration, metadata=metadata
     )
     made = make_report(source)
     make_folder(args.out.absolute().parent)

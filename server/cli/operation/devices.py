@@ -40,7 +40,7 @@ def report(listing: DeviceListing) -> str:
     lines += _table(("device", "model", "serial", "address", "state"), listing.serial_ports)
     troubled = [driver for driver in listing.drivers if driver.state != "ok"]
     if troubled:
-        lines += ["", "Drivers that could not look"]
+        lines += ["", "Drivers that could not search"]
         lines += [f"  {driver.name}: {driver.problem} {driver.remedy}" for driver in troubled]
     return "\n".join(lines)
 

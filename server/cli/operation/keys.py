@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
         "Keys let people and scripts in where the service asks for them: always on addresses other than loopback. A "
-        "viewer may look and stop the stage, an operator may also move, capture and measure, an admin may also delete."
+        "viewer may read and stop the stage, an operator may also move, capture and measure, an admin may also delete."
     )
     parser.add_argument("action", choices=["add", "list", "remove"])
     parser.add_argument("name", nargs="?", metavar="NAME", help="of the key: who or what uses it")

@@ -13,7 +13,7 @@ from server.store.repair import repair
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
-        "Set steps without their commit mark aside, remove what was half written, make the catalogue anew from the "
+        "Quarantine steps without their commit mark, remove what was half written, make the catalogue anew from the "
         "folders, and list everything that was done. Damaged files are listed and left alone. Ends with 1 when there "
         "are any."
     )

@@ -1,4 +1,4 @@
-"""``stereorig verify``: look through a data folder; changes nothing."""
+"""``stereorig verify``: check a data folder; changes nothing."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm:
         for k, (load, colour) in enumerate(zip(loads_kn, colours, strict=True)):
             axes[0].errorbar(x, 1e3 * found.found[k], 1e3 * found.sigma[k], label=f"{load:g} kN", color=colour, **_DOTS)
             _true(axes[0], x, 1e3 * found.true[k], half_crack_mm)
-            lens = np.max(found.lips[k]) * np.sqrt(1.0 - (inner / half_crack_mm) ** 2)  # one place is the middle
+            lens = np.max(found.lips[k]) * np.sqrt(1.0 - (inner / half_crack_mm) ** 2)  # one position is the middle
             axes[0].plot(inner, 1e3 * lens, "--", color="0.5", linewidth=0.7)
             axes[2].errorbar(x, 1e3 * found.parting[k], 1e3 * found.parting_sigma[k], color=colour, **_DOTS)
             _true(axes[2], x, 1e3 * found.parting_true[k], half_crack_mm)

@@ -17,7 +17,7 @@ from sim.panel import CrackedPanel
 from sim.rig import SimRig
 from sim.truth import Truth, truth_at
 
-ACROSS = tuple(round(0.15 * k, 2) for k in range(-6, 7))  # of the half crack: places of the extensometers
+ACROSS = tuple(round(0.15 * k, 2) for k in range(-6, 7))  # of the half crack: positions of the extensometers
 BEYOND = (-1.35, 1.35)  # the same, ahead of the tips: nothing opens there
 ENDS_PX = 15.0  # from the crack: half a subset, and half a step for the points about it
 CREST_FROM_KN = 20.0  # below it the panel has not buckled
@@ -60,7 +60,7 @@ class Slice:
     Attributes
     ----------
     xy_px, at_mm
-        (m, 2) its places, (m,) where they lie along the load or along the crack, true.
+        (m, 2) its positions, (m,) where they lie along the load or along the crack, true.
     found, sigma, true
         (steps, m) mm; the first two NaN where it is missing.
     """
@@ -130,7 +130,7 @@ def read_slice(
 
 
 def crests(at_mm: Float, height_mm: Float) -> list[Crest]:
-    """Find the highest place on each side of zero, by a parabola through the points about it."""
+    """Find the highest position on each side of zero, by a parabola through the points about it."""
     out = []
     for side in (-1.0, 1.0):
         use = np.isfinite(height_mm) & (side * at_mm > 0.0)
@@ -219,7 +219,7 @@ def add_checks(
             SAFE * float(opening.sigma[-1, middle]),
         ),
         Check(
-            f"crack opening at {last:g} kN, worst of {inside.sum()} places and of 2 ahead of the tips",
+            f"crack opening at {last:g} kN, worst of {inside.sum()} positions and of 2 ahead of the tips",
             "mm",
             float(worst),
             None,

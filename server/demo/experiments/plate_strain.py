@@ -2,7 +2,7 @@
 
 The face moves in the plane by half the thickness times the slope. A gauge takes a fit over its width for the slope in
 its middle. On the plate, whose face moves by ``k (1 - r^2 / a^2)`` times the radius, a whole window's fit is off by the
-same amount everywhere, ``k (M4 / M2 + M2) / a^2``, M2 and M4 the mean square and fourth power of its points' places.
+same amount everywhere, ``k (M4 / M2 + M2) / a^2``, M2 and M4 the mean square and fourth power of its points' positions.
 """
 
 from __future__ import annotations

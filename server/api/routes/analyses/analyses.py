@@ -154,7 +154,7 @@ def continue_analysis(
     responses=errors(404, 409),
 )
 def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> AnalysisAccepted:
-    """Measure the steps that have landed so far, then end the job; cancelling it instead ends it at once."""
+    """Measure the steps committed so far, then end the job; cancelling it instead ends it at once."""
     service.tests.analysis_path(test_id, analysis_id)
     runs = service.tests.analysis_jobs(test_id, analysis_id)
     job_id = runs[-1].job_id if runs else ""

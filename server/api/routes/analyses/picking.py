@@ -1,4 +1,4 @@
-"""Before an analysis: does the texture carry the subsets, and are a seed's two places one point."""
+"""Checks before an analysis: speckle quality for the subsets, and a seed's two positions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TextureReply(Reply):
     """Random error that the texture lets expect."""
 
     subset_px: int = Field(description="Width that was asked about.", examples=[33])
-    subsets: int = Field(description="Subsets that were looked at: the region's points.", examples=[841])
+    subsets: int = Field(description="Subsets that were rated: the region's points.", examples=[841])
     noise_grey: float = Field(description="Noise that was taken.", examples=[2.55])
     level: str = Field(description="`good`, `usable` or `poor`: what 95 % of the subsets reach.", examples=["good"])
     median_error_px: float | None = Field(None, description="Median of the expected error; null: no texture.")

@@ -120,7 +120,7 @@ def get_step_pixels(
     columns: Annotated[int, Query(ge=1, le=256, description="Number of them; fewer come where the image ends.")] = 1,
     rows: Annotated[int, Query(ge=1, le=256, description="Number of them; fewer come where the image ends.")] = 1,
 ) -> PixelsReply:
-    """Return them to the bit, however the image is looked at."""
+    """Return them to the bit, without the scaling of a preview."""
     pixels, full_scale = step_image(service, test_id, n, cam)
     _within(pixels, x_px, y_px)
     response.headers["Cache-Control"] = _KEPT

@@ -1,4 +1,4 @@
-"""Calibrations: begin, list, look, residuals, views."""
+"""Calibrations: begin, list, read, residuals, views."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def list_calibrations(service: ServiceDep, page: PageDep) -> CalibrationList:
 def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> CalibrationReply:
     """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it.
 
-    One that failed its verdict has what was refused in the same places, to be looked at; `state` stays `failed`.
+    One that failed its verdict has what was refused in the same fields, for inspection; `state` stays `failed`.
     """
     return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id).plain()))
 

@@ -1,4 +1,4 @@
-"""The cameras' noise: measure, list, look."""
+"""The cameras' noise: measure, list, read."""
 
 from __future__ import annotations
 

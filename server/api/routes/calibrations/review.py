@@ -19,7 +19,7 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> ExpectReply:
     """Predict each parameter's standard deviation, and what they do to points; nothing moves, nothing is kept.
 
-    The rig file's nominal cameras look at the target; the adjustment's own derivatives there give the covariance.
+    The rig file's nominal cameras image the target; the adjustment's own derivatives there give the covariance.
     """
     body = body or ExpectRequest.model_validate({})
     usual = service.config.calibration

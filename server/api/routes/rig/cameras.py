@@ -41,7 +41,7 @@ _BOUNDARY = "frame"
 
 @router.get("/rig", summary="The rig: cameras, stage, target, who holds it", response_model_exclude_unset=True)
 def get_rig(service: ServiceDep) -> RigReply:
-    """Return everything a client wants to know before it does anything."""
+    """Return the state of the rig, its target, cameras and stage."""
     return service.rig.describe()
 
 
@@ -67,7 +67,7 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
 
 @router.put(
     "/sim/scene",
-    summary="Choose what a simulated rig sees",
+    summary="Choose the scene of a simulated rig",
     response_model_exclude_unset=True,
     responses=errors(409, 422, 503),
 )

@@ -1,4 +1,4 @@
-"""Jobs: list, look, follow, cancel."""
+"""Jobs: list, read, follow, cancel."""
 
 from __future__ import annotations
 

@@ -128,8 +128,8 @@ async def create_step(
 def step_metadata(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepMetadata:
     """Metadata of a step as the client states them, in the form its document keeps."""
     stamp = None if body.timestamp_utc is None else utc_text(body.timestamp_utc)
-    said = {"label": body.label, "load_n": body.load_n, "timestamp_utc": stamp, "channels": body.channels}
-    return StepMetadata.model_validate({**said, **sent.document()})
+    stated = {"label": body.label, "load_n": body.load_n, "timestamp_utc": stamp, "channels": body.channels}
+    return StepMetadata.model_validate({**stated, **sent.document()})
 
 
 def _capture(service: Service, test_id: str, body: StepRequest, key: str | None) -> StepReply:
@@ -209,13 +209,13 @@ def import_images(
     data = {"cam1": cam1.file.read(), "cam2": cam2.file.read()}
     stamp = None if timestamp_utc is None else utc_text(timestamp_utc)
     readings = _readings(channels)
-    said = f"{label}\n{load_n}\n{stamp}\n{readings}".encode()
-    request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], said)
+    stated = f"{label}\n{load_n}\n{stamp}\n{readings}".encode()
+    request = mark(f"tests/{test_id}/steps:import", key, None, data["cam1"], data["cam2"], stated)
 
     def make() -> Ids:
         sent = {"label": label, "load_n": load_n, "timestamp_utc": stamp, "channels": readings or {}}
-        facts = StepMetadata.model_validate({**sent, **request.document()})
-        return {"n": import_step(service, test_id, data, facts).n}
+        metadata = StepMetadata.model_validate({**sent, **request.document()})
+        return {"n": import_step(service, test_id, data, metadata).n}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return StepReply.model_validate(step_reply(service, test_id, int(made["n"])))
