@@ -57,7 +57,7 @@ def cracks(figures: Path) -> Section:
     before, after = make_scene(rig, "panel", load=0.0), make_scene(rig, "panel", load=LOAD_KN)
     half = CrackedPanel().half_crack_mm
     along = np.linspace(-half, half, 41)
-    points = before.surface.place(np.stack([along, np.zeros(41)], axis=-1), 1.0)
+    points = before.surface.positions(np.stack([along, np.zeros(41)], axis=-1), 1.0)
     line = np.asarray(pair.cam1.project(before.sys_from_body.apply(points)).xy)
     plain = PointGrid.rectangle(20, 20, SIZE_PX[0] - 21, SIZE_PX[1] - 21, spacing_px=SPACING_PX)
     grid, options = plain.with_cracks([line]), MeasureOptions(subset_px=SUBSET_PX, patch="affine")

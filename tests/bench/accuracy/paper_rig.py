@@ -71,8 +71,8 @@ def plane_scene(texture: Texture, *, in_plane: Float | None = None, motion: Rigi
 def true_points(scene: Scene, moved: Scene, camera: Camera, xy_px: Float) -> tuple[Float, Float]:
     """Reference positions and displacements (..., 3), system frame, of the material that camera 1's pixels see."""
     st, lip = material_points(scene, camera, xy_px)
-    here = scene.sys_from_body.apply(scene.surface.place(st, lip))
-    there = moved.sys_from_body.apply(moved.surface.place(st, lip))
+    here = scene.sys_from_body.apply(scene.surface.positions(st, lip))
+    there = moved.sys_from_body.apply(moved.surface.positions(st, lip))
     return here, there - here
 
 
