@@ -135,7 +135,7 @@ class Device:
         return self.fault(error, "be opened")
 
     def fault(self, error: OSError, action: str) -> CameraError:
-        """Return the error, in the project's words, for a request ``action`` that the device refused."""
+        """Return the error, in the project's words, for the ``action`` that the device refused."""
         text = f"{self.path} cannot {action} ({error.strerror}, {errno.errorcode.get(error.errno or 0, error.errno)})"
         if error.errno in _GONE:
             return CameraError(
