@@ -131,7 +131,7 @@ def test_an_attached_burst_answers_when_it_has_ended(client: httpx.Client) -> No
 @pytest.mark.fault(16)
 def test_a_burst_goes_on_after_a_pair_that_is_refused_and_says_which(client: httpx.Client, service: Service) -> None:
     test_id = new_test(client)
-    pair, shoot, calls = service.rig.pair, service.rig.pair.shoot, 0
+    pair, shoot, calls = service.rig.pair, service.rig.pair.capture, 0
 
     def shoot_or_refuse(*args: Any, **more: Any) -> Any:
         nonlocal calls
