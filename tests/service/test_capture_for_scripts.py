@@ -131,20 +131,20 @@ def test_an_attached_burst_answers_when_it_has_ended(client: httpx.Client) -> No
 @pytest.mark.fault(16)
 def test_a_burst_goes_on_after_a_pair_that_is_refused_and_says_which(client: httpx.Client, service: Service) -> None:
     test_id = new_test(client)
-    pair, shoot, calls = service.rig.pair, service.rig.pair.capture, 0
+    pair, capture, calls = service.rig.pair, service.rig.pair.capture, 0
 
-    def shoot_or_refuse(*args: Any, **more: Any) -> Any:
+    def capture_or_refuse(*args: Any, **more: Any) -> Any:
         nonlocal calls
         calls += 1
         if calls == 2:
             raise CameraError("3 ms apart", code="skew_too_large", skew_ms=3.0)
-        return shoot(*args, **more)
+        return capture(*args, **more)
 
-    pair.shoot = shoot_or_refuse  # type: ignore[method-assign]
+    pair.capture = capture_or_refuse  # type: ignore[method-assign]
     try:
         answer = client.post(f"{API}/tests/{test_id}/steps", params={"attached": True}, json={"count": 3})
     finally:
-        del pair.shoot  # type: ignore[method-assign]
+        del pair.capture  # type: ignore[method-assign]
     job = answer.json()["job"]
     assert job["state"] == "failed"
     assert job["problem"]["code"] == "burst_incomplete"
