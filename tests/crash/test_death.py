@@ -22,7 +22,7 @@ from server.worker.death import MemoryWatch, cause_of_death, resident_mib
         (-15, "signal 15 (SIGTERM)"),
         (-64, "signal 64"),
         (3, "exit code 3"),
-        (None, "not tell"),
+        (None, "not report"),
     ],
 )
 def test_an_end_is_told_in_words(code: int | None, words: str) -> None:
