@@ -37,7 +37,8 @@ from tests.support.tiny_rig import tiny_rig
 PHASES = ("examples", "coverage", "fuzzing", "stateful")
 _STREAM_S = 0.03  # a reader of a live view or of events leaves after so long
 _HELD_S = 3.0  # who stays with a job, a burst of days it may be, lets go of it after so long
-_ID = re.compile(r"[tcjna][0-9]{6}-[0-9a-f]{6}")
+# what an earlier request of a run can have made: an id, or the number of one of its steps
+_MADE = re.compile(r"[tcjna][0-9]{6}-[0-9a-f]{6}|[1-9][0-9]?")
 # moves take no time, frames little; a clock that runs faster yet would lose frames on a busy machine
 FAST = {"velocity_mm_s": "velocity_mm_s = 20.0", "time_scale": "time_scale = 10.0"}
 
@@ -186,6 +187,26 @@ class Known:
     """What there is when a run begins: without it, most requests would end at an unknown id."""
 
     ids: dict[str, Any]
+    deleted: set[str] = field(default_factory=set)
+
+    def note_deleted(self, service: Service, case: Any) -> None:
+        """Bring back what all cases need; the rest of what was deleted stays so, see :meth:`check_gone`."""
+        needed = {self.ids[name] for name in ("test_id", "calibration_id", "noise_id")}
+        for entry in service.trash.entries():
+            if needed & {entry.test_id, entry.calibration_id, entry.noise_id}:
+                restore(service, entry.id)
+        if not needed & set((case.path_parameters or {}).values()):
+            self.deleted.add(case.formatted_path)
+
+    def check_gone(self, ctx: Any, response: Any, case: Any) -> None:
+        """What was deleted is not there for any later request, until somebody makes it again or brings it back."""
+        if response.status_code >= 300:
+            return
+        path, method = case.formatted_path, case.operation.method.upper()
+        if method in ("PUT", "POST"):
+            self.deleted = set() if path.endswith("/restore") else self.deleted - {path}
+        elif method in ("GET", "HEAD"):
+            assert not any(path == gone or path.startswith(f"{gone}/") for gone in self.deleted), f"deleted: {path}"
 
     def before_call(self, context: Any, case: Any, kwargs: Any) -> None:
         """Put ids that there are into a request's path, where it was not meant to be wrong."""
@@ -195,7 +216,7 @@ class Known:
             return
         for name, value in list((case.path_parameters or {}).items()):
             known = self.ids.get(name)
-            made = _ID.fullmatch(str(value)) is not None  # by an earlier request of this run
+            made = _MADE.fullmatch(str(value)) is not None
             meant = len(str(value)) > 40  # wrong on purpose, beside something else that is
             if known is not None and not made and not meant and zlib.crc32(str(value).encode()) % 4:
                 case.path_parameters[name] = known
@@ -261,6 +282,8 @@ def fuzz(
                 # values that do not fit each other or the rig are refused by rules that no schema can say; what the
                 # schema does say is held against `invalid_request` by a check of our own, above
                 "positive_data_acceptance": {"expected-statuses": ["2xx", "3xx", "4xx", "503", "507"]},
+                # of what is brought back it knows nothing; see `check_gone`
+                "use_after_free": {"enabled": False},
             },
         }
     )
@@ -278,9 +301,11 @@ def fuzz(
                 service.jobs.cancel(json.loads(response.content)["job"]["id"])
         # and what all cases need comes back from the trash
         if response.status_code < 300 and case.operation.method.upper() == "DELETE":
-            for entry in service.trash.entries():
-                if any(known.ids[name] == getattr(entry, name) for name in ("test_id", "calibration_id", "noise_id")):
-                    restore(service, entry.id)
+            known.note_deleted(service, case)
+
+    @schemathesis.check
+    def what_is_deleted_is_gone(ctx: Any, response: Any, case: Any) -> None:
+        known.check_gone(ctx, response, case)
 
     if only:
         schema = schema.include(operation_id=only)
@@ -299,6 +324,7 @@ def fuzz(
     finally:  # hooks are schemathesis' own, and would go on with this service in the next run
         schemathesis.hooks.unregister(before_call)
         schemathesis.hooks.unregister(after_call)
+        schemathesis.checks.CHECKS.unregister("what_is_deleted_is_gone")
     report.seconds = time.monotonic() - began
     return report
 
