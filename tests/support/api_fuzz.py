@@ -6,7 +6,6 @@ Used by test_fuzz.py; ``make fuzz`` runs it for longer.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
 import json
 import re
@@ -31,80 +30,15 @@ from server.api.docs.problem_pages import known_problems
 from server.config.rig_file import parse_config
 from server.workflows.deletion import restore
 from server.workflows.service import Service
+from tests.support.impatient_client import Impatient
 from tests.support.service_rig import TINY, served, true_cameras, wait_for_job, wait_for_rig
 from tests.support.tiny_rig import tiny_rig
 
 PHASES = ("examples", "coverage", "fuzzing", "stateful")
-_STREAM_S = 0.03  # a reader of a live view or of events leaves after so long
-_HELD_S = 3.0  # who stays with a job, a burst of days it may be, lets go of it after so long
 # what an earlier request of a run can have made: an id, or the number of one of its steps
 _MADE = re.compile(r"[tcjna][0-9]{6}-[0-9a-f]{6}|[1-9][0-9]?")
 # moves take no time, frames little; a clock that runs faster yet would lose frames on a busy machine
 FAST = {"velocity_mm_s": "velocity_mm_s = 20.0", "time_scale": "time_scale = 10.0"}
-
-
-class Impatient:
-    """A client that reads streams for a moment only, and stays with a job for seconds: they might never end."""
-
-    def __init__(self, app: Any) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        gone = asyncio.Event()
-        if scope["type"] == "http" and scope["path"].endswith(("/events", "/stream.mjpg")):
-            await self._read_for_a_moment(scope, _until(gone, receive), send, gone)
-        elif scope["type"] == "http" and b"attached" in scope["query_string"]:
-            asyncio.get_running_loop().call_later(_HELD_S, gone.set)
-            await self._app(scope, _until(gone, receive), send)  # which answers once it has stopped the job
-        else:
-            await self._app(scope, receive, send)
-
-    async def _read_for_a_moment(self, scope: Any, hears: Any, send: Any, gone: asyncio.Event) -> None:
-        answered = asyncio.Event()
-        ended = False
-
-        async def on_send(message: Any) -> None:
-            nonlocal ended
-            if ended:
-                return  # it is not received any more
-            ended = message["type"] == "http.response.body" and not message.get("more_body", False)
-            await send(message)
-            answered.set()
-
-        work = asyncio.ensure_future(self._app(scope, hears, on_send))
-        try:
-            answer = asyncio.ensure_future(answered.wait())
-            await asyncio.wait({work, answer}, return_when=asyncio.FIRST_COMPLETED)
-            answer.cancel()
-            done, _ = await asyncio.wait({work}, timeout=_STREAM_S)
-            if not done:
-                gone.set()
-                # it may have sent its last message, and not have returned yet
-                over, ended = ended, True
-                if not over:
-                    await send({"type": "http.response.body", "body": b"", "more_body": False})
-                done, _ = await asyncio.wait({work}, timeout=5.0)
-                assert done, "a stream goes on without its reader"
-            with contextlib.suppress(asyncio.CancelledError):
-                await work
-        finally:
-            work.cancel()
-
-
-def _until(gone: asyncio.Event, receive: Any) -> Any:
-    """What an application receives from a client: its body, and once it has gone, that."""
-    begun = False
-
-    async def hears() -> Any:
-        nonlocal begun
-        if begun:
-            await gone.wait()
-            return {"type": "http.disconnect"}
-        message = await receive()
-        begun = not message.get("more_body", False)
-        return message
-
-    return hears
 
 
 @schemathesis.check
@@ -182,37 +116,53 @@ def running_service(folder: Path) -> Iterator[Service]:
         service.close()
 
 
+def _within(path: str, folder: str) -> bool:
+    return path == folder or path.startswith(f"{folder}/")
+
+
 @dataclass
 class Known:
     """What there is when a run begins: without it, most requests would end at an unknown id."""
 
     ids: dict[str, Any]
+    made: set[str] = field(default_factory=set)
     deleted: set[str] = field(default_factory=set)
 
     def note_deleted(self, service: Service, case: Any) -> None:
-        """Bring back what all cases need; the rest of what was deleted stays so, see :meth:`check_gone`."""
+        """Bring back what all cases need; the rest of what was deleted stays so, see :meth:`check_there`."""
         needed = {self.ids[name] for name in ("test_id", "calibration_id", "noise_id")}
         for entry in service.trash.entries():
             if needed & {entry.test_id, entry.calibration_id, entry.noise_id}:
                 restore(service, entry.id)
         if not needed & set((case.path_parameters or {}).values()):
-            self.deleted.add(case.formatted_path)
+            gone = case.formatted_path
+            self.deleted.add(gone)
+            self.made = {path for path in self.made if not _within(path, gone)}
 
-    def check_gone(self, ctx: Any, response: Any, case: Any) -> None:
-        """What was deleted is not there for any later request, until somebody makes it again or brings it back."""
-        if response.status_code >= 300:
-            return
+    def check_there(self, ctx: Any, response: Any, case: Any) -> None:
+        """What was made is there, and what was deleted is not, for every later request of the run.
+
+        In place of schemathesis' own checks, which know nothing of what a run brings back, and take an id of one thing
+        for the id of another's part.
+        """
         path, method = case.formatted_path, case.operation.method.upper()
-        if method in ("PUT", "POST"):
+        if response.status_code == 404:
+            assert path not in self.made or method != "GET", f"made, and not deleted: {path}"
+        elif response.status_code < 300 and method in ("PUT", "POST"):
             self.deleted = set() if path.endswith("/restore") else self.deleted - {path}
-        elif method in ("GET", "HEAD"):
-            assert not any(path == gone or path.startswith(f"{gone}/") for gone in self.deleted), f"deleted: {path}"
+            answer = json.loads(response.content or b"null") if response.status_code == 201 else None
+            made = answer.get("id", answer.get("n")) if isinstance(answer, dict) else None
+            if made is not None:
+                self.made.add(f"{path.partition(':')[0]}/{made}")
+        elif response.status_code < 300 and method == "GET":
+            assert not any(_within(path, gone) for gone in self.deleted), f"deleted: {path}"
 
     def before_call(self, context: Any, case: Any, kwargs: Any) -> None:
         """Put ids that there are into a request's path, where it was not meant to be wrong."""
         parts = case.meta.components if case.meta is not None else {}
         path = next((info for kind, info in parts.items() if kind.value == "path_parameters"), None)
-        if path is not None and path.mode.is_negative:
+        mutations = getattr(case.meta.phase.data, "mutations", ()) if case.meta is not None else ()
+        if (path is not None and path.mode.is_negative) or any(m.parameter_location.value == "path" for m in mutations):
             return
         for name, value in list((case.path_parameters or {}).items()):
             known = self.ids.get(name)
@@ -282,8 +232,8 @@ def fuzz(
                 # values that do not fit each other or the rig are refused by rules that no schema can say; what the
                 # schema does say is held against `invalid_request` by a check of our own, above
                 "positive_data_acceptance": {"expected-statuses": ["2xx", "3xx", "4xx", "503", "507"]},
-                # of what is brought back it knows nothing; see `check_gone`
-                "use_after_free": {"enabled": False},
+                "use_after_free": {"enabled": False},  # see `Known.check_there`
+                "ensure_resource_availability": {"enabled": False},
             },
         }
     )
@@ -304,8 +254,8 @@ def fuzz(
             known.note_deleted(service, case)
 
     @schemathesis.check
-    def what_is_deleted_is_gone(ctx: Any, response: Any, case: Any) -> None:
-        known.check_gone(ctx, response, case)
+    def what_is_made_is_there(ctx: Any, response: Any, case: Any) -> None:
+        known.check_there(ctx, response, case)
 
     if only:
         schema = schema.include(operation_id=only)
@@ -324,7 +274,7 @@ def fuzz(
     finally:  # hooks are schemathesis' own, and would go on with this service in the next run
         schemathesis.hooks.unregister(before_call)
         schemathesis.hooks.unregister(after_call)
-        schemathesis.checks.CHECKS.unregister("what_is_deleted_is_gone")
+        schemathesis.checks.CHECKS.unregister("what_is_made_is_there")
     report.seconds = time.monotonic() - began
     return report
 
