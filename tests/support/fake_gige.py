@@ -142,6 +142,11 @@ class FakeCamera:
         """It hangs."""
         assert self._process is not None
         self._process.send_signal(signal.SIGSTOP)
+        # the signal reaches one thread, which stops the others: on a busy machine another still answers meanwhile
+        end = time.monotonic() + _START_S
+        while not _all_threads_stopped(self._process.pid):
+            assert time.monotonic() < end, f"{self.serial} does not stop"
+            time.sleep(0.001)
 
     def resume(self) -> None:
         """It goes on where it was."""
@@ -180,6 +185,12 @@ class FakeCamera:
         _ip("link", "del", self._cable, check=False)
         _ip("netns", "del", self._space, check=False)
         atexit.unregister(self.end)
+
+
+def _all_threads_stopped(pid: int) -> bool:
+    """Whether no thread of a process runs any longer; the state follows the name in brackets."""
+    states = [task.read_text().rpartition(")")[2].split()[0] for task in Path(f"/proc/{pid}/task").glob("*/stat")]
+    return all(state == "T" for state in states)
 
 
 def _clean_up_after_others() -> None:
