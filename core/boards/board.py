@@ -1,0 +1,92 @@
+"""Calibration boards beside the line grid: checkerboards, ChArUco boards and grids of dots.
+
+Index and frame: a board has ``size = (columns, rows)`` inner corners or dots. X runs along a row, Y down the columns as
+the board is printed, Z away from its viewer; the origin is the centre of the field of points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from core.arrays import Float
+from core.errors import TargetError
+
+BoardKind = Literal["checkerboard", "charuco", "circles", "circles_asymmetric"]
+TargetKind = Literal["line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric"]
+BOARD_KINDS: tuple[BoardKind, ...] = get_args(BoardKind)
+DEFAULT_DICTIONARY = "DICT_5X5_100"
+_MIN_SIZE, _MAX_SIZE = 3, 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardTarget:
+    """Description of a calibration board.
+
+    Attributes
+    ----------
+    kind
+        ``checkerboard``, ``charuco``, ``circles`` (rows and columns) or ``circles_asymmetric`` (every other row shifted
+        by one pitch).
+    size
+        (columns, rows) of inner corners, or dots a row and rows of dots.
+    pitch_mm
+        Side of a square, or distance of neighbouring dots; of an asymmetric grid, distance of neighbouring rows: dots
+        of one row lie two pitches apart.
+    node_tolerance_mm
+        The maker's bound on the error of a corner's or dot's position, per axis; 0 for an exact board.
+    marker_mm, dictionary
+        ChArUco: side of a marker, and the name of its dictionary.
+
+    Raises
+    ------
+    TargetError
+        Code ``target_invalid``, if a value is out of range.
+    """
+
+    kind: BoardKind
+    size: tuple[int, int]
+    pitch_mm: float
+    node_tolerance_mm: float = 0.0
+    marker_mm: float | None = None
+    dictionary: str = DEFAULT_DICTIONARY
+
+    def __post_init__(self) -> None:
+        size = tuple(self.size)
+        if self.kind not in BOARD_KINDS:
+            raise _invalid(f"kind must be one of {', '.join(BOARD_KINDS)}, got {self.kind!r}")
+        if len(size) != 2 or any(isinstance(n, bool) or int(n) != n for n in size):
+            raise _invalid(f"size must be two whole numbers, got {self.size!r}")
+        object.__setattr__(self, "size", (int(size[0]), int(size[1])))
+        if not (_MIN_SIZE <= min(self.size) and max(self.size) <= _MAX_SIZE):
+            raise _invalid(f"size must lie between {_MIN_SIZE} and {_MAX_SIZE} each way, got {list(self.size)}")
+        if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
+            raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")
+        if not 0.0 <= self.node_tolerance_mm < 0.25 * self.pitch_mm:
+            raise _invalid(
+                f"node_tolerance_mm must lie between 0 and a quarter of the pitch ({0.25 * self.pitch_mm:g} mm),"
+                f" got {self.node_tolerance_mm!r}"
+            )
+        if self.kind == "charuco" and (self.marker_mm is None or not 0.0 < self.marker_mm < self.pitch_mm):
+            raise _invalid(f"marker_mm must lie between 0 and the pitch ({self.pitch_mm:g} mm), got {self.marker_mm!r}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of points along X and along Y."""
+        return self.size
+
+    def points_mm(self) -> Float:
+        """Return the nominal positions (columns, rows, 2), X and Y in mm, Z is 0."""
+        i, j = np.meshgrid(np.arange(self.size[0]), np.arange(self.size[1]), indexing="ij")
+        x, y = i.astype(np.float64), j.astype(np.float64)
+        if self.kind == "circles_asymmetric":
+            x = 2.0 * x + (j % 2)
+        points = np.stack([x, y], axis=-1) * self.pitch_mm
+        low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+        return np.asarray(points - 0.5 * (low + high))
+
+
+def _invalid(cause: str) -> TargetError:
+    return TargetError(cause, code="target_invalid", remedy="Correct the target's description.")
