@@ -4,12 +4,4 @@ from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardT
 from core.boards.detect import detect_board
 from core.boards.view import BoardView
 
-__all__ = [
-    "BOARD_KINDS",
-    "DEFAULT_DICTIONARY",
-    "BoardKind",
-    "BoardTarget",
-    "BoardView",
-    "TargetKind",
-    "detect_board",
-]
+__all__ = ["BOARD_KINDS", "DEFAULT_DICTIONARY", "BoardKind", "BoardTarget", "BoardView", "TargetKind", "detect_board"]

@@ -37,9 +37,7 @@ def count_dots(grey8: NDArray[np.uint8]) -> int:
     return max(len(_blobs(grey8, dark=dark, block=0.05)[0]) for dark in (True, False))
 
 
-def refine_dots(
-    grey: Float, coarse_px: Float, moments_px2: Float, target: BoardTarget
-) -> tuple[Float, Float, Float]:
+def refine_dots(grey: Float, coarse_px: Float, moments_px2: Float, target: BoardTarget) -> tuple[Float, Float, Float]:
     """Fit each dot's rim.
 
     Returns
@@ -73,11 +71,7 @@ def refine_dots(
     good &= np.linalg.norm(fit.parameters[:, :2] - xy0, axis=1) < 0.5 * axis
     mean_radius = np.where(good, np.maximum(determinant, 1e-12) ** -0.5, np.nan)
     xy = np.where(good[:, None], fit.parameters[:, :2], np.nan)
-    return (
-        xy.reshape(*shape, 2),
-        np.where(good, fit.sigma_px, np.nan).reshape(shape),
-        mean_radius.reshape(shape),
-    )
+    return (xy.reshape(*shape, 2), np.where(good, fit.sigma_px, np.nan).reshape(shape), mean_radius.reshape(shape))
 
 
 def _levels(grey: Float, xy: Float, axis: Float, reach: Float) -> tuple[Float, Float]:

@@ -37,9 +37,7 @@ class FittedWindows:
     good: Bool
 
 
-def fit_windows(
-    image: Float, start: Float, radius_px: int, weight_of: WeightOf, model: Model
-) -> FittedWindows:
+def fit_windows(image: Float, start: Float, radius_px: int, weight_of: WeightOf, model: Model) -> FittedWindows:
     """Fit a model to the grey levels around each start.
 
     Parameters
