@@ -60,7 +60,7 @@ class BoardTarget:
         if len(size) != 2 or any(isinstance(n, bool) or int(n) != n for n in size):
             raise _invalid(f"size must be two whole numbers, got {self.size!r}")
         object.__setattr__(self, "size", (int(size[0]), int(size[1])))
-        if not (_MIN_SIZE <= min(self.size) and max(self.size) <= _MAX_SIZE):
+        if min(self.size) < _MIN_SIZE or max(self.size) > _MAX_SIZE:
             raise _invalid(f"size must lie between {_MIN_SIZE} and {_MAX_SIZE} each way, got {list(self.size)}")
         if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
             raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")

@@ -41,7 +41,7 @@ def find_checkerboard(grey8: NDArray[np.uint8], size: tuple[int, int]) -> Float 
 
 
 def checkerboard_size(grey8: NDArray[np.uint8]) -> tuple[int, int] | None:
-    """Return the size of the checkerboard that an image shows, whatever it is; None where there is none."""
+    """Return the size, the longer side first, of the checkerboard that an image shows; None where there is none."""
     small, _ = _reduced(grey8)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     try:
@@ -50,8 +50,8 @@ def checkerboard_size(grey8: NDArray[np.uint8]) -> tuple[int, int] | None:
         return None
     if not found or meta is None:
         return None
-    rows, columns = np.asarray(meta).shape[:2]
-    return int(columns), int(rows)
+    sides = np.asarray(meta).shape[:2]
+    return int(max(sides)), int(min(sides))
 
 
 def find_charuco(grey8: NDArray[np.uint8], target: BoardTarget) -> Float | None:
@@ -132,8 +132,8 @@ def refine_corners(grey: Float, coarse_px: Float, target: BoardTarget) -> tuple[
         d = np.stack([dx, dy], axis=-1)
         board = np.abs(np.einsum("nij,nmj->nmi", to_board[index], d))
         near = (board <= _RADIUS + 0.05).all(axis=-1)
-        free = board.min(axis=-1) < np.maximum(frame - rim[index], 0.0)[:, None] if np.isfinite(frame) else near
-        return (near & free).astype(np.float64)
+        free = board.min(axis=-1) < np.maximum(frame - rim[index], 0.0)[:, None]
+        return np.asarray(near & (free if np.isfinite(frame) else True), dtype=np.float64)
 
     for _ in range(2):  # the second time about the corner found, so that the window is symmetric about it
         fit = fit_windows(grey, start, radius, weight_of, corner)
@@ -182,7 +182,7 @@ def _steps(xy: Float, axis: int) -> Float:
     """Mean step to the neighbours along an axis, (columns, rows, 2); NaN without any."""
     total, count = np.zeros_like(xy), np.zeros(xy.shape[:2])
     step = np.diff(xy, axis=axis)
-    known = np.isfinite(step).all(axis=-1)
+    known = np.asarray(np.isfinite(step).all(axis=-1))
     for part in (slice(None, -1), slice(1, None)):
         at = (part, slice(None)) if axis == 0 else (slice(None), part)
         total[at] += np.where(known[..., None], step, 0.0)

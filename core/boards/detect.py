@@ -72,14 +72,14 @@ def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
     least = _LEAST_CHARUCO if target.kind == "charuco" else int(0.5 * found.size)
     if found.sum() < least:
         raise TargetError(
-            f"Only {int(found.sum())} of {found.size} points of the {_NAMES[target.kind]} are clear enough to be located.",
+            f"Only {int(found.sum())} of {found.size} points of the {_NAMES[target.kind]} can be located.",
             code="target_partly_seen",
             remedy="Show more of the board, evenly lit and in focus.",
         )
     pitch = float(np.nanmedian(neighbour_distances_px(xy, target)))
     if pitch < _LEAST_PITCH_PX:
         raise TargetError(
-            f"Neighbouring points of the {_NAMES[target.kind]} lie {pitch:.1f} px apart; {_LEAST_PITCH_PX:g} px are needed.",
+            f"Neighbouring points of the {_NAMES[target.kind]} lie {pitch:.1f} px apart, not {_LEAST_PITCH_PX:g} px.",
             code="target_too_small",
             remedy="Show the board larger, or use one with fewer points.",
         )
@@ -104,7 +104,7 @@ def _other(grey8: NDArray[np.uint8]) -> str | None:
         corners, _, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey8)
         if len(corners) >= _LEAST_MARKERS:
             return "ChArUco board (or markers of ArUco)"
-    size = checkerboard_size(grey8)
+    size = _squares(grey8)
     if size is not None:
         return f"checkerboard of {size[0]} x {size[1]} inner corners"
     dots = count_dots(grey8)
@@ -114,7 +114,7 @@ def _other(grey8: NDArray[np.uint8]) -> str | None:
 def _not_found(grey8: NDArray[np.uint8], target: BoardTarget) -> TargetError:
     wanted = f"{_NAMES[target.kind]} of {target.size[0]} x {target.size[1]}"
     if target.kind == "checkerboard":
-        size = checkerboard_size(grey8)
+        size = _squares(grey8)
         if size is not None and sorted(size) != sorted(target.size) and not _markers(grey8):
             return TargetError(
                 f"The image shows a checkerboard of {size[0]} x {size[1]} inner corners, described are "
@@ -142,6 +142,12 @@ def _not_found(grey8: NDArray[np.uint8], target: BoardTarget) -> TargetError:
     )
 
 
+def _squares(grey8: NDArray[np.uint8]) -> tuple[int, int] | None:
+    """Size of the checkerboard shown; the gaps between dots look like a few squares too."""
+    size = checkerboard_size(grey8)
+    return None if size is None or count_dots(grey8) > size[0] * size[1] else size
+
+
 def _markers(grey8: NDArray[np.uint8]) -> bool:
     other = _other(grey8)
     return other is not None and other.startswith("ChArUco")
@@ -160,7 +166,7 @@ def _checked(image: NDArray[Any]) -> Float:
 def _eight_bit(grey: Float) -> NDArray[np.uint8]:
     low, high = np.percentile(grey, [0.5, 99.5])
     scale = 255.0 / max(float(high - low), 1e-9)
-    return np.clip((grey - low) * scale, 0.0, 255.0).astype(np.uint8)
+    return np.asarray(np.clip((grey - low) * scale, 0.0, 255.0), dtype=np.uint8)
 
 
 def _upright(xy: Float, grey: Float | None, target: BoardTarget) -> tuple[Float, int]:

@@ -62,7 +62,7 @@ def refine_dots(grey: Float, coarse_px: Float, moments_px2: Float, target: Board
 
     def weight_of(index: NDArray[np.intp], dx: Float, dy: Float) -> Float:
         d = np.einsum("nij,nmj->nmi", matrix[index], np.stack([dx, dy], axis=-1))
-        return (np.linalg.norm(d, axis=-1) <= rings[index][:, None]).astype(np.float64)
+        return np.asarray(np.linalg.norm(d, axis=-1) <= rings[index][:, None], dtype=np.float64)
 
     fit = fit_windows(grey, start, radius, weight_of, dot)
     a, b, c = fit.parameters[:, 2], fit.parameters[:, 3], fit.parameters[:, 4]
@@ -83,7 +83,7 @@ def _levels(grey: Float, xy: Float, axis: Float, reach: Float) -> tuple[Float, F
         p = xy[:, None, :] + radius[:, None, None] * ring
         x = np.clip(np.rint(p[..., 0]), 0, columns - 1).astype(int)
         y = np.clip(np.rint(p[..., 1]), 0, rows - 1).astype(int)
-        return np.median(grey[y, x], axis=1)
+        return np.asarray(np.median(grey[y, x], axis=1))
 
     return at(np.minimum(reach, axis + 3.0)), at(0.4 * axis)
 
@@ -134,7 +134,8 @@ def _arranged(centres: Float, target: BoardTarget) -> Float | None:
     count = target.size[0] * target.size[1]
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         try:
-            found, grid = cv2.findCirclesGrid(points, target.size, flags, None, cv2.CirclesGridFinderParameters())
+            # without a detector of blobs the "image" is the list of points itself; the types do not know it
+            found, grid = cv2.findCirclesGrid(points, target.size, flags, None, cv2.CirclesGridFinderParameters())  # type: ignore[call-overload]
         except cv2.error:
             continue
         if found and grid is not None and len(grid) == count:

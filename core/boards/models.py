@@ -1,7 +1,7 @@
 """Pictures of a checkerboard's corner and of a dot, blurred by a Gaussian, with their derivatives.
 
-Lens blur and the pixel's own area together are close to a Gaussian; both pictures are symmetric about the point, so that
-another blur of the same symmetry moves no point.
+Lens blur and the pixel's own area together are close to a Gaussian; both pictures are symmetric about the point, so
+that another blur of the same symmetry moves no point.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def _fit_chunk(
 ) -> FittedWindows:
     n, p = start.shape
     rows, columns = image.shape
-    offsets = np.arange(-radius_px, radius_px + 1)
+    offsets = np.arange(-radius_px, radius_px + 1, dtype=np.float64)
     dy, dx = (d.ravel() for d in np.meshgrid(offsets, offsets, indexing="ij"))
     x = np.rint(start[:, :1]) + dx
     y = np.rint(start[:, 1:2]) + dy
