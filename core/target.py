@@ -8,6 +8,7 @@ the first position. Only inner intersections are used: the outermost lines end a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,24 +49,16 @@ class GridTarget:
     dark_lines: bool = True
 
     def __post_init__(self) -> None:
-        lines = tuple(self.lines)
-        if len(lines) != 2 or any(isinstance(n, bool) or int(n) != n for n in lines):
-            raise _invalid(f"lines must be two whole numbers, got {self.lines!r}")
-        object.__setattr__(self, "lines", (int(lines[0]), int(lines[1])))
+        object.__setattr__(self, "lines", two_whole_numbers("lines", self.lines))
         if min(self.lines) < _MIN_LINES:
-            raise _invalid(f"a grid needs at least {_MIN_LINES} lines each way, got {list(self.lines)}")
-        if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
-            raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")
+            raise invalid(f"a grid needs at least {_MIN_LINES} lines each way, got {list(self.lines)}")
+        check_pitch(self.pitch_mm)
         if not (0.0 < self.line_width_mm < 0.5 * self.pitch_mm):
-            raise _invalid(
+            raise invalid(
                 f"line_width_mm must lie between 0 and half of the pitch ({0.5 * self.pitch_mm:g} mm),"
                 f" got {self.line_width_mm!r}"
             )
-        if not (0.0 <= self.node_tolerance_mm < 0.25 * self.pitch_mm):
-            raise _invalid(
-                f"node_tolerance_mm must lie between 0 and a quarter of the pitch ({0.25 * self.pitch_mm:g} mm),"
-                f" got {self.node_tolerance_mm!r}"
-            )
+        check_tolerance(self.node_tolerance_mm, self.pitch_mm)
 
     @property
     def inner_shape(self) -> tuple[int, int]:
@@ -91,5 +84,29 @@ class GridTarget:
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
 
 
-def _invalid(cause: str) -> TargetError:
+def two_whole_numbers(name: str, values: Sequence[int]) -> tuple[int, int]:
+    """Return a description's two counts as integers, or raise ``target_invalid``."""
+    pair = tuple(values)
+    if len(pair) != 2 or any(isinstance(n, bool) or int(n) != n for n in pair):
+        raise invalid(f"{name} must be two whole numbers, got {values!r}")
+    return int(pair[0]), int(pair[1])
+
+
+def check_pitch(pitch_mm: float) -> None:
+    """Raise ``target_invalid`` for a distance of neighbouring points that no target can have."""
+    if not (np.isfinite(pitch_mm) and pitch_mm > 0.0):
+        raise invalid(f"pitch_mm must be positive and finite, got {pitch_mm!r}")
+
+
+def check_tolerance(node_tolerance_mm: float, pitch_mm: float) -> None:
+    """Raise ``target_invalid`` for a tolerance that would confuse neighbouring points."""
+    if not (0.0 <= node_tolerance_mm < 0.25 * pitch_mm):
+        raise invalid(
+            f"node_tolerance_mm must lie between 0 and a quarter of the pitch ({0.25 * pitch_mm:g} mm),"
+            f" got {node_tolerance_mm!r}"
+        )
+
+
+def invalid(cause: str) -> TargetError:
+    """Return the error for a description that no target can have."""
     return TargetError(cause, code="target_invalid", remedy="Correct the target's description.")

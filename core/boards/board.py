@@ -12,10 +12,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from core.arrays import Float
-from core.errors import TargetError
+from core.target import check_pitch, check_tolerance, invalid, two_whole_numbers
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "circles_asymmetric"]
-TargetKind = Literal["line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric"]
 BOARD_KINDS: tuple[BoardKind, ...] = get_args(BoardKind)
 DEFAULT_DICTIONARY = "DICT_5X5_100"
 _MIN_SIZE, _MAX_SIZE = 3, 200
@@ -54,28 +53,15 @@ class BoardTarget:
     dictionary: str = DEFAULT_DICTIONARY
 
     def __post_init__(self) -> None:
-        size = tuple(self.size)
         if self.kind not in BOARD_KINDS:
-            raise _invalid(f"kind must be one of {', '.join(BOARD_KINDS)}, got {self.kind!r}")
-        if len(size) != 2 or any(isinstance(n, bool) or int(n) != n for n in size):
-            raise _invalid(f"size must be two whole numbers, got {self.size!r}")
-        object.__setattr__(self, "size", (int(size[0]), int(size[1])))
+            raise invalid(f"kind must be one of {', '.join(BOARD_KINDS)}, got {self.kind!r}")
+        object.__setattr__(self, "size", two_whole_numbers("size", self.size))
         if min(self.size) < _MIN_SIZE or max(self.size) > _MAX_SIZE:
-            raise _invalid(f"size must lie between {_MIN_SIZE} and {_MAX_SIZE} each way, got {list(self.size)}")
-        if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0.0):
-            raise _invalid(f"pitch_mm must be positive and finite, got {self.pitch_mm!r}")
-        if not 0.0 <= self.node_tolerance_mm < 0.25 * self.pitch_mm:
-            raise _invalid(
-                f"node_tolerance_mm must lie between 0 and a quarter of the pitch ({0.25 * self.pitch_mm:g} mm),"
-                f" got {self.node_tolerance_mm!r}"
-            )
+            raise invalid(f"size must lie between {_MIN_SIZE} and {_MAX_SIZE} each way, got {list(self.size)}")
+        check_pitch(self.pitch_mm)
+        check_tolerance(self.node_tolerance_mm, self.pitch_mm)
         if self.kind == "charuco" and (self.marker_mm is None or not 0.0 < self.marker_mm < self.pitch_mm):
-            raise _invalid(f"marker_mm must lie between 0 and the pitch ({self.pitch_mm:g} mm), got {self.marker_mm!r}")
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of points along X and along Y."""
-        return self.size
+            raise invalid(f"marker_mm must lie between 0 and the pitch ({self.pitch_mm:g} mm), got {self.marker_mm!r}")
 
     def points_mm(self) -> Float:
         """Return the nominal positions (columns, rows, 2), X and Y in mm, Z is 0."""
@@ -86,7 +72,3 @@ class BoardTarget:
         points = np.stack([x, y], axis=-1) * self.pitch_mm
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
         return np.asarray(points - 0.5 * (low + high))
-
-
-def _invalid(cause: str) -> TargetError:
-    return TargetError(cause, code="target_invalid", remedy="Correct the target's description.")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from core.arrays import Float
 from core.boards.board import BoardTarget
 from core.boards.models import corner
-from core.boards.view import neighbour_distances_px
-from core.boards.windows import fit_windows
+from core.boards.view import neighbour_distances_px, steps_px
+from core.boards.windows import fit_windows, sample
 from core.errors import TargetError
 
 _COARSE_SIDE_PX = 1400  # OpenCV's search is slow on large images and finds no more there
@@ -104,7 +104,7 @@ def refine_corners(grey: Float, coarse_px: Float, target: BoardTarget) -> tuple[
     """
     shape = coarse_px.shape[:2]
     pitch = neighbour_distances_px(coarse_px, target)
-    along_x, along_y = _steps(coarse_px, 0), _steps(coarse_px, 1)
+    along_x, along_y = steps_px(coarse_px, 0), steps_px(coarse_px, 1)
     usable = np.isfinite(pitch) & np.isfinite(along_x).all(axis=-1) & np.isfinite(along_y).all(axis=-1)
     xy, sigma = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
     if not usable.any():
@@ -133,15 +133,14 @@ def refine_corners(grey: Float, coarse_px: Float, target: BoardTarget) -> tuple[
         board = np.abs(np.einsum("nij,nmj->nmi", to_board[index], d))
         near = (board <= _RADIUS + 0.05).all(axis=-1)
         free = board.min(axis=-1) < np.maximum(frame - rim[index], 0.0)[:, None]
-        return np.asarray(near & (free if np.isfinite(frame) else True), dtype=np.float64)
+        return np.asarray(near & free, dtype=np.float64)
 
     for _ in range(2):  # the second time about the corner found, so that the window is symmetric about it
         fit = fit_windows(grey, start, radius, weight_of, corner)
         moved = np.linalg.norm(fit.parameters[:, :2] - start_xy, axis=1)
         good = fit.good & (moved < _MAX_MOVE * step)
         start = np.where(good[:, None], fit.parameters, start)
-    crossing = np.abs(np.sin(fit.parameters[:, 2] - fit.parameters[:, 3])) > 0.15
-    good &= crossing & (np.abs(fit.parameters[:, 5]) > 0.0)
+    good &= np.abs(np.sin(fit.parameters[:, 2] - fit.parameters[:, 3])) > 0.15
     out, spread = np.full((len(start_xy), 2), np.nan), np.full(len(start_xy), np.nan)
     out[good], spread[good] = fit.parameters[good, :2], fit.sigma_px[good]
     xy[usable], sigma[usable] = out, spread
@@ -178,37 +177,17 @@ def _arranged(corners: NDArray[Any], size: tuple[int, int], factor: float) -> Fl
     return np.swapaxes(_full_scale(corners.reshape(size[1], size[0], 2), factor), 0, 1)
 
 
-def _steps(xy: Float, axis: int) -> Float:
-    """Mean step to the neighbours along an axis, (columns, rows, 2); NaN without any."""
-    total, count = np.zeros_like(xy), np.zeros(xy.shape[:2])
-    step = np.diff(xy, axis=axis)
-    known = np.asarray(np.isfinite(step).all(axis=-1))
-    for part in (slice(None, -1), slice(1, None)):
-        at = (part, slice(None)) if axis == 0 else (slice(None), part)
-        total[at] += np.where(known[..., None], step, 0.0)
-        count[at] += known
-    with np.errstate(invalid="ignore"):
-        return np.where(count[..., None] > 0, total / np.maximum(count, 1.0)[..., None], np.nan)
-
-
-def _samples(grey: Float, xy: Float) -> Float:
-    rows, columns = grey.shape
-    x = np.clip(np.rint(xy[..., 0]), 0, columns - 1).astype(int)
-    y = np.clip(np.rint(xy[..., 1]), 0, rows - 1).astype(int)
-    return np.asarray(grey[y, x])
-
-
 def _levels(grey: Float, xy: Float, radius: int) -> tuple[Float, Float]:
     offsets = np.arange(-radius, radius + 1)
     dy, dx = (d.ravel() for d in np.meshgrid(offsets, offsets, indexing="ij"))
-    samples = _samples(grey, xy[:, None, :] + np.stack([dx, dy], axis=-1))
+    samples = sample(grey, xy[:, None, :] + np.stack([dx, dy], axis=-1))
     low, high = np.percentile(samples, [20.0, 80.0], axis=1)
     return low, high
 
 
 def _signed_amplitude(grey: Float, xy: Float, ex: Float, ey: Float, size: Float) -> Float:
     # u is the distance to the edge along ex, positive along ey; v that to the edge along ey, positive against ex
-    inside = _samples(grey, xy + 0.25 * (ex + ey)) + _samples(grey, xy - 0.25 * (ex + ey))
-    across = _samples(grey, xy + 0.25 * (ex - ey)) + _samples(grey, xy - 0.25 * (ex - ey))
-    u_times_v = -1.0  # at xy + ex + ey
-    return np.maximum(size, 1e-3) * np.where(inside > across, u_times_v, -u_times_v)
+    inside = sample(grey, xy + 0.25 * (ex + ey)) + sample(grey, xy - 0.25 * (ex + ey))
+    across = sample(grey, xy + 0.25 * (ex - ey)) + sample(grey, xy - 0.25 * (ex - ey))
+    amplitude = np.maximum(size, 1e-3)
+    return np.where(inside > across, -amplitude, amplitude)  # u v is negative at xy + ex + ey

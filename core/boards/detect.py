@@ -13,7 +13,8 @@ from core.boards.board import BoardTarget
 from core.boards.corners import checkerboard_size, dark_at_start, find_charuco, find_checkerboard, refine_corners
 from core.boards.dots import count_dots, find_dots, refine_dots
 from core.boards.view import BoardView, neighbour_distances_px
-from core.errors import ImageError, TargetError
+from core.errors import TargetError
+from core.grid.threshold import checked_image
 
 _NAMES = {
     "checkerboard": "checkerboard",
@@ -46,27 +47,27 @@ def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
     Raises
     ------
     ImageError
-        ``image_unsupported``: no gray image.
+        ``image_unsupported``, ``image_unusable``: no gray image.
     TargetError
         ``target_not_found``, ``target_other`` (the image shows another target), ``target_size`` (another number of
         corners), ``target_too_small``, ``target_partly_seen``.
     """
-    grey = _checked(image)
+    grey = checked_image(image).astype(np.float64)
     grey8 = _eight_bit(grey)
     radius: Float | None = None
     if target.kind in ("circles", "circles_asymmetric"):
         dots = find_dots(grey8, target)
         if dots is None:
             raise _not_found(grey8, target)
-        arranged, turned = _upright(dots[0], None, target)
-        moments = _turned(dots[1], turned)
-        xy, sigma, radius = refine_dots(grey, arranged, moments, target)
+        centres, moments = dots
+        order = _upright(centres, None, target)
+        xy, sigma, radius = refine_dots(grey, centres.reshape(-1, 2)[order], moments.reshape(-1, 2, 2)[order], target)
     else:
         coarse = find_charuco(grey8, target) if target.kind == "charuco" else find_checkerboard(grey8, target.size)
         if coarse is None:
             raise _not_found(grey8, target)
         if target.kind == "checkerboard":
-            coarse, _ = _upright(coarse, grey, target)
+            coarse = coarse.reshape(-1, 2)[_upright(coarse, grey, target)]
         xy, sigma = refine_corners(grey, coarse, target)
     found = np.isfinite(xy).all(axis=-1)
     least = _LEAST_CHARUCO if target.kind == "charuco" else int(0.5 * found.size)
@@ -93,36 +94,27 @@ def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
     )
 
 
-def other_target(image: NDArray[Any]) -> str | None:
-    """Name the board that an image shows, None where it shows none of those known."""
-    return _other(_eight_bit(_checked(image)))
-
-
-def _other(grey8: NDArray[np.uint8]) -> str | None:
-    for name in _DICTIONARIES:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-        corners, _, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey8)
-        if len(corners) >= _LEAST_MARKERS:
-            return "ChArUco board (or markers of ArUco)"
-    size = _squares(grey8)
-    if size is not None:
-        return f"checkerboard of {size[0]} x {size[1]} inner corners"
-    dots = count_dots(grey8)
-    return f"grid of about {dots} dots" if dots >= _MANY_DOTS else None
-
-
 def _not_found(grey8: NDArray[np.uint8], target: BoardTarget) -> TargetError:
     wanted = f"{_NAMES[target.kind]} of {target.size[0]} x {target.size[1]}"
-    if target.kind == "checkerboard":
-        size = _squares(grey8)
-        if size is not None and sorted(size) != sorted(target.size) and not _markers(grey8):
-            return TargetError(
-                f"The image shows a checkerboard of {size[0]} x {size[1]} inner corners, described are "
-                f"{target.size[0]} x {target.size[1]}.",
-                code="target_size",
-                remedy="Correct size in the target's description, or show the whole board.",
-            )
-    other = _other(grey8)
+    markers = _shows_markers(grey8)
+    dots = count_dots(grey8)
+    size = None if markers else checkerboard_size(grey8)
+    if size is not None and dots > size[0] * size[1]:
+        size = None  # the gaps between dots look like a few squares too
+    if target.kind == "checkerboard" and size is not None and sorted(size) != sorted(target.size):
+        return TargetError(
+            f"The image shows a checkerboard of {size[0]} x {size[1]} inner corners, described are "
+            f"{target.size[0]} x {target.size[1]}.",
+            code="target_size",
+            remedy="Correct size in the target's description, or show the whole board.",
+        )
+    other = None
+    if markers:
+        other = "ChArUco board (or markers of ArUco)"
+    elif size is not None:
+        other = f"checkerboard of {size[0]} x {size[1]} inner corners"
+    elif dots >= _MANY_DOTS:
+        other = f"grid of about {dots} dots"
     if other is not None and not other.startswith(_NAMES[target.kind]):
         if target.kind.startswith("circles") and other.startswith("grid of about"):
             return TargetError(
@@ -142,25 +134,13 @@ def _not_found(grey8: NDArray[np.uint8], target: BoardTarget) -> TargetError:
     )
 
 
-def _squares(grey8: NDArray[np.uint8]) -> tuple[int, int] | None:
-    """Size of the checkerboard shown; the gaps between dots look like a few squares too."""
-    size = checkerboard_size(grey8)
-    return None if size is None or count_dots(grey8) > size[0] * size[1] else size
-
-
-def _markers(grey8: NDArray[np.uint8]) -> bool:
-    other = _other(grey8)
-    return other is not None and other.startswith("ChArUco")
-
-
-def _checked(image: NDArray[Any]) -> Float:
-    if image.ndim != 2 or min(image.shape) < 16:
-        raise ImageError(
-            f"The image has the shape {image.shape}, not (rows, columns).",
-            code="image_unsupported",
-            remedy="Give one-channel images.",
-        )
-    return np.ascontiguousarray(image, dtype=np.float64)
+def _shows_markers(grey8: NDArray[np.uint8]) -> bool:
+    for name in _DICTIONARIES:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        corners, _, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey8)
+        if len(corners) >= _LEAST_MARKERS:
+            return True
+    return False
 
 
 def _eight_bit(grey: Float) -> NDArray[np.uint8]:
@@ -169,40 +149,33 @@ def _eight_bit(grey: Float) -> NDArray[np.uint8]:
     return np.asarray(np.clip((grey - low) * scale, 0.0, 255.0), dtype=np.uint8)
 
 
-def _upright(xy: Float, grey: Float | None, target: BoardTarget) -> tuple[Float, int]:
+def _upright(points: Float, grey: Float | None, target: BoardTarget) -> NDArray[np.intp]:
     """Index the points as the board's own colours or rows do; where these do not tell, as the image does.
 
-    Returns the points and what was done: 1 for a mirrored index, 2 for half a turn, both added.
+    Returns the (columns, rows) numbers of the points, counted as they lie in ``points`` (columns, rows, 2).
     """
-    turned = 0
-    ex, ey = xy[-1, 0] - xy[0, 0], xy[0, -1] - xy[0, 0]
-    square = target.size[0] == target.size[1]
-    if ex[0] * ey[1] - ex[1] * ey[0] < 0.0 and target.kind != "circles_asymmetric":
-        xy, turned = xy[:, ::-1], turned + 1
-    if square and target.kind != "circles_asymmetric":
+    flat = points.reshape(-1, 2)
+    order = np.arange(len(flat)).reshape(target.size)
+    asymmetric = target.kind == "circles_asymmetric"
+    ex, ey = _sides(flat[order])
+    if ex[0] * ey[1] - ex[1] * ey[0] < 0.0 and not asymmetric:
+        order = order[:, ::-1]
+    if target.size[0] == target.size[1] and not asymmetric:
         # a square board may be indexed in four ways; X is what lies nearest to the rows
         for _ in range(3):
-            ex, ey = xy[-1, 0] - xy[0, 0], xy[0, -1] - xy[0, 0]
+            ex, _ey = _sides(flat[order])
             if ex[0] >= abs(ex[1]) - 1e-9:
                 break
-            xy = np.swapaxes(xy, 0, 1)[::-1]
-            turned += 4
-    if target.kind == "circles_asymmetric" and target.size[1] % 2:
-        return xy, turned
+            order = order.T[::-1]
+    if asymmetric and target.size[1] % 2:
+        return order
     if target.kind == "checkerboard" and sum(target.size) % 2 and grey is not None:
-        half_turn = not dark_at_start(grey, xy)
+        half_turn = not dark_at_start(grey, flat[order])
     else:
-        ex, ey = xy[-1, 0] - xy[0, 0], xy[0, -1] - xy[0, 0]
-        ex, ey = ex / np.linalg.norm(ex), ey / np.linalg.norm(ey)
-        half_turn = bool(ex[0] + ey[1] < 0.0)
-    if half_turn:
-        xy, turned = xy[::-1, ::-1], turned + 2
-    return np.ascontiguousarray(xy), turned
+        ex, ey = _sides(flat[order])
+        half_turn = bool(ex[0] / np.linalg.norm(ex) + ey[1] / np.linalg.norm(ey) < 0.0)
+    return order[::-1, ::-1] if half_turn else order
 
 
-def _turned(values: Float, turned: int) -> Float:
-    if turned & 1:
-        values = values[:, ::-1]
-    for _ in range(turned // 4):
-        values = np.swapaxes(values, 0, 1)[::-1]
-    return values[::-1, ::-1] if turned & 2 else values
+def _sides(xy: Float) -> tuple[Float, Float]:
+    return xy[-1, 0] - xy[0, 0], xy[0, -1] - xy[0, 0]

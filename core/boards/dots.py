@@ -10,7 +10,7 @@ from core.arrays import Float
 from core.boards.board import BoardTarget
 from core.boards.models import dot
 from core.boards.view import neighbour_distances_px
-from core.boards.windows import fit_windows
+from core.boards.windows import fit_windows, sample
 
 _MIN_AREA_PX = 12
 _MAX_RADIUS_PX = 60
@@ -75,15 +75,11 @@ def refine_dots(grey: Float, coarse_px: Float, moments_px2: Float, target: Board
 
 
 def _levels(grey: Float, xy: Float, axis: Float, reach: Float) -> tuple[Float, Float]:
-    rows, columns = grey.shape
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
     def at(radius: Float) -> Float:
-        p = xy[:, None, :] + radius[:, None, None] * ring
-        x = np.clip(np.rint(p[..., 0]), 0, columns - 1).astype(int)
-        y = np.clip(np.rint(p[..., 1]), 0, rows - 1).astype(int)
-        return np.asarray(np.median(grey[y, x], axis=1))
+        return np.asarray(np.median(sample(grey, xy[:, None, :] + radius[:, None, None] * ring), axis=1))
 
     return at(np.minimum(reach, axis + 3.0)), at(0.4 * axis)
 

@@ -29,12 +29,20 @@ class FittedWindows:
     sigma_px
         (n,) standard deviation of the position per axis, from the residuals of the window's own fit.
     good
-        (n,) True where the fit settled.
+        (n,) True where the window held samples enough and the fit ended at finite numbers.
     """
 
     parameters: Float
     sigma_px: Float
     good: Bool
+
+
+def sample(image: Float, xy_px: Float) -> Float:
+    """Return the grey levels (...) of the pixels nearest to positions (..., 2), of the border outside the image."""
+    rows, columns = image.shape
+    x = np.clip(np.rint(xy_px[..., 0]), 0, columns - 1).astype(int)
+    y = np.clip(np.rint(xy_px[..., 1]), 0, rows - 1).astype(int)
+    return np.asarray(image[y, x])
 
 
 def fit_windows(image: Float, start: Float, radius_px: int, weight_of: WeightOf, model: Model) -> FittedWindows:
@@ -80,7 +88,7 @@ def _fit_chunk(
     x = np.rint(start[:, :1]) + dx
     y = np.rint(start[:, 1:2]) + dy
     inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
-    grey = image[np.clip(y, 0, rows - 1).astype(int), np.clip(x, 0, columns - 1).astype(int)]
+    grey = sample(image, np.stack([x, y], axis=-1))
     weight = np.where(inside, weight_of(np.arange(first, first + n), x - start[:, :1], y - start[:, 1:2]), 0.0)
     params = start.copy()
     damping = np.full(n, 1e-3)

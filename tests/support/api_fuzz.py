@@ -35,8 +35,9 @@ from tests.support.service_rig import TINY, served, true_cameras, wait_for_job, 
 from tests.support.tiny_rig import tiny_rig
 
 PHASES = ("examples", "coverage", "fuzzing", "stateful")
-# what an earlier request of a run can have made: an id, or the number of one of its steps
+# a whole number as no schema writes it
 _OTHER_TEXT = re.compile(r"[+-]?\d+\.0*|\+\d+")
+# what an earlier request of a run can have made: an id, or the number of one of its steps
 _MADE = re.compile(r"[tcjna][0-9]{6}-[0-9a-f]{6}|[1-9][0-9]?")
 # moves take no time, frames little; a clock that runs faster yet would lose frames on a busy machine
 FAST = {"velocity_mm_s": "velocity_mm_s = 20.0", "time_scale": "time_scale = 10.0"}
