@@ -45,7 +45,12 @@ def image_positions(image_size_px: tuple[int, int]) -> Float:
 
 
 def fit_opencv(
-    lens: LensModel, image_size_px: tuple[int, int], *, skew: bool = True, tangential: bool = True
+    lens: LensModel,
+    image_size_px: tuple[int, int],
+    *,
+    skew: bool = True,
+    tangential: bool = True,
+    rational: bool = False,
 ) -> LensFit:
     """Fit OpenCV's model to a lens.
 
@@ -57,6 +62,8 @@ def fit_opencv(
         (width, height) over which they are to agree.
     skew, tangential
         True if the model has a skew, and p1 and p2; without them the other terms approximate them.
+    rational
+        True if the model has k4, k5 and k6, which a lens then keeps; without them k1, k2 and k3 approximate them.
 
     Raises
     ------
@@ -72,11 +79,14 @@ def fit_opencv(
     elif isinstance(lens, OpenCVLens):
         start = replace(lens, skew_px=lens.skew_px if skew else 0.0)
         start = start if tangential else replace(start, p1=0.0, p2=0.0)
+        if lens.is_rational and not rational:
+            # a series in r^2 may diverge inside the image; without k1, k2 and k3 every point is in the domain
+            start = replace(start, k1=0.0, k2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
         if start == lens:
             return LensFit(lens, 0.0, 0.0, _rays(lens, image_size_px)[2])
     else:
         raise TypeError(f"a {type(lens).__name__} cannot be fitted")
-    fixed = {*(() if skew else ("skew_px",)), *(() if tangential else ("p1", "p2"))}
+    fixed = {"k4", "k5", "k6", *(() if skew else ("skew_px",)), *(() if tangential else ("p1", "p2"))}
     if isinstance(lens, SeidelLens):
         fixed |= {"skew_px", "p1", "p2"}  # it is symmetric about its centre: they stay zero
     return _fit(lens, start, [n for n in start.parameter_names if n not in fixed], image_size_px)
@@ -88,7 +98,7 @@ def fit_seidel(lens: LensModel, image_size_px: tuple[int, int]) -> LensFit:
         return LensFit(lens, 0.0, 0.0, _rays(lens, image_size_px)[2])
     if not isinstance(lens, OpenCVLens):
         raise TypeError(f"a {type(lens).__name__} cannot be fitted")
-    start = SeidelLens(lens.fx_px, lens.cx_px, lens.cy_px, -lens.k1 / lens.fx_px**2, lens.fy_px / lens.fx_px)
+    start = SeidelLens(lens.fx_px, lens.cx_px, lens.cy_px, (lens.k4 - lens.k1) / lens.fx_px**2, lens.fy_px / lens.fx_px)
     return _fit(lens, start, start.parameter_names, image_size_px)
 
 

@@ -1,7 +1,7 @@
 """Lens models: from normalised camera coordinates to the image and back.
 
 A lens model maps the normalised point ``(X_cam / Z_cam, Y_cam / Z_cam)`` to image pixels. Two models share one small
-interface: the paper's Seidel term, Eqs. (5) to (8), and OpenCV's ``k1 k2 p1 p2 k3`` for imported rigs.
+interface: the paper's Seidel term, Eqs. (5) to (8), and OpenCV's ``k1 k2 p1 p2 k3 k4 k5 k6``.
 
 Conventions: pixel centres at integers, x = column to the right, y = row down. A point outside a model's domain is
 marked in ``valid``; its coordinates are then NaN and must not be used.
@@ -20,8 +20,9 @@ from core.arrays import Bool, Float
 
 SEIDEL = 0.0
 OPENCV = 1.0
-N_KERNEL_PARAMETERS = 12
+N_KERNEL_PARAMETERS = 15
 _NEWTON_STEPS = 30
+_BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 
 
 class MappedPoints(NamedTuple):
@@ -70,10 +71,11 @@ class LensModel(Protocol):
         ...
 
     def kernel_parameters(self) -> Float:
-        """Flat (12,) float64 form for compiled kernels.
+        """Flat (15,) float64 form for compiled kernels.
 
-        ``[kind, fx, fy, skew, cx, cy, d0, d1, d2, d3, d4, r2_max]`` with kind 0 = Seidel (d0 = kappa phd^2) or
-        1 = OpenCV (d = k1 k2 p1 p2 k3), and r2_max the largest normalised radius squared inside the domain.
+        ``[kind, fx, fy, skew, cx, cy, d0, d1, d2, d3, d4, r2_max, d5, d6, d7]`` with kind 0 = Seidel (d0 = kappa phd^2,
+        the other d zero) or 1 = OpenCV (d = k1 k2 p1 p2 k3, k4 k5 k6), and r2_max the largest normalised radius squared
+        inside the domain.
         """
         ...
 
@@ -154,17 +156,18 @@ class SeidelLens:
         """Flat form, see :class:`LensModel`."""
         k = self.kappa_per_px2 * self.phd_px**2
         r2_max = 1.0 / abs(k) if k != 0.0 else np.inf
-        return np.array(
-            [SEIDEL, self.phd_px, self.phd_px * self.aspect, 0.0, self.cx_px, self.cy_px, k, 0, 0, 0, 0, r2_max]
-        )
+        flat = np.zeros(N_KERNEL_PARAMETERS)
+        flat[:7] = SEIDEL, self.phd_px, self.phd_px * self.aspect, 0.0, self.cx_px, self.cy_px, k
+        flat[11] = r2_max
+        return flat
 
 
 @dataclass(frozen=True)
 class OpenCVLens:
-    """OpenCV's pinhole and distortion model with five coefficients and a skew.
+    """OpenCV's pinhole and distortion model with eight coefficients and a skew; the five-term one has k4 = k5 = k6 = 0.
 
-    ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)``, likewise y;
-    ``x_img = fx x_d + skew y_d + cx``, ``y_img = fy y_d + cy``.
+    ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)``, likewise
+    y; ``x_img = fx x_d + skew y_d + cx``, ``y_img = fy y_d + cy``.
     """
 
     fx_px: float
@@ -177,6 +180,9 @@ class OpenCVLens:
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
 
     parameter_names: ClassVar[tuple[str, ...]] = (
         "fx_px",
@@ -189,20 +195,46 @@ class OpenCVLens:
         "p1",
         "p2",
         "k3",
+        "k4",
+        "k5",
+        "k6",
     )
 
     @cached_property
+    def is_rational(self) -> bool:
+        """True if one of k4, k5, k6 is not zero."""
+        return self.k4 != 0.0 or self.k5 != 0.0 or self.k6 != 0.0
+
+    @cached_property
     def _r2_max(self) -> float:
-        # the radial polynomial folds back where d/dr [r (1 + k1 r^2 + k2 r^4 + k3 r^6)] = 0
-        roots = np.roots([7.0 * self.k3, 5.0 * self.k2, 3.0 * self.k1, 1.0])
-        real = roots[np.abs(roots.imag) < 1e-12 * np.maximum(1.0, np.abs(roots))].real
-        real = real[real > 0.0]
-        return float(real.min()) if real.size else float("inf")
+        # the radial factor N / D folds back where d/dr [r N / D] = (N D + 2 s (N' D - N D')) / D^2 = 0, s = r^2
+        if not self.is_rational:
+            return _smallest_positive_root([7.0 * self.k3, 5.0 * self.k2, 3.0 * self.k1, 1.0])
+        top = np.polynomial.Polynomial([1.0, self.k1, self.k2, self.k3])
+        bottom = np.polynomial.Polynomial([1.0, self.k4, self.k5, self.k6])
+        grown = top.deriv() * bottom - top * bottom.deriv()
+        slope = top * bottom + np.polynomial.Polynomial([0.0, 2.0]) * grown
+        return min(_smallest_positive_root(list(one.coef[::-1])) for one in (slope, bottom))
+
+    def _radial(self, r2: Float) -> Float:
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return radial / self._denominator(r2) if self.is_rational else radial
+
+    def _denominator(self, r2: Float) -> Float:
+        return 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+
+    def _radial_slope(self, r2: Float, radial: Float) -> Float:
+        """Twice the radial factor's derivative with respect to r^2."""
+        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3))
+        if self.is_rational:
+            bottom = 2.0 * (self.k4 + r2 * (2.0 * self.k5 + 3.0 * r2 * self.k6))
+            slope = (slope - radial * bottom) / self._denominator(r2)
+        return slope
 
     def _distorted(self, n: Float) -> Float:
         x, y = n[..., 0], n[..., 1]
         r2 = x * x + y * y
-        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        radial = self._radial(r2)
         xd = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
         yd = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
         return np.stack([xd, yd], axis=-1)
@@ -210,8 +242,8 @@ class OpenCVLens:
     def _distorted_jacobian(self, n: Float) -> Float:
         x, y = n[..., 0], n[..., 1]
         r2 = x * x + y * y
-        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3))  # d radial / d(r^2) * 2
+        radial = self._radial(r2)
+        slope = self._radial_slope(r2, radial)
         jac = np.empty((*n.shape[:-1], 2, 2))
         jac[..., 0, 0] = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
         jac[..., 0, 1] = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
@@ -225,8 +257,24 @@ class OpenCVLens:
             axis=-1,
         )
 
+    def _radially_undistorted(self, d: Float) -> Float:
+        """Invert the radial factor alone by bisection on the branch that contains the centre."""
+        r_d = np.hypot(d[..., 0], d[..., 1])
+        r_max = np.sqrt(self._r2_max)
+
+        def radius(t: Float) -> Float:
+            return t * r_max if np.isfinite(r_max) else t / (1.0 - t)
+
+        low, high = np.zeros_like(r_d), np.ones_like(r_d)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            r = radius(middle)
+            short = r * self._radial(r * r) < r_d
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        return d * np.divide(radius(low), r_d, out=np.ones_like(r_d), where=r_d > 0.0)[..., None]
+
     def image_from_normalised(self, xy_norm: ArrayLike) -> MappedPoints:
-        """Distort and map to pixels. Valid where the radial polynomial still grows."""
+        """Distort and map to pixels. Valid where the radius still grows, up to a pole of the radial factor."""
         n = np.asarray(xy_norm, dtype=np.float64)
         valid = n[..., 0] ** 2 + n[..., 1] ** 2 < self._r2_max
         return MappedPoints(self._image(self._distorted(np.where(valid[..., None], n, np.nan))), valid)
@@ -236,9 +284,10 @@ class OpenCVLens:
         xy = np.asarray(xy_px, dtype=np.float64)
         yd = (xy[..., 1] - self.cy_px) / self.fy_px
         d = np.stack([(xy[..., 0] - self.cx_px - self.skew_px * yd) / self.fx_px, yd], axis=-1)
-        n = d.copy()
         r_max = np.sqrt(self._r2_max)
         with np.errstate(all="ignore"):  # points that diverge are marked invalid below
+            # a quotient may level off or rise to a pole, where Newton's method from d itself would leave the branch
+            n = self._radially_undistorted(d) if self.is_rational else d.copy()
             for _ in range(_NEWTON_STEPS):
                 residual = self._distorted(n) - d
                 jac = self._distorted_jacobian(n)
@@ -264,24 +313,24 @@ class OpenCVLens:
         return out
 
     def parameter_jacobian(self, xy_norm: ArrayLike) -> Float:
-        """Differentiate with respect to fx, fy, cx, cy, skew, k1, k2, p1, p2, k3."""
+        """Differentiate with respect to fx, fy, cx, cy, skew, k1, k2, p1, p2, k3, k4, k5, k6."""
         n = np.asarray(xy_norm, dtype=np.float64)
         x, y = n[..., 0], n[..., 1]
         r2 = x * x + y * y
         d = self._distorted(n)
-        jac = np.zeros((*n.shape[:-1], 2, 10))
+        jac = np.zeros((*n.shape[:-1], 2, len(self.parameter_names)))
         jac[..., 0, 0] = d[..., 0]
         jac[..., 1, 1] = d[..., 1]
         jac[..., 0, 2] = 1.0
         jac[..., 1, 3] = 1.0
         jac[..., 0, 4] = d[..., 1]
-        terms = (
-            (5, x * r2, y * r2),
-            (6, x * r2**2, y * r2**2),
-            (7, 2.0 * x * y, r2 + 2.0 * y * y),
-            (8, r2 + 2.0 * x * x, 2.0 * x * y),
-            (9, x * r2**3, y * r2**3),
-        )
+        # the radial factor is N / D: its derivatives are those of N over D, and -N / D times those of D over D
+        bottom = self._denominator(r2) if self.is_rational else np.ones_like(r2)
+        radial = self._radial(r2)
+        terms = [(7, 2.0 * x * y, r2 + 2.0 * y * y), (8, r2 + 2.0 * x * x, 2.0 * x * y)]
+        for power, over, under in ((1, 5, 10), (2, 6, 11), (3, 9, 12)):
+            dx, dy = x * r2**power / bottom, y * r2**power / bottom
+            terms += [(over, dx, dy), (under, -radial * dx, -radial * dy)]
         for column, dx, dy in terms:
             jac[..., 0, column] = self.fx_px * dx + self.skew_px * dy
             jac[..., 1, column] = self.fy_px * dy
@@ -303,5 +352,16 @@ class OpenCVLens:
                 self.p2,
                 self.k3,
                 self._r2_max,
+                self.k4,
+                self.k5,
+                self.k6,
             ]
         )
+
+
+def _smallest_positive_root(coefficients: list[float]) -> float:
+    """Return the smallest positive real root of a polynomial, highest power first; infinity if it has none."""
+    roots = np.roots(coefficients)
+    real = roots[np.abs(roots.imag) < 1e-12 * np.maximum(1.0, np.abs(roots))].real
+    real = real[real > 0.0]
+    return float(real.min()) if real.size else float("inf")
