@@ -191,19 +191,32 @@ class Camera:
         n = p[..., :2] / p[..., 2:]
         return np.asarray(self.lens.image_jacobian(n) @ _normalised_jacobian(p) @ self.cam_from_sys.rotation)
 
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names, with units, of the numbers in :meth:`parameter_jacobian`'s last axis: the lens's, then the pose's."""
+        return (*self.lens.parameter_names, *POSE_NAMES)
+
+    def parameter_jacobian(self, points_sys_mm: ArrayLike) -> Float:
+        """Return d(image px) / d(:attr:`parameter_names`), (..., 2, n), at points (..., 3) of the system frame."""
+        return self._parameter_jacobian(points_sys_mm, len(self.lens.parameter_names))
+
     def ten_parameter_jacobian(self, points_sys_mm: ArrayLike) -> Float:
         """Return d(image px) / d(:data:`TEN_PARAMETER_NAMES`), (..., 2, 10), for a camera with the paper's lens."""
         if not isinstance(self.lens, SeidelLens):
             raise TypeError(f"a {type(self.lens).__name__} has no ten-parameter form")
+        return self._parameter_jacobian(points_sys_mm, 4)
+
+    def _parameter_jacobian(self, points_sys_mm: ArrayLike, n_lens: int) -> Float:
+        """Differentiate with respect to the lens's first parameters, then the pose's six."""
         points = np.asarray(points_sys_mm, dtype=np.float64)
         p = self.cam_from_sys.apply(points)
         n = p[..., :2] / p[..., 2:]
         to_cam = self.lens.image_jacobian(n) @ _normalised_jacobian(p)
-        jac = np.empty((*points.shape[:-1], 2, 10))
-        jac[..., :4] = self.lens.parameter_jacobian(n)[..., :4]
+        jac = np.empty((*points.shape[:-1], 2, n_lens + len(POSE_NAMES)))
+        jac[..., :n_lens] = self.lens.parameter_jacobian(n)[..., :n_lens]
         for i, dR in enumerate(rotation_derivatives(*angles_from_rotation(self.cam_from_sys.rotation))):
-            jac[..., 4 + i] = np.einsum("...ij,...j->...i", to_cam, points @ dR.T)
-        jac[..., 7:] = to_cam
+            jac[..., n_lens + i] = np.einsum("...ij,...j->...i", to_cam, points @ dR.T)
+        jac[..., n_lens + 3 :] = to_cam
         return jac
 
     def rays_cam(self, xy_px: ArrayLike) -> SpacePoints:

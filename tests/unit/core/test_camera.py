@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera, RigidTransform, angles_from_rotation, rotation_from_angles
+from core.arrays import Float
+from core.cameras.camera import POSE_NAMES, Camera, RigidTransform, angles_from_rotation, rotation_from_angles
 from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 from core.cameras.stereo import StereoPair
 
 SEIDEL = SeidelLens(12000.0, 255.0, 241.0, 3e-8, 0.9617)
 OPENCV = OpenCVLens(6638.0, 6640.0, 981.0, 610.0, 0.4, 0.0889, -2.84, 1e-3, -2e-3, 55.9)
+# a wide lens: a quotient that a polynomial in r^2 does not reach, 100 degrees across 2000 px
+RATIONAL = OpenCVLens(
+    820.0, 823.0, 981.0, 610.0, 0.4, k1=0.62, k2=0.21, p1=1e-3, p2=-2e-3, k3=0.012, k4=0.94, k5=0.38, k6=0.05
+)
+
+
+def opencv_matrix(lens: OpenCVLens) -> Float:
+    return np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]])
+
+
+def opencv_coefficients(lens: OpenCVLens) -> Float:
+    return np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6])
 
 
 def paper_camera(gamma: float = 0.5) -> Camera:
@@ -64,7 +79,52 @@ def test_opencv_lens_agrees_with_opencv() -> None:
     np.testing.assert_allclose(ours.xy, theirs[:, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("lens", [SEIDEL, OPENCV], ids=["seidel", "opencv"])
+def test_rational_lens_agrees_with_opencv_both_ways() -> None:
+    lens = replace(RATIONAL, skew_px=0.0)  # OpenCV has no skew
+    x, y = np.meshgrid(np.linspace(-1.2, 1.2, 25), np.linspace(-0.75, 0.75, 17))
+    n = np.stack([x.ravel(), y.ravel()], -1)
+    points = np.column_stack([n, np.ones(len(n))]) * 400.0
+    K, d = opencv_matrix(lens), opencv_coefficients(lens)
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, d)[0][:, 0]
+    ours = Camera(lens, RigidTransform.identity()).project(points)
+    assert ours.valid.all()
+    np.testing.assert_allclose(ours.xy, theirs, atol=1e-9)
+    settled = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-13)
+    back = cv2.undistortPoints(theirs[:, None], K, d, criteria=settled)[:, 0]
+    np.testing.assert_allclose(lens.normalised_from_image(theirs).xy, back, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        OpenCVLens(800.0, 800.0, 0.0, 0.0, k4=1.0),  # r / (1 + r^2) turns back at 1
+        OpenCVLens(800.0, 800.0, 0.0, 0.0, k4=-0.5),  # r / (1 - r^2 / 2) has a pole at sqrt 2
+        OpenCVLens(800.0, 800.0, 0.0, 0.0, k1=1.0, k4=-0.5),
+        OpenCVLens(800.0, 800.0, 0.0, 0.0, k1=2.0, k2=1.5, k4=2.4, k5=2.3, k6=0.4),
+        OpenCVLens(800.0, 800.0, 0.0, 0.0, k1=9.0, k2=5.0, k4=9.5, k5=9.0),
+    ],
+)
+def test_rational_lens_ends_where_the_radius_stops_growing_and_inverts_up_to_there(lens: OpenCVLens) -> None:
+    # brute force: walk outwards until OpenCV's radius falls or jumps to the other side
+    r = np.linspace(0.0, 3.0, 30001)
+    points = np.column_stack([r, np.zeros_like(r), np.ones_like(r)])
+    bent = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), opencv_coefficients(lens))[0][:, 0, 0]
+    falls = np.flatnonzero(np.diff(bent) <= 0.0)
+    end = r[falls[0]] if len(falls) else np.inf
+    valid = lens.image_from_normalised(points[:, :2]).valid
+    assert (valid == (r < end + 1e-12))[np.abs(r - end) > 2e-4].all()
+    # the inverse stays on the branch that contains the centre; next to a fold or pole a rounding is magnified
+    use = r < 0.99 * end
+    for angle in (0.0, 1.0, 2.5):
+        turn = np.array([np.cos(angle), np.sin(angle)])
+        back = lens.normalised_from_image(800.0 * bent[use, None] * turn)
+        assert back.valid.all()
+        np.testing.assert_allclose(back.xy, r[use, None] * turn, atol=1e-9)
+    if len(falls) and np.isfinite(bent).all() and bent.max() < 1.0:
+        assert not lens.normalised_from_image([800.0 * 1.001 * bent[r <= end].max(), 0.0]).valid
+
+
+@pytest.mark.parametrize("lens", [SEIDEL, OPENCV, RATIONAL], ids=["seidel", "opencv", "rational"])
 def test_lens_inverts_itself(lens: LensModel) -> None:
     assert isinstance(lens, LensModel)
     x, y = np.meshgrid(np.linspace(-200, 2000, 23), np.linspace(-200, 1400, 19))
@@ -75,7 +135,7 @@ def test_lens_inverts_itself(lens: LensModel) -> None:
     np.testing.assert_allclose(back.xy, xy, atol=1e-8)
 
 
-@pytest.mark.parametrize("lens", [SEIDEL, OPENCV], ids=["seidel", "opencv"])
+@pytest.mark.parametrize("lens", [SEIDEL, OPENCV, RATIONAL], ids=["seidel", "opencv", "rational"])
 def test_lens_jacobians_match_differences(lens: LensModel) -> None:
     n = np.random.default_rng(2).uniform(-0.1, 0.1, (20, 2))
     h = 1e-6
@@ -111,6 +171,30 @@ def test_camera_jacobians_match_differences() -> None:
         down = Camera.from_paper(**{**base, name: base[name] - h}).project(points).xy
         scale = np.abs(jac[..., i]).max()
         np.testing.assert_allclose(jac[..., i], (up - down) / (2 * h), atol=1e-5 * scale + 1e-6)
+
+
+@pytest.mark.parametrize("lens", [SEIDEL, OPENCV, RATIONAL], ids=["seidel", "opencv", "rational"])
+def test_camera_jacobian_of_any_lens_matches_differences(lens: LensModel) -> None:
+    angles, position = (0.8, 0.02, 0.5), (0.3, -0.2, 40.0)
+    points = np.random.default_rng(3).uniform(-4, 4, (10, 3))
+
+    def project(values: dict[str, float]) -> Float:
+        lens_values = {name: values[name] for name in lens.parameter_names}
+        a, b, c, *t = (values[name] for name in POSE_NAMES)
+        pose = RigidTransform(rotation_from_angles(a, b, c), np.array(t))
+        return Camera(type(lens)(**lens_values), pose).project(points).xy
+
+    camera = Camera(lens, RigidTransform(rotation_from_angles(*angles), np.array(position)))
+    base = {name: getattr(lens, name) for name in lens.parameter_names}
+    base.update(zip(POSE_NAMES, (*angles, *position), strict=True))
+    assert camera.parameter_names == tuple(base)
+    jac = camera.parameter_jacobian(points)
+    assert jac.shape == (10, 2, len(base))
+    for i, name in enumerate(camera.parameter_names):
+        h = 1e-11 if name == "kappa_per_px2" else 1e-6
+        difference = (project({**base, name: base[name] + h}) - project({**base, name: base[name] - h})) / (2 * h)
+        # the differences carry the projection's rounding, 1e-12 px over the step
+        np.testing.assert_allclose(jac[..., i], difference, atol=1e-5 * np.abs(jac[..., i]).max() + 1e-6)
 
 
 def test_outside_the_domain_is_invalid_and_stays_alone() -> None:
