@@ -2,7 +2,14 @@
 
 from core.calibration.checks.distance import DistanceCheck, check_known_distance
 from core.calibration.checks.measures import CheckMeasures, Measures, measure_points
-from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, TargetLike, inner_nodes_mm
+from core.calibration.inputs import (
+    AnyTarget,
+    CalibrationOptions,
+    CalibrationView,
+    NominalCamera,
+    TargetLike,
+    inner_nodes_mm,
+)
 from core.calibration.prepare import predict_uncertainty
 from core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
 from core.calibration.solve import calibrate
@@ -10,6 +17,7 @@ from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 
 __all__ = [
     "COVARIANCE_NAMES",
+    "AnyTarget",
     "CalibrationOptions",
     "CalibrationResult",
     "CalibrationView",

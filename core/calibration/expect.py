@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.fit.adjust import covariance_of
-from core.calibration.fit.model import N_CAMERA, camera_at, camera_of, collect
+from core.calibration.fit.layout import State, camera_of, camera_seeing
+from core.calibration.fit.named import named_covariance, parameter_names
 from core.calibration.inputs import (
+    AnyTarget,
+    BoardLike,
     CalibrationOptions,
     CalibrationView,
     NominalCamera,
-    TargetLike,
     extent_mm,
-    inner_nodes_mm,
+    nodes_of,
 )
-from core.calibration.prepare import EXPECTED_NOISE_PX
-from core.calibration.result import COVARIANCE_NAMES, TEN_OF_BOTH
+from core.calibration.prepare import EXPECTED_NOISE_PX, covariance_at, problem_of
 from core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
-from core.cameras.camera import TEN_PARAMETER_NAMES
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
 from core.names import CAMERAS
@@ -38,7 +37,7 @@ class Expectation:
     Attributes
     ----------
     parameters, sigma
-        Nominal value and expected standard deviation by name, as in :data:`COVARIANCE_NAMES`.
+        Nominal value and expected standard deviation by name, as a calibration's covariance names them.
     volume
         Uncertainty of points in the target's volume.
     points_mm, sigma_mm
@@ -58,18 +57,18 @@ class Expectation:
     reasons: tuple[str, ...]
 
 
-def correlation_of_lines(target: TargetLike, line_model: LineModel | None) -> float:
+def correlation_of_lines(target: AnyTarget, line_model: LineModel | None) -> float:
     """Observed coordinates per independent one, where intersections come from whole lines (1 where they do not)."""
     per_line = _PER_LINE.get(line_model or "")
-    if per_line is None:
+    if per_line is None or isinstance(target, BoardLike):
         return 1.0
-    n_a, n_b = (n - 2 for n in target.lines)
+    n_a, n_b = nodes_of(target).shape[:2]
     return max(float(2.0 * n_a * n_b / (per_line * (n_a + n_b))), 1.0)
 
 
 def expect(
     positions_mm: Sequence[float],
-    target: TargetLike,
+    target: AnyTarget,
     nominals: tuple[NominalCamera, NominalCamera],
     options: CalibrationOptions | None = None,
     *,
@@ -103,64 +102,52 @@ def expect(
         ``calibration_singular`` where the positions determine nothing.
     """
     options = options or CalibrationOptions()
-    nodes = inner_nodes_mm(target)
-    on_plane = np.concatenate([nodes, np.zeros((*nodes.shape[:2], 1))], axis=-1)
+    nodes = nodes_of(target)
     correlation = correlation_of_lines(target, line_model)
-    parameters = np.zeros((2, N_CAMERA))
-    observations, seen = [], []
+    blank = np.full((*nodes.shape[:2], 2), np.nan)
+    views = [
+        [CalibrationView(name, float(dz), blank, correlation=correlation) for dz in positions_mm] for name in CAMERAS
+    ]
+    problem = problem_of(views, target, nominals, options)
+    layout = problem.layout("paper")
+    x = np.zeros(layout.size)
+    for c, nominal in enumerate(nominals):
+        standoff, angle = nominal.placed()
+        x[layout.lens(c)] = layout.form.start(nominal.phd_px, nominal.centre_px, nominal.aspect)
+        x[layout.pose(c)] = np.radians(roll_deg), 0.0, np.radians(angle), 0.0, 0.0, standoff
+    state = State(x, {}, np.zeros_like(problem.flat_nodes_mm))
+    seen = []
     for c, (name, nominal) in enumerate(zip(CAMERAS, nominals, strict=True)):
-        cx, cy = nominal.centre_px
-        parameters[c, :10] = (
-            nominal.phd_px,
-            cx,
-            cy,
-            0.0,
-            np.radians(roll_deg),
-            0.0,
-            np.radians(nominal.angle_deg),
-            0.0,
-            0.0,
-            nominal.standoff_mm,
-        )
         width, height = nominal.image_size_px
-        views, shares = [], []
-        for dz in positions_mm:
-            image = camera_at(parameters[c], nominal.aspect, float(dz)).project(on_plane)
+        shares = []
+        for k, view in enumerate(views[c]):
+            image = camera_seeing(layout, state, c, view.dz_mm, None).project(problem.flat_nodes_mm)
             inside = image.valid & (image.xy >= -0.5).all(axis=-1) & (image.xy <= [width - 0.5, height - 0.5]).all(-1)
             shares.append(float(inside.mean()))
-            views.append(
-                CalibrationView(name, float(dz), np.where(inside[..., None], image.xy, np.nan), correlation=correlation)
-            )
+            views[c][k] = replace(view, xy_px=np.where(inside[:, None], image.xy, np.nan).reshape(blank.shape))
         seen.append(min(shares))
         if min(shares) < 0.25:
             raise CalibrationInputError(
-                f"By its nominal values {name} sees {100 * min(shares):.0f} % of the grid's inner intersections at "
+                f"By its nominal values {name} sees {100 * min(shares):.0f} % of the target's points at "
                 f"{positions_mm[int(np.argmin(shares))]:+g} mm.",
                 code="calibration_unseen",
                 remedy="Check phd_px, standoff_mm and image_size_px of the rig file, or use a target that fits.",
                 camera=name,
             )
-        observations.append(collect(views))
-    estimated = options.estimate_nodes is not False and target.node_tolerance_mm > 0.0
-    covariance = covariance_of(
-        parameters,
-        nodes.reshape(-1, 2),
-        observations,
-        nominals,
-        options,
-        noise_px=np.full(2, noise_px),
-        node_sigma_mm=target.node_tolerance_mm / float(np.sqrt(3.0)) if estimated else 0.0,
-    )
-    pair = StereoPair(*(camera_of(parameters[c], nominals[c].aspect) for c in range(2)))
-    volume = volume_uncertainty(pair, covariance, target)
+    problem = problem_of(views, target, nominals, options)
+    priors = problem.priors(layout)
+    names = parameter_names(layout, priors)
+    covariance = named_covariance(layout, priors, x, covariance_at(problem, layout, state, noise_px=noise_px))
+    pair = StereoPair(*(camera_of(layout, x, c) for c in range(2)))
+    volume = volume_uncertainty(pair, covariance, target, names)
     points = np.concatenate([np.zeros((1, 3)), _corners(volume.points_mm)])
-    G = point_derivatives(pair, points)
+    G = point_derivatives(pair, points, names)
     spread = np.diagonal(G @ covariance @ np.swapaxes(G, 1, 2), axis1=1, axis2=2)
-    values = parameters[:, : len(TEN_PARAMETER_NAMES)].ravel()
-    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))[TEN_OF_BOTH]
+    values = pair.values()
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     return Expectation(
-        parameters=dict(zip(COVARIANCE_NAMES, values.tolist(), strict=True)),
-        sigma=dict(zip(COVARIANCE_NAMES, sigma.tolist(), strict=True)),
+        parameters={name: values[name] for name in names},
+        sigma=dict(zip(names, sigma.tolist(), strict=True)),
         volume=volume,
         points_mm=points,
         sigma_mm=np.sqrt(np.maximum(spread, 0.0)),
@@ -174,7 +161,7 @@ def _corners(points_mm: Float) -> Float:
     return np.array([[x, y, z] for z in (low[2], high[2]) for y in (low[1], high[1]) for x in (low[0], high[0])])
 
 
-def _reasons(volume: VolumeUncertainty, target: TargetLike, options: CalibrationOptions) -> tuple[str, ...]:
+def _reasons(volume: VolumeUncertainty, target: AnyTarget, options: CalibrationOptions) -> tuple[str, ...]:
     limits = (
         (
             volume.relative_shape,
@@ -183,7 +170,8 @@ def _reasons(volume: VolumeUncertainty, target: TargetLike, options: Calibration
             f"{1e3 * options.max_shape_uncertainty * extent_mm(target):.3g} um.",
         ),
         (
-            volume.centre_px,
+            # of a single stage the direction is unknown, and one with the centre
+            volume.centre_px if options.moves == "cameras" else 0.0,
             options.max_centre_sigma_px,
             f"An image centre would be uncertain by {volume.centre_px:.3g} px; allowed are "
             f"{options.max_centre_sigma_px:g} px.",

@@ -9,17 +9,20 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration.checks.positions import PositionCheck, check_positions
-from core.calibration.fit.adjust import covariance_of
-from core.calibration.fit.model import N_CAMERA, camera_of, collect
-from core.calibration.fit.start import start_values
+from core.calibration.fit.layout import Layout, State, camera_of
+from core.calibration.fit.named import named_covariance, parameter_names
+from core.calibration.fit.normal import assemble, covariance
+from core.calibration.fit.problem import Problem
+from core.calibration.fit.start import start_pose
 from core.calibration.inputs import (
+    AnyTarget,
     CalibrationOptions,
     CalibrationView,
     NominalCamera,
-    TargetLike,
     check_view,
-    inner_nodes_mm,
     is_held_out,
+    nodes_of,
+    pitch_scale_sigma,
 )
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 from core.cameras.stereo import StereoPair
@@ -32,8 +35,8 @@ _SAME_POSITION_MM = 1e-6
 Views = list[list[CalibrationView]]
 
 
-def sort_views(views: Sequence[CalibrationView], target: TargetLike, nominals: Sequence[NominalCamera]) -> Views:
-    """Return each camera's views by ascending position, every one checked.
+def sort_views(views: Sequence[CalibrationView], target: AnyTarget, nominals: Sequence[NominalCamera]) -> Views:
+    """Return each camera's views, every one checked: stage positions ascending, then free poses by their numbers.
 
     Raises
     ------
@@ -42,17 +45,26 @@ def sort_views(views: Sequence[CalibrationView], target: TargetLike, nominals: S
     """
     per_camera: Views = []
     for name, nominal in zip(CAMERAS, nominals, strict=True):
-        own = sorted((v for v in views if v.camera == name), key=lambda v: v.dz_mm)
+        own = [v for v in views if v.camera == name]
         for view in own:
             check_view(view, target, nominal)
+        own.sort(key=lambda v: (v.dz_mm is None, v.frame if v.dz_mm is None else v.dz_mm))
         per_camera.append(own)
     return per_camera
 
 
 def split_hold_out(per_camera: Views, options: CalibrationOptions) -> Views:
     """Return the views to fit; raises as :func:`check_hold_out`."""
-    check_hold_out([[v.dz_mm for v in own] for own in per_camera], options)
-    return [[v for v in own if not is_held_out(v.dz_mm, options)] for own in per_camera]
+    check_hold_out([[v.dz_mm for v in own if v.dz_mm is not None] for own in per_camera], options)
+    frames = {v.frame for own in per_camera for v in own}
+    for held in options.held_out_frames:
+        if held not in frames:
+            raise CalibrationInputError(
+                f"The held-out pose {held} is not among those taken.",
+                code="hold_out_unknown",
+                remedy="Hold out poses that were taken, by their numbers.",
+            )
+    return [[v for v in own if not is_held_out(v.dz_mm, options, v.frame)] for own in per_camera]
 
 
 def check_hold_out(positions_mm: Sequence[Sequence[float]], options: CalibrationOptions) -> None:
@@ -61,14 +73,9 @@ def check_hold_out(positions_mm: Sequence[Sequence[float]], options: Calibration
     Raises
     ------
     CalibrationInputError
-        ``view_missing`` where a camera has no view, ``hold_out_unknown`` where a held-out position was not taken,
-        ``hold_out_all`` where nothing is left to fit.
+        ``hold_out_unknown`` where a held-out position was not taken, ``hold_out_all`` where no position is left to fit.
     """
     for name, taken in zip(CAMERAS, positions_mm, strict=True):
-        if not taken:
-            raise CalibrationInputError(
-                f"There is no view of {name}.", code="view_missing", remedy="Give views of both cameras.", camera=name
-            )
         for held in options.held_out_mm:
             if not any(abs(t - held) <= options.hold_out_tolerance_mm for t in taken):
                 raise CalibrationInputError(
@@ -78,7 +85,7 @@ def check_hold_out(positions_mm: Sequence[Sequence[float]], options: Calibration
                     remedy="Hold out positions at which views were taken.",
                     camera=name,
                 )
-        if all(is_held_out(t, options) for t in taken):
+        if taken and all(is_held_out(t, options) for t in taken):
             raise CalibrationInputError(
                 f"Every position of {name} is held out.",
                 code="hold_out_all",
@@ -87,16 +94,55 @@ def check_hold_out(positions_mm: Sequence[Sequence[float]], options: Calibration
             )
 
 
+def check_both(per_camera: Views) -> None:
+    """Raise ``view_missing`` where a camera has no view."""
+    for name, own in zip(CAMERAS, per_camera, strict=True):
+        if not own:
+            raise CalibrationInputError(
+                f"There is no view of {name}.", code="view_missing", remedy="Give views of both cameras.", camera=name
+            )
+
+
+def node_sigmas_mm(target: AnyTarget, options: CalibrationOptions, *, free: bool) -> tuple[float, float]:
+    """Prior standard deviations of a node's correction, within the target's plane and out of it; 0 holds them.
+
+    A bound of +-t with nothing known inside it has t over the root of three. Out of plane it shows in free poses only.
+    """
+    if options.estimate_nodes is False or not target.node_tolerance_mm > 0.0:
+        return 0.0, 0.0
+    within = target.node_tolerance_mm / float(np.sqrt(3.0))
+    flatness = getattr(target, "flatness_mm", None)
+    across = within if flatness is None else float(flatness) / float(np.sqrt(3.0))
+    return within, across if free else 0.0
+
+
+def problem_of(
+    per_camera: Views, target: AnyTarget, nominals: tuple[NominalCamera, NominalCamera], options: CalibrationOptions
+) -> Problem:
+    """Return the problem of fitting these views."""
+    views = tuple(v for own in per_camera for v in own)
+    free = any(v.frame is not None for v in views)
+    staged = any(v.dz_mm is not None for v in views)
+    return Problem(
+        views=views,
+        nodes_mm=nodes_of(target),
+        nominals=nominals,
+        options=options,
+        moves=options.moves if staged else "free",
+        node_sigma_mm=node_sigmas_mm(target, options, free=free),
+        pitch_scale_sigma=pitch_scale_sigma(target),
+    )
+
+
 def predict_uncertainty(
     views: Sequence[CalibrationView],
-    target: TargetLike,
-    nominals: Sequence[NominalCamera],
+    target: AnyTarget,
+    nominals: tuple[NominalCamera, NominalCamera],
     options: CalibrationOptions | None = None,
     *,
-    node_sigma_mm: float = 0.0,
     noise_px: float = EXPECTED_NOISE_PX,
 ) -> VolumeUncertainty:
-    """Predict the uncertainty of a calibration with views at these positions, from nominal values and before any fit.
+    """Predict the uncertainty of a calibration with views at these stage positions, from nominal values alone.
 
     Raises
     ------
@@ -105,52 +151,78 @@ def predict_uncertainty(
     """
     options = options or CalibrationOptions()
     fitted = split_hold_out(sort_views(views, target, nominals), options)
-    nodes = inner_nodes_mm(target)
-    parameters = np.zeros((2, N_CAMERA))
+    problem = problem_of(fitted, target, nominals, options)
+    layout = problem.layout("paper")
+    x = np.zeros(layout.size)
     for c, nominal in enumerate(nominals):
-        reference = min(fitted[c], key=lambda v: abs(v.dz_mm))
-        parameters[c, :10] = start_values(reference, nodes, nominal, float(np.radians(nominal.angle_deg)))
-    covariance = covariance_of(
-        parameters,
-        nodes.reshape(-1, 2),
-        [collect(v) for v in fitted],
-        nominals,
-        options,
-        noise_px=np.full(2, noise_px),
-        node_sigma_mm=node_sigma_mm,
+        own = [v for v in fitted[c] if v.dz_mm is not None]
+        reference = min(own, key=lambda v: abs(v.position_mm))
+        x[layout.lens(c)] = layout.form.start(nominal.phd_px, nominal.centre_px, nominal.aspect)
+        x[layout.pose(c)] = start_pose(reference, problem.nodes_mm, nominal, float(np.radians(nominal.placed()[1])))
+    return predict_at(problem, layout, x, target, noise_px=noise_px)
+
+
+def predict_at(problem: Problem, layout: Layout, x: Float, target: AnyTarget, *, noise_px: float) -> VolumeUncertainty:
+    """Predict the uncertainty at given values of the unknowns, without any residual."""
+    sigma = covariance_at(problem, layout, State(x, {}, np.zeros_like(problem.flat_nodes_mm)), noise_px=noise_px)
+    pair = StereoPair(*(camera_of(layout, x, c) for c in range(2)))
+    names, named = (
+        parameter_names(layout, problem.priors(layout)),
+        named_covariance(layout, problem.priors(layout), x, sigma),
     )
-    pair = StereoPair(*(camera_of(parameters[c], nominals[c].aspect) for c in range(2)))
-    return volume_uncertainty(pair, covariance, target)
+    return volume_uncertainty(pair, named, target, names)
+
+
+def covariance_at(problem: Problem, layout: Layout, state: State, *, noise_px: float) -> Float:
+    """Covariance (m, m) of the unknowns at given values, without any residual: the prediction before measuring.
+
+    Raises
+    ------
+    CalibrationError
+        Code ``calibration_singular``.
+    """
+    noise = np.full(2, noise_px)
+    normal = assemble(layout, state, problem.rows, problem.flat_nodes_mm, problem.priors(layout), noise)
+    return covariance(normal).unknowns
 
 
 def compare_positions(
-    per_camera: Views, nodes_mm: Float, nominals: Sequence[NominalCamera]
-) -> tuple[PositionCheck, PositionCheck]:
-    """Check every camera's positions, held-out ones included, against its images."""
-    one, two = (check_positions(own, nodes_mm, n) for own, n in zip(per_camera, nominals, strict=True))
-    return one, two
+    per_camera: Views, nodes_mm: Float, nominals: Sequence[NominalCamera], options: CalibrationOptions
+) -> tuple[PositionCheck, ...]:
+    """Check every camera's stage positions, held-out ones included, against its images; empty without any."""
+    staged = [[v for v in own if v.dz_mm is not None] for own in per_camera]
+    if not all(staged):
+        return ()
+    along_axis = options.moves == "cameras"
+    return tuple(
+        check_positions(own, nodes_mm, n, along_axis=along_axis) for own, n in zip(staged, nominals, strict=True)
+    )
 
 
 def predict_or_refuse(
     per_camera: Views,
     fitted: Views,
-    target: TargetLike,
-    nominals: Sequence[NominalCamera],
+    target: AnyTarget,
+    nominals: tuple[NominalCamera, NominalCamera],
     options: CalibrationOptions,
-    node_sigma_mm: float,
-) -> VolumeUncertainty:
-    """Predict the uncertainty, and refuse views for which it is too large.
+) -> VolumeUncertainty | None:
+    """Predict the uncertainty from the stage's views, and refuse them where it is too large.
+
+    Free poses cannot be predicted from nominal values, and where there are some the stage's views need not determine
+    everything; None then.
 
     Raises
     ------
     CalibrationInputError
         ``calibration_one_position`` or ``calibration_dz_too_small``, with the predicted uncertainty.
     """
+    if any(v.frame is not None for own in per_camera for v in own):
+        return None
     everything = [v for own in per_camera for v in own]
     # a declared tilt of the stage axis increases the centre's uncertainty at any travel
     travel_only = replace(options, axis_tilt_sigma_rad=0.0)
     try:
-        predicted = predict_uncertainty(everything, target, nominals, travel_only, node_sigma_mm=node_sigma_mm)
+        predicted = predict_uncertainty(everything, target, nominals, travel_only)
         figure = (
             f"{1e3 * predicted.shape_rms_mm:.2f} um rms of shape, {predicted.centre_px:.1f} px of the image centre "
             f"(prior {options.centre_sigma_px:g} px), {100.0 * predicted.standoff_relative:.2f} % of the standoff"
@@ -158,12 +230,13 @@ def predict_or_refuse(
         relative = predicted.relative_shape
     except CalibrationError:
         predicted, figure, relative = None, "without bound", float("inf")
-    travels = [max(v.dz_mm for v in own) - min(v.dz_mm for v in own) for own in fitted]
-    for name, own, travel in zip(CAMERAS, fitted, travels, strict=True):
+    positions = [[v.position_mm for v in own if v.dz_mm is not None] for own in fitted]
+    travels = [max(own) - min(own) for own in positions]
+    for name, own, travel in zip(CAMERAS, positions, travels, strict=True):
         if travel <= _SAME_POSITION_MM:
             views_text = "only one view" if len(own) == 1 else f"{len(own)} views, all"
             raise CalibrationInputError(
-                f"{name} has {views_text} at {own[0].dz_mm:+.3f} mm to fit: predicted uncertainty {figure}.",
+                f"{name} has {views_text} at {own[0]:+.3f} mm to fit: predicted uncertainty {figure}.",
                 code="calibration_one_position",
                 predicted_shape=relative,
                 camera=name,
@@ -171,7 +244,8 @@ def predict_or_refuse(
     if (
         predicted is None
         or not relative <= options.max_shape_uncertainty
-        or not predicted.centre_px <= options.max_centre_sigma_px
+        # the unknown direction of a single stage is one with the centre, and both cancel in space
+        or (options.moves == "cameras" and not predicted.centre_px <= options.max_centre_sigma_px)
         or not predicted.standoff_relative <= options.max_standoff_sigma
     ):
         raise CalibrationInputError(

@@ -7,97 +7,111 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.arrays import Float
+from core.calibration.checks.flatness import check_flatness
 from core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from core.calibration.checks.positions import PositionCheck
+from core.calibration.choice.held_out import HeldOutView, held_out_view
+from core.calibration.choice.lens import Chosen
+from core.calibration.choice.screening import points_mm
 from core.calibration.fit.adjust import Adjustment
-from core.calibration.fit.model import camera_at, camera_of, predicted_residual
-from core.calibration.inputs import (
-    CalibrationOptions,
-    CalibrationView,
-    NominalCamera,
-    TargetLike,
-    inner_nodes_mm,
-    is_held_out,
-)
-from core.calibration.prepare import Views
-from core.calibration.result import TEN_OF_BOTH, CalibrationResult, ViewResult
+from core.calibration.fit.layout import camera_of, camera_seeing
+from core.calibration.fit.named import named_covariance, parameter_names
+from core.calibration.fit.unit_vector import direction
+from core.calibration.inputs import AnyTarget, CalibrationOptions, NominalCamera
+from core.calibration.result import CalibrationResult, LensChosen, StageFound, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 from core.calibration.verdict import assess, checks_made
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
+from core.names import CAMERAS
+
+_PER_POSE = 4  # nodes each way of a free pose that stand for the volume
 
 
 def build_result(
-    adjustment: Adjustment,
-    per_camera: Views,
-    target: TargetLike,
+    chosen: Chosen,
+    target: AnyTarget,
     nominals: tuple[NominalCamera, NominalCamera],
     options: CalibrationOptions,
     *,
-    predicted: VolumeUncertainty,
-    positions: tuple[PositionCheck, PositionCheck],
-    nodes_estimated: bool,
+    predicted: VolumeUncertainty | None,
+    positions: tuple[PositionCheck, ...],
 ) -> CalibrationResult:
     """Evaluate all views, fitted and held out, under the adjusted cameras.
 
     Raises
     ------
     CalibrationError
-        Code ``calibration_not_finite`` where a number that would be stored is not finite.
+        Code ``calibration_not_finite`` where a number that would be stored is not finite, ``target_not_flat``.
     """
-    nominal_nodes = inner_nodes_mm(target)
-    corrections = adjustment.node_corrections_mm.reshape(nominal_nodes.shape)
-    nodes = nominal_nodes + corrections
-    results: list[ViewResult] = []
-    for c, own in enumerate(per_camera):
-        for view in own:
-            p, aspect = adjustment.parameters[c], nominals[c].aspect
-            m = _measure(p, aspect, nodes, view)
-            residual = predicted_residual(p, aspect, nodes, view)
-            held = is_held_out(view.dz_mm, options)
-            results.append(ViewResult(view.camera, view.dz_mm, view.label, held, residual, m.rbe_px, m.raz_mm, m.nsce))
-    fitted = _check(adjustment, per_camera, nodes, nominal_nodes, nominals, options, held_out=False)
-    held_out = (
-        _check(adjustment, per_camera, nodes, nominal_nodes, nominals, options, held_out=True)
-        if options.held_out_mm
-        else None
-    )
-    pair = StereoPair(*(camera_of(adjustment.parameters[c], nominals[c].aspect) for c in range(2)))
-    uncertainty = volume_uncertainty(pair, adjustment.covariance, target)
-    covariance = adjustment.covariance[np.ix_(TEN_OF_BOTH, TEN_OF_BOTH)]
-    sigmas = np.sqrt(np.diagonal(adjustment.covariance)).reshape(2, -1)
-    finite = (adjustment.parameters, covariance, adjustment.noise_px, corrections, uncertainty.sigma_mm)
+    adjustment, problem = chosen.screened.adjustment, chosen.screened.problem
+    layout, state = adjustment.layout, adjustment.state
+    nominal_points = problem.flat_nodes_mm * (1.0 + state.x[layout.pitch_scale])
+    points = points_mm(problem, layout, state)
+    fitted_views = [
+        held_out_view(v, camera_seeing(layout, state, CAMERAS.index(v.camera), v.dz_mm, v.frame), points)
+        for v in problem.views
+    ]
+    fitted_views = [
+        HeldOutView(h.view, h.camera, np.where(row.found[:, None], h.xy_px, np.nan))
+        for h, row in zip(fitted_views, chosen.screened.rows, strict=True)
+    ]
+    given = {id(v) for v in problem.views}
+    apart = [h for h in chosen.held_out if id(h.view) not in given]
+    results = [_view(h, points, held_out=False) for h in fitted_views] + [
+        _view(h, points, held_out=True) for h in apart
+    ]
+    results.sort(key=lambda v: (v.camera, v.dz_mm is None, v.frame if v.dz_mm is None else v.dz_mm))
+    fitted = _check(fitted_views, points, nominal_points)
+    held_out = _check(chosen.held_out, points, nominal_points) if chosen.held_out else None
+    check_flatness(chosen.structure, adjustment)
+    pair = StereoPair(*(camera_of(layout, state.x, c) for c in range(2)))
+    names = parameter_names(layout, adjustment.priors)
+    covariance = named_covariance(layout, adjustment.priors, state.x, adjustment.covariance)
+    volume = None if problem.staged else _points_of_poses(chosen, points)
+    uncertainty = volume_uncertainty(pair, covariance, target, names, volume)
+    free_nodes = adjustment.priors.nodes_free
+    corrections = state.nodes_mm[:, :free_nodes].reshape(*problem.nodes_mm.shape[:2], free_nodes)
+    finite = (state.x, covariance, adjustment.noise_px, state.nodes_mm, uncertainty.sigma_mm)
     if not all(np.isfinite(part).all() for part in finite) or not np.isfinite(fitted.mean.rbe_px):
         raise CalibrationError("The adjustment ended at numbers that are not finite.", code="calibration_not_finite")
+    aspect_estimated = bool(adjustment.priors.free[layout.lens(0)][layout.form.aspect_index])
     verdict = assess(
         fitted=fitted,
         held_out=held_out,
         views=results,
         uncertainty=uncertainty,
-        node_corrections_mm=corrections if nodes_estimated else None,
+        node_corrections_mm=corrections[..., :2] if free_nodes else None,
         node_tolerance_mm=target.node_tolerance_mm,
         options=options,
-        centres=[
-            (camera.paper_parameters(), nominal.image_size_px)
-            for camera, nominal in zip((pair.cam1, pair.cam2), nominals, strict=True)
-        ],
+        centres=[(c.lens, n.image_size_px) for c, n in zip((pair.cam1, pair.cam2), nominals, strict=True)],
+        structure=chosen.structure,
+        dropped=chosen.screened.dropped,
+        staged=bool(problem.staged),
     )
+    sigma = np.sqrt(np.maximum(np.diagonal(adjustment.covariance), 0.0))
     return CalibrationResult(
         pair=pair,
+        names=names,
         covariance=covariance,
+        lens=LensChosen(chosen.model, chosen.reasons, chosen.structure),
+        stage=_stage(adjustment),
+        pitch_scale=float(state.x[layout.pitch_scale]),
+        pitch_scale_sigma=float(sigma[layout.pitch_scale]),
+        dropped=chosen.screened.dropped,
         noise_px=adjustment.noise_px,
         redundancy=adjustment.redundancy,
-        axis_tilt_rad=adjustment.parameters[:, 10:],
-        axis_tilt_sigma_rad=sigmas[:, 10:],
-        node_corrections_mm=corrections if nodes_estimated else None,
-        node_sigma_mm=adjustment.node_sigma_mm.reshape(nominal_nodes.shape) if nodes_estimated else None,
+        axis_tilt_rad=np.stack([state.x[layout.tilt(c)] for c in range(2)]),
+        axis_tilt_sigma_rad=np.stack([sigma[layout.tilt(c)] for c in range(2)]),
+        node_corrections_mm=corrections if free_nodes else None,
+        node_sigma_mm=adjustment.node_sigma_mm.reshape(corrections.shape) if free_nodes else None,
         fitted=fitted,
         held_out=held_out,
         views=tuple(results),
         uncertainty=uncertainty,
         predicted=predicted,
         positions=positions,
-        checks=checks_made(held_out=held_out, options=options),
+        checks=checks_made(held_out=held_out, options=options, moves=problem.moves, aspect_estimated=aspect_estimated),
         verdict=verdict,
         nominals=nominals,
         options=options,
@@ -105,30 +119,76 @@ def build_result(
     )
 
 
-def _measure(parameters: Float, aspect: float, nodes_mm: Float, view: CalibrationView) -> Measures:
-    found = view.found
-    points = np.column_stack([nodes_mm[found], np.zeros(int(found.sum()))])
-    return measure_points(camera_at(parameters, aspect, view.dz_mm), points, view.xy_px[found])
+def _stage(adjustment: Adjustment) -> StageFound:
+    layout, x = adjustment.layout, adjustment.state.x
+    sigma = np.sqrt(np.maximum(np.diagonal(adjustment.covariance), 0.0))
+    single = layout.moves in ("target", "both_cameras") and bool(layout.steps)
+    scales = [layout.stage_scale(axis) for axis in range(2)]
+    steps = []
+    for axis, dz in layout.steps:
+        index = layout.step(axis, dz)
+        if index is not None and adjustment.priors.free[index]:
+            steps.append((axis, dz, float(x[index]), float(sigma[index])))
+    return StageFound(
+        moves=layout.moves,
+        direction_sys=direction(x[layout.direction]) if single else None,
+        direction_sigma_rad=sigma[layout.direction] if single else None,
+        scale=x[scales],
+        scale_sigma=sigma[scales],
+        steps=tuple(steps),
+    )
 
 
-def _check(
-    adjustment: Adjustment,
-    per_camera: Views,
-    nodes_mm: Float,
-    nominal_nodes_mm: Float,
-    nominals: Sequence[NominalCamera],
-    options: CalibrationOptions,
-    *,
-    held_out: bool,
-) -> CheckMeasures:
-    chosen = [[v for v in own if is_held_out(v.dz_mm, options) == held_out] for own in per_camera]
+def _points_of_poses(chosen: Chosen, points: Float) -> Float:
+    """Some of the target's points in every free pose that both cameras see, system frame."""
+    problem, state = chosen.screened.problem, chosen.screened.adjustment.state
+    shape = problem.nodes_mm.shape[:2]
+    index = np.arange(len(points)).reshape(shape)
+    rows, columns = (np.unique(np.linspace(0, n - 1, _PER_POSE).round().astype(int)) for n in shape)
+    some = index[np.ix_(rows, columns)].ravel()
+    seen = [{v.frame: v for v in problem.views if v.camera == name} for name in CAMERAS]
+    out = []
+    for frame in sorted(set(seen[0]) & set(seen[1]) - {None}, key=lambda k: -1 if k is None else k):
+        found = seen[0][frame].found.ravel() & seen[1][frame].found.ravel()
+        own = points[[k for k in some if found[k]] or list(np.flatnonzero(found)[:_PER_POSE])]
+        pose = state.sys_from_target.get(frame) if frame is not None else None
+        out.append(own if pose is None else pose.apply(own))
+    return np.concatenate(out)
+
+
+def _view(h: HeldOutView, points: Float, *, held_out: bool) -> ViewResult:
+    m = _measure(h, points)
+    view = h.view
+    residual = (h.xy_px - h.camera.project(points).xy).reshape(view.xy_px.shape)
+    return ViewResult(
+        camera=view.camera,
+        dz_mm=view.dz_mm,
+        frame=view.frame,
+        name=view.label,
+        held_out=held_out,
+        residual_px=residual,
+        rbe_px=m.rbe_px,
+        raz_mm=m.raz_mm,
+        nsce=m.nsce,
+        cam_from_target=h.camera.cam_from_sys,
+    )
+
+
+def _measure(h: HeldOutView, points: Float) -> Measures:
+    found = np.isfinite(h.xy_px).all(axis=1)
+    return measure_points(h.camera, points[found], h.xy_px[found])
+
+
+def _check(views: Sequence[HeldOutView], points: Float, nominal_points: Float) -> CheckMeasures:
+    own = [[h for h in views if h.view.camera == name] for name in CAMERAS]
 
     def measures(c: int, nodes: Float) -> Measures:
-        return pooled([_measure(adjustment.parameters[c], nominals[c].aspect, nodes, v) for v in chosen[c]])
+        return pooled([_measure(h, nodes) for h in own[c]])
 
-    corrected = measures(0, nodes_mm), measures(1, nodes_mm)
-    against_nominal = measures(0, nominal_nodes_mm), measures(1, nominal_nodes_mm)
-    one, two = (tuple(v.dz_mm for v in own) for own in chosen)
+    corrected = measures(0, points), measures(1, points)
+    against_nominal = measures(0, nominal_points), measures(1, nominal_points)
+    one, two = (tuple(h.view.dz_mm for h in c if h.view.dz_mm is not None) for c in own)
+    f1, f2 = (tuple(h.view.frame for h in c if h.view.frame is not None) for c in own)
     return CheckMeasures(
-        mean_of_cameras(corrected), corrected, mean_of_cameras(against_nominal), against_nominal, (one, two)
+        mean_of_cameras(corrected), corrected, mean_of_cameras(against_nominal), against_nominal, (one, two), (f1, f2)
     )

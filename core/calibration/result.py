@@ -10,14 +10,17 @@ import numpy as np
 from core.arrays import Float
 from core.calibration.checks.measures import CheckMeasures
 from core.calibration.checks.positions import PositionCheck
-from core.calibration.inputs import CalibrationOptions, NominalCamera
+from core.calibration.choice.screening import DroppedView
+from core.calibration.choice.structure import Structure
+from core.calibration.fit.lens_form import LensName
+from core.calibration.inputs import CalibrationOptions, Moves, NominalCamera
 from core.calibration.uncertainty import VolumeUncertainty
-from core.cameras.camera import TEN_PARAMETER_NAMES
+from core.cameras.camera import TEN_PARAMETER_NAMES, RigidTransform
 from core.cameras.stereo import StereoPair
 from core.names import CAMERAS, CameraName
 
+#: parameters of a pair with the paper's lens and a given aspect ratio, the usual order of a covariance
 COVARIANCE_NAMES = tuple(f"{camera}.{name}" for camera in CAMERAS for name in TEN_PARAMETER_NAMES)
-TEN_OF_BOTH = np.r_[0:10, 12:22]  # indices of the ten parameters of both cameras among the adjustment's 24
 Level = Literal["good", "warning", "failed"]
 
 
@@ -27,22 +30,70 @@ class ViewResult:
 
     Attributes
     ----------
-    camera, dz_mm, name, held_out
-        The view, and True if it was left out of the fit.
+    camera, dz_mm, frame, name, held_out
+        The view, its stage position or the number of its free pose, and True if it was left out of the fit.
     residual_px
         (n_a, n_b, 2) measured minus projected, NaN where not found; against the nodes the calibration used.
     rbe_px, raz_mm, nsce
         The paper's measures of this view.
+    cam_from_target
+        Pose of the target in the camera's frame.
     """
 
     camera: CameraName
-    dz_mm: float
+    dz_mm: float | None
+    frame: int | None
     name: str
     held_out: bool
     residual_px: Float
     rbe_px: float
     raz_mm: float
     nsce: float
+    cam_from_target: RigidTransform
+
+
+@dataclass(frozen=True)
+class LensChosen:
+    """Lens model of a calibration.
+
+    Attributes
+    ----------
+    model
+        Its name.
+    reasons
+        Why it was taken.
+    structure
+        What its residuals hold beyond noise.
+    """
+
+    model: LensName
+    reasons: tuple[str, ...]
+    structure: tuple[Structure, ...]
+
+
+@dataclass(frozen=True)
+class StageFound:
+    """What the views say of the stage.
+
+    Attributes
+    ----------
+    moves
+        What it moves.
+    direction_sys, direction_sigma_rad
+        (3,) unit vector along which a single stage moves the target in the system frame, dZ growing, and the standard
+        deviation of its first two components (2,); None where each camera has its own stage or nothing moves.
+    scale, scale_sigma
+        (2,) relative error of each axis' travel; zero and zero where it was held.
+    steps
+        Positions read back with the error found and its standard deviation, mm: (axis, dZ, error, sigma).
+    """
+
+    moves: Moves
+    direction_sys: Float | None
+    direction_sigma_rad: Float | None
+    scale: Float
+    scale_sigma: Float
+    steps: tuple[tuple[int, float, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -70,8 +121,17 @@ class CalibrationResult:
     ----------
     pair
         The cameras at dZ = 0.
-    covariance
-        (20, 20) of :data:`COVARIANCE_NAMES`: ten parameters of camera 1, then of camera 2. Priors are included.
+    names, covariance
+        Estimated parameters of camera 1, then of camera 2, and their covariance (n, n); with the paper's lens and a
+        given aspect ratio :data:`COVARIANCE_NAMES`. Priors are included.
+    lens
+        Lens model and why.
+    stage
+        What was found of the stage.
+    pitch_scale, pitch_scale_sigma
+        Relative error of the target's pitch; zero and zero where it was held.
+    dropped
+        Views left out, with the reasons.
     noise_px
         (2,) standard deviation per coordinate of the intersections, from the residuals, per camera.
     redundancy
@@ -79,7 +139,8 @@ class CalibrationResult:
     axis_tilt_rad, axis_tilt_sigma_rad
         (2, 2) camera by direction; zero where the axis was held.
     node_corrections_mm, node_sigma_mm
-        (n_a, n_b, 2) estimated departures of the nodes from the nominal grid; None where the grid was held.
+        (n_a, n_b, 2), with free poses (n_a, n_b, 3): estimated departures of the nodes from the nominal target; None
+        where it was held.
     fitted, held_out
         The paper's measures; ``held_out`` is None where no position was left out.
     views
@@ -87,9 +148,9 @@ class CalibrationResult:
     uncertainty
         Predicted uncertainty in the target's volume.
     predicted
-        The same as it was predicted before the fit, from nominal values.
+        The same as it was predicted before the fit, from nominal values; None where the poses were free.
     positions
-        Declared against seen positions, per camera.
+        Declared against seen positions, per camera; empty without stage positions.
     checks
         Checks made and not made.
     verdict
@@ -97,7 +158,13 @@ class CalibrationResult:
     """
 
     pair: StereoPair
+    names: tuple[str, ...]
     covariance: Float
+    lens: LensChosen
+    stage: StageFound
+    pitch_scale: float
+    pitch_scale_sigma: float
+    dropped: tuple[DroppedView, ...]
     noise_px: Float
     redundancy: Float
     axis_tilt_rad: Float
@@ -108,8 +175,8 @@ class CalibrationResult:
     held_out: CheckMeasures | None
     views: tuple[ViewResult, ...]
     uncertainty: VolumeUncertainty
-    predicted: VolumeUncertainty
-    positions: tuple[PositionCheck, PositionCheck]
+    predicted: VolumeUncertainty | None
+    positions: tuple[PositionCheck, ...]
     checks: tuple[CheckDone, ...]
     verdict: Verdict
     nominals: tuple[NominalCamera, NominalCamera]
@@ -118,10 +185,12 @@ class CalibrationResult:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Standard deviation of each parameter, by its name in :data:`COVARIANCE_NAMES`."""
-        return dict(zip(COVARIANCE_NAMES, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
+        """Standard deviation of each estimated parameter, by its name in ``names``."""
+        return dict(zip(self.names, np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0)).tolist(), strict=True))
 
     @property
     def covariance_per_camera(self) -> tuple[Float, Float]:
-        """(10, 10) of each camera."""
-        return self.covariance[:10, :10], self.covariance[10:, 10:]
+        """(n, n) of each camera."""
+        own = [[k for k, name in enumerate(self.names) if name.startswith(f"{camera}.")] for camera in CAMERAS]
+        one, two = (self.covariance[np.ix_(k, k)] for k in own)
+        return one, two

@@ -1,4 +1,4 @@
-"""The calibration of both cameras from the target's intersections."""
+"""The calibration of both cameras from the target's points."""
 
 from __future__ import annotations
 
@@ -7,22 +7,27 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.checks.angles import check_angles
-from core.calibration.fit.adjust import Adjustment, adjust
-from core.calibration.fit.model import N_CAMERA, camera_of, collect
-from core.calibration.fit.single import fit_single
-from core.calibration.fit.start import start_values
-from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, TargetLike, inner_nodes_mm
-from core.calibration.prepare import Views, compare_positions, predict_or_refuse, sort_views, split_hold_out
+from core.calibration.checks.angles import check_angles, check_order
+from core.calibration.choice.lens import Chosen, choose_lens
+from core.calibration.fit.layout import camera_of
+from core.calibration.inputs import AnyTarget, CalibrationOptions, CalibrationView, NominalCamera, nodes_of
+from core.calibration.prepare import (
+    check_both,
+    compare_positions,
+    predict_or_refuse,
+    problem_of,
+    sort_views,
+    split_hold_out,
+)
 from core.calibration.report import build_result
 from core.calibration.result import CalibrationResult
-from core.errors import CalibrationError
+from core.errors import CalibrationError, CalibrationInputError
 from core.names import CAMERAS
 
 
 def calibrate(
     views: Sequence[CalibrationView],
-    target: TargetLike,
+    target: AnyTarget,
     nominals: tuple[NominalCamera, NominalCamera],
     options: CalibrationOptions | None = None,
 ) -> CalibrationResult:
@@ -31,9 +36,9 @@ def calibrate(
     Parameters
     ----------
     views
-        Views of both cameras in any order, held-out ones included.
+        Views of both cameras in any order, held-out ones included: at stage positions, of free poses, or both.
     target
-        The grid.
+        The grid or board.
     nominals
         Nominal values of camera 1 and camera 2.
     options
@@ -42,7 +47,8 @@ def calibrate(
     Returns
     -------
     CalibrationResult
-        In the system frame: the target's plane at dZ = 0, origin at its centre.
+        In the system frame: the target's plane at dZ = 0, origin at its centre; where all poses are free, that of the
+        first pose.
 
     Raises
     ------
@@ -53,53 +59,45 @@ def calibrate(
 
     References
     ----------
-    Helm, McNeill, Sutton (1996), doi:10.1117/1.600624, section 3.2.3, Eqs. (9) to (11), (15) to (17).
+    Helm, McNeill, Sutton (1996), doi:10.1117/1.600624, section 3.2.3, Eqs. (9) to (11), (15) to (17); for free poses
+    Zhang (2000), doi:10.1109/34.888718.
     """
     options = options or CalibrationOptions()
-    nodes = inner_nodes_mm(target)
     per_camera = sort_views(views, target, nominals)
+    check_both(per_camera)
+    _check_moves(per_camera, options)
     fitted = split_hold_out(per_camera, options)
-    nodes_estimated = options.estimate_nodes is not False and target.node_tolerance_mm > 0.0
-    # a bound of +-t with nothing known inside it has this standard deviation
-    node_sigma = target.node_tolerance_mm / float(np.sqrt(3.0)) if nodes_estimated else 0.0
-
-    positions = compare_positions(per_camera, nodes, nominals)
-    predicted = predict_or_refuse(per_camera, fitted, target, nominals, options, node_sigma)
+    positions = compare_positions(per_camera, nodes_of(target), nominals, options)
+    predicted = predict_or_refuse(per_camera, fitted, target, nominals, options)
+    problem = problem_of(fitted, target, nominals, options)
+    kept = {id(v) for own in fitted for v in own}
+    held = [v for own in per_camera for v in own if id(v) not in kept]
     try:
-        adjustment = _fit(fitted, nodes, nominals, options, node_sigma)
+        chosen = choose_lens(problem, held)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(f"The solver failed: {error}.", code="calibration_singular") from error
-    return build_result(
-        adjustment,
-        per_camera,
-        target,
-        nominals,
-        options,
-        predicted=predicted,
-        positions=positions,
-        nodes_estimated=nodes_estimated,
-    )
+    _check_cameras(chosen, nominals)
+    return build_result(chosen, target, nominals, options, predicted=predicted, positions=positions)
 
 
-def _fit(
-    fitted: Views,
-    nodes_mm: Float,
-    nominals: tuple[NominalCamera, NominalCamera],
-    options: CalibrationOptions,
-    node_sigma_mm: float,
-) -> Adjustment:
-    observations = [collect(own) for own in fitted]
-    flat = nodes_mm.reshape(-1, 2)
-    parameters = np.zeros((2, N_CAMERA))
-    for c, nominal in enumerate(nominals):
-        reference = min(fitted[c], key=lambda v: abs(v.dz_mm))
-        gamma = float(np.radians(nominal.angle_deg))
-        # a plane seen from the other side of its normal is nearly as good a start; trying both reveals exchanged or
-        # mirrored cameras
-        starts = [start_values(reference, nodes_mm, nominal, g) for g in (gamma, -gamma)]
-        parameters[c, :10] = fit_single(observations[c], flat, nominal, starts, centre_sigma_px=options.centre_sigma_px)
-    check_angles(
-        {name: camera_of(parameters[c], nominals[c].aspect).cam_from_sys.rotation for c, name in enumerate(CAMERAS)},
-        dict(zip(CAMERAS, nominals, strict=True)),
-    )
-    return adjust(parameters, flat, observations, nominals, options, node_sigma_mm=node_sigma_mm)
+def _check_moves(per_camera: Sequence[Sequence[CalibrationView]], options: CalibrationOptions) -> None:
+    staged = [v for own in per_camera for v in own if v.dz_mm is not None]
+    if options.moves == "free" and staged:
+        raise CalibrationInputError(
+            f"{staged[0].label} names a stage position, but nothing is declared to move by it.",
+            code="moves_undeclared",
+            remedy='Declare moves = "cameras", "both_cameras" or "target", or name the views by their numbers.',
+        )
+
+
+def _check_cameras(chosen: Chosen, nominals: tuple[NominalCamera, NominalCamera]) -> None:
+    adjustment = chosen.screened.adjustment
+    rotations: dict[str, Float] = {
+        name: camera_of(adjustment.layout, adjustment.state.x, c).cam_from_sys.rotation
+        for c, name in enumerate(CAMERAS)
+    }
+    known: dict[str, NominalCamera] = dict(zip(CAMERAS, nominals, strict=True))
+    if chosen.screened.problem.staged:
+        check_angles(rotations, known)
+    else:
+        check_order(rotations, known)

@@ -6,19 +6,20 @@ space.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.fit.model import N_CAMERA
-from core.calibration.inputs import TargetLike, extent_mm
+from core.calibration.inputs import AnyTarget, extent_mm, half_sides_mm
 from core.cameras.stereo import StereoPair
+from core.names import CAMERAS
 
 
 @dataclass(frozen=True)
 class VolumeUncertainty:
-    """Predicted standard deviations over the target's volume, from the calibration alone.
+    """Predicted standard deviations over the calibrated volume, from the calibration alone.
 
     Attributes
     ----------
@@ -51,39 +52,55 @@ class VolumeUncertainty:
     standoff_relative: float
 
 
-def point_derivatives(pair: StereoPair, points_mm: Float) -> Float:
-    """Return d(triangulated point) / d(parameters of both cameras) at fixed image points, (n, 3, 24).
+def image_derivatives(pair: StereoPair, points_mm: Float, names: Sequence[str]) -> Float:
+    """Return d(images in both cameras, x1 y1 x2 y2) / d(parameters by name), (n, 4, len(names)).
 
-    Least-squares triangulation: with A = d(images)/d(point), the point moves by -(A'A)^-1 A' B. Columns of the axis
-    tilts are zero, since measuring happens at dZ = 0.
+    ``names`` are those of a calibration's covariance: ``cam1.`` or ``cam2.`` and a name of the camera's parameters.
+    """
+    B = np.zeros((len(points_mm), 4, len(names)))
+    for c, (prefix, camera) in enumerate(zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)):
+        own = [(k, name.removeprefix(f"{prefix}.")) for k, name in enumerate(names) if name.startswith(f"{prefix}.")]
+        known = camera.parameter_names
+        jacobian = camera.parameter_jacobian(points_mm)
+        B[:, 2 * c : 2 * c + 2, [k for k, _ in own]] = jacobian[..., [known.index(name) for _, name in own]]
+    return B
+
+
+def point_derivatives(pair: StereoPair, points_mm: Float, names: Sequence[str]) -> Float:
+    """Return d(triangulated point) / d(parameters by name) at fixed image points, (n, 3, len(names)).
+
+    Least-squares triangulation: with A = d(images)/d(point), the point moves by -(A'A)^-1 A' B.
     """
     A = np.concatenate([pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)], axis=-2)
-    B = np.zeros((len(points_mm), 4, 2 * N_CAMERA))
-    B[:, :2, :10] = pair.cam1.ten_parameter_jacobian(points_mm)
-    B[:, 2:, N_CAMERA : N_CAMERA + 10] = pair.cam2.ten_parameter_jacobian(points_mm)
     At = np.swapaxes(A, 1, 2)
-    return np.asarray(-np.linalg.solve(At @ A, At @ B))
+    return np.asarray(-np.linalg.solve(At @ A, At @ image_derivatives(pair, points_mm, names)))
 
 
-def volume_points_mm(target: TargetLike) -> Float:
-    """5 x 5 x 3 points over the inner intersections and a quarter of their extent in depth, (75, 3)."""
-    half = 0.5 * target.pitch_mm * (np.array(target.lines) - 3)
+def volume_points_mm(target: AnyTarget) -> Float:
+    """5 x 5 x 3 points over the target's points at dZ = 0 and a quarter of their extent in depth, (75, 3)."""
+    half = half_sides_mm(target)
     x, y = np.linspace(-half[0], half[0], 5), np.linspace(-half[1], half[1], 5)
     z = np.array([-1.0, 0.0, 1.0]) * extent_mm(target) / 8.0
     return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def volume_uncertainty(pair: StereoPair, covariance: Float, target: TargetLike) -> VolumeUncertainty:
-    """Propagate the (24, 24) covariance of both cameras' parameters to points in the target's volume."""
-    points = volume_points_mm(target)
-    G = point_derivatives(pair, points)
+def volume_uncertainty(
+    pair: StereoPair, covariance: Float, target: AnyTarget, names: Sequence[str], points_mm: Float | None = None
+) -> VolumeUncertainty:
+    """Propagate the covariance of both cameras' parameters, by name, to points in the calibrated volume.
+
+    ``points_mm`` (n, 3) are the points; without them those of :func:`volume_points_mm`.
+    """
+    points = volume_points_mm(target) if points_mm is None else points_mm
+    G = point_derivatives(pair, points, names)
     cov = G @ covariance @ np.swapaxes(G, 1, 2)
     sigma = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))
+    middle = points.mean(axis=0)
     motions = np.zeros((len(points), 3, 7))  # three shifts, three turns, one scale
     motions[:, range(3), range(3)] = 1.0
     for axis in range(3):
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], points)
-    motions[:, :, 6] = points
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], points - middle)
+    motions[:, :, 6] = points - middle
     design = motions.reshape(-1, 7)
     flat = G.reshape(-1, G.shape[2])
     rigid = design[:, :6]
@@ -91,19 +108,20 @@ def volume_uncertainty(pair: StereoPair, covariance: Float, target: TargetLike) 
     shape_variance = float(np.einsum("ip,pq,iq->", shape, covariance, shape, optimize=True)) / len(flat)
     scale_row = np.linalg.lstsq(design, flat, rcond=None)[0][6]
     shape_rms = float(np.sqrt(max(shape_variance, 0.0)))
-    sigmas = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(2, N_CAMERA)
-    depths = np.array([camera.cam_from_sys.translation_mm[2] for camera in (pair.cam1, pair.cam2)])
-    flat_z = points[:, 2] == 0.0
-    radius = np.abs(points[:, :2]).max(axis=1) * flat_z
-    corner = flat_z & (np.abs(points[:, 0] * points[:, 1]) == np.abs(points[:, 0] * points[:, 1]).max())
+    by_name = dict(zip(names, np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).tolist(), strict=True))
+    depths = {n: c.cam_from_sys.translation_mm[2] for n, c in zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)}
+    nearest = int(np.argmin(np.linalg.norm(points - middle, axis=1)))
+    flat_z = points[:, 2] == points[nearest, 2]
+    reach = np.abs((points - middle)[:, 0] * (points - middle)[:, 1])
+    corner = flat_z & (reach == reach[flat_z].max())
     return VolumeUncertainty(
         points,
         sigma,
         shape_rms,
         shape_rms / extent_mm(target),
         float(np.sqrt(max(scale_row @ covariance @ scale_row, 0.0))),
-        float(sigma[flat_z & (radius == 0.0), 2].max()),
+        float(sigma[nearest, 2]),
         float(sigma[corner, 2].max()),
-        float(sigmas[:, 1:3].max()),
-        float((sigmas[:, 9] / depths).max()),
+        max(by_name[f"{n}.{axis}"] for n in CAMERAS for axis in ("cx_px", "cy_px")),
+        max(by_name[f"{n}.z0_mm"] / float(depth) for n, depth in depths.items()),
     )

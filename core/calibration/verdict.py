@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.checks.measures import CheckMeasures
-from core.calibration.inputs import CalibrationOptions
+from core.calibration.checks.measures import CheckMeasures, focal_lengths_px
+from core.calibration.choice.screening import DroppedView
+from core.calibration.choice.structure import Structure
+from core.calibration.inputs import CalibrationOptions, Moves
 from core.calibration.result import CheckDone, Level, Verdict, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty
+from core.cameras.lens import LensModel
 from core.names import CAMERAS
 
 GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
 #: lenses sit within some per cent of the sensor's centre; a share of the image's diagonal
 CENTRE_SHARE = 0.15
+#: of the fitted RBE: structure of less than this moves the shape by less than the noise does
+STRUCTURE_SHARE = 0.2
+#: of all views; with more of them left out something is wrong with the way they were taken
+DROPPED_SHARE = 1.0 / 3.0
 _ORDER: tuple[Level, Level, Level] = ("good", "warning", "failed")
 
 
@@ -40,16 +47,23 @@ def assess(
     node_corrections_mm: Float | None,
     node_tolerance_mm: float,
     options: CalibrationOptions,
-    centres: Sequence[tuple[Mapping[str, float], tuple[int, int]]] = (),
+    centres: Sequence[tuple[LensModel, tuple[int, int]]] = (),
+    structure: Sequence[Structure] = (),
+    dropped: Sequence[DroppedView] = (),
+    staged: bool = True,
 ) -> Verdict:
-    """Assess a calibration by the held-out RBE of each camera, the predicted uncertainty and the node corrections."""
+    """Assess a calibration.
+
+    By the held-out RBE of each camera, the predicted uncertainty, the node corrections, structure left in the residuals
+    and views that were dropped.
+    """
     level: Level = "good"
     reasons: list[str] = []
     if held_out is None:
         level = "warning"
         reasons.append(
-            f"No position was held out, so that nothing independent confirms the calibration; fitted RBE "
-            f"{fitted.mean.rbe_px:.4f} px."
+            f"No {'position' if staged else 'pose'} was held out, so that nothing independent confirms the "
+            f"calibration; fitted RBE {fitted.mean.rbe_px:.4f} px."
         )
         measures, word = fitted, "Fitted"
     else:
@@ -84,41 +98,80 @@ def assess(
                 f"Node corrections reach {1e3 * correction_mm:.1f} um against a tolerance of "
                 f"{1e3 * node_tolerance_mm:.1f} um: the target, its tolerance or the aspect ratio may be wrong."
             )
-    for name, (camera, size) in zip(CAMERAS, centres, strict=False):
-        off = np.hypot(camera["cx_px"] - 0.5 * (size[0] - 1), camera["cy_px"] - 0.5 * (size[1] - 1))
+    for name, (lens, size) in zip(CAMERAS, centres, strict=False):
+        cx, cy = lens.kernel_parameters()[4:6]
+        off = float(np.hypot(cx - 0.5 * (size[0] - 1), cy - 0.5 * (size[1] - 1)))
         if off > CENTRE_SHARE * np.hypot(*size):
             # an axis off the optical axis moves the principal point by phd * angle, and no residual shows it
             level = worst(level, "warning")
-            reasons.append(
-                f"The principal point of {name} lies {off:.0f} px from the image's centre: its stage may travel "
-                f"{1e3 * off / camera['phd_px']:.0f} mrad off the optical axis, or the image is a part of the sensor's."
+            suspect = (
+                f"its stage may travel {1e3 * off / focal_lengths_px(lens)[0]:.0f} mrad off the optical axis, or "
+                if staged
+                else ""
             )
+            reasons.append(
+                f"The principal point of {name} lies {off:.0f} px from the image's centre: {suspect}the image is a "
+                "part of the sensor's."
+            )
+    for found in structure:
+        # a misfit that the noise hides does not mislead; its uncertainty holds it
+        if found.rms_px > STRUCTURE_SHARE * min(p.rbe_px for p in fitted.per_camera):
+            level = worst(level, "warning")
+            reasons.append(found.text)
+    if dropped:
+        names = ", ".join(view.name for view in dropped)
+        reasons.append(f"Left out of the fit: {names}.")
+        if len(dropped) > DROPPED_SHARE * (len(views) + len(dropped)):
+            level = worst(level, "warning")
+            reasons.append(f"{len(dropped)} of {len(views) + len(dropped)} views had to be left out.")
     return Verdict(level, tuple(reasons))
 
 
-def checks_made(*, held_out: CheckMeasures | None, options: CalibrationOptions) -> tuple[CheckDone, ...]:
+def checks_made(
+    *, held_out: CheckMeasures | None, options: CalibrationOptions, moves: Moves, aspect_estimated: bool
+) -> tuple[CheckDone, ...]:
     """Return the checks made and not made: a wrong scale or a tilted axis does not show in residuals."""
-    if held_out is None:
-        held = CheckDone("held_out", False, "No position was held out.")
-    else:
-        where = sorted({round(p, 3) for c in held_out.positions_mm for p in c})
-        held = CheckDone("held_out", True, f"Held-out positions {where} mm: RBE {held_out.mean.rbe_px:.4f} px.")
-    tilt = options.axis_tilt_sigma_rad
-    return (
-        held,
-        CheckDone("positions", True, "Order, sign, unit and spacing of the positions agree with the images' scale."),
-        CheckDone("angles", True, "The viewing angles agree with the nominal ones and between the cameras."),
+    staged = moves != "free"
+    checks = [_held_out_done(held_out, staged=staged)]
+    if staged:
+        checks += [
+            CheckDone(
+                "positions", True, "Order, sign, unit and spacing of the positions agree with the images' scale."
+            ),
+            CheckDone("angles", True, "The viewing angles agree with the nominal ones and between the cameras."),
+        ]
+    checks.append(
         CheckDone(
             "known_distance",
             False,
             "A wrong pitch cannot be seen in the residuals: measure a known distance with both cameras.",
-        ),
-        CheckDone(
-            "stage_axis",
-            tilt > 0.0,
+        )
+    )
+    tilt = options.axis_tilt_sigma_rad
+    if moves == "cameras":
+        text = (
             f"A tilt of the stage axis cannot be seen in the residuals; {1e3 * tilt:g} mrad are in the covariance."
             if tilt > 0.0
-            else "A tilt of the stage axis cannot be seen in the residuals; none was declared.",
-        ),
-        CheckDone("aspect", False, "The aspect ratio was taken as given."),
-    )
+            else "A tilt of the stage axis cannot be seen in the residuals; none was declared."
+        )
+        checks.append(CheckDone("stage_axis", tilt > 0.0, text))
+    elif staged:
+        checks.append(CheckDone("stage_axis", True, "The stage's direction was found from the views."))
+    if aspect_estimated:
+        checks.append(CheckDone("aspect", True, "The aspect ratio was found from the free poses."))
+    else:
+        checks.append(CheckDone("aspect", False, "The aspect ratio was taken as given."))
+    return tuple(checks)
+
+
+def _held_out_done(held_out: CheckMeasures | None, *, staged: bool) -> CheckDone:
+    if held_out is None:
+        return CheckDone("held_out", False, f"No {'position' if staged else 'pose'} was held out.")
+    parts = []
+    where = sorted({round(p, 3) for c in held_out.positions_mm for p in c})
+    if where:
+        parts.append(f"positions {where} mm")
+    frames = sorted({k for c in held_out.frames for k in c})
+    if frames:
+        parts.append(f"{len(frames)} poses, fitted without them")
+    return CheckDone("held_out", True, f"Held-out {' and '.join(parts)}: RBE {held_out.mean.rbe_px:.4f} px.")

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Bool, Float
-from core.calibration.fit.model import N_CAMERA
+from core.calibration.result import COVARIANCE_NAMES
 from core.calibration.uncertainty import point_derivatives
-from core.cameras.camera import Camera
+from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 
 _MIN_POINTS = 8
 _AT_ONCE = 20_000
-_TEN = [*range(10), *range(N_CAMERA, N_CAMERA + 10)]
+_BEYOND = 0.1  # of the depths of free poses: what the volume goes on before and behind them
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,16 @@ class CalibratedVolume:
     depth_mm
         (2, 2) smallest and largest depth, of either camera.
     covariance
-        (20, 20) of both cameras' ten parameters, None where it is not known.
+        (n, n) of both cameras' parameters in ``names``, None where it is not known.
+    names
+        Names of these parameters.
     """
 
     pair: StereoPair
     slope: Float
     depth_mm: Float
     covariance: Float | None = None
+    names: tuple[str, ...] = COVARIANCE_NAMES
 
     def contains(self, points_mm: ArrayLike) -> Bool:
         """Return (...) True for points (..., 3) of the system frame inside both cameras' volumes; False for NaN."""
@@ -86,8 +89,8 @@ class CalibratedVolume:
         return out
 
     def slopes(self, points_mm: Float) -> Float:
-        """Derivatives (n, 3, 20) of points (n, 3) over the parameters of ``covariance``."""
-        return np.asarray(point_derivatives(self.pair, points_mm)[..., _TEN])
+        """Derivatives (n, 3, len(names)) of points (n, 3) over the parameters of ``covariance``."""
+        return point_derivatives(self.pair, points_mm, self.names)
 
 
 def calibrated_volume(
@@ -98,8 +101,9 @@ def calibrated_volume(
     *,
     pitch_mm: float,
     covariance: Float | None = None,
+    names: tuple[str, ...] = COVARIANCE_NAMES,
 ) -> CalibratedVolume | None:
-    """Build the volume from the views.
+    """Build the volume from views at stage positions, each camera moved along its optical axis.
 
     It ends one pitch beyond the outermost intersection that was seen, and before and behind at as much again as the
     camera travelled.
@@ -116,27 +120,67 @@ def calibrated_volume(
         Each camera's travels dZ of the views that were fitted.
     pitch_mm
         Distance of neighbouring intersections.
-    covariance
-        (20, 20) of the parameters.
+    covariance, names
+        Covariance of the parameters, and their names.
 
     Returns
     -------
     CalibratedVolume or None
         None if a camera has too few points or distances.
     """
-    nodes = np.asarray(nodes_mm, dtype=np.float64).reshape(-1, 2)
-    points = np.column_stack([nodes, np.zeros(len(nodes))])
+    seen, margins = [], []
+    points = _on_plane(nodes_mm)
+    for camera, size, positions in zip((pair.cam1, pair.cam2), sizes_px, positions_mm, strict=True):
+        margins.append(float(np.ptp(positions)) if len(positions) else 0.0)
+        parts = [_seen(camera.moved(dz), points, size) for dz in sorted(set(positions))]
+        seen.append(np.concatenate(parts) if parts else np.zeros((0, 3)))
+    return _volume(pair, seen, margins, pitch_mm, covariance, names)
+
+
+def volume_of_poses(
+    pair: StereoPair,
+    nodes_mm: ArrayLike,
+    sizes_px: Sequence[tuple[int, int]],
+    cam_from_target: Sequence[Sequence[RigidTransform]],
+    *,
+    pitch_mm: float,
+    covariance: Float | None = None,
+    names: tuple[str, ...] = COVARIANCE_NAMES,
+) -> CalibratedVolume | None:
+    """Build the volume from the target's poses in each camera's frame, see :func:`calibrated_volume`.
+
+    Before and behind, it ends a tenth of the seen depths beyond them.
+    """
+    seen, margins = [], []
+    points = _on_plane(nodes_mm)
+    for camera, size, poses in zip((pair.cam1, pair.cam2), sizes_px, cam_from_target, strict=True):
+        parts = [_seen(Camera(camera.lens, pose), points, size) for pose in poses]
+        own = np.concatenate(parts) if parts else np.zeros((0, 3))
+        seen.append(own)
+        margins.append(_BEYOND * float(np.ptp(own[:, 2])) if len(own) else 0.0)
+    return _volume(pair, seen, margins, pitch_mm, covariance, names)
+
+
+def _volume(
+    pair: StereoPair,
+    seen: Sequence[Float],
+    margins_mm: Sequence[float],
+    pitch_mm: float,
+    covariance: Float | None,
+    names: tuple[str, ...],
+) -> CalibratedVolume | None:
     slope, depth = np.empty(2), np.empty((2, 2))
-    for c, (camera, size, positions) in enumerate(zip((pair.cam1, pair.cam2), sizes_px, positions_mm, strict=True)):
-        travel = float(np.ptp(positions)) if len(positions) else 0.0
-        if not travel > 0.0:
+    for c, (own, margin) in enumerate(zip(seen, margins_mm, strict=True)):
+        if not margin > 0.0 or len(own) < _MIN_POINTS:
             return None
-        seen = np.concatenate([_seen(camera.moved(dz), points, size) for dz in sorted(set(positions))])
-        if len(seen) < _MIN_POINTS:
-            return None
-        slope[c] = ((np.hypot(seen[:, 0], seen[:, 1]) + pitch_mm) / seen[:, 2]).max()
-        depth[c] = seen[:, 2].min() - travel, seen[:, 2].max() + travel
-    return CalibratedVolume(pair, slope, depth, covariance)
+        slope[c] = ((np.hypot(own[:, 0], own[:, 1]) + pitch_mm) / own[:, 2]).max()
+        depth[c] = own[:, 2].min() - margin, own[:, 2].max() + margin
+    return CalibratedVolume(pair, slope, depth, covariance, names)
+
+
+def _on_plane(nodes_mm: ArrayLike) -> Float:
+    nodes = np.asarray(nodes_mm, dtype=np.float64).reshape(-1, 2)
+    return np.column_stack([nodes, np.zeros(len(nodes))])
 
 
 def _seen(camera: Camera, points: Float, size: tuple[int, int]) -> Float:

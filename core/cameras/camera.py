@@ -147,6 +147,13 @@ class Camera:
         pose = RigidTransform(rotation_from_angles(alpha_rad, beta_rad, gamma_rad), np.array([x0_mm, y0_mm, z0_mm]))
         return Camera(SeidelLens(phd_px, cx_px, cy_px, kappa_per_px2, aspect), pose)
 
+    def values(self) -> dict[str, float]:
+        """Return the values of :attr:`parameter_names`, by name."""
+        alpha, beta, gamma = angles_from_rotation(self.cam_from_sys.rotation)
+        pose = (alpha, beta, gamma, *(float(v) for v in self.cam_from_sys.translation_mm))
+        lens = {name: float(getattr(self.lens, name)) for name in self.lens.parameter_names}
+        return lens | dict(zip(POSE_NAMES, pose, strict=True))
+
     def paper_parameters(self) -> dict[str, float]:
         """Return the eleven parameters of a camera with the paper's lens.
 
@@ -157,21 +164,7 @@ class Camera:
         """
         if not isinstance(self.lens, SeidelLens):
             raise TypeError(f"a {type(self.lens).__name__} has no form in the paper's eleven parameters")
-        alpha, beta, gamma = angles_from_rotation(self.cam_from_sys.rotation)
-        x0, y0, z0 = (float(v) for v in self.cam_from_sys.translation_mm)
-        return {
-            "phd_px": self.lens.phd_px,
-            "cx_px": self.lens.cx_px,
-            "cy_px": self.lens.cy_px,
-            "kappa_per_px2": self.lens.kappa_per_px2,
-            "aspect": self.lens.aspect,
-            "alpha_rad": alpha,
-            "beta_rad": beta,
-            "gamma_rad": gamma,
-            "x0_mm": x0,
-            "y0_mm": y0,
-            "z0_mm": z0,
-        }
+        return self.values()
 
     def moved(self, dz_mm: float) -> Camera:
         """Return the camera after travelling ``dz_mm`` along its optical axis, away from the target (9), (10)."""
@@ -189,7 +182,7 @@ class Camera:
         """Return d(image px) / d(X_sys, Y_sys, Z_sys) in px/mm, (..., 2, 3)."""
         p = self.cam_from_sys.apply(points_sys_mm)
         n = p[..., :2] / p[..., 2:]
-        return np.asarray(self.lens.image_jacobian(n) @ _normalised_jacobian(p) @ self.cam_from_sys.rotation)
+        return np.asarray(self.lens.image_jacobian(n) @ normalised_jacobian(p) @ self.cam_from_sys.rotation)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -211,7 +204,7 @@ class Camera:
         points = np.asarray(points_sys_mm, dtype=np.float64)
         p = self.cam_from_sys.apply(points)
         n = p[..., :2] / p[..., 2:]
-        to_cam = self.lens.image_jacobian(n) @ _normalised_jacobian(p)
+        to_cam = self.lens.image_jacobian(n) @ normalised_jacobian(p)
         jac = np.empty((*points.shape[:-1], 2, n_lens + len(POSE_NAMES)))
         jac[..., :n_lens] = self.lens.parameter_jacobian(n)[..., :n_lens]
         for i, dR in enumerate(rotation_derivatives(*angles_from_rotation(self.cam_from_sys.rotation))):
@@ -257,7 +250,7 @@ def project_cam(lens: LensModel, points_cam_mm: ArrayLike) -> MappedPoints:
     return lens.image_from_normalised(n)
 
 
-def _normalised_jacobian(points_cam_mm: Float) -> Float:
+def normalised_jacobian(points_cam_mm: Float) -> Float:
     """Return d(X/Z, Y/Z) / d(X, Y, Z), (..., 2, 3)."""
     z = points_cam_mm[..., 2]
     jac = np.zeros((*points_cam_mm.shape[:-1], 2, 3))

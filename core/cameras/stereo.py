@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
+from core.names import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,14 @@ class StereoPair:
     def cam2_from_cam1(self) -> RigidTransform:
         """The relative pose used by the matching."""
         return self.cam2.cam_from_sys @ self.cam1.sys_from_cam
+
+    def values(self) -> dict[str, float]:
+        """Return both cameras' parameters by name: ``cam1.`` or ``cam2.`` and the camera's own name."""
+        return {
+            f"{name}.{key}": value
+            for name, camera in zip(CAMERAS, (self.cam1, self.cam2), strict=True)
+            for key, value in camera.values().items()
+        }
 
     @property
     def baseline_mm(self) -> float:

@@ -17,7 +17,7 @@ from core.errors import CalibrationError
 from core.grid import GridOptions, GridView, detect_grid
 from core.names import CAMERAS
 from core.target import GridTarget
-from server.formats.calibrations.native import calibration_content
+from server.formats.calibrations.native import calibration_content, view_record
 from server.formats.images import GrayImage, read_image
 from server.formats.results.netcdf import written_dataset
 from server.formats.version import software_version
@@ -160,18 +160,7 @@ def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, Gri
     """Write each intersection's position and its residual, (view, i, j, xy)."""
     residuals = np.stack([view.residual_px for view in result.views])
     found = np.stack([grids[view.name].xy_px for view in result.views])
-    view_records = [
-        {
-            "name": v.name,
-            "camera": v.camera,
-            "dz_mm": v.dz_mm,
-            "held_out": v.held_out,
-            "rbe_px": v.rbe_px,
-            "raz_mm": v.raz_mm,
-            "nsce": v.nsce,
-        }
-        for v in result.views
-    ]
+    view_records = [view_record(v) for v in result.views]
     with written_dataset(path, checksum=True) as data:
         for name, size in zip(("view", "i", "j", "xy"), residuals.shape, strict=True):
             data.createDimension(name, size)

@@ -35,7 +35,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One of the eleven parameters of both cameras."""
+    """One parameter of both cameras."""
 
     key: str
     label: str
@@ -80,10 +80,11 @@ class CalibrationPart:
 
     @property
     def parameters(self) -> list[Parameter]:
-        """The eleven parameters with their standard deviations."""
+        """The parameters with their standard deviations: the paper's eleven, or OpenCV's and the pose."""
         cameras = {"cam1": self._record.cam1, "cam2": self._record.cam2}
         rows = []
-        for name in ELEVEN_PARAMETER_NAMES:
+        paper = all(name in found for found in cameras.values() for name in ELEVEN_PARAMETER_NAMES)
+        for name in ELEVEN_PARAMETER_NAMES if paper else [n for n in cameras["cam1"] if n in cameras["cam2"]]:
             unit = next((of for end, of in _UNITS.items() if name.endswith(f"_{end}")), "")
             label = name.split("_")[0] if name.endswith("px2") or not unit else name.rsplit("_", 1)[0]
             values = tuple(
@@ -104,14 +105,19 @@ class CalibrationPart:
             f"rig {origin.rig!r}" if origin.rig else "",
             f"stereorig {origin.software_version}" if origin.software_version else "",
             f"axis tilt prior {tilt:g} rad" if tilt else "",
+            f"lens model {self._record.lens.model}",
         ]
         made = "; ".join(filter(None, more))
-        ground = "dark lines on bright ground" if target.dark_lines else "bright lines on dark ground"
-        return (
-            f"Target: grid of {target.lines[0]} x {target.lines[1]} lines, pitch {target.pitch_mm:g} mm, "
-            f"line width {target.line_width_mm:g} mm, maker's tolerance {target.node_tolerance_mm:g} mm, {ground}."
-            + (f" Made with {made}." if made else "")
-        )
+        what = f"pitch {target.pitch_mm:g} mm, maker's tolerance {target.node_tolerance_mm:g} mm"
+        if target.lines is not None:
+            ground = "dark lines on bright ground" if target.dark_lines else "bright lines on dark ground"
+            name = (
+                f"grid of {target.lines[0]} x {target.lines[1]} lines, line width {target.line_width_mm:g} mm, {ground}"
+            )
+        else:
+            columns, rows = target.size or (0, 0)
+            name = f"{target.kind.replace('_', ', ')} of {columns} x {rows} points"
+        return f"Target: {name}, {what}." + (f" Made with {made}." if made else "")
 
     @property
     def lenses(self) -> list[tuple[str, str, str]]:

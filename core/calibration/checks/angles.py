@@ -30,7 +30,7 @@ def check_angles(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -
     beta, gamma, nominal, alpha = {}, {}, {}, {}
     for name, R in fitted.items():
         a, b, g = (float(np.degrees(v)) for v in angles_from_rotation(R))
-        alpha[name], beta[name], gamma[name], nominal[name] = a, b, g, nominals[name].angle_deg
+        alpha[name], beta[name], gamma[name], nominal[name] = a, b, g, nominals[name].placed()[1]
     found = ", ".join(f"{n} gamma {gamma[n]:+.1f} beta {beta[n]:+.1f} (nominal {nominal[n]:+.1f} and 0)" for n in gamma)
     context = {"gamma_deg": gamma, "beta_deg": beta, "nominal_deg": nominal}
     off = {n: abs(gamma[n] - nominal[n]) for n in gamma}
@@ -93,4 +93,35 @@ def check_angles(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -
             code="image_mirrored",
             remedy="Check that no image is flipped and that both cameras are mounted upright.",
             **context,
+        )
+
+
+def check_order(fitted: dict[str, Float], nominals: dict[str, NominalCamera]) -> None:
+    """Compare the side of camera 2 with the nominal angles, where poses are free and the target's frame says nothing.
+
+    Parameters
+    ----------
+    fitted
+        ``cam_from_sys`` rotation (3, 3) per camera.
+    nominals
+        Nominal cameras; without angles nothing is compared.
+
+    Raises
+    ------
+    CalibrationInputError
+        ``cameras_swapped``.
+    """
+    one, two = nominals["cam1"].angle_deg, nominals["cam2"].angle_deg
+    if one is None or two is None:
+        return
+    _, _, gamma = angles_from_rotation(fitted["cam2"] @ fitted["cam1"].T)
+    found, nominal = float(np.degrees(gamma)), two - one
+    if abs(nominal) > 5.0 and abs(found + nominal) < 0.5 * abs(found - nominal):
+        raise CalibrationInputError(
+            f"The cameras seem swapped: camera 2 is turned by {found:+.1f} degrees from camera 1, nominal are "
+            f"{nominal:+.1f}.",
+            code="cameras_swapped",
+            remedy="Exchange the images or the nominal angles of cam1 and cam2.",
+            found_deg=found,
+            nominal_deg=nominal,
         )

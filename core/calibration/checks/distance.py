@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Float
+from core.calibration.result import COVARIANCE_NAMES
 from core.calibration.uncertainty import point_derivatives
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
@@ -45,6 +47,7 @@ def check_known_distance(
     distance_mm: float,
     *,
     covariance: Float | None = None,
+    names: Sequence[str] | None = None,
     localisation_sigma_px: float = 0.05,
     distance_sigma_mm: float = 0.0,
 ) -> DistanceCheck:
@@ -58,8 +61,9 @@ def check_known_distance(
         (2, 2, 2): which camera, which mark, (x, y).
     distance_mm
         The known distance.
-    covariance
-        (20, 20) of the calibration; None counts the marks' localisation only.
+    covariance, names
+        Covariance of the calibration and its parameters' names, those of the paper's lens without them; None counts the
+        marks' localisation only.
     localisation_sigma_px, distance_sigma_mm
         Standard deviations of the marks' image coordinates and of the known distance.
 
@@ -91,7 +95,7 @@ def check_known_distance(
     per_point = np.linalg.inv(np.swapaxes(A, 1, 2) @ A) * localisation_sigma_px**2
     variance += float(along @ per_point.sum(axis=0) @ along)
     if covariance is not None:
-        G = point_derivatives(pair, space.xyz_mm)[..., np.r_[0:10, 12:22]]
+        G = point_derivatives(pair, space.xyz_mm, COVARIANCE_NAMES if names is None else names)
         row = along @ (G[1] - G[0])
         variance += float(row @ covariance @ row)
     sigma = float(np.sqrt(variance))

@@ -9,7 +9,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.cameras.camera import Camera
-from core.cameras.lens import SeidelLens
+from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,9 @@ class CheckMeasures:
     nominal_mean, nominal_per_camera
         Against the nominal grid.
     positions_mm
-        Positions that entered, ascending, per camera.
+        Stage positions that entered, ascending, per camera.
+    frames
+        Numbers of the free poses that entered, per camera.
     """
 
     mean: Measures
@@ -41,25 +43,34 @@ class CheckMeasures:
     nominal_mean: Measures
     nominal_per_camera: tuple[Measures, Measures]
     positions_mm: tuple[tuple[float, ...], tuple[float, ...]]
+    frames: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
 
 
-def measure_points(camera: Camera, points_sys_mm: Float, xy_px: Float) -> Measures:
-    """Compute RAZ (15), NSCE (16) and RBE (17) of one camera (moved to its position) over points (n, 3), (n, 2).
+def measure_points(camera: Camera, points_mm: Float, xy_px: Float) -> Measures:
+    """Compute RAZ (15), NSCE (16) and RBE (17) of one camera over points (n, 3), (n, 2) of a plane target.
 
-    Points without an image or without a ray count as infinite error: a calibration that loses points is not better.
+    The camera's pose is that towards the target, so that the target's plane is Z = 0. Points without an image or
+    without a ray count as infinite error: a calibration that loses points is not better.
     """
-    if not isinstance(camera.lens, SeidelLens):
-        raise TypeError("the paper's measures need the paper's lens")
-    f_u, f_v = camera.lens.phd_px, camera.lens.aspect * camera.lens.phd_px
-    image = camera.project(points_sys_mm)
-    back = camera.back_project_to_plane(xy_px)
+    f_u, f_v = focal_lengths_px(camera.lens)
+    image = camera.project(points_mm)
+    back = camera.back_project_to_plane(xy_px, point_sys_mm=points_mm)
     lost = ~(image.valid & back.valid)
     rbe = np.where(lost, np.inf, np.linalg.norm(xy_px - image.xy, axis=-1))
-    raz = np.where(lost, np.inf, np.linalg.norm((points_sys_mm - back.xyz_mm)[..., :2], axis=-1))
-    truth_cam, found_cam = camera.cam_from_sys.apply(points_sys_mm), camera.cam_from_sys.apply(back.xyz_mm)
+    raz = np.where(lost, np.inf, np.linalg.norm((points_mm - back.xyz_mm)[..., :2], axis=-1))
+    truth_cam, found_cam = camera.cam_from_sys.apply(points_mm), camera.cam_from_sys.apply(back.xyz_mm)
     across = np.sum((truth_cam - found_cam)[..., :2] ** 2, axis=-1)
     nsce = np.where(lost, np.inf, np.sqrt(across / (found_cam[..., 2] ** 2 * (f_u**-2 + f_v**-2) / 12.0)))
     return Measures(float(rbe.mean()), float(raz.mean()), float(nsce.mean()), int(rbe.size))
+
+
+def focal_lengths_px(lens: LensModel) -> tuple[float, float]:
+    """Return f_u and f_v of Eq. (16): along the rows and the columns."""
+    if isinstance(lens, SeidelLens):
+        return lens.phd_px, lens.aspect * lens.phd_px
+    if isinstance(lens, OpenCVLens):
+        return lens.fx_px, lens.fy_px
+    raise TypeError(f"a {type(lens).__name__} has no pinhole distance")
 
 
 def pooled(parts: Sequence[Measures]) -> Measures:

@@ -17,6 +17,7 @@ from core.calibration.inputs import CalibrationView, NominalCamera
 from core.errors import CalibrationInputError
 
 _UNITS = ((1e3, "micrometres for millimetres"), (25.4, "mils or inches for millimetres"), (10.0, "a factor of ten"))
+_STRAIGHT, _NEARLY_STRAIGHT = 0.02, 0.1  # of the travel: what the positions may lie off the line
 _VISIBLE = 1e-4  # travel over standoff that image scales show with certainty
 
 
@@ -74,8 +75,22 @@ def seen_distances(views: Sequence[CalibrationView], nodes_mm: Float, aspect: fl
     return 1.0 / scale, float(np.sqrt(np.mean(relative**2)))
 
 
-def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: NominalCamera) -> PositionCheck:
+def check_positions(
+    views: Sequence[CalibrationView], nodes_mm: Float, nominal: NominalCamera, *, along_axis: bool = True
+) -> PositionCheck:
     """Compare the declared positions of one camera's views with those seen in the images.
+
+    Parameters
+    ----------
+    views
+        One camera's views, by ascending position.
+    nodes_mm
+        (n_a, n_b, 2) nominal points.
+    nominal
+        The nominal camera.
+    along_axis
+        True if the camera moves along its optical axis. A stage in another direction turns the target's obliquity, and
+        the reciprocal of the image's scale is then only near a straight line.
 
     Raises
     ------
@@ -83,11 +98,13 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
         ``positions_sign_reversed``, ``positions_unit``, ``positions_permuted`` or ``position_wrong``.
     """
     camera = views[0].camera
-    dz = np.array([v.dz_mm for v in views])
+    dz = np.array([v.position_mm for v in views])
     distance, relative_noise = seen_distances(views, nodes_mm, nominal.aspect)
-    noise_mm = relative_noise * nominal.standoff_mm
+    nominal_mm, _ = nominal.placed()
+    bent = _STRAIGHT if along_axis else _NEARLY_STRAIGHT
+    noise_mm = relative_noise * nominal_mm
     at_zero = distance[np.argmin(np.abs(dz))]
-    seen = nominal.standoff_mm * (distance / at_zero - 1.0)
+    seen = nominal_mm * (distance / at_zero - 1.0)
     seen += dz[np.argmin(np.abs(dz))]
     if np.ptp(dz) == 0.0:
         return PositionCheck(dz, seen, float("nan"), 0.0)
@@ -99,7 +116,7 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
     shown = ", ".join(f"{d:+.3f} (seen {s:+.3f})" for d, s in zip(dz, seen, strict=True))
     context = {"camera": camera, "declared_mm": dz.tolist(), "seen_mm": seen.tolist()}
 
-    visible = max(_VISIBLE * nominal.standoff_mm, 6.0 * noise_mm)
+    visible = max(_VISIBLE * nominal_mm, 6.0 * noise_mm)
     if max(float(np.ptp(seen)), float(np.ptp(dz))) < visible:
         return check  # too little travel for this check; the predicted uncertainty decides if it is enough
     if float(np.ptp(seen)) < visible:
@@ -119,8 +136,8 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
             **context,
         )
     in_order = float(np.corrcoef(np.sort(dz), np.sort(distance))[0, 1])
-    left_mm = float(np.sqrt(np.mean(left**2))) / at_zero * nominal.standoff_mm
-    if standoff <= 0.0 or (rms_mm > 0.02 * float(np.ptp(dz)) and left_mm > 4.0 * noise_mm):
+    left_mm = float(np.sqrt(np.mean(left**2))) / at_zero * nominal_mm
+    if standoff <= 0.0 or (rms_mm > bent * float(np.ptp(dz)) and left_mm > 4.0 * noise_mm):
         best = np.sort(dz)[np.argsort(np.argsort(distance))]
         moved = [v.label for v, a, b in zip(views, dz, best, strict=True) if a != b]
         if in_order > 0.999 and moved and in_order > agreement + 1e-3:
@@ -139,7 +156,7 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
             remedy="Check the position of the view named, and that nothing but the camera moved.",
             **context,
         )
-    factor = standoff / nominal.standoff_mm
+    factor = standoff / nominal_mm
     if not 0.5 < factor < 2.0:
         suspected = next(
             (text for f, text in _UNITS if 0.6 < factor / f < 1.6 or 0.6 < factor * f < 1.6),
@@ -147,7 +164,7 @@ def check_positions(views: Sequence[CalibrationView], nodes_mm: Float, nominal: 
         )
         raise CalibrationInputError(
             f"{camera}: the positions declared imply a standoff of {standoff:.4g} mm against the nominal "
-            f"{nominal.standoff_mm:g} mm; suspected cause: {suspected}.",
+            f"{nominal_mm:g} mm; suspected cause: {suspected}.",
             code="positions_unit",
             remedy="Give positions in millimetres, or correct the nominal standoff.",
             **context,

@@ -1,84 +1,17 @@
-"""One camera's views as arrays: predicted image positions, residuals and derivatives, Eqs. (9) to (11)."""
+"""One view's predicted image positions, residuals and derivatives, Eqs. (3) to (11), for any lens and motion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.calibration.inputs import CalibrationView
-from core.cameras.camera import TEN_PARAMETER_NAMES, Camera, RigidTransform
-
-N_CAMERA = 12  # ten parameters and the tilt of the stage axis in x and y
-TILT_NAMES = ("axis_tilt_x_rad", "axis_tilt_y_rad")
-
-
-@dataclass(frozen=True)
-class Observations:
-    """All fitted views of one camera.
-
-    Attributes
-    ----------
-    dz_mm
-        (v,).
-    xy_px
-        (v, n, 2), NaN where not found.
-    found
-        (v, n).
-    weight
-        (v, n), mean 1 over the points found; 0 where not found.
-    correlation
-        Observed coordinates per independent one.
-    """
-
-    dz_mm: Float
-    xy_px: Float
-    found: Bool
-    weight: Float
-    correlation: float = 1.0
-
-    @property
-    def count(self) -> int:
-        """Number of observed coordinates."""
-        return 2 * int(self.found.sum())
-
-
-def collect(views: Sequence[CalibrationView]) -> Observations:
-    """Stack one camera's views."""
-    xy = np.stack([v.xy_px.reshape(-1, 2) for v in views])
-    found = np.asarray(np.isfinite(xy).all(axis=-1))
-    if all(v.sigma_px is not None for v in views):
-        sigma = np.stack([np.broadcast_to(np.asarray(v.sigma_px), v.xy_px.shape[:2]).ravel() for v in views])
-        sigma = np.where(np.isfinite(sigma) & found, sigma, np.inf)
-        # a localiser that claims much less noise at some nodes would otherwise decide the fit there
-        sigma = np.maximum(sigma, 0.5 * np.median(sigma[found]))
-        weight = 1.0 / sigma**2
-    else:
-        weight = found.astype(np.float64)
-    return Observations(
-        np.array([v.dz_mm for v in views]),
-        np.where(found[..., None], xy, np.nan),
-        found,
-        weight / weight[found].mean(),
-        float(np.mean([v.correlation for v in views])),
-    )
-
-
-def camera_of(parameters: Float, aspect: float) -> Camera:
-    """Build the camera from its (10,) or (12,) parameters."""
-    values = {name: float(v) for name, v in zip(TEN_PARAMETER_NAMES, parameters[:10], strict=True)}
-    return Camera.from_paper(**values, aspect=aspect)
-
-
-def camera_at(parameters: Float, aspect: float, dz_mm: float) -> Camera:
-    """Return the camera after its travel ``dz_mm`` along the (possibly tilted) stage axis."""
-    camera = camera_of(parameters, aspect)
-    tilt = parameters[10:12] if parameters.size > 10 else np.zeros(2)
-    shift = dz_mm * np.array([tilt[0], tilt[1], 1.0])
-    pose = camera.cam_from_sys
-    return Camera(camera.lens, RigidTransform(pose.rotation, pose.translation_mm + shift))
+from core.arrays import Float
+from core.calibration.fit.layout import Layout, State, camera_of, shift_cam_mm, travel_mm
+from core.calibration.fit.observations import ViewRows
+from core.calibration.fit.unit_vector import direction, direction_jacobian
+from core.cameras.camera import normalised_jacobian, rotation_derivatives
 
 
 @dataclass(frozen=True)
@@ -88,43 +21,86 @@ class Linearised:
     Attributes
     ----------
     residual_px
-        (v, n, 2).
-    by_camera
-        (v, n, 2, 12).
+        (n, 2).
+    by_unknown
+        (n, 2, p).
+    columns
+        (p,) places of these unknowns in the vector.
     by_node
-        (v, n, 2, 2), px/mm.
+        (n, 2, 3), px/mm.
+    normalised
+        (n, 2) predicted points at depth 1 in the camera's frame.
     valid
-        True if every observed point has an image under these parameters.
+        True if every observed point has an image.
     """
 
     residual_px: Float
-    by_camera: Float
+    by_unknown: Float
+    columns: NDArray[np.intp]
     by_node: Float
+    normalised: Float
     valid: bool
 
 
-def linearise(parameters: Float, aspect: float, nodes_mm: Float, obs: Observations) -> Linearised:
-    """Evaluate one camera's views at ``nodes_mm`` (n, 2)."""
-    points = np.column_stack([nodes_mm, np.zeros(len(nodes_mm))])
-    v, n = obs.found.shape
-    residual = np.zeros((v, n, 2))
-    by_camera = np.zeros((v, n, 2, N_CAMERA))
-    by_node = np.zeros((v, n, 2, 2))
-    valid = True
-    for k, dz in enumerate(obs.dz_mm):
-        camera = camera_at(parameters, aspect, float(dz))
-        image = camera.project(points)
-        valid = valid and bool(image.valid[obs.found[k]].all())
-        use = obs.found[k] & image.valid
-        residual[k, use] = obs.xy_px[k, use] - image.xy[use]
-        ten = camera.ten_parameter_jacobian(points[use])
-        by_camera[k, use, :, :10] = ten
-        by_camera[k, use, :, 10:] = dz * ten[..., 7:9]  # a tilt moves x0 and y0 in proportion to the travel
-        by_node[k, use] = camera.point_jacobian(points[use])[..., :2]
-    return Linearised(residual, by_camera, by_node, valid)
-
-
-def predicted_residual(parameters: Float, aspect: float, nodes_mm: Float, view: CalibrationView) -> Float:
-    """Measured minus projected, (n_a, n_b, 2) px, NaN where not found; ``nodes_mm`` is (n_a, n_b, 2)."""
-    points = np.concatenate([nodes_mm, np.zeros((*nodes_mm.shape[:2], 1))], axis=-1)
-    return np.asarray(view.xy_px - camera_at(parameters, aspect, view.dz_mm).project(points).xy)
+def linearise(layout: Layout, state: State, view: ViewRows, nominal_nodes_mm: Float) -> Linearised:
+    """Evaluate one view at the nominal nodes (n, 3) and the state's corrections of them."""
+    x, c, form = state.x, view.camera, layout.form
+    camera = camera_of(layout, x, c)
+    R, T = camera.cam_from_sys.rotation, camera.cam_from_sys.translation_mm
+    scale = 1.0 + float(x[layout.pitch_scale])
+    target = nominal_nodes_mm * scale + state.nodes_mm
+    frame = None if view.frame is None else layout.frame(view.frame)
+    pose = None if view.frame is None else state.sys_from_target.get(view.frame)
+    body = target if pose is None else pose.apply(target)
+    single = layout.moves != "cameras"
+    if view.dz_mm is not None and single:
+        body = body + travel_mm(layout, x, c, view.dz_mm) * direction(x[layout.direction])
+    p = body @ R.T + T
+    if view.dz_mm is not None and not single:
+        p = p + shift_cam_mm(layout, x, c, view.dz_mm, R)
+    in_front = p[:, 2] > 0.0
+    p = np.where(in_front[:, None], p, np.nan)
+    n = p[:, :2] / p[:, 2:]
+    image = camera.lens.image_from_normalised(n)
+    use = view.found & in_front & image.valid
+    valid = bool((use | ~view.found).all())
+    safe = np.where(use[:, None], n, 0.0)
+    with np.errstate(invalid="ignore"):
+        to_cam = camera.lens.image_jacobian(safe) @ normalised_jacobian(np.where(use[:, None], p, [0.0, 0.0, 1.0]))
+    blocks: list[tuple[Float, slice]] = [(form.jacobian(camera.lens, x[layout.lens(c)], safe), layout.lens(c))]
+    angles = x[layout.pose(c)][:3]
+    turns = np.einsum("nij,ajk,nk->nia", to_cam, rotation_derivatives(*angles), body, optimize=True)
+    blocks.append((np.concatenate([turns, to_cam], axis=-1), layout.pose(c)))
+    if view.dz_mm is not None:
+        axis = layout.axis_of(c)
+        travel = travel_mm(layout, x, c, view.dz_mm)
+        span = layout.direction if single else layout.tilt(c)
+        frame_of = R if single else np.eye(3)
+        along = to_cam @ (frame_of @ direction(x[span]))
+        blocks.append((travel * to_cam @ (frame_of @ direction_jacobian(x[span])), span))
+        index = layout.stage_scale(axis)
+        blocks.append((view.dz_mm * along[..., None], slice(index, index + 1)))
+        step = layout.step(axis, view.dz_mm)
+        if step is not None:
+            blocks.append((along[..., None], slice(step, step + 1)))
+    to_sys = to_cam @ R
+    to_target = to_sys if pose is None else to_sys @ pose.rotation
+    if frame is not None and pose is not None:
+        arm = target @ pose.rotation.T
+        cross = np.zeros((len(arm), 3, 3))  # d(omega x arm)/d(omega)
+        cross[:, 0, 1], cross[:, 0, 2] = arm[:, 2], -arm[:, 1]
+        cross[:, 1, 0], cross[:, 1, 2] = -arm[:, 2], arm[:, 0]
+        cross[:, 2, 0], cross[:, 2, 1] = arm[:, 1], -arm[:, 0]
+        blocks.append((np.concatenate([to_sys @ cross, to_sys], axis=-1), frame))
+    blocks.append(
+        (
+            np.einsum("nij,nj->ni", to_target, nominal_nodes_mm)[..., None],
+            slice(layout.pitch_scale, layout.pitch_scale + 1),
+        )
+    )
+    columns = np.concatenate([np.arange(s.start, s.stop) for _, s in blocks])
+    A = np.concatenate([b for b, _ in blocks], axis=-1)
+    A[~use] = 0.0
+    to_target = np.where(use[:, None, None], to_target, 0.0)
+    residual = np.where(use[:, None], view.xy_px - image.xy, 0.0)
+    return Linearised(residual, A, columns, to_target, safe, valid)

@@ -23,8 +23,8 @@ def affine_of_view(view: CalibrationView, nodes_mm: Float, aspect: float) -> tup
     return solution[:2].T, solution[2]
 
 
-def start_values(view: CalibrationView, nodes_mm: Float, nominal: NominalCamera, gamma_rad: float) -> Float:
-    """Return the ten parameters to start from, in the order of :data:`core.cameras.camera.TEN_PARAMETER_NAMES`.
+def start_pose(view: CalibrationView, nodes_mm: Float, nominal: NominalCamera, gamma_rad: float) -> Float:
+    """Return the pose (6,) to start from: alpha, beta, gamma, x0, y0, z0.
 
     With beta = 0 the rows of Eq. (1) give, whatever gamma is, the rows' direction of the image of X_sys as sin(alpha)
     and that of Y_sys as cos(alpha).
@@ -32,7 +32,8 @@ def start_values(view: CalibrationView, nodes_mm: Float, nominal: NominalCamera,
     A, b = affine_of_view(view, nodes_mm, nominal.aspect)
     alpha = float(np.arctan2(A[1, 0], A[1, 1]))
     cx, cy = nominal.centre_px
-    depth = nominal.standoff_mm + view.dz_mm
+    standoff, _ = nominal.placed()
+    depth = standoff + view.position_mm
     x0 = (b[0] - cx) * depth / nominal.phd_px
     y0 = (b[1] - cy / nominal.aspect) * depth / nominal.phd_px
-    return np.array([nominal.phd_px, cx, cy, 0.0, alpha, 0.0, gamma_rad, x0, y0, nominal.standoff_mm])
+    return np.array([alpha, 0.0, gamma_rad, x0, y0, standoff])

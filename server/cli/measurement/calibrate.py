@@ -7,7 +7,7 @@ import re
 from math import isfinite
 from pathlib import Path
 
-from core.calibration import COVARIANCE_NAMES, CalibrationResult, Measures
+from core.calibration import CalibrationResult, Measures
 from core.errors import InputError
 from core.names import CAMERAS
 from server.cli.terminal import ProgressLine
@@ -95,13 +95,13 @@ def parse_hold_out(text: str) -> tuple[float, ...]:
 def report(result: CalibrationResult) -> str:
     """Write the calibration as a short table."""
     sigma = result.sigma
-    one, two = result.pair.cam1.paper_parameters(), result.pair.cam2.paper_parameters()
+    one, two = result.pair.cam1.values(), result.pair.cam2.values()
     lines = [f"{'':15}{'cam1':>24}{'cam2':>26}"]
     for key in one:
         cells = []
         for name, values in (("cam1", one), ("cam2", two)):
             full = f"{name}.{key}"
-            spread = f" +- {sigma[full]:.1g}" if full in COVARIANCE_NAMES else " given"
+            spread = f" +- {sigma[full]:.1g}" if full in sigma else " given"
             cells.append(f"{values[key]:14.6g}{spread:<11}")
         lines.append(f"{key:15}" + " ".join(cells).rstrip())
     lines.append("")

@@ -15,9 +15,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from core.calibration import COVARIANCE_NAMES, CalibrationResult, CheckMeasures, Measures
+from core.boards import BoardTarget
+from core.calibration import COVARIANCE_NAMES, CalibrationResult, CheckMeasures, Measures, ViewResult
+from core.cameras.camera import POSE_NAMES, Camera, RigidTransform
+from core.cameras.lens import SeidelLens
+from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
+from core.names import CAMERAS
 from core.target import GridTarget
 from server.formats.files import write_bytes
 
@@ -25,7 +31,7 @@ FORMAT_VERSION = 1
 
 
 def calibration_content(
-    result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, object] | None = None
+    result: CalibrationResult, target: GridTarget | BoardTarget, *, provenance: Mapping[str, object] | None = None
 ) -> dict[str, Any]:
     """Return the content of calibration.json as plain numbers, lists and texts.
 
@@ -41,10 +47,26 @@ def calibration_content(
     return {
         "format": "stereorig calibration",
         "format_version": FORMAT_VERSION,
-        "cam1": result.pair.cam1.paper_parameters(),
-        "cam2": result.pair.cam2.paper_parameters(),
+        "cam1": result.pair.cam1.values(),
+        "cam2": result.pair.cam2.values(),
+        "lens": {
+            "model": result.lens.model,
+            "reasons": list(result.lens.reasons),
+            "structure": [
+                {
+                    "name": found.name,
+                    "camera": found.camera,
+                    "terms": {name: {"value": v, "sigma": s} for name, (v, s) in found.terms.items()},
+                    "probability": found.probability,
+                    "rms_px": found.rms_px,
+                }
+                for found in result.lens.structure
+            ],
+        },
+        "stage": _stage(result),
+        "pitch_scale": {"value": result.pitch_scale, "sigma": result.pitch_scale_sigma},
         "image_size_px": {f"cam{c + 1}": list(n.image_size_px) for c, n in enumerate(result.nominals)},
-        "covariance": {"names": list(COVARIANCE_NAMES), "matrix": result.covariance.tolist()},
+        "covariance": {"names": list(result.names), "matrix": result.covariance.tolist()},
         "sigma": result.sigma,
         "noise_px": _by_camera(result.noise_px),
         "redundancy": _by_camera(result.redundancy),
@@ -61,21 +83,11 @@ def calibration_content(
             "scale": result.uncertainty.scale,
             "centre_z_mm": result.uncertainty.centre_z_mm,
             "corner_z_mm": result.uncertainty.corner_z_mm,
-            "predicted_shape_rms_mm": result.predicted.shape_rms_mm,
+            "predicted_shape_rms_mm": None if result.predicted is None else result.predicted.shape_rms_mm,
         },
-        "views": [
-            {
-                "name": view.name,
-                "camera": view.camera,
-                "dz_mm": view.dz_mm,
-                "held_out": view.held_out,
-                "rbe_px": view.rbe_px,
-                "raz_mm": view.raz_mm,
-                "nsce": view.nsce,
-            }
-            for view in result.views
-        ],
-        "target": {**asdict(target), "lines": list(target.lines)},
+        "views": [{**view_record(view), "cam_from_target": pose_record(view.cam_from_target)} for view in result.views],
+        "dropped": [asdict(view) for view in result.dropped],
+        "target": target_record(target),
         "node_corrections_mm": None if result.node_corrections_mm is None else result.node_corrections_mm.tolist(),
         "node_sigma_mm": None if result.node_sigma_mm is None else result.node_sigma_mm.tolist(),
         "nominal": {
@@ -86,8 +98,52 @@ def calibration_content(
     }
 
 
+def target_record(target: GridTarget | BoardTarget) -> dict[str, Any]:
+    """Return a target's description as plain values, its kind among them."""
+    kind = {"kind": "line_grid"} if isinstance(target, GridTarget) else {}
+    return {**kind, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(target).items()}}
+
+
+def view_record(view: ViewResult) -> dict[str, Any]:
+    """Return a view's name, place and measures."""
+    return {
+        "name": view.name,
+        "camera": view.camera,
+        "dz_mm": view.dz_mm,
+        "frame": view.frame,
+        "held_out": view.held_out,
+        "rbe_px": view.rbe_px,
+        "raz_mm": view.raz_mm,
+        "nsce": view.nsce,
+    }
+
+
+def pose_record(pose: RigidTransform) -> dict[str, list[float]]:
+    """Return a pose as a rotation vector and a translation."""
+    return {
+        "rotation_vector_rad": Rotation.from_matrix(pose.rotation).as_rotvec().tolist(),
+        "translation_mm": pose.translation_mm.tolist(),
+    }
+
+
+def _stage(result: CalibrationResult) -> dict[str, Any]:
+    found = result.stage
+    return {
+        "moves": found.moves,
+        "direction_sys": None if found.direction_sys is None else found.direction_sys.tolist(),
+        "direction_sigma_rad": None if found.direction_sigma_rad is None else found.direction_sigma_rad.tolist(),
+        "scale": found.scale.tolist(),
+        "scale_sigma": found.scale_sigma.tolist(),
+        "steps": [{"axis": a, "dz_mm": dz, "error_mm": e, "sigma_mm": s} for a, dz, e, s in found.steps],
+    }
+
+
 def write_calibration(
-    path: str | Path, result: CalibrationResult, target: GridTarget, *, provenance: Mapping[str, object] | None = None
+    path: str | Path,
+    result: CalibrationResult,
+    target: GridTarget | BoardTarget,
+    *,
+    provenance: Mapping[str, object] | None = None,
 ) -> None:
     """Write calibration.json as a temporary file, sync it and rename it.
 
@@ -101,8 +157,19 @@ def write_calibration(
     write_bytes(Path(path), (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
-def covariance_in(content: Mapping[str, object], *, name: str) -> NDArray[np.float64] | None:
-    """Return the (20, 20) covariance of a calibration.json's content in the order of COVARIANCE_NAMES, None without.
+def covariance_in(
+    content: Mapping[str, object], *, name: str, pair: StereoPair
+) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
+    """Return the covariance (n, n) of a calibration.json's content and its parameters' names, None without.
+
+    Parameters
+    ----------
+    content
+        Of the file.
+    name
+        The file's, for messages.
+    pair
+        Its cameras, whose parameters the names must be.
 
     Raises
     ------
@@ -121,14 +188,30 @@ def covariance_in(content: Mapping[str, object], *, name: str) -> NDArray[np.flo
         raise _unusable(name, "its matrix holds something else than numbers") from error
     if matrix.shape != (len(names), len(names)):
         raise _unusable(name, f"its matrix is {matrix.shape} for {len(names)} names")
-    missing = [n for n in COVARIANCE_NAMES if n not in names]
+    cameras = dict(zip(CAMERAS, (pair.cam1, pair.cam2), strict=True))
+    needed = [f"{cam}.{key}" for cam, camera in cameras.items() for key in _needed(camera)]
+    missing = [n for n in needed if n not in names]
     if missing:
         raise _unusable(name, f"its names lack {', '.join(missing)}")
-    order = [names.index(n) for n in COVARIANCE_NAMES]
-    matrix = matrix[np.ix_(order, order)]
+    known = {f"{cam}.{key}" for cam, camera in cameras.items() for key in camera.parameter_names}
+    # the usual order where it is the paper's lens, so that equal files give equal sums
+    order = [n for n in COVARIANCE_NAMES if n in names]
+    order = (
+        [*order, *(n for n in names if n in known and n not in order)]
+        if len(order) == len(COVARIANCE_NAMES)
+        else [n for n in names if n in known]
+    )
+    index = [names.index(n) for n in order]
+    matrix = matrix[np.ix_(index, index)]
     if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0):
         raise _unusable(name, "its matrix is not finite and symmetric")
-    return matrix
+    return tuple(order), matrix
+
+
+def _needed(camera: Camera) -> tuple[str, ...]:
+    if isinstance(camera.lens, SeidelLens):
+        return ("phd_px", "cx_px", "cy_px", "kappa_per_px2", *POSE_NAMES)
+    return ("fx_px", "fy_px", "cx_px", "cy_px", *POSE_NAMES)
 
 
 def _unusable(name: str, why: str) -> FileFormatError:
@@ -156,4 +239,5 @@ def _measures(check: CheckMeasures) -> dict[str, object]:
             "per_camera": {f"cam{c + 1}": _three(m) for c, m in enumerate(check.nominal_per_camera)},
         },
         "positions_mm": {f"cam{c + 1}": list(p) for c, p in enumerate(check.positions_mm)},
+        "frames": {f"cam{c + 1}": list(p) for c, p in enumerate(check.frames)},
     }

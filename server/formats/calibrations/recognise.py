@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
+from core.cameras.camera import ELEVEN_PARAMETER_NAMES, POSE_NAMES, Camera, RigidTransform, rotation_from_angles
+from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from core.names import CAMERAS
@@ -102,21 +103,28 @@ def _nested_deeper(value: Any, limit: int) -> bool:
 def _camera(name: str, which: str, content: Any) -> Camera:
     if not isinstance(content, dict):
         raise unreadable(name, f"{which} is missing" if content is None else f"{which} is not an object")
-    missing = [key for key in ELEVEN_PARAMETER_NAMES if key not in content]
+    opencv = "fx_px" in content and "phd_px" not in content
+    needed = ("fx_px", "fy_px", "cx_px", "cy_px", *POSE_NAMES) if opencv else ELEVEN_PARAMETER_NAMES
+    missing = [key for key in needed if key not in content]
     if missing:
         raise unreadable(name, f"{which} lacks {', '.join(missing)}")
     values: dict[str, float] = {}
-    for key in ELEVEN_PARAMETER_NAMES:
+    terms = [key for key in OpenCVLens.parameter_names if key in content] if opencv else []
+    for key in dict.fromkeys([*needed, *terms]):
         value = content[key]
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise unreadable(name, f"{key} of {which} is {value!r}, not a number")
         if not np.isfinite(value):
             raise invalid(name, f"{key} of {which} is {value}")
         values[key] = float(value)
-    for key in ("phd_px", "aspect", "z0_mm"):
+    for key in ("fx_px", "fy_px", "z0_mm") if opencv else ("phd_px", "aspect", "z0_mm"):
         if values[key] <= 0.0:
             raise invalid(name, f"{key} of {which} is {values[key]:g}, not positive")
-    return Camera.from_paper(**values)
+    if not opencv:
+        return Camera.from_paper(**values)
+    alpha, beta, gamma, *shift = (values.pop(key) for key in POSE_NAMES)
+    pose = RigidTransform(rotation_from_angles(alpha, beta, gamma), np.array(shift))
+    return Camera(OpenCVLens(**values), pose)
 
 
 def _size(content: Mapping[str, object], which: str) -> tuple[int, int] | None:

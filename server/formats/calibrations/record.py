@@ -51,22 +51,48 @@ class UncertaintyRecord(Record):
     scale: float | None = None
 
 
+class PoseRecord(Record):
+    """A pose: rotation vector and translation."""
+
+    rotation_vector_rad: tuple[float, float, float]
+    translation_mm: tuple[float, float, float]
+
+
 class ViewRecord(Measures):
-    """One image of the target."""
+    """One image of the target, at a stage position or in a free pose."""
 
     camera: str
-    dz_mm: float
+    dz_mm: float | None = None
+    frame: int | None = None
     held_out: bool = False
+    cam_from_target: PoseRecord | None = None
 
 
 class TargetRecord(Record):
-    """The grid that was observed."""
+    """The target that was observed: a line grid with ``lines``, another board with ``size``."""
 
-    lines: tuple[int, int]
+    kind: str = "line_grid"
+    lines: tuple[int, int] | None = None
+    size: tuple[int, int] | None = None
     pitch_mm: float
-    line_width_mm: float
+    line_width_mm: float | None = None
     node_tolerance_mm: float = 0.0
     dark_lines: bool = True
+    marker_mm: float | None = None
+    dictionary: str | None = None
+
+
+class LensRecord(Record):
+    """Lens model, and why it was taken."""
+
+    model: str = "paper"
+    reasons: list[str] = Field(default=[])
+
+
+class StageRecord(Record):
+    """What the stage moved."""
+
+    moves: str = "cameras"
 
 
 class CameraIdentity(Record):
@@ -100,6 +126,8 @@ class CalibrationRecord(Record):
     checks: ChecksRecord | None = None
     verdict: VerdictRecord = VerdictRecord()
     uncertainty: UncertaintyRecord = UncertaintyRecord()
+    lens: LensRecord = LensRecord()
+    stage: StageRecord = StageRecord()
     sigma: dict[str, float | None] = Field(default={})
     views: list[ViewRecord] | None = None
     target: TargetRecord | None = None

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import math
 
-from core.calibration.volume import CalibratedVolume, calibrated_volume
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from core.arrays import Float
+from core.boards.board import BOARD_KINDS, BoardKind, BoardTarget
+from core.calibration import COVARIANCE_NAMES
+from core.calibration.volume import CalibratedVolume, calibrated_volume, volume_of_poses
+from core.cameras.camera import RigidTransform
 from core.errors import TargetError
 from core.names import CAMERAS
 from core.target import GridTarget
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.record import ChecksRecord
+from server.formats.calibrations.record import ChecksRecord, PoseRecord, TargetRecord
 
 
 def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
@@ -27,20 +34,59 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
         return None
     # those that the fit used
     fitted = [view for view in record.views if not view.held_out]
-    positions = [[view.dz_mm for view in fitted if view.camera == cam] for cam in CAMERAS]
     target = record.target
+    points = _points_mm(target)
+    if points is None:
+        return None
+    found = covariance_in(calibration.details, name="calibration.json", pair=calibration.pair)
+    names, covariance = (COVARIANCE_NAMES, None) if found is None else found
+    if record.stage.moves == "cameras" and all(view.dz_mm is not None for view in fitted):
+        positions = [
+            [view.dz_mm for view in fitted if view.camera == cam and view.dz_mm is not None] for cam in CAMERAS
+        ]
+        return calibrated_volume(
+            calibration.pair,
+            points,
+            (sizes[0], sizes[1]),
+            positions,
+            pitch_mm=target.pitch_mm,
+            covariance=covariance,
+            names=names,
+        )
+    poses = [
+        [_transform(view.cam_from_target) for view in fitted if view.camera == cam and view.cam_from_target is not None]
+        for cam in CAMERAS
+    ]
+    return volume_of_poses(
+        calibration.pair,
+        points,
+        (sizes[0], sizes[1]),
+        poses,
+        pitch_mm=target.pitch_mm,
+        covariance=covariance,
+        names=names,
+    )
+
+
+def _points_mm(target: TargetRecord) -> Float | None:
     try:
-        grid = GridTarget(pitch_mm=target.pitch_mm, lines=target.lines, line_width_mm=target.line_width_mm)
+        if target.kind == "line_grid":
+            if target.lines is None or target.line_width_mm is None:
+                return None
+            grid = GridTarget(pitch_mm=target.pitch_mm, lines=target.lines, line_width_mm=target.line_width_mm)
+            return grid.all_points_mm()
+        if target.kind not in BOARD_KINDS or target.size is None:
+            return None
+        # the points of a board of markers are those of the checkerboard without them
+        kind: BoardKind = "checkerboard" if target.kind == "charuco" else target.kind
+        return BoardTarget(kind=kind, size=target.size, pitch_mm=target.pitch_mm).points_mm()
     except TargetError:
         return None
-    return calibrated_volume(
-        calibration.pair,
-        grid.all_points_mm(),
-        (sizes[0], sizes[1]),
-        positions,
-        pitch_mm=grid.pitch_mm,
-        covariance=covariance_in(calibration.details, name="calibration.json"),
-    )
+
+
+def _transform(pose: PoseRecord) -> RigidTransform:
+    rotation = Rotation.from_rotvec(pose.rotation_vector_rad).as_matrix()
+    return RigidTransform(rotation, np.array(pose.translation_mm))
 
 
 def rbe_of(calibration: LoadedCalibration) -> float | None:

@@ -15,10 +15,11 @@ from server.formats.calibrations.native import covariance_in, write_calibration
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.target_toml import read_rig, read_target
 from server.formats.views import find_views
-from tests.support.calibration_truth import HELD, NOMINAL, make_views
+from tests.support.calibration_truth import HELD, NOMINAL, Grid, make_views
 from tests.support.requirements import ROOT
 
 TARGET = "pitch_mm = 1.0\nlines = [11, 11]\nline_width_mm = 0.03\nnode_tolerance_mm = 0.004\ndark_lines = true\n"
+PAPER_PAIR = calibrate(make_views(), Grid(), NOMINAL, HELD).pair
 CAMERA = "image_size_px = [512, 480]\nphd_px = 12000\nstandoff_mm = 400.0\nangle_deg = -30\naspect = 0.9617\n"
 RIG = f"[rig]\nname = 'x'\n[cam1]\n{CAMERA}driver = 'sim'\n[cam2]\n{CAMERA}"
 
@@ -160,15 +161,17 @@ def test_calibration_json_holds_what_its_readers_need(tmp_path: Path) -> None:
     for a, b in ((loaded.pair.cam1, result.pair.cam1), (loaded.pair.cam2, result.pair.cam2)):
         assert a.paper_parameters() == pytest.approx(b.paper_parameters(), rel=1e-14)
     assert loaded.image_size1_px == loaded.image_size2_px == (512, 480)
-    back = covariance_in(loaded.details, name=str(path))
-    assert back is not None
+    found = covariance_in(loaded.details, name=str(path), pair=loaded.pair)
+    assert found is not None
+    assert found[0] == COVARIANCE_NAMES
+    back = found[1]
     np.testing.assert_allclose(back, result.covariance, rtol=1e-14)
 
     shuffled = {"names": names[::-1], "matrix": np.asarray(content["covariance"]["matrix"])[::-1, ::-1].tolist()}
-    again = covariance_in({"covariance": shuffled}, name="x")
+    again = covariance_in({"covariance": shuffled}, name="x", pair=loaded.pair)
     assert again is not None
-    np.testing.assert_array_equal(again, back)
-    assert covariance_in({}, name="x") is None
+    np.testing.assert_array_equal(again[1], back)
+    assert covariance_in({}, name="x", pair=loaded.pair) is None
     assert len(COVARIANCE_NAMES) == 20
 
 
@@ -184,7 +187,7 @@ def test_calibration_json_holds_what_its_readers_need(tmp_path: Path) -> None:
 )
 def test_a_damaged_covariance_is_refused(covariance: object) -> None:
     with pytest.raises(FileFormatError, match="covariance in x"):
-        covariance_in({"covariance": covariance}, name="x")
+        covariance_in({"covariance": covariance}, name="x", pair=PAPER_PAIR)
 
 
 def test_eleven_numbers_a_camera_are_enough(tmp_path: Path) -> None:

@@ -1,0 +1,44 @@
+"""Refusal of a target that is not flat although it was declared exact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from core.calibration.choice.structure import Structure
+from core.calibration.fit.adjust import Adjustment
+from core.errors import CalibrationError
+
+_SHARE = 1.0  # of the noise: a bow that moves the points by more rules the fit
+_LEAST_PX = 0.05  # less than this does no harm worth a refusal; the verdict names it
+
+
+def check_flatness(structure: Sequence[Structure], adjustment: Adjustment) -> None:
+    """Refuse a calibration whose residuals show above all that the target is bowed.
+
+    Parameters
+    ----------
+    structure
+        What the residuals hold.
+    adjustment
+        The fit, for its noise.
+
+    Raises
+    ------
+    CalibrationError
+        Code ``target_not_flat``.
+    """
+    noise = float(np.mean(adjustment.noise_px))
+    for found in structure:
+        if found.name != "bow" or found.rms_px < max(_SHARE * noise, _LEAST_PX):
+            continue
+        values = {name: value for name, (value, _) in found.terms.items()}
+        bow = max(abs(values["XX_mm"]), abs(values["YY_mm"]), abs(values["XY_mm"]))
+        raise CalibrationError(
+            f"The target is not flat: it is bowed by about {bow:.2g} mm from its middle to its rim, which moves its "
+            f"points by {found.rms_px:.2f} px.",
+            code="target_not_flat",
+            remedy="Use a rigid, flat target, or declare its errors (node_tolerance_mm, flatness_mm).",
+            bow_mm=bow,
+        )

@@ -1,0 +1,41 @@
+"""The adjustment's unknowns as the parameters that a calibration states, by name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.arrays import Float
+from core.calibration.fit.layout import Layout, Priors
+from core.cameras.camera import POSE_NAMES
+from core.names import CAMERAS
+
+
+def parameter_names(layout: Layout, priors: Priors) -> tuple[str, ...]:
+    """Names of both cameras' estimated parameters: ``cam1.phd_px`` and so on."""
+    names: list[str] = []
+    for c, camera in enumerate(CAMERAS):
+        own = layout.form.names(aspect_estimated=_aspect_estimated(layout, priors, c))
+        names.extend(f"{camera}.{name}" for name in (*own, *POSE_NAMES))
+    return tuple(names)
+
+
+def named_covariance(layout: Layout, priors: Priors, x: Float, covariance: Float) -> Float:
+    """Covariance of the parameters in :func:`parameter_names` from that of the unknowns (m, m) at ``x``."""
+    J = named_derivatives(layout, priors, x)
+    return np.asarray(J @ covariance @ J.T)
+
+
+def named_derivatives(layout: Layout, priors: Priors, x: Float) -> Float:
+    """Derivatives (names, m) of the named parameters over the unknowns."""
+    blocks = []
+    for c in range(2):
+        lens = layout.form.to_names(x[layout.lens(c)], aspect_estimated=_aspect_estimated(layout, priors, c))
+        block = np.zeros((len(lens) + len(POSE_NAMES), layout.size))
+        block[: len(lens), layout.lens(c)] = lens
+        block[len(lens) :, layout.pose(c)] = np.eye(len(POSE_NAMES))
+        blocks.append(block)
+    return np.concatenate(blocks)
+
+
+def _aspect_estimated(layout: Layout, priors: Priors, c: int) -> bool:
+    return bool(priors.free[layout.lens(c)][layout.form.aspect_index])

@@ -1,0 +1,219 @@
+"""What is to be adjusted: views, nominal points and settings; its unknowns under a lens model, and their start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from core.arrays import Float
+from core.calibration.fit.free_start import pose_of, start_free
+from core.calibration.fit.layout import Layout, Priors, State, camera_of, priors
+from core.calibration.fit.lens_form import LensForm, LensName
+from core.calibration.fit.observations import ViewRows, collect
+from core.calibration.fit.single import fit_single
+from core.calibration.fit.start import start_pose
+from core.calibration.inputs import CalibrationOptions, CalibrationView, Moves, NominalCamera
+from core.cameras.camera import RigidTransform, angles_from_rotation
+from core.names import CAMERAS
+
+_PAPER = LensForm("paper")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Views to fit, with all that is given.
+
+    Attributes
+    ----------
+    views
+        The views to fit, of both cameras.
+    nodes_mm
+        (n_a, n_b, 2) nominal points.
+    nominals, options
+        Nominal cameras and settings.
+    moves
+        What the stage moves; ``free`` where there are no stage positions.
+    node_sigma_mm
+        Prior on a node's correction within the plane, and out of it; 0 holds them.
+    pitch_scale_sigma
+        Relative prior on the pitch.
+    system_frame
+        Number of the free pose that defines the system frame; None where the stage's views do.
+    """
+
+    views: tuple[CalibrationView, ...]
+    nodes_mm: Float
+    nominals: tuple[NominalCamera, NominalCamera]
+    options: CalibrationOptions
+    moves: Moves
+    node_sigma_mm: tuple[float, float] = (0.0, 0.0)
+    pitch_scale_sigma: float = 0.0
+    system_frame: int | None = None
+
+    @property
+    def flat_nodes_mm(self) -> Float:
+        """(n, 3) nominal points."""
+        flat = self.nodes_mm.reshape(-1, 2)
+        return np.column_stack([flat, np.zeros(len(flat))])
+
+    @property
+    def rows(self) -> list[ViewRows]:
+        """The views as rows of the adjustment."""
+        return collect(self.views)
+
+    @property
+    def staged(self) -> tuple[CalibrationView, ...]:
+        """Views at stage positions."""
+        return tuple(v for v in self.views if v.dz_mm is not None)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Numbers of the free poses, ascending."""
+        return tuple(sorted({v.frame for v in self.views if v.frame is not None}))
+
+    def layout(self, model: LensName) -> Layout:
+        """Return the unknowns under a lens model."""
+        axes = {
+            (("cam1", "cam2").index(v.camera) if self.moves == "cameras" else 0, v.position_mm) for v in self.staged
+        }
+        free = tuple(k for k in self.frames if k != self.system_frame)
+        return Layout(LensForm(model), self.moves, free, tuple(sorted(axes)))
+
+    def priors(self, layout: Layout) -> Priors:
+        """Return the priors of the unknowns."""
+        return priors(
+            layout,
+            self.nominals,
+            self.options,
+            pitch_scale_sigma=self.pitch_scale_sigma,
+            node_sigma_mm=self.node_sigma_mm,
+        )
+
+    def without(self, views: Sequence[CalibrationView]) -> Problem:
+        """Return the problem without some views; the frame that defines the system frame stays one of those left."""
+        left = tuple(v for v in self.views if not any(v is other for other in views))
+        frames = sorted({v.frame for v in left if v.frame is not None})
+        first = self.system_frame
+        if first is not None and first not in frames:
+            first = frames[0] if frames else None
+        return replace(self, views=left, system_frame=first)
+
+
+def started(problem: Problem) -> tuple[Problem, State, tuple[int, ...]]:
+    """Return the problem with its points counted alike, a start under the paper's lens, and frames that do not fit."""
+    if problem.staged:
+        state = _from_stage(problem)
+        return problem, _with_poses(problem, state), ()
+    return _from_free(problem)
+
+
+def converted(state: State, layout: Layout, other: Layout) -> State:
+    """Return a state under another lens model, in the other layout of the same problem."""
+    x = np.zeros(other.size)
+    for c in range(2):
+        x[other.lens(c)] = layout.form.converted(state.x[layout.lens(c)], other.form)
+        x[other.pose(c)] = state.x[layout.pose(c)]
+        x[other.tilt(c)] = state.x[layout.tilt(c)]
+    tail = other.size - other.motion
+    x[other.motion :] = state.x[layout.motion : layout.motion + tail]
+    return State(x, dict(state.sys_from_target), state.nodes_mm.copy())
+
+
+def restricted(state: State, layout: Layout, other: Layout) -> State:
+    """Return a state for a problem with fewer free poses or steps, under the same lens model.
+
+    The system frame moves with the pose that defines it.
+    """
+    x = np.zeros(other.size)
+    x[: other.motion + 5] = state.x[: layout.motion + 5]
+    for k, step in enumerate(other.steps):
+        index = layout.step(*step)
+        x[other.motion + 5 + k] = 0.0 if index is None else state.x[index]
+    poses = {k: state.sys_from_target[k] for k in other.frames}
+    return State(x, poses, state.nodes_mm.copy())
+
+
+def rebased(state: State, layout: Layout, frame: int) -> State:
+    """Return the state in the system frame that another free pose defines."""
+    new_from_old = state.sys_from_target[frame].inverse()
+    old_from_new = state.sys_from_target[frame]
+    x = state.x.copy()
+    for c in range(2):
+        pose = camera_of(layout, state.x, c).cam_from_sys @ old_from_new
+        x[layout.pose(c)] = pose_numbers(pose)
+    poses = {k: new_from_old @ p for k, p in state.sys_from_target.items() if k != frame}
+    return State(x, poses, state.nodes_mm)
+
+
+def pose_numbers(pose: RigidTransform) -> Float:
+    """Return alpha, beta, gamma, x0, y0, z0 of a pose, (6,)."""
+    return np.array([*angles_from_rotation(pose.rotation), *pose.translation_mm])
+
+
+def _from_stage(problem: Problem) -> State:
+    layout = problem.layout("paper")
+    x = np.zeros(layout.size)
+    rows = problem.rows
+    directions = []
+    for c, (name, nominal) in enumerate(zip(CAMERAS, problem.nominals, strict=True)):
+        own = [v for v in problem.staged if v.camera == name]
+        own_rows = [r for r in rows if r.camera == c and r.dz_mm is not None]
+        reference = min(own, key=lambda v: abs(v.position_mm))
+        gamma = float(np.radians(nominal.placed()[1]))
+        # a plane seen from the other side of its normal is nearly as good a start; trying both reveals exchanged or
+        # mirrored cameras
+        starts = [start_pose(reference, problem.nodes_mm, nominal, g) for g in (gamma, -gamma)]
+        found, direction = fit_single(
+            layout, c, own_rows, problem.flat_nodes_mm, nominal, starts, centre_sigma_px=problem.options.centre_sigma_px
+        )
+        x[layout.lens(c)], x[layout.pose(c)] = found[:5], found[5:]
+        directions.append(direction)
+    x[layout.direction] = np.mean(directions, axis=0)
+    return State(x, {}, np.zeros_like(problem.flat_nodes_mm))
+
+
+def _with_poses(problem: Problem, state: State) -> State:
+    """Add the free poses by the cameras that the stage's views gave."""
+    layout = problem.layout("paper")
+    poses: dict[int, RigidTransform] = {}
+    for view in problem.views:
+        if view.frame is None or view.frame in poses:
+            continue
+        camera = camera_of(layout, state.x, CAMERAS.index(view.camera))
+        pose = pose_of(view, problem.nodes_mm, camera.lens)
+        if pose is not None:
+            poses[view.frame] = camera.sys_from_cam @ pose
+    return State(state.x, poses, state.nodes_mm)
+
+
+def _from_free(problem: Problem) -> tuple[Problem, State, tuple[int, ...]]:
+    nodes = problem.nodes_mm
+    symmetric = bool(np.allclose(nodes[::-1, ::-1], -nodes, atol=1e-9))
+    start = start_free(problem.views, nodes, problem.nominals, symmetric=symmetric)
+    views = tuple(
+        replace(v, xy_px=v.xy_px[::-1, ::-1], sigma_px=_turned(v.sigma_px))
+        if v.camera == "cam2" and v.frame in start.half_turned
+        else v
+        for v in problem.views
+        if v.frame in start.cam1_from_target
+    )
+    first = min(k for k in start.cam1_from_target if k not in start.odd)
+    turned = replace(problem, views=views, system_frame=first)
+    layout = turned.layout("paper")
+    x = np.zeros(layout.size)
+    cam1 = start.cam1_from_target[first]
+    for c, pose in enumerate((cam1, start.cam2_from_cam1 @ cam1)):
+        nominal = problem.nominals[c]
+        focal, k1 = float(start.focal_px[c]), float(start.k1[c])
+        values = _PAPER.start(focal, nominal.centre_px, nominal.aspect)
+        values[3] = -k1 / focal**2
+        x[layout.lens(c)], x[layout.pose(c)] = values, pose_numbers(pose)
+    sys_from_cam1 = cam1.inverse()
+    poses = {k: sys_from_cam1 @ start.cam1_from_target[k] for k in layout.frames}
+    return turned, State(x, poses, np.zeros_like(problem.flat_nodes_mm)), start.odd
+
+
+def _turned(sigma_px: float | Float | None) -> float | Float | None:
+    return sigma_px if sigma_px is None or np.ndim(sigma_px) == 0 else np.asarray(sigma_px)[::-1, ::-1]
