@@ -81,7 +81,7 @@ def test_the_pixel_loops_warp_is_exact_to_a_hundred_thousandth_of_a_pixel(kind, 
     pose = pair.cam2_from_cam1
     xc, yc, _ = pair.cam1.rays_cam(xy).xyz_mm
     powers = np.empty((3, 16))
-    assert set_up_nodes(lens1, left + half - xy[0], top + half - xy[1], half, xc, yc, np.empty(22), powers)
+    assert set_up_nodes(lens1, left + half - xy[0], top + half - xy[1], half, xc, yc, np.empty(25), powers)
     R, t = pose.rotation, pose.translation_mm
     M = R @ np.array([[xc, 1.0, 0.0], [yc, 0.0, 1.0], [1.0, 0.0, 0.0]]) + t[:, None] * w
     warp = np.zeros(22, np.float32)
