@@ -17,7 +17,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.cameras.lens import N_KERNEL_PARAMETERS, SEIDEL
+from core.cameras.lens import SEIDEL
 from core.matching.image import PAD
 from core.matching.kernels.loops import data, monomials
 from core.matching.kernels.naming import inner, kernel
@@ -111,12 +111,6 @@ def _expanded(lens, u, v, l0, p1, p2):
 
 
 @inner
-def lens_expansion(lens, u, v):
-    """Expand a lens about the normalised point (u, v)."""
-    return _rational_expansion(lens, u, v) if is_rational(lens) else _plain_expansion(lens, u, v)
-
-
-@inner
 def _slopes(lens, near, u, v):
     """Return d(image px) / d(normalised) at (u, v) from the expansion there: the four entries row by row."""
     l1, h11, h12, h22 = near.l1, near.h11, near.h12, near.h22
@@ -129,7 +123,9 @@ def _slopes(lens, near, u, v):
 @njit(nogil=True, error_model="numpy")
 def lens_jacobian(lens, u, v):
     """Return d(image px) / d(normalised) at (u, v): the four entries row by row."""
-    return _slopes(lens, lens_expansion(lens, u, v), u, v)
+    if is_rational(lens):
+        return _slopes(lens, _rational_expansion(lens, u, v), u, v)
+    return _slopes(lens, _plain_expansion(lens, u, v), u, v)
 
 
 @inner
@@ -151,6 +147,40 @@ def _radially_undistorted(lens, xd, yd):
     return xd * factor, yd * factor
 
 
+def _make_newton(expansion: Any, made_for: str) -> Any:
+    """Compile Newton's method for an expansion's lenses."""
+
+    @kernel(made_for)
+    def newton(lens, x, y, u, v):
+        """Normalised point of a pixel from a guess (u, v); NaN outside the lens model's domain."""
+        error = np.inf
+        for _ in range(_NEWTON_STEPS):
+            if u * u + v * v >= lens[11]:  # keep to the branch that contains the centre
+                shrink = 0.999 * math.sqrt(lens[11] / (u * u + v * v))
+                u *= shrink
+                v *= shrink
+            near = expansion(lens, u, v)
+            j11, j12, j21, j22 = _slopes(lens, near, u, v)
+            ex, ey = near.x - x, near.y - y
+            error = max(abs(ex), abs(ey))
+            det = j11 * j22 - j12 * j21
+            du = (j22 * ex - j12 * ey) / det
+            dv = (j11 * ey - j21 * ex) / det
+            u -= du
+            v -= dv
+            if abs(du) + abs(dv) < 1e-14:
+                break
+        if error < 1e-9 * (1.0 + abs(x) + abs(y)) and u * u + v * v < lens[11]:
+            return u, v
+        return np.nan, np.nan
+
+    return newton
+
+
+_plain_newton = _make_newton(_plain_expansion, "plain")
+_rational_newton = _make_newton(_rational_expansion, "rational")
+
+
 @inner
 def undistort(lens, x, y):
     """Normalised point (u, v) of a pixel; NaN outside the lens model's domain."""
@@ -160,29 +190,10 @@ def undistort(lens, x, y):
         q = 1.0 - 4.0 * lens[6] * (xd * xd + yd * yd)
         factor = 2.0 / (1.0 + math.sqrt(q)) if q > 0.0 else np.nan
         return xd * factor, yd * factor
-    u, v = xd, yd
     if is_rational(lens):  # it may level off or rise to a pole, where Newton's method from afar would leave the branch
         u, v = _radially_undistorted(lens, xd, yd)
-    error = np.inf
-    for _ in range(_NEWTON_STEPS):
-        if u * u + v * v >= lens[11]:  # keep to the branch that contains the centre
-            shrink = 0.999 * math.sqrt(lens[11] / (u * u + v * v))
-            u *= shrink
-            v *= shrink
-        near = lens_expansion(lens, u, v)
-        j11, j12, j21, j22 = lens_jacobian(lens, u, v)
-        ex, ey = near.x - x, near.y - y
-        error = max(abs(ex), abs(ey))
-        det = j11 * j22 - j12 * j21
-        du = (j22 * ex - j12 * ey) / det
-        dv = (j11 * ey - j21 * ex) / det
-        u -= du
-        v -= dv
-        if abs(du) + abs(dv) < 1e-14:
-            break
-    if error < 1e-9 * (1.0 + abs(x) + abs(y)) and u * u + v * v < lens[11]:
-        return u, v
-    return np.nan, np.nan
+        return _rational_newton(lens, x, y, u, v)
+    return _plain_newton(lens, x, y, xd, yd)
 
 
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
@@ -366,7 +377,7 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
         q0, q1, q2 = (Vec(builder, builder.load(one)) for one in sums)
         inverse = 1.0 / q2
         u, v = q0 * inverse, q1 * inverse
-        a, uv = [number(lens, LONG(i)) for i in range(N_KERNEL_PARAMETERS)], u * v
+        a, uv = [number(lens, LONG(i)) for i in range(12)], u * v
         uu, vv = u * u, v * v
         r2 = uu + vv
         # both lens models at once: a polynomial over a polynomial, one of which is 1
@@ -380,7 +391,8 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
         top = 1.0 + r2 * (a[6] + r2 * (a[7] + r2 * a[10]))
         kept = cgutils.alloca_once_value(builder, if_seidel(1.0 / (1.0 + a[6] * r2), top).value)
         with builder.if_then(_any_nonzero(builder, lens, (12, 13, 14))):
-            builder.store((top / (1.0 + r2 * (a[12] + r2 * (a[13] + r2 * a[14])))).value, kept)
+            k4, k5, k6 = (number(lens, LONG(i)) for i in (12, 13, 14))
+            builder.store((top / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))).value, kept)
         radial = Vec(builder, builder.load(kept))
         p1, p2 = if_seidel(0.0, a[8]), if_seidel(0.0, a[9])
         xd = u * radial + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
