@@ -46,10 +46,21 @@ def rays(lens: Float, x0: float, y0: float, step: float, nx: Float, ny: Float) -
 def _undistort(lens: Float, xd: float, yd: float, nx: float, ny: float) -> tuple[float, float, bool]:
     """Invert OpenCV's distortion by Newton's method from the guess (nx, ny)."""
     k1, k2, p1, p2, k3 = lens[6], lens[7], lens[8], lens[9], lens[10]
+    k4, k5, k6 = lens[12], lens[13], lens[14]
+    rational = k4 != 0.0 or k5 != 0.0 or k6 != 0.0
     for _ in range(_STEPS):
         r2 = nx * nx + ny * ny
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        if rational:
+            if not r2 < lens[11]:  # stepped over a pole or fold: back onto the branch that contains the centre
+                shrink = 0.999 * np.sqrt(lens[11] / r2)
+                nx *= shrink
+                ny *= shrink
+                continue
+            bottom = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            radial /= bottom
+            slope = (slope - 2.0 * radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) / bottom
         fx = nx * radial + 2.0 * p1 * nx * ny + p2 * (r2 + 2.0 * nx * nx) - xd
         fy = ny * radial + p1 * (r2 + 2.0 * ny * ny) + 2.0 * p2 * nx * ny - yd
         a = radial + nx * nx * slope + 2.0 * p1 * ny + 6.0 * p2 * nx

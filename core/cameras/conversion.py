@@ -14,6 +14,7 @@ from core.errors import CalibrationError
 
 _ACROSS = 41  # positions across the image, each way
 _STEPS = 30
+_HALVINGS = 30
 _SETTLED_PX = 1e-11
 
 
@@ -128,7 +129,12 @@ def _fit(
         jacobian = np.where(mapped.valid[:, None, None], jacobian, 0.0).reshape(-1, len(columns))
         scale = np.maximum(np.sqrt((jacobian**2).sum(axis=0)), 1e-300)  # columns differ by many powers of ten
         step = np.linalg.lstsq(jacobian / scale, residual, rcond=1e-14)[0] / scale
-        fitted = replace(fitted, **{n: float(getattr(fitted, n) + d) for n, d in zip(free, step, strict=True)})
+        for _ in range(_HALVINGS):
+            moved = replace(fitted, **{n: float(getattr(fitted, n) + d) for n, d in zip(free, step, strict=True)})
+            if moved.image_from_normalised(normalised).valid.sum() >= mapped.valid.sum():
+                break
+            step = 0.5 * step  # it would fold back inside the image
+        fitted = moved
         if not np.isfinite(step).all() or np.abs(jacobian @ step).max() < _SETTLED_PX:
             break
     mapped = fitted.image_from_normalised(normalised)

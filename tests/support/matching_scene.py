@@ -45,6 +45,20 @@ def opencv_pair(size: int = SIZE) -> StereoPair:
     """Two strongly distorting lenses off their axes, skewed, 19 degrees apart, 390 mm."""
     lens1 = OpenCVLens(5400.0, 5380.0, 700.0, -420.0, 1.5, 0.16, -2.1, 4e-4, -7e-4, 11.0)
     lens2 = OpenCVLens(5350.0, 5390.0, -650.0, 510.0, -0.8, -0.21, 1.7, -5e-4, 3e-4, -9.0)
+    return _turned_pair(lens1, lens2, size)
+
+
+def rational_pair(size: int = SIZE) -> StereoPair:
+    """Corners of two wide lenses of OpenCV's eight terms, 25 degrees off their axes; no skew, as OpenCV has none.
+
+    What k4, k5 and k6 do there is hundreds of pixels, and their slopes across a subset are percents.
+    """
+    lens1 = OpenCVLens(5400.0, 5380.0, 2300.0, -1300.0, 0.0, 0.62, 0.21, 4e-4, -7e-4, 0.012, 0.94, 0.38, 0.05)
+    lens2 = OpenCVLens(5350.0, 5390.0, -1900.0, 1200.0, 0.0, -0.35, 0.14, -5e-4, 3e-4, -0.05, 0.11, 0.52, -0.21)
+    return _turned_pair(lens1, lens2, size)
+
+
+def _turned_pair(lens1: OpenCVLens, lens2: OpenCVLens, size: int) -> StereoPair:
     c, s = np.cos(np.deg2rad(19.0)), np.sin(np.deg2rad(19.0))
     # point both cameras so that the window's centre sees the origin
     poses = []

@@ -25,7 +25,8 @@ from core.matching.kernels.shape import make_shape
 
 def _stamp() -> int:
     here = Path(__file__).parent
-    sources = [*sorted(here.glob("*.py")), here.parents[1] / "status.py"]
+    # besides the kernels' own: what their constants and the layout of a lens come from
+    sources = [*sorted(here.glob("*.py")), here.parents[1] / "status.py", here.parents[1] / "cameras" / "lens.py"]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).digest()
     return int.from_bytes(digest[:7], "big")
 

@@ -205,7 +205,7 @@ def make_point(degree: int, images: int) -> PointKernels:
         basis[0, 0] = 1.0
         reference = ReferenceSpace(
             raw=np.empty(n_raw),
-            node_work=np.empty(22),
+            node_work=np.empty(25),
             powers=np.empty((few, N_NODES)),
             basis=basis,
             middle=np.empty(3),

@@ -7,6 +7,8 @@ A lens is the flat array of ``LensModel.kernel_parameters``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,17 +20,19 @@ from numba.extending import intrinsic
 from core.cameras.lens import SEIDEL
 from core.matching.image import PAD
 from core.matching.kernels.loops import data, monomials
-from core.matching.kernels.naming import inner
+from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 _NEWTON_STEPS = 20
+_BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 
 
 class LensExpansion(NamedTuple):
     """A lens about a normalised point.
 
-    ``x, y`` (px), the radial factor's coefficients ``l1, l2, l3`` in powers of rho = r^2 - r0^2, and the matrix
-    ``h11, h12, h22`` that acts on the offset besides: radial factor at the centre plus the tangential terms' slopes.
+    ``x, y`` (px), what the radial factor changes by with rho = r^2 - r0^2, ``(l1 rho + l2 rho^2 + l3 rho^3) / (1 + d1
+    rho + d2 rho^2 + d3 rho^3)``, and the matrix ``h11, h12, h22`` that acts on the offset besides: radial factor at the
+    centre plus the tangential terms' slopes. The d are zero unless the lens is rational.
     """
 
     x: float
@@ -39,14 +43,20 @@ class LensExpansion(NamedTuple):
     h11: float
     h12: float
     h22: float
+    d1: float
+    d2: float
+    d3: float
 
 
 @inner
-def lens_expansion(lens, u, v):
-    """Expand a lens about the normalised point (u, v).
+def is_rational(lens):
+    """Return True if the lens has one of OpenCV's k4, k5, k6."""
+    return lens[12] != 0.0 or lens[13] != 0.0 or lens[14] != 0.0
 
-    Exact for OpenCV's polynomial; the Seidel term 1 / (1 + k r^2) leaves (k rho)^4, below 1e-12 here.
-    """
+
+@inner
+def _plain_expansion(lens, u, v):
+    """Expand a Seidel or five-term lens; the Seidel term 1 / (1 + k r^2) leaves (k rho)^4, below 1e-12 here."""
     r2 = u * u + v * v
     if lens[0] == SEIDEL:
         k = lens[6]
@@ -63,6 +73,33 @@ def lens_expansion(lens, u, v):
         l1 = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)
         l2 = k2 + 3.0 * k3 * r2
         l3 = k3
+    x, y, h11, h12, h22 = _expanded(lens, u, v, l0, p1, p2)
+    return LensExpansion(x, y, l1, l2, l3, h11, h12, h22, 0.0, 0.0, 0.0)
+
+
+@inner
+def _rational_expansion(lens, u, v):
+    """Expand a lens with k4, k5, k6, exactly."""
+    r2 = u * u + v * v
+    k1, k2, k3 = lens[6], lens[7], lens[10]
+    k4, k5, k6 = lens[12], lens[13], lens[14]
+    # the radial factor N / D changes by (N - l0 D) / D with l0 = N / D at the centre; all of it over the centre's D
+    over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    d1 = over * (k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2))
+    d2 = over * (k5 + 3.0 * k6 * r2)
+    d3 = over * k6
+    l0 = over * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+    l1 = over * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)) - l0 * d1
+    l2 = over * (k2 + 3.0 * k3 * r2) - l0 * d2
+    l3 = over * k3 - l0 * d3
+    x, y, h11, h12, h22 = _expanded(lens, u, v, l0, lens[8], lens[9])
+    return LensExpansion(x, y, l1, l2, l3, h11, h12, h22, d1, d2, d3)
+
+
+@inner
+def _expanded(lens, u, v, l0, p1, p2):
+    """Position, and the matrix of the terms without l1, l2, l3."""
+    r2 = u * u + v * v
     xd = u * l0 + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
     yd = v * l0 + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v
     x = lens[4] + lens[1] * xd + lens[3] * yd
@@ -70,18 +107,78 @@ def lens_expansion(lens, u, v):
     h11 = l0 + 2.0 * p1 * v + 6.0 * p2 * u
     h12 = 2.0 * p1 * u + 2.0 * p2 * v
     h22 = l0 + 6.0 * p1 * v + 2.0 * p2 * u
-    return LensExpansion(x, y, l1, l2, l3, h11, h12, h22)
+    return x, y, h11, h12, h22
 
 
-@njit(nogil=True, error_model="numpy")
-def lens_jacobian(lens, u, v):
-    """Return d(image px) / d(normalised) at (u, v): the four entries row by row."""
-    near = lens_expansion(lens, u, v)
+@inner
+def _slopes(lens, near, u, v):
+    """Return d(image px) / d(normalised) at (u, v) from the expansion there: the four entries row by row."""
     l1, h11, h12, h22 = near.l1, near.h11, near.h12, near.h22
     a11 = h11 + 2.0 * l1 * u * u
     a12 = h12 + 2.0 * l1 * u * v
     a22 = h22 + 2.0 * l1 * v * v
     return lens[1] * a11 + lens[3] * a12, lens[1] * a12 + lens[3] * a22, lens[2] * a12, lens[2] * a22
+
+
+@njit(nogil=True, error_model="numpy")
+def lens_jacobian(lens, u, v):
+    """Return d(image px) / d(normalised) at (u, v): the four entries row by row."""
+    if is_rational(lens):
+        return _slopes(lens, _rational_expansion(lens, u, v), u, v)
+    return _slopes(lens, _plain_expansion(lens, u, v), u, v)
+
+
+@inner
+def _radially_undistorted(lens, xd, yd):
+    """Invert the radial factor of a rational lens alone, by bisection on the branch that contains the centre."""
+    r_d, r_max = math.sqrt(xd * xd + yd * yd), math.sqrt(lens[11])
+    low, high, r_low = 0.0, 1.0, 0.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        r = middle * r_max if r_max < np.inf else middle / (1.0 - middle)
+        r2 = r * r
+        radial = 1.0 + r2 * (lens[6] + r2 * (lens[7] + r2 * lens[10]))
+        radial /= 1.0 + r2 * (lens[12] + r2 * (lens[13] + r2 * lens[14]))
+        if r * radial < r_d:
+            low, r_low = middle, r
+        else:
+            high = middle
+    factor = r_low / r_d if r_d > 0.0 else 1.0
+    return xd * factor, yd * factor
+
+
+def _make_newton(expansion: Any, made_for: str) -> Any:
+    """Compile Newton's method for an expansion's lenses."""
+
+    @kernel(made_for)
+    def newton(lens, x, y, u, v):
+        """Normalised point of a pixel from a guess (u, v); NaN outside the lens model's domain."""
+        error = np.inf
+        for _ in range(_NEWTON_STEPS):
+            if u * u + v * v >= lens[11]:  # keep to the branch that contains the centre
+                shrink = 0.999 * math.sqrt(lens[11] / (u * u + v * v))
+                u *= shrink
+                v *= shrink
+            near = expansion(lens, u, v)
+            j11, j12, j21, j22 = _slopes(lens, near, u, v)
+            ex, ey = near.x - x, near.y - y
+            error = max(abs(ex), abs(ey))
+            det = j11 * j22 - j12 * j21
+            du = (j22 * ex - j12 * ey) / det
+            dv = (j11 * ey - j21 * ex) / det
+            u -= du
+            v -= dv
+            if abs(du) + abs(dv) < 1e-14:
+                break
+        if error < 1e-9 * (1.0 + abs(x) + abs(y)) and u * u + v * v < lens[11]:
+            return u, v
+        return np.nan, np.nan
+
+    return newton
+
+
+_plain_newton = _make_newton(_plain_expansion, "plain")
+_rational_newton = _make_newton(_rational_expansion, "rational")
 
 
 @inner
@@ -93,27 +190,10 @@ def undistort(lens, x, y):
         q = 1.0 - 4.0 * lens[6] * (xd * xd + yd * yd)
         factor = 2.0 / (1.0 + math.sqrt(q)) if q > 0.0 else np.nan
         return xd * factor, yd * factor
-    u, v = xd, yd
-    error = np.inf
-    for _ in range(_NEWTON_STEPS):
-        if u * u + v * v >= lens[11]:  # keep to the branch that contains the centre
-            shrink = 0.999 * math.sqrt(lens[11] / (u * u + v * v))
-            u *= shrink
-            v *= shrink
-        near = lens_expansion(lens, u, v)
-        j11, j12, j21, j22 = lens_jacobian(lens, u, v)
-        ex, ey = near.x - x, near.y - y
-        error = max(abs(ex), abs(ey))
-        det = j11 * j22 - j12 * j21
-        du = (j22 * ex - j12 * ey) / det
-        dv = (j11 * ey - j21 * ex) / det
-        u -= du
-        v -= dv
-        if abs(du) + abs(dv) < 1e-14:
-            break
-    if error < 1e-9 * (1.0 + abs(x) + abs(y)) and u * u + v * v < lens[11]:
-        return u, v
-    return np.nan, np.nan
+    if is_rational(lens):  # it may level off or rise to a pole, where Newton's method from afar would leave the branch
+        u, v = _radially_undistorted(lens, xd, yd)
+        return _rational_newton(lens, x, y, u, v)
+    return _plain_newton(lens, x, y, xd, yd)
 
 
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
@@ -128,64 +208,105 @@ NODES, _FIT = _nodes()
 N_NODES = 16
 
 
-@intrinsic
-def _node_rays(_typingctx: Any, q: Any, iterations: Any, powers: Any) -> Any:
-    """Undistort the nodes by Newton's method with the Jacobian at the centre.
+def _any_nonzero(builder: Any, pointer: Any, places: Sequence[int]) -> Any:
+    """Compare numbers of an array with zero; NaN counts as other than zero."""
+    zero = ir.Constant(DOUBLE, 0.0)
+    found = [builder.fcmp_unordered("!=", builder.load(at(builder, pointer, LONG(i))), zero) for i in places]
+    return reduce(builder.or_, found)
 
-    Parameters
-    ----------
-    q
-        (22,) offset of the subset's centre x, y, half its width, px; the centre's ray; the lens expansion l1, l2, l3,
-        h11, h12, h22, p1, p2, fx, fy, skew; inverse Jacobian row by row; out: largest last error, px, and largest
-        squared radius.
-    iterations
-        int64.
-    powers
-        (M, 16) out: monomials of the nodes' rays.
-    """
-    sig = types.void(q, iterations, powers)
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer, out = (data(context, builder, sig, args, i) for i in (0, 2))
-        number = [spread(builder, builder.load(at(builder, pointer, LONG(i))), N_NODES) for i in range(20)]
-        dx, dy, half, xc, yc, l1, l2, l3, h11, h12, h22, p1, p2, fx, fy, fs, i11, i12, i21, i22 = number
-        vector = ir.VectorType(DOUBLE, N_NODES)
-        x, y = (
-            centre + half * Vec(builder, ir.Constant(vector, [float(c) for c in NODES[axis]]))
-            for axis, centre in enumerate((dx, dy))
-        )
-        state = [cgutils.alloca_once(builder, vector) for _ in range(3)]
+def _make_node_rays(rational: bool) -> Any:
+    def node_rays(_typingctx: Any, q: Any, iterations: Any, powers: Any) -> Any:
+        """Undistort the nodes by Newton's method with the Jacobian at the centre.
 
-        def put(u: Vec, v: Vec, error: Vec) -> None:
-            for one, value in zip(state, (u, v, error), strict=True):
-                builder.store(value.value, one)
+        Parameters
+        ----------
+        q
+            (25,) offset of the subset's centre x, y, half its width, px; the centre's ray; the lens expansion l1, l2,
+            l3, h11, h12, h22, p1, p2, fx, fy, skew; inverse Jacobian row by row; the lens expansion d1, d2, d3; out:
+            largest last error, px, and largest squared radius.
+        iterations
+            int64.
+        powers
+            (M, 16) out: monomials of the nodes' rays.
+        """
+        sig = types.void(q, iterations, powers)
 
-        put(i11 * x + i12 * y, i21 * x + i22 * y, x)
-        with cgutils.for_range(builder, args[1]):
-            u, v = (Vec(builder, builder.load(one)) for one in state[:2])
-            uu, vv, uv = u * u, v * v, u * v
-            rho = 2.0 * (xc * u + yc * v) + uu + vv
-            dl = rho * (l1 + rho * (l2 + rho * l3))
-            xd = (u + xc) * dl + h11 * u + h12 * v + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
-            yd = (v + yc) * dl + h12 * u + h22 * v + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)
-            ex, ey = x - (fx * xd + fs * yd), y - fy * yd
-            put(u + (i11 * ex + i12 * ey), v + (i21 * ex + i22 * ey), ex * ex + ey * ey)
-        u, v, error = (Vec(builder, builder.load(one)) for one in state)
-        one = Vec(builder, ir.Constant(vector, [1.0] * N_NODES))
-        curved = builder.icmp_signed(
-            "==", builder.extract_value(context.make_array(sig.args[2])(context, builder, args[2]).shape, 0), LONG(6)
-        )
-        for row, value in enumerate((one, u, v)):
-            store(value, at(builder, out, LONG(N_NODES * row)))
-        with builder.if_then(curved):
-            for row, value in enumerate((u * u, u * v, v * v)):
-                store(value, at(builder, out, LONG(N_NODES * (3 + row))))
-        reach = (u + xc) * (u + xc) + (v + yc) * (v + yc)
-        for position, value in ((20, error), (21, reach)):
-            builder.store(value.reduce("fmax"), at(builder, pointer, LONG(position)))
-        return context.get_dummy_value()
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            pointer, out = (data(context, builder, sig, args, i) for i in (0, 2))
+            n_numbers = 23 if rational else 20
+            number = [spread(builder, builder.load(at(builder, pointer, LONG(i))), N_NODES) for i in range(n_numbers)]
+            dx, dy, half, xc, yc, l1, l2, l3, h11, h12, h22, p1, p2, fx, fy, fs, i11, i12, i21, i22, *under = number
+            vector = ir.VectorType(DOUBLE, N_NODES)
+            x, y = (
+                centre + half * Vec(builder, ir.Constant(vector, [float(c) for c in NODES[axis]]))
+                for axis, centre in enumerate((dx, dy))
+            )
+            state = [cgutils.alloca_once(builder, vector) for _ in range(3)]
 
-    return sig, codegen
+            def put(u: Vec, v: Vec, error: Vec) -> None:
+                for one, value in zip(state, (u, v, error), strict=True):
+                    builder.store(value.value, one)
+
+            put(i11 * x + i12 * y, i21 * x + i22 * y, x)
+            with cgutils.for_range(builder, args[1]):
+                u, v = (Vec(builder, builder.load(one)) for one in state[:2])
+                uu, vv, uv = u * u, v * v, u * v
+                rho = 2.0 * (xc * u + yc * v) + uu + vv
+                dl = rho * (l1 + rho * (l2 + rho * l3))
+                if rational:
+                    d1, d2, d3 = under
+                    dl = dl / (1.0 + rho * (d1 + rho * (d2 + rho * d3)))
+                xd = (u + xc) * dl + h11 * u + h12 * v + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
+                yd = (v + yc) * dl + h12 * u + h22 * v + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)
+                ex, ey = x - (fx * xd + fs * yd), y - fy * yd
+                put(u + (i11 * ex + i12 * ey), v + (i21 * ex + i22 * ey), ex * ex + ey * ey)
+            u, v, error = (Vec(builder, builder.load(one)) for one in state)
+            one = Vec(builder, ir.Constant(vector, [1.0] * N_NODES))
+            shape = context.make_array(sig.args[2])(context, builder, args[2]).shape
+            curved = builder.icmp_signed("==", builder.extract_value(shape, 0), LONG(6))
+            for row, value in enumerate((one, u, v)):
+                store(value, at(builder, out, LONG(N_NODES * row)))
+            with builder.if_then(curved):
+                for row, value in enumerate((u * u, u * v, v * v)):
+                    store(value, at(builder, out, LONG(N_NODES * (3 + row))))
+            reach = (u + xc) * (u + xc) + (v + yc) * (v + yc)
+            for position, value in ((23, error), (24, reach)):
+                builder.store(value.reduce("fmax"), at(builder, pointer, LONG(position)))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    return intrinsic(node_rays)
+
+
+def _make_set_up_nodes(rational: bool) -> Any:
+    """Compile the nodes' set-up; apart for rational lenses, so that the others do not divide or round otherwise."""
+    expansion, node_rays = _rational_expansion if rational else _plain_expansion, _make_node_rays(rational)
+
+    @kernel("rational" if rational else "plain")
+    def set_up(lens, dx, dy, half, xc, yc, q, powers):
+        """Compute the rays, see :func:`set_up_nodes`."""
+        near = expansion(lens, xc, yc)
+        _, _, l1, l2, l3, h11, h12, h22, d1, d2, d3 = near
+        j11, j12, j21, j22 = _slopes(lens, near, xc, yc)
+        det = j11 * j22 - j12 * j21
+        polynomial = lens[0] != SEIDEL
+        q[0], q[1], q[2], q[3], q[4] = dx, dy, half, xc, yc
+        q[5], q[6], q[7], q[8], q[9], q[10] = l1, l2, l3, h11, h12, h22
+        q[11], q[12] = (lens[8], lens[9]) if polynomial else (0.0, 0.0)
+        q[13], q[14], q[15] = lens[1], lens[2], lens[3]
+        q[16], q[17], q[18], q[19] = j22 / det, -j12 / det, -j21 / det, j11 / det
+        q[20], q[21], q[22] = d1, d2, d3
+        node_rays(q, 3, powers)
+        if not q[23] < 1e-16:
+            node_rays(q, 2 * _NEWTON_STEPS, powers)
+        return q[23] < 1e-12 and q[24] < lens[11]
+
+    return set_up
+
+
+_set_up_plain_nodes, _set_up_rational_nodes = _make_set_up_nodes(False), _make_set_up_nodes(True)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -203,7 +324,7 @@ def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
     xc, yc
         The point's ray.
     q
-        (22,) work space.
+        (25,) work space.
     powers
         (M, 16) out: the monomials of the rays.
 
@@ -212,19 +333,9 @@ def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
     bool
         False if the subset leaves the lens model's domain.
     """
-    _, _, l1, l2, l3, h11, h12, h22 = lens_expansion(lens, xc, yc)
-    j11, j12, j21, j22 = lens_jacobian(lens, xc, yc)
-    det = j11 * j22 - j12 * j21
-    polynomial = lens[0] != SEIDEL
-    q[0], q[1], q[2], q[3], q[4] = dx, dy, half, xc, yc
-    q[5], q[6], q[7], q[8], q[9], q[10] = l1, l2, l3, h11, h12, h22
-    q[11], q[12] = (lens[8], lens[9]) if polynomial else (0.0, 0.0)
-    q[13], q[14], q[15] = lens[1], lens[2], lens[3]
-    q[16], q[17], q[18], q[19] = j22 / det, -j12 / det, -j21 / det, j11 / det
-    _node_rays(q, 3, powers)
-    if not q[20] < 1e-16:
-        _node_rays(q, 2 * _NEWTON_STEPS, powers)
-    return q[20] < 1e-12 and q[21] < lens[11]
+    if is_rational(lens):
+        return _set_up_rational_nodes(lens, dx, dy, half, xc, yc, q, powers)
+    return _set_up_plain_nodes(lens, dx, dy, half, xc, yc, q, powers)
 
 
 @intrinsic
@@ -278,7 +389,11 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
             return Vec(builder, builder.select(seidel, other, no.value))
 
         top = 1.0 + r2 * (a[6] + r2 * (a[7] + r2 * a[10]))
-        radial = if_seidel(1.0 / (1.0 + a[6] * r2), top)
+        kept = cgutils.alloca_once_value(builder, if_seidel(1.0 / (1.0 + a[6] * r2), top).value)
+        with builder.if_then(_any_nonzero(builder, lens, (12, 13, 14))):
+            k4, k5, k6 = (number(lens, LONG(i)) for i in (12, 13, 14))
+            builder.store((top / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))).value, kept)
+        radial = Vec(builder, builder.load(kept))
         p1, p2 = if_seidel(0.0, a[8]), if_seidel(0.0, a[9])
         xd = u * radial + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
         yd = v * radial + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)

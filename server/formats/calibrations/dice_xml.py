@@ -33,7 +33,8 @@ _SYSTEMS = ("OPENCV", "GENERIC_SYSTEM")
 _OPENCV_LENSES = ("OPENCV_LENS_DISTORTION", "OPENCV_DIS")
 _NO_LENSES = ("NO_LENS_DISTORTION", "NONE")
 _DISTORTION = ("K1", "K2", "K3", "P1", "P2")
-_NOT_CARRIED = ("FS", "K4", "K5", "K6", "S1", "S2", "S3", "S4", "T1", "T2")
+_RATIONAL = ("K4", "K5", "K6")  # read, not written
+_NOT_CARRIED = ("FS", "S1", "S2", "S3", "S4", "T1", "T2")
 
 
 def is_dice(data: bytes) -> bool:
@@ -107,7 +108,7 @@ def _camera(name: str, camera: Element) -> tuple[OpenCVLens, RigidTransform, Ima
         if _number(name, where, key, values) != 0.0:
             raise unsupported(name, f"{where} has {key} = {values[key]}, which the lens model here does not have")
     numbers = {key.lower(): _number(name, where, key, values, None) for key in ("FX", "FY", "CX", "CY")}
-    distortion = {key.lower(): _number(name, where, key, values) for key in _DISTORTION}
+    distortion = {key.lower(): _number(name, where, key, values) for key in (*_DISTORTION, *_RATIONAL)}
     if model in _NO_LENSES and any(distortion.values()):
         raise unsupported(name, f"{where} has distortion coefficients but the lens model {model}")
     pose = RigidTransform(

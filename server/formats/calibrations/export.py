@@ -50,6 +50,7 @@ MEDIA_TYPES: dict[CalibrationForm, str] = {
 _ROUNDING_PX = 1e-9
 _SKEW = {"opencv": False, "dice": False, "matchid": True, "vic3d": True}
 _TANGENTIAL = {"opencv": True, "dice": True, "matchid": True, "vic3d": False}
+_RATIONAL = {"opencv": True, "dice": False, "matchid": False, "vic3d": False}
 _NOTES: dict[CalibrationForm, tuple[str, ...]] = {
     "json": (),
     "paper": ("covariance, checks and verdict are not carried over",),
@@ -163,7 +164,7 @@ def _convert(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) 
         data = _paper(loaded, fits, sizes if known else None)
     else:
         fits = [
-            fit_opencv(camera.lens, size, skew=_SKEW[form], tangential=_TANGENTIAL[form])
+            fit_opencv(camera.lens, size, skew=_SKEW[form], tangential=_TANGENTIAL[form], rational=_RATIONAL[form])
             for camera, size in zip(cameras, sizes, strict=True)
         ]
         data = _other(loaded, form, fits, sizes if known else None).encode()

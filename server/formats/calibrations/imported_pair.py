@@ -1,6 +1,6 @@
 """A stereo pair from another program's numbers, after they were checked.
 
-Imported rigs keep their own lens model (OpenCV's k1 k2 p1 p2 k3); the system frame is camera 1's own frame.
+Imported rigs keep their own lens model (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6); the system frame is camera 1's own frame.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def unsupported(name: str, why: str) -> FileFormatError:
     return FileFormatError(
         f"The calibration {name} cannot be carried over exactly: {why}.",
         code="calibration_unsupported",
-        remedy="Calibrate again with OpenCV's k1 k2 p1 p2 k3 model, or with this program.",
+        remedy="Calibrate again with OpenCV's k1 k2 p1 p2 k3 model, with k4 k5 k6 or without, or with this program.",
     )
 
 
@@ -61,7 +61,7 @@ def proper_rotation(name: str, entry: str, values: ArrayLike) -> NDArray[np.floa
 
 
 def opencv_lens(name: str, which: str, values: Mapping[str, float]) -> OpenCVLens:
-    """Build one lens from ``fx fy cx cy`` and, where given, ``skew k1 k2 p1 p2 k3``."""
+    """Build one lens from ``fx fy cx cy`` and, where given, ``skew k1 k2 p1 p2 k3 k4 k5 k6``."""
     for key, value in values.items():
         if not np.isfinite(value):
             raise invalid(name, f"{key} of {which} is {value}")
@@ -74,7 +74,7 @@ def opencv_lens(name: str, which: str, values: Mapping[str, float]) -> OpenCVLen
         values["cx"],
         values["cy"],
         values.get("skew", 0.0),
-        *(values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")),
+        *(values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     )
 
 

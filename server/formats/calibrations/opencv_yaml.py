@@ -1,7 +1,8 @@
 """OpenCV stereo calibrations: ``cameraMatrix1/2, distCoeffs1/2, R, T, imageSize`` in YAML, JSON or XML.
 
 As ``cv2.stereoCalibrate`` returns them: ``X_cam2 = R X_cam1 + T``. Matrices may be OpenCV's own (``!!opencv-matrix``)
-or plain nested lists. The lens model here ends at k3: longer coefficient vectors are taken if the rest is zero.
+or plain nested lists. The lens model here ends at k6: longer coefficient vectors are taken if thin prism and tilt are
+zero.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ ImageSize = tuple[int, int] | None
 
 KEYS = ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "R", "T")
 _LENGTHS = (4, 5, 8, 12, 14)
-_ORDER = ("k1", "k2", "p1", "p2", "k3")
+_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+_CARRIED = {5: _ORDER[:5], 8: _ORDER[:8]}
 _MAX_NUMBERS = 100
 _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
 
@@ -119,10 +121,13 @@ def _lens(name: str, content: dict[str, object], which: int) -> OpenCVLens:
     d = _array(name, content, f"distCoeffs{which}").ravel()
     if d.size not in _LENGTHS:
         raise unreadable(name, f"distCoeffs{which} has {d.size} values; OpenCV has {_LENGTHS}")
-    if np.any(d[5:]):
-        raise unsupported(name, f"distCoeffs{which} has terms beyond k3 (rational, thin prism or tilt)")
+    other = [f"{term} = {value:g}" for term, value in zip(_ORDER[8:], d[8:], strict=False) if value != 0.0]
+    if other:
+        raise unsupported(
+            name, f"distCoeffs{which} has {', '.join(other)}; thin prism (s1 to s4) and tilt (tau) are not known here"
+        )
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "skew": K[0, 1]}
-    values.update(zip(_ORDER, d[:5], strict=False))
+    values.update(zip(_CARRIED[8], d[:8], strict=False))
     return opencv_lens(name, f"camera {which}", {k: float(v) for k, v in values.items()})
 
 
@@ -165,7 +170,8 @@ def opencv_text(
 ) -> str:
     """Return a stereo calibration as ``cv2.FileStorage`` reads it; the skew, which OpenCV does not have, must be 0.
 
-    The image size is given where both cameras share one.
+    The image size is given where both cameras share one. A lens has five coefficients, eight where k4, k5 or k6 is not
+    zero.
     """
     pose = pair.cam2_from_cam1
     lines = ["%YAML:1.0", "---", f"# {comment}"]
@@ -174,7 +180,8 @@ def opencv_text(
     for k, lens in enumerate((lens1, lens2), 1):
         matrix = [[lens.fx_px, lens.skew_px, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
         lines += _text_of(f"cameraMatrix{k}", np.array(matrix))
-        lines += _text_of(f"distCoeffs{k}", np.array([[getattr(lens, name) for name in _ORDER]]))
+        terms = _CARRIED[8 if lens.is_rational else 5]
+        lines += _text_of(f"distCoeffs{k}", np.array([[getattr(lens, term) for term in terms]]))
     lines += _text_of("R", pose.rotation) + _text_of("T", pose.translation_mm.reshape(3, 1))
     return "\n".join(lines) + "\n"
 

@@ -129,7 +129,7 @@ def independent_projection(camera: Any, points_mm: Float) -> Float:
     p = points_mm @ camera.cam_from_sys.rotation.T + camera.cam_from_sys.translation_mm
     lens = camera.lens
     if isinstance(lens, OpenCVLens):
-        bent = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+        bent = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6])
         zero = np.zeros(3)
         distorted = cv2.projectPoints(p.reshape(-1, 1, 3), zero, zero, np.eye(3), bent)[0].reshape(-1, 2)
         x, y = distorted[:, 0], distorted[:, 1]

@@ -1,4 +1,4 @@
-"""The kernels against their numpy twin: same solution, same correlation, for both lenses and both splines."""
+"""The kernels against their numpy twin: same solution, same correlation, for all lenses and both splines."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ import pytest
 
 from core.matching import MatchOptions, fit_motion, fit_shape
 from core.matching.kernels.warp import set_up_nodes, set_up_warp
-from tests.support.matching_scene import Plane, Texture, digitise, opencv_pair, paper_pair, render, true_g, true_w
+from tests.support.matching_scene import (
+    Plane,
+    Texture,
+    digitise,
+    opencv_pair,
+    paper_pair,
+    rational_pair,
+    render,
+    true_g,
+    true_w,
+)
 from tests.support.matching_twin import Twin
 
+PAIRS = {"seidel": lambda: paper_pair(kappa=2e-8), "opencv": opencv_pair, "rational": rational_pair}
 XY = np.array([[52.0, 61.0], [80.0, 80.0], [103.0, 94.0]])
 AFTER = Plane(np.array([0.02, -0.01, 0.015]), np.array([[1.01, 0.02], [-0.015, 0.995], [0.03, -0.02]]))
 
 
 def scene(kind):
-    pair = paper_pair(kappa=2e-8) if kind == "seidel" else opencv_pair()
+    pair = PAIRS[kind]()
     texture = Texture(blob_mm=0.05 if kind == "seidel" else 0.11)
     rng = np.random.default_rng(5)
     images = [
@@ -27,7 +38,7 @@ def scene(kind):
     return pair, images
 
 
-@pytest.mark.parametrize("kind", ["seidel", "opencv"])
+@pytest.mark.parametrize("kind", ["seidel", "opencv", "rational"])
 @pytest.mark.parametrize(("interpolation", "order"), [("cubic", 3), ("quintic", 5)])
 def test_shape_solution_is_the_twins(kind, interpolation, order):
     pair, images = scene(kind)
@@ -39,11 +50,14 @@ def test_shape_solution_is_the_twins(kind, interpolation, order):
         twin = Twin(pair, images[:2], xy, subset=25, order=order)
         p = twin.solve(np.array([*w[i], 0.0]))
         mine = np.array([*fit.w[i], fit.epipolar_px[i]])
-        assert np.abs(twin.position(0, p, twin.XY) - twin.position(0, mine, twin.XY)).max() < 1e-5
+        # the kernel's Jacobian has the lens's slopes at the point; in a corner of a wide lens, where they change by
+        # percents across the subset, both solutions weigh the noise (0.01 px) differently by a hundredth
+        limit = 1e-4 if kind == "rational" else 1e-5
+        assert np.abs(twin.position(0, p, twin.XY) - twin.position(0, mine, twin.XY)).max() < limit
         assert abs(fit.zncc[i, 0] - twin.residual(0, p)[2]) < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["seidel", "opencv"])
+@pytest.mark.parametrize("kind", ["seidel", "opencv", "rational"])
 @pytest.mark.parametrize(("interpolation", "order"), [("cubic", 3), ("quintic", 5)])
 def test_motion_solution_is_the_twins(kind, interpolation, order):
     pair, images = scene(kind)
@@ -67,10 +81,10 @@ def test_motion_solution_is_the_twins(kind, interpolation, order):
             assert abs(fit.zncc[i, k] - twin.residual(k, p)[2]) < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["seidel", "opencv"])
+@pytest.mark.parametrize("kind", ["seidel", "opencv", "rational"])
 @pytest.mark.parametrize("subset", [33, 61])
 def test_the_pixel_loops_warp_is_exact_to_a_hundred_thousandth_of_a_pixel(kind, subset):
-    pair = paper_pair(kappa=2e-8) if kind == "seidel" else opencv_pair()
+    pair = PAIRS[kind]()
     xy = np.array([82.3, 77.8])
     lens1, lens2 = (np.array(camera.lens.kernel_parameters()) for camera in (pair.cam1, pair.cam2))
     half = 0.5 * (subset - 1)
@@ -81,7 +95,7 @@ def test_the_pixel_loops_warp_is_exact_to_a_hundred_thousandth_of_a_pixel(kind, 
     pose = pair.cam2_from_cam1
     xc, yc, _ = pair.cam1.rays_cam(xy).xyz_mm
     powers = np.empty((3, 16))
-    assert set_up_nodes(lens1, left + half - xy[0], top + half - xy[1], half, xc, yc, np.empty(22), powers)
+    assert set_up_nodes(lens1, left + half - xy[0], top + half - xy[1], half, xc, yc, np.empty(25), powers)
     R, t = pose.rotation, pose.translation_mm
     M = R @ np.array([[xc, 1.0, 0.0], [yc, 0.0, 1.0], [1.0, 0.0, 0.0]]) + t[:, None] * w
     warp = np.zeros(22, np.float32)

@@ -14,6 +14,7 @@ import yaml
 from core.cameras.camera import Camera
 from core.cameras.lens import OpenCVLens
 from core.errors import FileFormatError
+from server.formats.calibrations.plausibility import check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
 
 K1 = np.array([[6638.6, 0.0, 981.5], [0.0, 6639.8, 610.0], [0.0, 0.0, 1.0]])
@@ -107,16 +108,27 @@ def test_yaml_bombs_and_objects_are_refused(tmp_path: Path) -> None:
         assert refused(path).code == "calibration_unreadable"
 
 
-@pytest.mark.parametrize("length", [4, 5, 8, 14])
+@pytest.mark.parametrize("length", [4, 5, 8, 12, 14])
 def test_coefficient_vectors_of_every_length(tmp_path: Path, length: int) -> None:
     d1, d2 = (np.concatenate([d, np.zeros(9)])[:length] for d in (D1, D2))
     loaded = load_calibration(opencv_file(tmp_path / "a.yml", distCoeffs1=d1, distCoeffs2=d2[None]))
     check_against_opencv(loaded, d1, d2)
-    if length > 5:
-        d2[5] = 0.1
-        error = refused(opencv_file(tmp_path / "b.yml", distCoeffs1=d1, distCoeffs2=d2))
-        assert error.code == "calibration_unsupported"
-        assert "distCoeffs2" in error.cause
+    if length >= 8:  # k4, k5, k6
+        d2[5:8] = 0.8, -2.0, 30.0
+        rational = load_calibration(opencv_file(tmp_path / "b.yml", distCoeffs1=d1, distCoeffs2=d2))
+        check_against_opencv(rational, d1, d2)
+        assert check_calibration(rational).volume.max_px < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("place", "term"), [(8, "s1"), (9, "s2"), (10, "s3"), (11, "s4"), (12, "tau_x"), (13, "tau_y")]
+)
+def test_thin_prism_and_tilt_are_refused_by_name(tmp_path: Path, place: int, term: str) -> None:
+    d2 = np.zeros(12 if place < 12 else 14)
+    d2[:5], d2[place] = D2, 0.01
+    error = refused(opencv_file(tmp_path / "a.yml", distCoeffs2=d2))
+    assert error.code == "calibration_unsupported"
+    assert f"distCoeffs2 has {term} = 0.01;" in error.cause
 
 
 @pytest.mark.parametrize(
@@ -278,7 +290,13 @@ def test_dice_files_that_are_refused(old: str, new: str, code: str, word: str) -
     assert word in caught.value.cause
 
 
-@pytest.mark.parametrize("term", ["K4", "S1", "T1", "FS"])
+def test_dice_rational_terms_are_opencvs() -> None:
+    # DICe's own source names OpenCV's formula for its OPENCV_LENS_DISTORTION
+    more = "".join(f'<Parameter name="K{i}" type="double" value="{v}"/>' for i, v in ((4, 0.8), (5, -2.0), (6, 30.0)))
+    check_against_opencv(load_text(dice_text(extra=more)), D1, np.array([*D2, 0.8, -2.0, 30.0]))
+
+
+@pytest.mark.parametrize("term", ["S1", "T1", "FS"])
 def test_dice_lens_terms_that_cannot_be_carried_over(term: str) -> None:
     assert load_text(dice_text(extra=f'<Parameter name="{term}" type="double" value="0.0"/>'))
     with pytest.raises(FileFormatError, match=term) as caught:
