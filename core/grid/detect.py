@@ -119,6 +119,7 @@ def detect_grid(
         fit_rms_px=float(np.sqrt(np.mean(residual**2))),
         pieces_px=found.table.ends_px(),
         pieces_used=good,
+        line_offsets=found.fit.line_offsets,
     )
 
 

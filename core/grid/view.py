@@ -45,6 +45,34 @@ class GridOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LineOffsets:
+    """Noise of the ``local`` model's inner intersections, line by line.
+
+    Each line is a polygon whose corners are its intersections: neighbouring corners share the pieces between them, so
+    that their offsets across the line are correlated (about -0.2). Offsets of different lines are independent. With the
+    rows N = [normal_a; normal_b] at an intersection,
+
+        N (xy_found - xy_true) = (offset across its line of family a, offset across its line of family b).
+
+    Attributes
+    ----------
+    normal_a, normal_b
+        (n_a - 2, n_b - 2, 2) unit vector in the image across the line of family a, and of family b, at each
+        intersection [i along X_sys, j along Y_sys].
+    covariance_a
+        (n_a - 2, n_b - 2, n_b - 2) px^2: of inner line i of family a, between its offsets at intersections j and j'.
+    covariance_b
+        (n_b - 2, n_a - 2, n_a - 2) px^2: of inner line j of family b, between its offsets at intersections i and i'.
+        Both with the corners on the outermost lines marginalised.
+    """
+
+    normal_a: Float
+    normal_b: Float
+    covariance_a: Float
+    covariance_b: Float
+
+
+@dataclass(frozen=True, kw_only=True)
 class GridView:
     """The grid detected in one image.
 
@@ -87,6 +115,9 @@ class GridView:
         (n, 2, 2) end points of the line pieces used, for pictures.
     pieces_used
         (n,) False for a piece that dirt or glare spoilt.
+    line_offsets
+        Joint covariance of the intersections of each line under the ``local`` model; None under the other models,
+        whose intersections all share the lines' few numbers.
     """
 
     target: GridTarget
@@ -106,6 +137,7 @@ class GridView:
     fit_rms_px: float
     pieces_px: Float
     pieces_used: Bool
+    line_offsets: LineOffsets | None = None
 
     @property
     def sigma_px(self) -> Float:
