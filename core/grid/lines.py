@@ -102,7 +102,7 @@ class _Distortion:
         return u + self.terms(u) @ self.D
 
     def gradient(self, xy_px: Float, normal: Float) -> Float:
-        """Return the unit vectors (..., 2) in the image across lines whose corrected normals are ``normal`` (..., 2)."""
+        """Return unit vectors (..., 2) in the image across lines whose normals in corrected coordinates are given."""
         u = (xy_px - self.centre_px) / self.scale_px
         h = 1e-5
         steps = [(self.terms(u + d) - self.terms(u - d)) @ self.D / (2.0 * h) for d in h * np.eye(2)]
