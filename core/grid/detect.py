@@ -9,10 +9,18 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
-from core.grid.checks import blame_glare, check_coverage, check_lattice, check_pieces, check_regular, saturation_level
+from core.grid.checks import (
+    blame_glare,
+    check_coverage,
+    check_lattice,
+    check_oblique,
+    check_pieces,
+    check_regular,
+    saturation_level,
+)
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
 from core.grid.directions import directions
-from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
+from core.grid.lattice import Lattice, find_lattice, not_found, oriented, pitch_px
 from core.grid.lines import LineFit, fit_lines
 from core.grid.piece_table import PieceTable, line_points, piece_table
 from core.grid.profile import OUT, fit_pieces
@@ -52,15 +60,17 @@ def detect_grid(
     ImageError
         ``image_unsupported``, ``image_unusable``: no gray image.
     TargetError
-        ``target_not_found``: no two families of lines. ``target_rotated``: lines not within 45 +- 20 degrees, or
-        counts swapped. ``target_line_count``: another number of lines than described. ``target_partly_seen``: the
-        grid leaves the image. ``target_dirty``, ``target_glare``: too many or too important pieces of lines are
-        spoilt. ``target_irregular``: lines that are no regular grid. The error's context holds the figures, and
-        ``segments_px`` for a picture where there are any.
+        ``target_not_found``: no two families of lines. ``target_rotated``: counts swapped, or lines along rows and
+        columns with the paper's localiser. ``target_line_count``: another number of lines than described.
+        ``target_partly_seen``: the grid leaves the image. ``target_dirty``, ``target_glare``: too many or too important
+        pieces of lines are spoilt. ``target_irregular``: lines that are no regular grid. The error's context holds the
+        figures, and ``segments_px`` for a picture where there are any.
 
     Notes
     -----
-    A grid without marks looks the same when turned by 90 or 180 degrees or mirrored, see :class:`GridView`.
+    Lines may run at any angle. A grid without marks looks the same when turned by 90 or 180 degrees or mirrored, see
+    :class:`GridView`: lines at about 45 degrees are indexed with X_sys right and down and Y_sys left and down, lines
+    along the rows and columns with X_sys to the right and Y_sys down; ``GridOptions.orientation`` has the rule between.
 
     References
     ----------
@@ -77,8 +87,10 @@ def detect_grid(
     size = (grey.shape[1], grey.shape[0])
     saturation = opts.saturation if opts.saturation is not None else saturation_level(image)
     try:
-        lattice, threshold = _coarse(grey, target)
-        check_lattice(lattice, target, size, opts)
+        lattice, threshold = _coarse(grey, target, opts)
+        check_lattice(lattice, target, size)
+        if localiser == "paper":
+            check_oblique(lattice)
     except TargetError as error:
         raise blame_glare(error, grey, saturation) from error
     nodes = lattice.nodes_px
@@ -123,7 +135,7 @@ def detect_grid(
     )
 
 
-def _coarse(grey: Float32, target: GridTarget) -> tuple[Lattice, float]:
+def _coarse(grey: Float32, target: GridTarget, options: GridOptions) -> tuple[Lattice, float]:
     """Find the lattice at the scale that shows all its lines; else the one with the most of them."""
     best: tuple[Lattice, float] | None = None
     failure: TargetError | None = None
@@ -137,7 +149,7 @@ def _coarse(grey: Float32, target: GridTarget) -> tuple[Lattice, float]:
             )
             continue
         try:
-            lattice = find_lattice(picture, directions(picture))
+            lattice = oriented(find_lattice(picture, directions(picture)), options.orientation, target.lines)
         except TargetError as error:
             failure = failure or error
             continue
