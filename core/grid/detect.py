@@ -31,6 +31,8 @@ from core.target import GridTarget
 
 _OUTLIER = 6.0  # standard deviations at which a line point is an outlier
 _ROUNDS = 3
+_CLEAR_DEPTH = 3.0  # of the noise, at which lines are lines whatever the target
+_LEAST_SHOWN = 5  # lines each way
 
 
 def detect_grid(
@@ -133,6 +135,51 @@ def detect_grid(
         pieces_used=good,
         line_offsets=found.fit.line_offsets,
     )
+
+
+def find_grid(image: NDArray[Any], target: GridTarget, *, options: GridOptions | None = None) -> Float:
+    """Find the grid's inner intersections coarsely, for a live picture: within about half a pixel of the image's own.
+
+    Parameters
+    ----------
+    image, target, options
+        As for :func:`detect_grid`.
+
+    Returns
+    -------
+    Float
+        (n_a - 2, n_b - 2, 2) px, indexed as :func:`detect_grid` does.
+
+    Raises
+    ------
+    ImageError, TargetError
+        As :func:`detect_grid`, without its checks for dirt and glare on single pieces.
+    """
+    opts = GridOptions() if options is None else options
+    grey = checked_image(image)
+    lattice, _ = _coarse(grey, target, opts)
+    check_lattice(lattice, target, (grey.shape[1], grey.shape[0]))
+    return np.ascontiguousarray(lattice.nodes_px[1:-1, 1:-1])
+
+
+def lines_shown(image: NDArray[Any]) -> Float | None:
+    """Return the intersections (m_a, m_b, 2) of a line grid of any counts in an image, None where it shows none."""
+    grey = checked_image(image)
+    best: Float | None = None
+    for dark in (True, False):
+        for width in (0.03, 0.1):
+            target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=width, dark_lines=dark)
+            for factor in coarse_factors((grey.shape[1], grey.shape[0]), target)[:2]:
+                picture = line_picture(grey, target, factor)
+                if picture.threshold < _CLEAR_DEPTH * picture.noise:
+                    continue
+                try:
+                    nodes = find_lattice(picture, directions(picture)).nodes_px
+                except (TargetError, np.linalg.LinAlgError):
+                    continue
+                if min(nodes.shape[:2]) >= _LEAST_SHOWN and (best is None or nodes.size > best.size):
+                    best = nodes
+    return best
 
 
 def _coarse(grey: Float32, target: GridTarget, options: GridOptions) -> tuple[Lattice, float]:

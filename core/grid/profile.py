@@ -175,7 +175,7 @@ def _search(image: Float32, piece: Float, guard: float, sign: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _solve(M: Float, b: Float, x: Float) -> bool:
+def solve_cholesky(M: Float, b: Float, x: Float) -> bool:
     """Solve M x = b by Cholesky, overwriting M; False where M is not positive definite (a saturated or empty piece)."""
     n = M.shape[0]
     for i in range(n):
@@ -323,7 +323,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
             M[i, i] *= 1.0 + lam
             if not M[i, i] > 0.0:
                 return
-        if not _solve(M, g, delta):
+        if not solve_cholesky(M, g, delta):
             return
         lam *= 0.2
         for i in range(_N):
@@ -337,7 +337,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
         M = accepted.copy()
         J[:] = 0.0
         J[j] = 1.0
-        if not _solve(M, J, delta):
+        if not solve_cholesky(M, J, delta):
             return
         C[:, j] = delta
     peak, _, _, _ = profile_terms(0.0, par[7], par[6], a, b)
