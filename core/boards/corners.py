@@ -16,12 +16,22 @@ from core.boards.refine import sample
 _LEAST_SEEN = 4
 
 
-def find_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | None:
-    """Return coarse corners (columns, rows, 2) of a whole board, None where it is not found."""
-    for picture, factor in pictures.scales():
+def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bool = False) -> Float | None:
+    """Return coarse corners (columns, rows, 2) of a whole board, None where it is not found.
+
+    ``coarsely``: on the smallest picture only.
+    """
+    for picture, factor in pictures.scales()[: 1 if coarsely else None]:
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if found:
-            return _arranged(np.asarray(corners), size, factor)
+            grid = _arranged(np.asarray(corners), size, factor)
+            if _alternates(pictures.grey, grid):
+                return grid
+    return None
+
+
+def search_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | None:
+    """Search longer, where :func:`find_checkerboard` found nothing."""
     for picture, factor in pictures.scales()[:2]:
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
@@ -29,7 +39,9 @@ def find_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | None
             flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
             found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
         if found:
-            return _arranged(np.asarray(corners), size, factor)
+            grid = _arranged(np.asarray(corners), size, factor)
+            if _alternates(pictures.grey, grid):
+                return grid
     return None
 
 
@@ -45,11 +57,16 @@ def any_checkerboard(pictures: Pictures) -> Float | None:
         return None
     rows, columns = (int(n) for n in np.asarray(meta).shape[:2])
     grid = _arranged(np.asarray(corners), (columns, rows), factor)
+    if not _alternates(pictures.grey, grid):
+        return None
     return grid if columns >= rows else np.swapaxes(grid, 0, 1)
 
 
-def find_charuco(pictures: Pictures, target: BoardTarget) -> Float | None:
-    """Return coarse corners (columns, rows, 2), NaN where hidden; None where fewer than four are seen."""
+def find_charuco(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> Float | None:
+    """Return coarse corners (columns, rows, 2), NaN where hidden; None where fewer than four are seen.
+
+    ``coarsely``: on the smallest picture only, if it shows any.
+    """
     dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(target.dictionary))
     columns, rows = target.size
     squares = (columns + 1, rows + 1)
@@ -71,7 +88,7 @@ def find_charuco(pictures: Pictures, target: BoardTarget) -> Float | None:
             )
             if seen == columns * rows:
                 return best
-        if factor == 1.0:
+        if factor == 1.0 or (coarsely and best is not None):
             break
     return best
 
@@ -87,19 +104,32 @@ def dark_at_start(grey: Float32, xy_px: Float) -> bool:
 
 def squares_hold_markers(grey: Float32, xy_px: Float) -> bool:
     """Return True where the light squares between corners (columns, rows, 2) of a board hold dark parts."""
-    c00, c10, c01, c11 = xy_px[:-1, :-1], xy_px[1:, :-1], xy_px[:-1, 1:], xy_px[1:, 1:]
-    at = np.linspace(0.25, 0.75, 9)
-    levels = []
-    for s in at:
-        for t in at:
-            place = (1 - s) * (1 - t) * c00 + s * (1 - t) * c10 + (1 - s) * t * c01 + s * t * c11
-            levels.append(sample(grey, place))
-    inside = np.stack(levels, axis=-1)  # of each square
-    first = (np.add.outer(np.arange(inside.shape[0]), np.arange(inside.shape[1])) % 2) == 0
-    one, other = np.percentile(inside[first], 80), np.percentile(inside[~first], 80)
-    light, dark = (inside[first], inside[~first]) if one > other else (inside[~first], inside[first])
+    one, other = _squares(grey, xy_px)
+    light, dark = (one, other) if _lightness(one) > _lightness(other) else (other, one)
     middle = 0.5 * (np.median(dark) + np.percentile(light, 90))
     return bool(np.median((light < middle).mean(axis=-1)) > 0.2)
+
+
+def _alternates(grey: Float32, xy_px: Float) -> bool:
+    """Return True where the squares between corners are light and dark in turn, as the cells of a line grid are not."""
+    one, other = _squares(grey, xy_px)
+    low, high = np.percentile(np.concatenate([one.ravel(), other.ravel()]), [5.0, 95.0])
+    return abs(_lightness(one) - _lightness(other)) > 0.4 * float(high - low)
+
+
+def _squares(grey: Float32, xy_px: Float) -> tuple[Float, Float]:
+    """Grey levels (n, 81) within the squares of either colour."""
+    c00, c10, c01, c11 = xy_px[:-1, :-1], xy_px[1:, :-1], xy_px[:-1, 1:], xy_px[1:, 1:]
+    s, t = (v.ravel()[:, None, None, None] for v in np.meshgrid(np.linspace(0.25, 0.75, 9), np.linspace(0.25, 0.75, 9)))
+    places = (1 - s) * (1 - t) * c00 + s * (1 - t) * c10 + (1 - s) * t * c01 + s * t * c11
+    inside = np.moveaxis(sample(grey, places), 0, -1)
+    first = (np.add.outer(np.arange(inside.shape[0]), np.arange(inside.shape[1])) % 2) == 0
+    return inside[first], inside[~first]
+
+
+def _lightness(squares: Float) -> float:
+    """Level of squares (n, m) that may hold markers."""
+    return float(np.median(np.percentile(squares, 80.0, axis=-1)))
 
 
 def _arranged(corners: NDArray[Any], size: tuple[int, int], factor: float) -> Float:

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.boards.board import BoardTarget
-from core.boards.corners import any_checkerboard, dark_at_start, find_charuco, find_checkerboard, squares_hold_markers
+from core.boards.corners import (
+    any_checkerboard,
+    dark_at_start,
+    find_charuco,
+    find_checkerboard,
+    search_checkerboard,
+    squares_hold_markers,
+)
 from core.boards.dots import DotSearch, find_dots
 from core.boards.naming import declared_text, other_target, shown_target
 from core.boards.pictures import Pictures
@@ -110,32 +117,41 @@ def find_board(image: NDArray[Any], target: BoardTarget) -> Float:
     Raises
     ------
     ImageError, TargetError
-        As :func:`detect_board`, but for what only the fit of the points shows.
+        As :func:`detect_board`, but for what only the fit of the points shows; a search that finds nothing does not go
+        on to name what is seen.
     """
-    return _find(Pictures(checked_image(image)), target).xy_px
+    return _find(Pictures(checked_image(image)), target, coarsely=True).xy_px
 
 
-def _find(pictures: Pictures, target: BoardTarget) -> _Coarse:
+def _find(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> _Coarse:
     if target.kind in ("circles", "circles_asymmetric"):
-        search = find_dots(pictures, target)
+        search = find_dots(pictures, target, coarsely=coarsely)
         if search.found is None:
-            raise _no_dots(pictures, target, search)
+            raise _nothing(target) if coarsely else _no_dots(pictures, target, search)
         dots = search.found
         return _Coarse(dots.centres, dots.moments, dots.hollow, dots.marks)
     if target.kind == "charuco":
-        corners = find_charuco(pictures, target)
+        corners = find_charuco(pictures, target, coarsely=coarsely)
         if corners is None:
-            raise _not_found(pictures, target)
+            raise _nothing(target) if coarsely else _not_found(pictures, target)
         _check_markers(corners, target)
         return _Coarse(corners)
-    corners = find_checkerboard(pictures, target.size)
+    corners = find_checkerboard(pictures, target.size, coarsely=coarsely)
     if corners is None:
-        raise _not_found(pictures, target)
+        if coarsely:
+            raise _nothing(target)
+        failure = _not_found(pictures, target)
+        corners = None if failure.code == "target_other" else search_checkerboard(pictures, target.size)
+        if corners is None:
+            raise failure
     if squares_hold_markers(pictures.grey, corners):
         shown = shown_target(pictures, with_lines=False)
         other = None if shown is None else other_target(shown, target)
-        if other is not None:
-            raise other
+        raise other or TargetError(
+            f"The light squares of the {declared_text(target)} hold dark parts, as those of a ChArUco board.",
+            code="target_other",
+            remedy="Correct kind in the target's description, or use the target declared.",
+        )
     return _Coarse(corners.reshape(-1, 2)[_upright(corners, pictures.grey)])
 
 

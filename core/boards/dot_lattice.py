@@ -164,6 +164,9 @@ def arrange(lattice: DotLattice, target: BoardTarget) -> Arranged:
             fill = len(member) / (np.prod(span) / (2.0 if asymmetric else 1.0))
             # the rectangle that the dots fill best is the grid's own; of its turns, the longer side along X
             size = (int(np.ceil(span[0] / 2)), int(span[1])) if asymmetric else (int(span[0]), int(span[1]))
+            whole = not asymmetric or span[0] % 2 == 0  # its rows hold as many dots each
+            if not whole:
+                continue
             if fill > fullest + 1e-9 or (fill > fullest - 1e-9 and size[0] > counts[0]):
                 fullest, counts = fill, size
             way, other_row = _laid(turned, member, target, asymmetric)

@@ -22,6 +22,7 @@ from core.boards.pictures import Pictures, full_scale
 
 _MIN_AREA_PX = 12
 _ROUND = 0.12  # largest share of an outline's area that may lie outside its own ellipse, or lack in it
+_ROUGH, _ROUGH_PX = 0.035, 0.16  # unroundness of an outline, and that by its pixels, over half of its mean radius
 _FLATTEST = 0.04  # least ratio of the second moments' eigenvalues: tilts up to 78 degrees
 _SIZES = 1.8  # ratio of lengths within which dots are of one size, marks among them
 _LARGER = 1.2  # ratio of lengths of a larger mark to its neighbours
@@ -80,10 +81,10 @@ class DotSearch:
     mirrored: bool
 
 
-def find_dots(pictures: Pictures, target: BoardTarget) -> DotSearch:
-    """Find a grid of dots."""
+def find_dots(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> DotSearch:
+    """Find a grid of dots; ``coarsely``: on the smallest picture only."""
     best = DotSearch(None, (0, 0), np.zeros((0, 2)), False)
-    for picture, scale in pictures.scales():
+    for picture, scale in pictures.scales()[: 1 if coarsely else None]:
         for dark in (True, False):
             for block in _BLOCKS:
                 blobs = find_blobs(picture, dark=dark, block=block, scale=scale)
@@ -148,10 +149,20 @@ def _round_outlines(contours: Sequence[NDArray[Any]], largest: float) -> tuple[F
         trace = second[0, 0] + second[1, 1]
         if determinant < _FLATTEST * (0.5 * trace) ** 2:
             continue
+        if _unround(contour, m["m10"] / area, m["m01"] / area, second) > _ROUGH + _ROUGH_PX * determinant**-0.25:
+            continue
         centres.append((m["m10"] / area, m["m01"] / area))
         moments.append(second)
         areas.append(area)
     return np.array(centres).reshape(-1, 2), np.array(moments).reshape(-1, 2, 2), np.array(areas)
+
+
+def _unround(contour: NDArray[Any], x: float, y: float, second: NDArray[Any]) -> float:
+    """Standard deviation of an outline's distance from its centre, as part of its own ellipse's; 0.1 for a square."""
+    d = contour.reshape(-1, 2) - np.array([x, y])
+    square = np.einsum("ni,ij,nj->n", d, np.linalg.inv(second), d)
+    rho = np.sqrt(np.maximum(square, 0.0))
+    return float(rho.std() / rho.mean())
 
 
 def _level(picture: NDArray[Any], centres: Float, moments: Float, radius: float) -> Float:

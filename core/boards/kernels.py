@@ -73,8 +73,8 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
         by_v += dv
         by_s += sign * (ga * a * hb + ha * gb * b) / s
     du, dv = amplitude * by_u, amplitude * by_v
-    J[0] = du * su + dv * sv
-    J[1] = -du * cu - dv * cv
+    J[0] = du * su + dv * sv - p[7]
+    J[1] = -du * cu - dv * cv - p[8]
     J[2] = -du * tu
     J[3] = -dv * tv
     J[4] = 1.0
@@ -97,8 +97,8 @@ def _dot(p: Float, x: float, y: float, J: Float) -> float:
     e, slope = _edge((rho - 1.0) / steep, s)
     inside = 0.5 * (1.0 - e)
     by_rho = -0.5 * p[6] * slope / steep
-    J[0] = -by_rho * (m * a + n * b) / rho
-    J[1] = -by_rho * (m * b + n * c) / rho
+    J[0] = -by_rho * (m * a + n * b) / rho - p[8]
+    J[1] = -by_rho * (m * b + n * c) / rho - p[9]
     J[2] = by_rho * m * dx / rho
     J[3] = by_rho * (m * dy + n * dx) / rho
     J[4] = by_rho * n * dy / rho

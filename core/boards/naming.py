@@ -20,7 +20,15 @@ from core.target import GridTarget
 
 ShownKind = Literal["line_grid", "markers"] | BoardKind
 
-_DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
+# the numbers up to 250 are the same in the larger dictionaries of a family
+_DICTIONARIES = (
+    "DICT_4X4_250",
+    "DICT_5X5_250",
+    "DICT_6X6_250",
+    "DICT_7X7_250",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_36h11",
+)
 _LEAST_MARKERS = 4
 _LEAST_DOTS = 25
 _FULL = 0.9
@@ -61,6 +69,11 @@ def declared_text(target: GridTarget | BoardTarget) -> str:
     }[target.kind]
 
 
+def with_article(text: str) -> str:
+    """Return a noun with its article."""
+    return f"{'an' if text[0] in 'aeiou' else 'a'} {text}"
+
+
 def shown_target(pictures: Pictures, *, with_lines: bool = True) -> Shown | None:
     """Name the target in an image; None where there is none to be sure of.
 
@@ -77,9 +90,8 @@ def shown_target(pictures: Pictures, *, with_lines: bool = True) -> Shown | None
     dots = _dots(pictures)
     board = any_checkerboard(pictures)
     # the gaps between dots look like a few squares too
-    if board is not None and (dots is None or len(dots.outline_px) < board.shape[0] * board.shape[1]):
-        if squares_hold_markers(pictures.grey, board):
-            return Shown("markers", "ChArUco board (or markers of ArUco)", None, board.reshape(-1, 2))
+    fewer = dots is None or board is None or len(dots.outline_px) < board.shape[0] * board.shape[1]
+    if board is not None and fewer and not squares_hold_markers(pictures.grey, board):
         size = board.shape[0], board.shape[1]
         text = f"checkerboard of {size[0]} x {size[1]} inner corners"
         return Shown("checkerboard", text, size, board.reshape(-1, 2))
@@ -96,7 +108,7 @@ def other_target(shown: Shown, target: GridTarget | BoardTarget) -> TargetError 
     if shown.kind == declared and not (isinstance(target, BoardTarget) and _other_markers(shown, target)):
         return None
     return TargetError(
-        f"This is a {shown.text}, declared is a {declared_text(target)}.",
+        f"This is {with_article(shown.text)}, declared is {with_article(declared_text(target))}.",
         code="target_other",
         remedy="Correct kind in the target's description, or use the target declared.",
         shown=shown.kind,
@@ -107,9 +119,13 @@ def _other_markers(shown: Shown, target: BoardTarget) -> bool:
     """Return True where markers seen are those of another family of dictionaries than declared."""
     if shown.kind != "markers":
         return False
-    family = "_".join(target.dictionary.split("_")[:2])
-    known = any(name.startswith(family + "_") for name in _DICTIONARIES)
-    return known and "DICT_" in shown.text and family + "_" not in shown.text
+    family = _family(target.dictionary)
+    return family in map(_family, _DICTIONARIES) and not shown.text.endswith(family)
+
+
+def _family(dictionary: str) -> str:
+    """Return a dictionary's name without its size: those of one family begin with the same markers."""
+    return dictionary.rstrip("0123456789").rstrip("_") if dictionary[5:6].isdigit() else dictionary
 
 
 def _markers(pictures: Pictures) -> Shown | None:
@@ -122,7 +138,7 @@ def _markers(pictures: Pictures) -> Shown | None:
         if len(corners) > most:
             most = len(corners)
             outline = np.concatenate([np.asarray(c, dtype=np.float64).reshape(-1, 2) for c in corners]) * factor
-            text = f"ChArUco board (or markers of ArUco) with {most} markers of {name.removesuffix('1000')}*"
+            text = f"ChArUco board (or markers of ArUco) with {most} markers of {_family(name)}"
             best = Shown("markers", text, None, outline)
     return best
 

@@ -77,14 +77,12 @@ def find_target(image: NDArray[Any], target: GridTarget | BoardTarget, *, option
     Raises
     ------
     ImageError, TargetError
-        As :func:`detect_target`, but for what only the fit of the points shows.
+        As :func:`detect_target`, but for what only the fit of the points shows, and without the name of another target:
+        where nothing is found, :func:`detect_target` tells why.
     """
     if isinstance(target, BoardTarget):
         return find_board(image, target)
-    try:
-        return find_grid(image, target, options=options)
-    except TargetError as error:
-        raise _named(image, target, error) from error
+    return find_grid(image, target, options=options)
 
 
 def _named(image: NDArray[Any], target: GridTarget, error: TargetError) -> TargetError:

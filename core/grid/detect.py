@@ -165,7 +165,6 @@ def find_grid(image: NDArray[Any], target: GridTarget, *, options: GridOptions |
 def lines_shown(image: NDArray[Any]) -> Float | None:
     """Return the intersections (m_a, m_b, 2) of a line grid of any counts in an image, None where it shows none."""
     grey = checked_image(image)
-    best: Float | None = None
     for dark in (True, False):
         for width in (0.03, 0.1):
             target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=width, dark_lines=dark)
@@ -177,9 +176,9 @@ def lines_shown(image: NDArray[Any]) -> Float | None:
                     nodes = find_lattice(picture, directions(picture)).nodes_px
                 except (TargetError, np.linalg.LinAlgError):
                     continue
-                if min(nodes.shape[:2]) >= _LEAST_SHOWN and (best is None or nodes.size > best.size):
-                    best = nodes
-    return best
+                if min(nodes.shape[:2]) >= _LEAST_SHOWN:
+                    return nodes
+    return None
 
 
 def _coarse(grey: Float32, target: GridTarget, options: GridOptions) -> tuple[Lattice, float]:
