@@ -83,10 +83,10 @@ class ImageError(InputError):
 
 
 class TargetError(InputError):
-    """The calibration grid was not found, or could not be indexed without doubt."""
+    """The calibration target was not found, or could not be indexed without doubt."""
 
     code = "target_not_found"
-    remedy = "Show the whole grid, clean, evenly lit, lines at about 45 degrees to the rows."
+    remedy = "Show the whole target, clean, evenly lit and in focus."
 
 
 class CalibrationInputError(InputError):

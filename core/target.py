@@ -1,9 +1,12 @@
 """The calibration target: a precision grid of two families of equidistant lines.
 
-Index and frame conventions, the same for every camera: ``lines = (n_a, n_b)``. Walking along X_sys, which in the
-image goes right and down, one crosses the ``n_a`` lines of family a; walking along Y_sys, left and down, the
-``n_b`` lines of family b. The origin is the centre of the full set of lines, Z_sys = 0 is the plane of the grid at
-the first position. Only inner intersections are used: the outermost lines end at their crossings.
+Index and frame conventions, the same for every camera: ``lines = (n_a, n_b)``. Walking along X_sys one crosses the
+``n_a`` lines of family a; walking along Y_sys, a quarter turn clockwise from it in the image, the ``n_b`` lines of
+family b. In the image X_sys goes right and down and Y_sys left and down where the lines lie at 45 degrees; X_sys goes
+right and Y_sys down where they lie along rows and columns. In general X_sys lies between 23 degrees above the rows and
+67 degrees below, unless the other way is asked for (``core.grid.GridOptions.orientation``). The origin is the centre of
+the full set of lines, Z_sys = 0 is the plane of the grid at the first position. Only inner intersections are used: the
+outermost lines end at their crossings.
 """
 
 from __future__ import annotations

@@ -1,7 +1,20 @@
-"""Checkerboards, ChArUco boards and grids of dots: their description and their points in an image."""
+"""Checkerboards, ChArUco boards and grids of dots: their description, their points in an image, and any target's."""
 
 from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget
-from core.boards.detect import detect_board
+from core.boards.detect import detect_board, find_board
+from core.boards.eccentricity import dot_centre_offset_px
+from core.boards.targets import detect_target, find_target
 from core.boards.view import BoardView
 
-__all__ = ["BOARD_KINDS", "DEFAULT_DICTIONARY", "BoardKind", "BoardTarget", "BoardView", "detect_board"]
+__all__ = [
+    "BOARD_KINDS",
+    "DEFAULT_DICTIONARY",
+    "BoardKind",
+    "BoardTarget",
+    "BoardView",
+    "detect_board",
+    "detect_target",
+    "dot_centre_offset_px",
+    "find_board",
+    "find_target",
+]

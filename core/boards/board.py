@@ -9,9 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import cv2
 import numpy as np
 
 from core.arrays import Float
+from core.errors import TargetError
 from core.target import check_pitch, check_tolerance, invalid, two_whole_numbers
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "circles_asymmetric"]
@@ -38,6 +40,8 @@ class BoardTarget:
         The maker's bound on the error of a corner's or dot's position, per axis; 0 for an exact board.
     marker_mm, dictionary
         ChArUco: side of a marker, and the name of its dictionary.
+    dot_diameter_mm
+        Diameter of a dot where it is known; None: it is measured in the images.
 
     Raises
     ------
@@ -51,6 +55,7 @@ class BoardTarget:
     node_tolerance_mm: float = 0.0
     marker_mm: float | None = None
     dictionary: str = DEFAULT_DICTIONARY
+    dot_diameter_mm: float | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in BOARD_KINDS:
@@ -62,6 +67,16 @@ class BoardTarget:
         check_tolerance(self.node_tolerance_mm, self.pitch_mm)
         if self.kind == "charuco" and (self.marker_mm is None or not 0.0 < self.marker_mm < self.pitch_mm):
             raise invalid(f"marker_mm must lie between 0 and the pitch ({self.pitch_mm:g} mm), got {self.marker_mm!r}")
+        if self.dot_diameter_mm is not None and not 0.0 < self.dot_diameter_mm < self.nearest_mm:
+            raise invalid(
+                f"dot_diameter_mm must lie between 0 and the dots' distance ({self.nearest_mm:g} mm),"
+                f" got {self.dot_diameter_mm!r}"
+            )
+
+    @property
+    def nearest_mm(self) -> float:
+        """Distance of the nearest two points, mm."""
+        return self.pitch_mm * (float(np.sqrt(2.0)) if self.kind == "circles_asymmetric" else 1.0)
 
     def points_mm(self) -> Float:
         """Return the nominal positions (columns, rows, 2), X and Y in mm, Z is 0."""
@@ -72,3 +87,21 @@ class BoardTarget:
         points = np.stack([x, y], axis=-1) * self.pitch_mm
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
         return np.asarray(points - 0.5 * (low + high))
+
+
+def dictionary_id(name: str) -> int:
+    """Return OpenCV's number of a dictionary of markers.
+
+    Raises
+    ------
+    TargetError
+        Code ``target_invalid`` where there is none of that name.
+    """
+    value = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if not isinstance(value, int):
+        raise TargetError(
+            f"There is no dictionary {name!r} of markers.",
+            code="target_invalid",
+            remedy="Name one of OpenCV's, such as DICT_5X5_100.",
+        )
+    return value

@@ -1,4 +1,4 @@
-"""Inner corners of checkerboards and ChArUco boards: found by OpenCV, then fitted by their blurred picture."""
+"""Coarse inner corners of checkerboards and ChArUco boards, found by OpenCV."""
 
 from __future__ import annotations
 
@@ -8,186 +8,129 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards.board import BoardTarget
-from core.boards.models import corner
-from core.boards.view import neighbour_distances_px, steps_px
-from core.boards.windows import fit_windows, sample
-from core.errors import TargetError
+from core.arrays import Float, Float32
+from core.boards.board import BoardTarget, dictionary_id
+from core.boards.pictures import COARSE_SIDE_PX, FINE_SIDE_PX, Pictures, full_scale
+from core.boards.refine import sample
 
-_COARSE_SIDE_PX = 1400  # OpenCV's search is slow on large images and finds no more there
-_RADIUS = 0.4  # of the distance of neighbouring corners
-_MAX_RADIUS_PX = 24
-_MIN_RADIUS_PX = 3
-_RIM_PX = 2.0  # blur of a marker's own edges
-_MAX_MOVE = 0.25  # of the distance of neighbouring corners, from the coarse corner
+_LEAST_SEEN = 4
 
 
-def find_checkerboard(grey8: NDArray[np.uint8], size: tuple[int, int]) -> Float | None:
-    """Return coarse corners (columns, rows, 2) of a whole board, None where it is not found."""
-    small, factor = _reduced(grey8)
-    pictures = [(small, factor)] if factor == 1.0 else [(small, factor), (grey8, 1.0)]
-    for picture, scale in pictures:
-        for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE):
-            found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
-            if found:
-                return _arranged(np.asarray(corners), size, scale)
-        found, corners = cv2.findChessboardCorners(
-            picture, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-        )
+def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bool = False) -> Float | None:
+    """Return coarse corners (columns, rows, 2) of a whole board, None where it is not found.
+
+    ``coarsely``: on the smallest picture only.
+    """
+    for picture, factor in pictures.scales()[: 1 if coarsely else None]:
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if found:
-            return _arranged(np.asarray(corners), size, scale)
+            grid = _arranged(np.asarray(corners), size, factor)
+            if _alternates(pictures.grey, grid):
+                return grid
     return None
 
 
-def checkerboard_size(grey8: NDArray[np.uint8]) -> tuple[int, int] | None:
-    """Return the size, the longer side first, of the checkerboard that an image shows; None where there is none."""
-    small, _ = _reduced(grey8)
+def search_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | None:
+    """Search longer, where :func:`find_checkerboard` found nothing."""
+    for picture, factor in pictures.scales()[:2]:
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+        if not found:
+            flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+            found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+        if found:
+            grid = _arranged(np.asarray(corners), size, factor)
+            if _alternates(pictures.grey, grid):
+                return grid
+    return None
+
+
+def any_checkerboard(pictures: Pictures) -> Float | None:
+    """Return the corners (columns, rows, 2) of the largest checkerboard seen, more columns than rows, or None."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    picture, factor = pictures.reduced(COARSE_SIDE_PX)
     try:
-        found, _corners, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (3, 3), flags)
     except cv2.error:
         return None
     if not found or meta is None:
         return None
-    sides = np.asarray(meta).shape[:2]
-    return int(max(sides)), int(min(sides))
+    rows, columns = (int(n) for n in np.asarray(meta).shape[:2])
+    grid = _arranged(np.asarray(corners), (columns, rows), factor)
+    if not _alternates(pictures.grey, grid):
+        return None
+    return grid if columns >= rows else np.swapaxes(grid, 0, 1)
 
 
-def find_charuco(grey8: NDArray[np.uint8], target: BoardTarget) -> Float | None:
-    """Return coarse corners (columns, rows, 2), NaN where hidden; None where fewer than four are seen."""
+def find_charuco(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> Float | None:
+    """Return coarse corners (columns, rows, 2), NaN where hidden; None where fewer than four are seen.
+
+    ``coarsely``: on the smallest picture only, if it shows any.
+    """
     dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(target.dictionary))
     columns, rows = target.size
-    small, factor = _reduced(grey8, 2200)
+    squares = (columns + 1, rows + 1)
     best: Float | None = None
-    for legacy in (False, True):
-        board = cv2.aruco.CharucoBoard(
-            (columns + 1, rows + 1), float(target.pitch_mm), float(target.marker_mm or 0.0), dictionary
-        )
-        board.setLegacyPattern(legacy)
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(small)
-        if ids is None or len(ids) < 4:
-            continue
-        out = np.full((columns, rows, 2), np.nan)
-        index = np.asarray(ids).ravel()
-        out[index % columns, index // columns] = _full_scale(np.asarray(corners).reshape(-1, 2), factor)
-        if best is None or np.isfinite(out).sum() > np.isfinite(best).sum():
-            best = out
+    seen = 0
+    for side in (COARSE_SIDE_PX, FINE_SIDE_PX):
+        picture, factor = pictures.reduced(side)
+        for legacy in (False, True):
+            board = cv2.aruco.CharucoBoard(squares, float(target.pitch_mm), float(target.marker_mm or 0.0), dictionary)
+            board.setLegacyPattern(legacy)
+            corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
+            if ids is None or len(ids) < max(_LEAST_SEEN, seen + 1):
+                continue
+            seen = len(ids)
+            best = np.full((columns, rows, 2), np.nan)
+            index = np.asarray(ids).ravel()
+            best[index % columns, index // columns] = full_scale(
+                np.asarray(corners, dtype=np.float64).reshape(-1, 2), factor
+            )
+            if seen == columns * rows:
+                return best
+        if factor == 1.0 or (coarsely and best is not None):
+            break
     return best
 
 
-def dictionary_id(name: str) -> int:
-    """Return OpenCV's number of a dictionary of markers.
-
-    Raises
-    ------
-    TargetError
-        Code ``target_invalid`` where there is none of that name.
-    """
-    value = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
-    if not isinstance(value, int):
-        raise TargetError(
-            f"There is no dictionary {name!r} of markers.",
-            code="target_invalid",
-            remedy="Name one of OpenCV's, such as DICT_5X5_100.",
-        )
-    return value
-
-
-def refine_corners(grey: Float, coarse_px: Float, target: BoardTarget) -> tuple[Float, Float]:
-    """Fit each corner's crossed edges.
-
-    Returns
-    -------
-    xy_px, sigma_px
-        (columns, rows, 2), and (columns, rows); NaN where a corner is hidden, or its picture is none of crossed edges.
-    """
-    shape = coarse_px.shape[:2]
-    pitch = neighbour_distances_px(coarse_px, target)
-    along_x, along_y = steps_px(coarse_px, 0), steps_px(coarse_px, 1)
-    usable = np.isfinite(pitch) & np.isfinite(along_x).all(axis=-1) & np.isfinite(along_y).all(axis=-1)
-    xy, sigma = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
-    if not usable.any():
-        return xy, sigma
-    start_xy, ex, ey, step = coarse_px[usable], along_x[usable], along_y[usable], pitch[usable]
-    radius = int(np.clip(round(_RADIUS * float(np.median(step))), _MIN_RADIUS_PX, _MAX_RADIUS_PX))
-    low, high = _levels(grey, start_xy, radius)
-    start = np.column_stack(
-        [
-            start_xy,
-            np.arctan2(ex[:, 1], ex[:, 0]),
-            np.arctan2(ey[:, 1], ey[:, 0]),
-            0.5 * (low + high),
-            _signed_amplitude(grey, start_xy, ex, ey, 0.5 * (high - low)),
-            np.full(len(start_xy), 1.0),
-        ]
-    )
-    # half of the white frame about a marker, in pitches
-    frame = np.inf if target.kind != "charuco" else 0.5 * (1.0 - float(target.marker_mm or 0.0) / target.pitch_mm)
-    axes = np.stack([ex, ey], axis=-1)
-    to_board = np.linalg.inv(axes)
-    rim = _RIM_PX / step
-
-    def weight_of(index: NDArray[np.intp], dx: Float, dy: Float) -> Float:
-        d = np.stack([dx, dy], axis=-1)
-        board = np.abs(np.einsum("nij,nmj->nmi", to_board[index], d))
-        near = (board <= _RADIUS + 0.05).all(axis=-1)
-        free = board.min(axis=-1) < np.maximum(frame - rim[index], 0.0)[:, None]
-        return np.asarray(near & free, dtype=np.float64)
-
-    for _ in range(2):  # the second time about the corner found, so that the window is symmetric about it
-        fit = fit_windows(grey, start, radius, weight_of, corner)
-        moved = np.linalg.norm(fit.parameters[:, :2] - start_xy, axis=1)
-        good = fit.good & (moved < _MAX_MOVE * step)
-        start = np.where(good[:, None], fit.parameters, start)
-    good &= np.abs(np.sin(fit.parameters[:, 2] - fit.parameters[:, 3])) > 0.15
-    out, spread = np.full((len(start_xy), 2), np.nan), np.full(len(start_xy), np.nan)
-    out[good], spread[good] = fit.parameters[good, :2], fit.sigma_px[good]
-    xy[usable], sigma[usable] = out, spread
-    return xy, sigma
-
-
-def dark_at_start(grey: Float, xy_px: Float) -> bool:
+def dark_at_start(grey: Float32, xy_px: Float) -> bool:
     """Return True where the square beyond corner [0, 0], diagonally outside, is darker than its neighbour."""
     ex, ey = xy_px[1, 0] - xy_px[0, 0], xy_px[0, 1] - xy_px[0, 0]
-    outside = _mean_at(grey, xy_px[0, 0] - 0.35 * (ex + ey))
-    beside = _mean_at(grey, xy_px[0, 0] + 0.35 * (ex - ey))
-    return outside < beside
+    nine = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
+    outside = sample(grey, xy_px[0, 0] - 0.35 * (ex + ey) + nine).mean()
+    beside = sample(grey, xy_px[0, 0] + 0.35 * (ex - ey) + nine).mean()
+    return bool(outside < beside)
 
 
-def _mean_at(grey: Float, xy: Float) -> float:
-    x, y = (int(v) for v in np.rint(xy))
-    part = grey[max(y - 1, 0) : max(y + 2, 1), max(x - 1, 0) : max(x + 2, 1)]
-    return float(part.mean()) if part.size else float("nan")
+def squares_hold_markers(grey: Float32, xy_px: Float) -> bool:
+    """Return True where the light squares between corners (columns, rows, 2) of a board hold dark parts."""
+    one, other = _squares(grey, xy_px)
+    light, dark = (one, other) if _lightness(one) > _lightness(other) else (other, one)
+    middle = 0.5 * (np.median(dark) + np.percentile(light, 90))
+    return bool(np.median((light < middle).mean(axis=-1)) > 0.2)
 
 
-def _reduced(grey8: NDArray[np.uint8], side_px: int = _COARSE_SIDE_PX) -> tuple[NDArray[np.uint8], float]:
-    factor = max(grey8.shape) / side_px
-    if factor <= 1.0:
-        return grey8, 1.0
-    size = (round(grey8.shape[1] / factor), round(grey8.shape[0] / factor))
-    return np.asarray(cv2.resize(grey8, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), factor
+def _alternates(grey: Float32, xy_px: Float) -> bool:
+    """Return True where the squares between corners are light and dark in turn, as the cells of a line grid are not."""
+    one, other = _squares(grey, xy_px)
+    low, high = np.percentile(np.concatenate([one.ravel(), other.ravel()]), [5.0, 95.0])
+    return abs(_lightness(one) - _lightness(other)) > 0.4 * float(high - low)
 
 
-def _full_scale(xy: NDArray[Any], factor: float) -> Float:
-    return (xy.astype(np.float64) + 0.5) * factor - 0.5
+def _squares(grey: Float32, xy_px: Float) -> tuple[Float, Float]:
+    """Grey levels (n, 81) within the squares of either colour."""
+    c00, c10, c01, c11 = xy_px[:-1, :-1], xy_px[1:, :-1], xy_px[:-1, 1:], xy_px[1:, 1:]
+    s, t = (v.ravel()[:, None, None, None] for v in np.meshgrid(np.linspace(0.25, 0.75, 9), np.linspace(0.25, 0.75, 9)))
+    places = (1 - s) * (1 - t) * c00 + s * (1 - t) * c10 + (1 - s) * t * c01 + s * t * c11
+    inside = np.moveaxis(sample(grey, places), 0, -1)
+    first = (np.add.outer(np.arange(inside.shape[0]), np.arange(inside.shape[1])) % 2) == 0
+    return inside[first], inside[~first]
+
+
+def _lightness(squares: Float) -> float:
+    """Level of squares (n, m) that may hold markers."""
+    return float(np.median(np.percentile(squares, 80.0, axis=-1)))
 
 
 def _arranged(corners: NDArray[Any], size: tuple[int, int], factor: float) -> Float:
-    return np.swapaxes(_full_scale(corners.reshape(size[1], size[0], 2), factor), 0, 1)
-
-
-def _levels(grey: Float, xy: Float, radius: int) -> tuple[Float, Float]:
-    offsets = np.arange(-radius, radius + 1)
-    dy, dx = (d.ravel() for d in np.meshgrid(offsets, offsets, indexing="ij"))
-    samples = sample(grey, xy[:, None, :] + np.stack([dx, dy], axis=-1))
-    low, high = np.percentile(samples, [20.0, 80.0], axis=1)
-    return low, high
-
-
-def _signed_amplitude(grey: Float, xy: Float, ex: Float, ey: Float, size: Float) -> Float:
-    # u is the distance to the edge along ex, positive along ey; v that to the edge along ey, positive against ex
-    inside = sample(grey, xy + 0.25 * (ex + ey)) + sample(grey, xy - 0.25 * (ex + ey))
-    across = sample(grey, xy + 0.25 * (ex - ey)) + sample(grey, xy - 0.25 * (ex - ey))
-    amplitude = np.maximum(size, 1e-3)
-    return np.where(inside > across, -amplitude, amplitude)  # u v is negative at xy + ex + ey
+    return np.swapaxes(full_scale(corners.reshape(size[1], size[0], 2), factor), 0, 1)

@@ -1,32 +1,48 @@
-"""Detection of a board in one image, and the name of another target that it shows instead."""
+"""Detection of a board in one image: coarse search, then the fit of every point, and the cause where it fails."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
+from core.arrays import Bool, Float, Float32
 from core.boards.board import BoardTarget
-from core.boards.corners import checkerboard_size, dark_at_start, find_charuco, find_checkerboard, refine_corners
-from core.boards.dots import count_dots, find_dots, refine_dots
+from core.boards.corners import (
+    any_checkerboard,
+    dark_at_start,
+    find_charuco,
+    find_checkerboard,
+    search_checkerboard,
+    squares_hold_markers,
+)
+from core.boards.dots import DotSearch, find_dots
+from core.boards.naming import declared_text, other_target, shown_target
+from core.boards.pictures import Pictures
+from core.boards.refine import Refined, refine_corners, refine_dots
 from core.boards.view import BoardView, neighbour_distances_px
 from core.errors import TargetError
 from core.grid.threshold import checked_image
 
-_NAMES = {
-    "checkerboard": "checkerboard",
-    "charuco": "ChArUco board",
-    "circles": "grid of dots",
-    "circles_asymmetric": "asymmetric grid of dots",
-}
 _LEAST_CHARUCO = 8
 _LEAST_PITCH_PX = 8.0
-_MANY_DOTS = 25
-_DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
-_LEAST_MARKERS = 4
+_LEAST_LATTICE = 16  # dots in rows and columns, to speak of a grid of another size
+_WIDEST_BLUR = 0.22  # of the distance of neighbouring points; beyond, edges run into each other
+_LARGEST_SIGMA_PX = 0.5  # a point located no better tells a calibration nothing
+_IRREGULAR = 0.35  # of a step, by which neighbouring steps of one board may differ
+_SHOW_WHOLE = "Show the whole board, evenly lit and in focus; check size and kind of the target's description."
+
+
+@dataclass(frozen=True)
+class _Coarse:
+    """Points found before their fit: (columns, rows, 2), NaN where hidden; of dots their outlines too."""
+
+    xy_px: Float
+    moments: Float | None = None
+    hollow: Bool | None = None
+    marks: tuple[tuple[int, int], ...] = ()
 
 
 def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
@@ -42,134 +58,250 @@ def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
     Returns
     -------
     BoardView
-        Points in pixels; indices follow the board, and where it looks the same turned by half a turn, the image.
+        Points in pixels. Indices follow the board: the colours of a checkerboard with an odd sum of columns and rows, a
+        ChArUco board's markers, a grid's orientation marks, the rows of an asymmetric grid with an odd number of them.
+        Where a board looks the same turned by half a turn (or a quarter, with as many columns as rows), X is what lies
+        nearest to the image's rows, to the right.
 
     Raises
     ------
     ImageError
         ``image_unsupported``, ``image_unusable``: no gray image.
     TargetError
-        ``target_not_found``, ``target_other`` (the image shows another target), ``target_size`` (another number of
-        corners), ``target_too_small``, ``target_partly_seen``.
+        ``target_not_found``; ``target_other``: the image shows another target; ``target_size``: another number of
+        points; ``target_too_small``; ``target_partly_seen``: the board leaves the image, or too few of its points can
+        be located; ``target_blurred``: no point can be located to half a pixel; ``target_irregular``: markers that lie
+        on no such board; ``image_mirrored``: an asymmetric grid seen in a mirror.
     """
-    grey = checked_image(image).astype(np.float64)
-    grey8 = _eight_bit(grey)
-    radius: Float | None = None
-    if target.kind in ("circles", "circles_asymmetric"):
-        dots = find_dots(grey8, target)
-        if dots is None:
-            raise _not_found(grey8, target)
-        centres, moments = dots
-        order = _upright(centres, None, target)
-        xy, sigma, radius = refine_dots(grey, centres.reshape(-1, 2)[order], moments.reshape(-1, 2, 2)[order], target)
+    pictures = Pictures(checked_image(image))
+    coarse = _find(pictures, target)
+    if coarse.moments is not None:
+        fit = refine_dots(pictures.grey, coarse.xy_px, coarse.moments, target, coarse.hollow)
     else:
-        coarse = find_charuco(grey8, target) if target.kind == "charuco" else find_checkerboard(grey8, target.size)
-        if coarse is None:
-            raise _not_found(grey8, target)
-        if target.kind == "checkerboard":
-            coarse = coarse.reshape(-1, 2)[_upright(coarse, grey, target)]
-        xy, sigma = refine_corners(grey, coarse, target)
-    found = np.isfinite(xy).all(axis=-1)
-    least = _LEAST_CHARUCO if target.kind == "charuco" else int(0.5 * found.size)
-    if found.sum() < least:
-        raise TargetError(
-            f"Only {int(found.sum())} of {found.size} points of the {_NAMES[target.kind]} can be located.",
-            code="target_partly_seen",
-            remedy="Show more of the board, evenly lit and in focus.",
+        fit = refine_corners(pictures.grey, coarse.xy_px, target)
+    sigma = np.sqrt(0.5 * np.trace(fit.covariance_px2, axis1=-2, axis2=-1))
+    _check(fit, sigma, coarse.xy_px, target)
+    radius = None
+    if fit.ellipse is not None:
+        with np.errstate(invalid="ignore"):
+            radius = np.linalg.det(fit.ellipse) ** -0.5
+    return BoardView(
+        target=target,
+        xy_px=fit.xy_px,
+        sigma_px=sigma,
+        radius_px=radius,
+        pitch_px=float(np.nanmedian(neighbour_distances_px(fit.xy_px, target))),
+        image_size_px=pictures.size_px,
+        covariance_px2=fit.covariance_px2,
+        ellipse_per_px=fit.ellipse,
+        blur_px=fit.blur_px,
+        contrast=fit.contrast,
+        noise=fit.noise,
+        marks=coarse.marks,
+    )
+
+
+def find_board(image: NDArray[Any], target: BoardTarget) -> Float:
+    """Find a board's points coarsely, for a live picture: within about half a pixel of the image's own.
+
+    Parameters
+    ----------
+    image, target
+        As for :func:`detect_board`.
+
+    Returns
+    -------
+    Float
+        (columns, rows, 2) px, NaN where a point was not seen, indexed as :func:`detect_board` does.
+
+    Raises
+    ------
+    ImageError, TargetError
+        As :func:`detect_board`, but for what only the fit of the points shows; a search that finds nothing does not go
+        on to name what is seen.
+    """
+    return _find(Pictures(checked_image(image)), target, coarsely=True).xy_px
+
+
+def _find(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> _Coarse:
+    if target.kind in ("circles", "circles_asymmetric"):
+        search = find_dots(pictures, target, coarsely=coarsely)
+        if search.found is None:
+            raise _nothing(target) if coarsely else _no_dots(pictures, target, search)
+        dots = search.found
+        return _Coarse(dots.centres, dots.moments, dots.hollow, dots.marks)
+    if target.kind == "charuco":
+        corners = find_charuco(pictures, target, coarsely=coarsely)
+        if corners is None:
+            raise _nothing(target) if coarsely else _not_found(pictures, target)
+        _check_markers(corners, target)
+        return _Coarse(corners)
+    corners = find_checkerboard(pictures, target.size, coarsely=coarsely)
+    if corners is None:
+        if coarsely:
+            raise _nothing(target)
+        failure = _not_found(pictures, target)
+        corners = None if failure.code == "target_other" else search_checkerboard(pictures, target.size)
+        if corners is None:
+            raise failure
+    if squares_hold_markers(pictures.grey, corners):
+        shown = shown_target(pictures, with_lines=False)
+        other = None if shown is None else other_target(shown, target)
+        raise other or TargetError(
+            f"The light squares of the {declared_text(target)} hold dark parts, as those of a ChArUco board.",
+            code="target_other",
+            remedy="Correct kind in the target's description, or use the target declared.",
         )
-    pitch = float(np.nanmedian(neighbour_distances_px(xy, target)))
+    return _Coarse(corners.reshape(-1, 2)[_upright(corners, pictures.grey)])
+
+
+def _check(fit: Refined, sigma: Float, coarse_px: Float, target: BoardTarget) -> None:
+    """Raise an error where too little of a board can be located, or not well enough."""
+    name = declared_text(target)
+    pitch = float(np.nanmedian(neighbour_distances_px(coarse_px, target)))
     if pitch < _LEAST_PITCH_PX:
         raise TargetError(
-            f"Neighbouring points of the {_NAMES[target.kind]} lie {pitch:.1f} px apart, not {_LEAST_PITCH_PX:g} px.",
+            f"Neighbouring points of the {name} lie {pitch:.1f} px apart, not {_LEAST_PITCH_PX:g} px.",
             code="target_too_small",
             remedy="Show the board larger, or use one with fewer points.",
         )
-    return BoardView(
-        target=target,
-        xy_px=xy,
-        sigma_px=sigma,
-        radius_px=radius,
-        pitch_px=pitch,
-        image_size_px=(grey.shape[1], grey.shape[0]),
-    )
+    if fit.blur_px > _WIDEST_BLUR * pitch:
+        raise TargetError(
+            f"The edges of the {name} are blurred by {fit.blur_px:.1f} px, more than {_WIDEST_BLUR:g} of the points'"
+            f" distance of {pitch:.1f} px.",
+            code="target_blurred",
+            remedy="Focus on the board, shorten the exposure, or hold the board still.",
+            blur_px=fit.blur_px,
+        )
+    found = np.isfinite(fit.xy_px).all(axis=-1)
+    least = _LEAST_CHARUCO if target.kind == "charuco" else int(0.5 * found.size)
+    if found.sum() < least:
+        raise TargetError(
+            f"Only {int(found.sum())} of {found.size} points of the {name} can be located.",
+            code="target_partly_seen",
+            remedy="Show more of the board, evenly lit and in focus.",
+            points_px=coarse_px.reshape(-1, 2).tolist(),
+        )
+    typical = float(np.nanmedian(sigma))
+    if typical > _LARGEST_SIGMA_PX:
+        raise TargetError(
+            f"The points of the {name} can be located to {typical:.2f} px only: edges blurred by {fit.blur_px:.1f} px"
+            f" with a contrast of {fit.contrast:.3g} over a noise of {fit.noise:.3g} grey levels.",
+            code="target_blurred",
+            remedy="Focus on the board, shorten the exposure, and light it better.",
+            blur_px=fit.blur_px,
+        )
 
 
-def _not_found(grey8: NDArray[np.uint8], target: BoardTarget) -> TargetError:
-    wanted = f"{_NAMES[target.kind]} of {target.size[0]} x {target.size[1]}"
-    markers = _shows_markers(grey8)
-    dots = count_dots(grey8)
-    size = None if markers else checkerboard_size(grey8)
-    if size is not None and dots > size[0] * size[1]:
-        size = None  # the gaps between dots look like a few squares too
-    if target.kind == "checkerboard" and size is not None and sorted(size) != sorted(target.size):
-        return TargetError(
-            f"The image shows a checkerboard of {size[0]} x {size[1]} inner corners, described are "
-            f"{target.size[0]} x {target.size[1]}.",
-            code="target_size",
-            remedy="Correct size in the target's description, or show the whole board.",
+def _check_markers(corners: Float, target: BoardTarget) -> None:
+    """Raise an error for corners whose numbers lie in no regular order: a board of another size or dictionary."""
+    bends = []
+    for axis in (0, 1):
+        step = np.diff(corners, axis=axis)
+        change = np.linalg.norm(np.diff(step, axis=axis), axis=-1)
+        a = step[1:] if axis == 0 else step[:, 1:]
+        b = step[:-1] if axis == 0 else step[:, :-1]
+        mean = 0.5 * (np.linalg.norm(a, axis=-1) + np.linalg.norm(b, axis=-1))
+        bends.append((change / mean).ravel())
+    ratio = np.concatenate(bends)
+    ratio = ratio[np.isfinite(ratio)]
+    if len(ratio) and float(np.median(ratio)) > _IRREGULAR:
+        raise TargetError(
+            f"The numbers of the markers lie on no {declared_text(target)}.",
+            code="target_irregular",
+            remedy="Check size and dictionary of the target's description, and that one board only is seen.",
         )
-    other = None
-    if markers:
-        other = "ChArUco board (or markers of ArUco)"
-    elif size is not None:
-        other = f"checkerboard of {size[0]} x {size[1]} inner corners"
-    elif dots >= _MANY_DOTS:
-        other = f"grid of about {dots} dots"
-    if other is not None and not other.startswith(_NAMES[target.kind]):
-        if target.kind.startswith("circles") and other.startswith("grid of about"):
-            return TargetError(
-                f"The image shows a {other}, but no {wanted} dots.",
-                code="target_not_found",
-                remedy="Check size and kind of the target's description, and show the whole board.",
-            )
+
+
+def _no_dots(pictures: Pictures, target: BoardTarget, search: DotSearch) -> TargetError:
+    if search.mirrored:
         return TargetError(
-            f"This is a {other}, described is a {wanted}.",
-            code="target_other",
-            remedy="Correct kind in the target's description, or use the target described.",
+            f"The {declared_text(target)} is seen in a mirror: its second row begins where the first should.",
+            code="image_mirrored",
+            remedy="Mirror the camera's images back, or turn the board's printed side to the cameras.",
         )
+    shown = shown_target(pictures)
+    other = None if shown is None else other_target(shown, target)
+    if other is not None and shown is not None and len(shown.outline_px) >= len(search.outline_px):
+        return other
+    if len(search.outline_px) >= _LEAST_LATTICE:
+        return _other_size(search.counts, search.outline_px, pictures, target, "dots")
+    return _nothing(target)
+
+
+def _not_found(pictures: Pictures, target: BoardTarget) -> TargetError:
+    shown = shown_target(pictures)
+    if shown is None:
+        return _nothing(target)
+    other = other_target(shown, target)
+    if other is not None:
+        return other
+    if shown.size is not None:
+        corners = any_checkerboard(pictures)
+        outline = shown.outline_px if corners is None else corners.reshape(-1, 2)
+        return _other_size(shown.size, outline, pictures, target, "inner corners")
+    return _nothing(target)
+
+
+def _other_size(
+    counts: tuple[int, int], outline_px: Float, pictures: Pictures, target: BoardTarget, what: str
+) -> TargetError:
+    """Return the error for a board of other counts: cut by the image's border, or another one."""
+    found, declared = sorted(counts), sorted(target.size)
+    fewer = found[0] <= declared[0] and found[1] <= declared[1]
+    if fewer and found != declared and _reaches_border(outline_px, counts, pictures.size_px):
+        return TargetError(
+            f"The board leaves the image: {counts[0]} x {counts[1]} {what} are seen, declared are {target.size[0]} x"
+            f" {target.size[1]}.",
+            code="target_partly_seen",
+            remedy="Move the board or the camera until the whole board lies inside the image.",
+            found=list(counts),
+            expected=list(target.size),
+            points_px=outline_px.tolist(),
+        )
+    if found == declared:
+        return _nothing(target)
     return TargetError(
-        f"No {wanted} was found.",
-        code="target_not_found",
-        remedy="Show the whole board, evenly lit and in focus; check size and kind of the target's description.",
+        f"The image shows a board of {counts[0]} x {counts[1]} {what}, declared are {target.size[0]} x"
+        f" {target.size[1]}.",
+        code="target_size",
+        remedy="Correct size in the target's description, or show the whole board.",
+        found=list(counts),
+        expected=list(target.size),
+        points_px=outline_px.tolist(),
     )
 
 
-def _shows_markers(grey8: NDArray[np.uint8]) -> bool:
-    for name in _DICTIONARIES:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-        corners, _, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey8)
-        if len(corners) >= _LEAST_MARKERS:
-            return True
-    return False
+def _reaches_border(outline_px: Float, counts: tuple[int, int], size_px: tuple[int, int]) -> bool:
+    """Return True where one more row of points would lie at the image's border or beyond."""
+    low, high = outline_px.min(axis=0), outline_px.max(axis=0)
+    step = np.sqrt(np.prod(high - low) / max(float((counts[0] - 1) * (counts[1] - 1)), 1.0))
+    return bool((low - 1.3 * step < 0.0).any() or (high + 1.3 * step > np.array(size_px) - 1.0).any())
 
 
-def _eight_bit(grey: Float) -> NDArray[np.uint8]:
-    low, high = np.percentile(grey, [0.5, 99.5])
-    scale = 255.0 / max(float(high - low), 1e-9)
-    return np.asarray(np.clip((grey - low) * scale, 0.0, 255.0), dtype=np.uint8)
+def _nothing(target: BoardTarget) -> TargetError:
+    return TargetError(f"No {declared_text(target)} was found.", code="target_not_found", remedy=_SHOW_WHOLE)
 
 
-def _upright(points: Float, grey: Float | None, target: BoardTarget) -> NDArray[np.intp]:
-    """Index the points as the board's own colours or rows do; where these do not tell, as the image does.
+def _upright(points: Float, grey: Float32) -> NDArray[np.intp]:
+    """Index a checkerboard's corners as its own colours do; where these do not tell, as the image does.
 
     Returns the (columns, rows) numbers of the points, counted as they lie in ``points`` (columns, rows, 2).
     """
+    size = points.shape[:2]
     flat = points.reshape(-1, 2)
-    order = np.arange(len(flat)).reshape(target.size)
-    asymmetric = target.kind == "circles_asymmetric"
+    order = np.arange(len(flat)).reshape(size)
     ex, ey = _sides(flat[order])
-    if ex[0] * ey[1] - ex[1] * ey[0] < 0.0 and not asymmetric:
+    if ex[0] * ey[1] - ex[1] * ey[0] < 0.0:
         order = order[:, ::-1]
-    if target.size[0] == target.size[1] and not asymmetric:
+    if size[0] == size[1]:
         # a square board may be indexed in four ways; X is what lies nearest to the rows
         for _ in range(3):
             ex, _ey = _sides(flat[order])
             if ex[0] >= abs(ex[1]) - 1e-9:
                 break
             order = order.T[::-1]
-    if asymmetric and target.size[1] % 2:
-        return order
-    if target.kind == "checkerboard" and sum(target.size) % 2 and grey is not None:
+    if sum(size) % 2:
         half_turn = not dark_at_start(grey, flat[order])
     else:
         ex, ey = _sides(flat[order])

@@ -1,6 +1,17 @@
 """Grid detection from the target's description alone: section 3.2.2's image processing, and a better localiser."""
 
-from core.grid.detect import detect_grid
-from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, Localiser
+from core.grid.detect import detect_grid, find_grid, lines_shown
+from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, LineOffsets, Localiser, Orientation
 
-__all__ = ["GridOptions", "GridOverlay", "GridView", "LineModel", "Localiser", "detect_grid"]
+__all__ = [
+    "GridOptions",
+    "GridOverlay",
+    "GridView",
+    "LineModel",
+    "LineOffsets",
+    "Localiser",
+    "Orientation",
+    "detect_grid",
+    "find_grid",
+    "lines_shown",
+]

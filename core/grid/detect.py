@@ -9,10 +9,18 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
-from core.grid.checks import blame_glare, check_coverage, check_lattice, check_pieces, check_regular, saturation_level
+from core.grid.checks import (
+    blame_glare,
+    check_coverage,
+    check_lattice,
+    check_oblique,
+    check_pieces,
+    check_regular,
+    saturation_level,
+)
 from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
 from core.grid.directions import directions
-from core.grid.lattice import Lattice, find_lattice, not_found, pitch_px
+from core.grid.lattice import Lattice, find_lattice, not_found, oriented, pitch_px
 from core.grid.lines import LineFit, fit_lines
 from core.grid.piece_table import PieceTable, line_points, piece_table
 from core.grid.profile import OUT, fit_pieces
@@ -23,6 +31,8 @@ from core.target import GridTarget
 
 _OUTLIER = 6.0  # standard deviations at which a line point is an outlier
 _ROUNDS = 3
+_CLEAR_DEPTH = 3.0  # of the noise, at which lines are lines whatever the target
+_LEAST_SHOWN = 5  # lines each way
 
 
 def detect_grid(
@@ -52,15 +62,17 @@ def detect_grid(
     ImageError
         ``image_unsupported``, ``image_unusable``: no gray image.
     TargetError
-        ``target_not_found``: no two families of lines. ``target_rotated``: lines not within 45 +- 20 degrees, or
-        counts swapped. ``target_line_count``: another number of lines than described. ``target_partly_seen``: the
-        grid leaves the image. ``target_dirty``, ``target_glare``: too many or too important pieces of lines are
-        spoilt. ``target_irregular``: lines that are no regular grid. The error's context holds the figures, and
-        ``segments_px`` for a picture where there are any.
+        ``target_not_found``: no two families of lines. ``target_rotated``: counts swapped, or lines along rows and
+        columns with the paper's localiser. ``target_line_count``: another number of lines than described.
+        ``target_partly_seen``: the grid leaves the image. ``target_dirty``, ``target_glare``: too many or too important
+        pieces of lines are spoilt. ``target_irregular``: lines that are no regular grid. The error's context holds the
+        figures, and ``segments_px`` for a picture where there are any.
 
     Notes
     -----
-    A grid without marks looks the same when turned by 90 or 180 degrees or mirrored, see :class:`GridView`.
+    Lines may run at any angle. A grid without marks looks the same when turned by 90 or 180 degrees or mirrored, see
+    :class:`GridView`: lines at about 45 degrees are indexed with X_sys right and down and Y_sys left and down, lines
+    along the rows and columns with X_sys to the right and Y_sys down; ``GridOptions.orientation`` has the rule between.
 
     References
     ----------
@@ -77,8 +89,10 @@ def detect_grid(
     size = (grey.shape[1], grey.shape[0])
     saturation = opts.saturation if opts.saturation is not None else saturation_level(image)
     try:
-        lattice, threshold = _coarse(grey, target)
-        check_lattice(lattice, target, size, opts)
+        lattice, threshold = _coarse(grey, target, opts)
+        check_lattice(lattice, target, size)
+        if localiser == "paper":
+            check_oblique(lattice)
     except TargetError as error:
         raise blame_glare(error, grey, saturation) from error
     nodes = lattice.nodes_px
@@ -119,10 +133,55 @@ def detect_grid(
         fit_rms_px=float(np.sqrt(np.mean(residual**2))),
         pieces_px=found.table.ends_px(),
         pieces_used=good,
+        line_offsets=found.fit.line_offsets,
     )
 
 
-def _coarse(grey: Float32, target: GridTarget) -> tuple[Lattice, float]:
+def find_grid(image: NDArray[Any], target: GridTarget, *, options: GridOptions | None = None) -> Float:
+    """Find the grid's inner intersections coarsely, for a live picture: within about half a pixel of the image's own.
+
+    Parameters
+    ----------
+    image, target, options
+        As for :func:`detect_grid`.
+
+    Returns
+    -------
+    Float
+        (n_a - 2, n_b - 2, 2) px, indexed as :func:`detect_grid` does.
+
+    Raises
+    ------
+    ImageError, TargetError
+        As :func:`detect_grid`, without its checks for dirt and glare on single pieces.
+    """
+    opts = GridOptions() if options is None else options
+    grey = checked_image(image)
+    lattice, _ = _coarse(grey, target, opts)
+    check_lattice(lattice, target, (grey.shape[1], grey.shape[0]))
+    return np.ascontiguousarray(lattice.nodes_px[1:-1, 1:-1])
+
+
+def lines_shown(image: NDArray[Any]) -> Float | None:
+    """Return the intersections (m_a, m_b, 2) of a line grid of any counts in an image, None where it shows none."""
+    grey = checked_image(image)
+    for dark in (True, False):
+        for width in (0.03, 0.1):
+            target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=width, dark_lines=dark)
+            for factor in coarse_factors((grey.shape[1], grey.shape[0]), target)[:2]:
+                picture = line_picture(grey, target, factor)
+                if picture.threshold < _CLEAR_DEPTH * picture.noise:
+                    continue
+                try:
+                    nodes = find_lattice(picture, directions(picture)).nodes_px
+                except (TargetError, np.linalg.LinAlgError):
+                    continue
+                if min(nodes.shape[:2]) >= _LEAST_SHOWN:
+                    return nodes
+    return None
+
+
+def _coarse(grey: Float32, target: GridTarget, options: GridOptions) -> tuple[Lattice, float]:
     """Find the lattice at the scale that shows all its lines; else the one with the most of them."""
     best: tuple[Lattice, float] | None = None
     failure: TargetError | None = None
@@ -136,7 +195,7 @@ def _coarse(grey: Float32, target: GridTarget) -> tuple[Lattice, float]:
             )
             continue
         try:
-            lattice = find_lattice(picture, directions(picture))
+            lattice = oriented(find_lattice(picture, directions(picture)), options.orientation, target.lines)
         except TargetError as error:
             failure = failure or error
             continue

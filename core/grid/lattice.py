@@ -1,7 +1,6 @@
 """Numbered intersections of two sets of lines, or the reason why there are none.
 
-Family a: lines at constant X_sys, crossed walking along X_sys (right and down in the image); family b: lines at
-constant Y_sys.
+Family a: lines at constant X_sys, crossed walking along X_sys; family b: lines at constant Y_sys.
 """
 
 from __future__ import annotations
@@ -18,11 +17,16 @@ from core.grid.chains import Chain, CoarseLine, link, order
 from core.grid.directions import Directions, family_pieces
 from core.grid.lines import meet_parabolas
 from core.grid.threshold import LinePicture
+from core.grid.view import Orientation
 
 _COARSE = ("centre_px", "direction", "bend")
 _MIN_CROSSING_RAD = np.radians(40.0)
 _MIN_LINES = 4
 _MIN_SEEN = 0.4
+# upper ends of the quarter of a turn in which X_sys lies. Without a named orientation, grids within 22 degrees of 45
+# are indexed as diagonal ones, and grids within 22 degrees of the rows as upright ones
+_HIGHEST_DEG: dict[Orientation | None, float] = {"diagonal": 90.0, "upright": 45.0, None: 67.0}
+_SURELY_UPRIGHT_DEG = 10.0  # within this a grid is not taken for a diagonal one by its counts
 _STRAY_END = 0.1  # of the pitch; an end line that deviates by more is an edge or a frame
 
 
@@ -139,6 +143,49 @@ def _try_pair(
         return None, 0.0, (0, 0)
     seen = sum(line.seen_px for line in chain_a.lines) + sum(line.seen_px for line in chain_b.lines)
     return lattice, seen, counts
+
+
+def oriented(lattice: Lattice, orientation: Orientation | None, lines: tuple[int, int]) -> Lattice:
+    """Index a lattice by the quarter of a turn in which its X_sys must lie.
+
+    A grid without marks may be indexed in four right-handed ways, and whatever the rule, there is one angle at which it
+    jumps. Without ``orientation`` that is 67 degrees, equal to -23: beyond there, where the counts of a grid of unequal
+    counts fit the other way only, they decide. With rolls on both sides of it two cameras would index differently, and
+    ``orientation`` must be named.
+
+    Parameters
+    ----------
+    lattice
+        Indexed in any right-handed way.
+    orientation
+        See :class:`core.grid.view.GridOptions`.
+    lines
+        Counts of the target.
+    """
+    highest = _HIGHEST_DEG[orientation]
+    # X_sys is turned back into (highest - 90, highest]
+    turns = int(np.ceil((float(np.degrees(lattice.rotation_rad)) - highest) / 90.0))
+    turned = _turned(lattice, turns)
+    rotation_deg = float(np.degrees(turned.rotation_rad))
+    swapped = turned.counts == (lines[1], lines[0]) and lines[0] != lines[1]
+    if orientation is None and swapped and rotation_deg < -_SURELY_UPRIGHT_DEG:
+        return _turned(turned, -1)
+    return turned
+
+
+def _turned(lattice: Lattice, turns: int) -> Lattice:
+    """Return the lattice with X_sys turned back by quarter turns: X_sys becomes -Y_sys, Y_sys becomes X_sys."""
+    turns %= 4
+    if turns == 0:
+        return lattice
+    nodes, H = lattice.nodes_px, lattice.plane_to_image
+    for _ in range(turns):
+        # new [i, j] is old [j, n_b - 1 - i]
+        H = H @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, nodes.shape[1] - 1.0], [0.0, 0.0, 1.0]])
+        nodes = np.swapaxes(nodes[:, ::-1], 0, 1)
+    nodes = np.ascontiguousarray(nodes)
+    rotation = lattice_rotation(H, (nodes.shape[0], nodes.shape[1]))
+    return Lattice(nodes, H, rotation, lattice.strays)
 
 
 def _seen_share(lattice: Lattice, chain_a: Chain, chain_b: Chain) -> float:

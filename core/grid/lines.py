@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.grid.view import LineModel
+from core.grid.view import LineModel, LineOffsets
 
 _BASE_TERMS = 5
 _ALL_TERMS = 10
@@ -73,6 +73,8 @@ class LineFit:
     straight_px
         (n_a, n_b, 2) intersections in coordinates without distortion, up to a projective map; equal to ``nodes_px``
         under the parabola model.
+    line_offsets
+        Joint covariance along each line, see :class:`core.grid.view.LineOffsets`; of the local model only.
     """
 
     nodes_px: Float
@@ -80,6 +82,7 @@ class LineFit:
     residual_px: Float
     variance_px2: Float
     straight_px: Float
+    line_offsets: LineOffsets | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,14 @@ class _Distortion:
     def correct(self, xy_px: Float) -> Float:
         u = (xy_px - self.centre_px) / self.scale_px
         return u + self.terms(u) @ self.D
+
+    def gradient(self, xy_px: Float, normal: Float) -> Float:
+        """Return unit vectors (..., 2) in the image across lines whose normals in corrected coordinates are given."""
+        u = (xy_px - self.centre_px) / self.scale_px
+        h = 1e-5
+        steps = [(self.terms(u + d) - self.terms(u - d)) @ self.D / (2.0 * h) for d in h * np.eye(2)]
+        across = normal + np.stack([np.sum(normal * step, axis=-1) for step in steps], axis=-1)
+        return np.asarray(across / np.linalg.norm(across, axis=-1, keepdims=True))
 
     def distort(self, v: Float) -> Float:
         u = v.copy()
@@ -369,7 +380,7 @@ def _fit_polygons(
     na, nb = counts
     index = _line_index(points, counts)
     offset = np.zeros((na, nb, 2))
-    variance = np.zeros((na, nb, 2))
+    covariance_a, covariance_b = np.zeros((na, nb, nb)), np.zeros((nb, na, na))
     residual = fit.residual_px.copy()
     for k in range(na + nb):
         mine = index == k
@@ -386,20 +397,31 @@ def _fit_polygons(
         N += 1e-6 * np.median(W) * S.T @ S
         A = np.linalg.solve(N, (J * W[:, None]).T)
         corner = A @ fit.residual_px[mine]
-        noise = np.sum(A**2 * points.sigma_px[mine] ** 2, axis=1)
+        # the points' noise is that across the line in the image, where the offsets' covariance holds too: the scale of
+        # the corrected coordinates changes little between a corner and the points beside it
+        noise = (A * points.sigma_px[mine] ** 2) @ A.T
         residual[mine] = fit.residual_px[mine] - J @ corner
         if k < na:
-            offset[k, :, 0], variance[k, :, 0] = corner, noise
+            offset[k, :, 0], covariance_a[k] = corner, noise
         else:
-            offset[:, k - na, 1], variance[:, k - na, 1] = corner, noise
+            offset[:, k - na, 1], covariance_b[k - na] = corner, noise
     M = np.zeros((na, nb, 2, 2))
     M[..., 0, :] = normal[:na, None]
     M[..., 1, :] = normal[None, na:]
-    inverse = np.linalg.inv(M)
-    move = (inverse @ offset[..., None])[..., 0] / distortion.scale_px
-    V = np.zeros((na, nb, 2, 2))
-    V[..., 0, 0], V[..., 1, 1] = variance[..., 0], variance[..., 1]
+    move = np.linalg.solve(M, offset[..., None])[..., 0] / distortion.scale_px
     straight = fit.straight_px + move
-    return LineFit(
-        distortion.distort(straight), inverse @ V @ np.swapaxes(inverse, -1, -2), residual, points.sigma_px**2, straight
+    nodes = distortion.distort(straight)
+    across = np.stack([distortion.gradient(nodes, M[..., r, :]) for r in range(2)], axis=-2)
+    inverse = np.linalg.inv(across)
+    V = np.zeros((na, nb, 2, 2))
+    V[..., 0, 0] = np.einsum("ijj->ij", covariance_a)
+    V[..., 1, 1] = np.einsum("jii->ij", covariance_b)
+    inner = slice(1, -1)
+    offsets = LineOffsets(
+        normal_a=across[inner, inner, 0],
+        normal_b=across[inner, inner, 1],
+        covariance_a=covariance_a[inner, inner, inner],
+        covariance_b=covariance_b[inner, inner, inner],
     )
+    covariance = inverse @ V @ np.swapaxes(inverse, -1, -2)
+    return LineFit(nodes, covariance, residual, points.sigma_px**2, straight, offsets)

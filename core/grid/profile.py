@@ -72,6 +72,7 @@ _WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be distinguished from thei
 _WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
 _MAX_BLUR = 8.0
 _MIN_PIXELS = 20
+_MIN_BOX = 0.01  # px; narrower boxes, of lines along the rows or columns, change the profile by 1e-5 of itself
 
 
 @njit(cache=True, nogil=True)
@@ -174,7 +175,7 @@ def _search(image: Float32, piece: Float, guard: float, sign: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _solve(M: Float, b: Float, x: Float) -> bool:
+def solve_cholesky(M: Float, b: Float, x: Float) -> bool:
     """Solve M x = b by Cholesky, overwriting M; False where M is not positive definite (a saturated or empty piece)."""
     n = M.shape[0]
     for i in range(n):
@@ -208,7 +209,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     out[15] = 0.0
     width, blur = piece[14], piece[15]
     fit_width = width > _WIDTH_SEEN
-    a, b = abs(piece[2]), abs(piece[3])
+    a, b = max(abs(piece[2]), _MIN_BOX), max(abs(piece[3]), _MIN_BOX)
     spread = sqrt(blur * blur + 1.0 / 12.0)
     guard = 0.5 * width + guard_blurs * spread
     half_width = max(min(0.5 * width + 5.0 * spread + 1.0, piece[17]), 0.5 * width + 2.0 * spread)
@@ -322,7 +323,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
             M[i, i] *= 1.0 + lam
             if not M[i, i] > 0.0:
                 return
-        if not _solve(M, g, delta):
+        if not solve_cholesky(M, g, delta):
             return
         lam *= 0.2
         for i in range(_N):
@@ -336,7 +337,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
         M = accepted.copy()
         J[:] = 0.0
         J[j] = 1.0
-        if not _solve(M, J, delta):
+        if not solve_cholesky(M, J, delta):
             return
         C[:, j] = delta
     peak, _, _, _ = profile_terms(0.0, par[7], par[6], a, b)

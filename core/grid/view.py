@@ -12,6 +12,7 @@ from core.target import GridTarget
 
 Localiser = Literal["profile", "paper"]
 LineModel = Literal["straight", "parabola", "local"]
+Orientation = Literal["diagonal", "upright"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,16 +33,48 @@ class GridOptions:
         Part of all line pieces that dirt or glare may spoil.
     max_bad_on_line
         Part of one line's pieces that may be spoilt.
-    max_rotation_rad
-        Largest departure of the grid's rotation from 45 degrees: 20 degrees and an allowance for the estimate's own
-        error.
+    orientation
+        Which of the four ways of indexing a grid without marks is taken. ``diagonal``: X_sys runs right and down, at
+        more than 0 and up to 90 degrees from the rows. ``upright``: X_sys is the direction nearest to the rows, to the
+        right, at more than -45 and up to 45 degrees. Between 0 and 45 degrees both are the same. None: X_sys at more
+        than -23 and up to 67 degrees, so that small differences of two cameras' rolls change the index nowhere but
+        there; a caller that knows how the other camera saw the grid names the orientation. See
+        :func:`core.grid.lattice.oriented`.
     """
 
     line_model: LineModel | None = None
     saturation: float | None = None
     max_bad_fraction: float = 0.15
     max_bad_on_line: float = 0.4
-    max_rotation_rad: float = float(np.radians(22.0))
+    orientation: Orientation | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineOffsets:
+    """Noise of the ``local`` model's inner intersections, line by line.
+
+    Each line is a polygon whose corners are its intersections: neighbouring corners share the pieces between them, so
+    that their offsets across the line are correlated (about -0.2). Offsets of different lines are independent. With the
+    rows N = [normal_a; normal_b] at an intersection,
+
+        N (xy_found - xy_true) = (offset across its line of family a, offset across its line of family b).
+
+    Attributes
+    ----------
+    normal_a, normal_b
+        (n_a - 2, n_b - 2, 2) unit vector in the image across the line of family a, and of family b, at each
+        intersection [i along X_sys, j along Y_sys].
+    covariance_a
+        (n_a - 2, n_b - 2, n_b - 2) px^2: of inner line i of family a, between its offsets at intersections j and j'.
+    covariance_b
+        (n_b - 2, n_a - 2, n_a - 2) px^2: of inner line j of family b, between its offsets at intersections i and i'.
+        Both with the corners on the outermost lines marginalised.
+    """
+
+    normal_a: Float
+    normal_b: Float
+    covariance_a: Float
+    covariance_b: Float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +82,10 @@ class GridView:
     """The grid detected in one image.
 
     A grid without marks looks the same when turned by 90 or 180 degrees or mirrored: no single image distinguishes
-    them. The indices here follow the image (X_sys right and down, Y_sys left and down), so both cameras give the same
-    physical corner the same index as long as both images are upright. A turned or mirrored image is detected in the
-    calibration, whose angles then disagree with the nominal rig.
+    them. The indices here follow the image (X_sys to the right and Y_sys down, turned clockwise by ``rotation_rad``,
+    see ``GridOptions.orientation``), so both cameras give the same physical corner the same index as long as both
+    images are upright. A turned or mirrored image is detected in the calibration, whose angles then disagree with the
+    nominal rig.
 
     Attributes
     ----------
@@ -80,13 +114,17 @@ class GridView:
     threshold
         Part of the local contrast at which the image was made binary.
     rotation_rad
-        Rotation of the grid in the image, near alpha of Eq. (1).
+        Rotation of the grid in the image, near alpha of Eq. (1): the turn of X_sys from the rows, clockwise as one sees
+        the image.
     fit_rms_px
         Rms residual of the line pieces across the lines after the line model's fit.
     pieces_px
         (n, 2, 2) end points of the line pieces used, for pictures.
     pieces_used
         (n,) False for a piece that dirt or glare spoilt.
+    line_offsets
+        Joint covariance of the intersections of each line under the ``local`` model; None under the other models,
+        whose intersections all share the lines' few numbers.
     """
 
     target: GridTarget
@@ -106,6 +144,7 @@ class GridView:
     fit_rms_px: float
     pieces_px: Float
     pieces_used: Bool
+    line_offsets: LineOffsets | None = None
 
     @property
     def sigma_px(self) -> Float:

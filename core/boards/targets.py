@@ -1,0 +1,94 @@
+"""One way to find whichever target is declared, and the name of another one that an image shows instead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Float
+from core.boards.board import BoardTarget
+from core.boards.detect import detect_board, find_board
+from core.boards.naming import other_target, shown_target
+from core.boards.pictures import Pictures
+from core.boards.view import BoardView
+from core.errors import TargetError
+from core.grid import GridOptions, GridView, Localiser, detect_grid, find_grid
+from core.grid.threshold import checked_image
+from core.target import GridTarget
+
+# causes that another target than a line grid gives the search for lines
+_MAY_BE_OTHER = frozenset(
+    {"target_not_found", "target_line_count", "target_partly_seen", "target_dirty", "target_glare", "target_irregular"}
+)
+
+
+def detect_target(
+    image: NDArray[Any],
+    target: GridTarget | BoardTarget,
+    *,
+    localiser: Localiser = "profile",
+    options: GridOptions | None = None,
+) -> GridView | BoardView:
+    """Find the target declared, or name the one that is seen.
+
+    Parameters
+    ----------
+    image
+        (rows, columns) gray image.
+    target
+        Line grid or board.
+    localiser, options
+        Of line grids, see :func:`core.grid.detect_grid`.
+
+    Returns
+    -------
+    GridView or BoardView
+        After the target's kind.
+
+    Raises
+    ------
+    ImageError, TargetError
+        See :func:`core.grid.detect_grid` and :func:`core.boards.detect_board`; ``target_other`` where a line grid is
+        declared and a board is seen, too.
+    """
+    if isinstance(target, BoardTarget):
+        return detect_board(image, target)
+    try:
+        return detect_grid(image, target, localiser=localiser, options=options)
+    except TargetError as error:
+        raise _named(image, target, error) from error
+
+
+def find_target(image: NDArray[Any], target: GridTarget | BoardTarget, *, options: GridOptions | None = None) -> Float:
+    """Find the target declared coarsely and fast, for a live picture.
+
+    Parameters
+    ----------
+    image, target, options
+        As for :func:`detect_target`.
+
+    Returns
+    -------
+    Float
+        (n_x, n_y, 2) points within about half a pixel, indexed as the views of :func:`detect_target`; NaN where hidden.
+
+    Raises
+    ------
+    ImageError, TargetError
+        As :func:`detect_target`, but for what only the fit of the points shows, and without the name of another target:
+        where nothing is found, :func:`detect_target` tells why.
+    """
+    if isinstance(target, BoardTarget):
+        return find_board(image, target)
+    return find_grid(image, target, options=options)
+
+
+def _named(image: NDArray[Any], target: GridTarget, error: TargetError) -> TargetError:
+    """Return the error that names a board seen in place of a line grid; else the error itself."""
+    if error.code not in _MAY_BE_OTHER:
+        return error
+    shown = shown_target(Pictures(checked_image(np.asarray(image))), with_lines=False)
+    other = None if shown is None else other_target(shown, target)
+    return error if other is None else other
