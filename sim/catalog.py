@@ -75,8 +75,8 @@ def make_scene(
         Rigid motion on top, system frame.
     **parameters
         ``steel``: ``ra_um``. ``plate``: fields of :class:`CircularPlate`. ``panel``: fields of :class:`CrackedPanel`.
-        ``strip``: ``poisson``. ``sphere``: ``radius_mm``. Targets: ``pose`` or ``hand``, ``smear_mm``, and attributes of
-        :class:`SimTarget` such as ``node_tolerance_mm`` and ``bow_mm``. All but targets: ``speckle_mm``.
+        ``strip``: ``poisson``. ``sphere``: ``radius_mm``. Targets: ``pose`` or ``hand``, ``smear_mm``, and
+        attributes of :class:`SimTarget` such as ``node_tolerance_mm`` and ``bow_mm``. All but targets: ``speckle_mm``.
 
     Raises
     ------

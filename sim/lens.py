@@ -179,7 +179,7 @@ def _rays_of(flat: Float, xy_px: ArrayLike) -> MappedPoints:
     out = np.empty_like(points)
     scattered_rays(flat, points, out)
     out = out.reshape(xy.shape)
-    return MappedPoints(out, np.isfinite(out).all(axis=-1))
+    return MappedPoints(out, np.asarray(np.isfinite(out).all(axis=-1)))
 
 
 def warmed(lens: LensModel, shift_px: tuple[float, float], focal: float) -> LensModel:

@@ -131,12 +131,12 @@ def _smeared(
     """Mean over the body's way during the exposure, by Gauss's rule, about its pose."""
     places, weights = np.polynomial.legendre.leggauss(_SMEAR_NODES)
     way, pose = 0.5 * np.asarray(scene.smear_mm), scene.sys_from_body
-    total = 0.0
+    views = []
     for place, weight in zip(places, weights, strict=True):
         there = RigidTransform(pose.rotation, pose.translation_mm + place * way)
         still = replace(scene, sys_from_body=there, smear_mm=(0.0, 0.0, 0.0))
-        total = total + 0.5 * weight * render(still, camera, size_px, options=options, window=window)
-    return np.asarray(total)
+        views.append(0.5 * weight * render(still, camera, size_px, options=options, window=window))
+    return np.asarray(np.sum(views, axis=0))
 
 
 def _samples(

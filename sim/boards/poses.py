@@ -111,4 +111,5 @@ def _common_view(cameras: Sequence[Camera]) -> tuple[Float, Float]:
     mean = np.mean([camera.cam_from_sys.rotation for camera in cameras], axis=0)
     u, _, vt = np.linalg.svd(mean)
     nearest = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return np.linalg.lstsq(normal_matrix, rhs, rcond=None)[0], np.asarray(nearest.T)
+    centre = np.linalg.lstsq(normal_matrix, rhs, rcond=None)[0]
+    return centre.astype(np.float64), np.asarray(nearest.T)

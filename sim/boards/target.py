@@ -21,7 +21,7 @@ _MOST, _LEAST = 200, 3
 
 @dataclass(frozen=True, kw_only=True)
 class SimTarget:
-    """The calibration target: the rig file's ``[target]``, and its faults from ``[sim.target]`` or a scene's parameters.
+    """The calibration target: the rig file's ``[target]``; its faults from ``[sim.target]`` or a scene's parameters.
 
     Attributes
     ----------
@@ -161,11 +161,10 @@ class SimTarget:
 
 def target_from_tables(known: Mapping[str, Any], true: Mapping[str, Any]) -> SimTarget:
     """Read ``[target]`` and, on top of it, ``[sim.target]``."""
-    for name in (
-        "pitch_mm",
-        *(("lines", "line_width_mm") if known.get("kind", "line_grid") == "line_grid" else ("size",)),
-    ):
-        known[name]  # a KeyError names what is missing
+    own = ("lines", "line_width_mm") if known.get("kind", "line_grid") == "line_grid" else ("size",)
+    for name in ("pitch_mm", *own):
+        if name not in known:
+            raise KeyError(name)
     wanted = {name: value for name, value in known.items() if name in _FIELDS}
     return SimTarget(**_fields(wanted | dict(true))).checked()
 
