@@ -27,28 +27,58 @@ def rays(lens: Float, x0: float, y0: float, step: float, nx: Float, ny: Float) -
     ``lens`` is the flat form of :func:`sim.lens.flat_lens`.
     """
     fx, fy, skew, cx, cy, k1 = lens[1], lens[2], lens[3], lens[4], lens[5], lens[6]
+    columns = nx.shape[1]
+    xd = np.empty(columns)
     for j in range(nx.shape[0]):
         yd = (y0 + j * step - cy) / fy
         if lens[0] == SEIDEL:
-            for i in range(nx.shape[1]):
-                xd = (x0 + i * step - cx) / fx
-                q = 4.0 * k1 * (xd * xd + yd * yd)
+            for i in range(columns):
+                x = (x0 + i * step - cx) / fx
+                q = 4.0 * k1 * (x * x + yd * yd)
                 scale = 2.0 / (1.0 + np.sqrt(1.0 - q)) if q < 1.0 else np.nan
-                nx[j, i] = xd * scale
+                nx[j, i] = x * scale
                 ny[j, i] = yd * scale
-        else:
-            known = 0  # points of this row just before, in line with which the next is guessed
-            for i in range(nx.shape[1]):
-                xd = (x0 + i * step - cx - skew * yd) / fx
-                if known >= 3:
-                    gx = 3.0 * (nx[j, i - 1] - nx[j, i - 2]) + nx[j, i - 3]
-                    gy = 3.0 * (ny[j, i - 1] - ny[j, i - 2]) + ny[j, i - 3]
-                else:
-                    gx, gy = (nx[j, i - 1], ny[j, i - 1]) if known else (0.0, 0.0)
-                gx, gy, ok = _undistort(lens, xd, yd, gx, gy)
-                nx[j, i] = gx if ok else np.nan
-                ny[j, i] = gy if ok else np.nan
-                known = known + 1 if ok else 0
+            continue
+        for i in range(columns):
+            xd[i] = (x0 + i * step - cx - skew * yd) / fx
+        if j >= 3 and _undistort_row(lens, xd, yd, nx[j - 3 : j], ny[j - 3 : j], nx[j], ny[j]):
+            continue
+        gx, gy = 0.0, 0.0
+        for i in range(columns):
+            gx, gy, ok = _undistort(lens, xd[i], yd, gx, gy)
+            nx[j, i] = gx if ok else np.nan
+            ny[j, i] = gy if ok else np.nan
+            if not ok:
+                gx, gy = 0.0, 0.0
+
+
+# one step for a whole row without a branch, so that it runs on the vector unit
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _undistort_row(lens: Float, xd: Float, yd: float, before_x: Float, before_y: Float, nx: Float, ny: Float) -> bool:
+    """Write a row's directions by one Newton step from those extrapolated from three rows; return if all are exact."""
+    k1, k2, p1, p2, k3 = lens[6], lens[7], lens[8], lens[9], lens[10]
+    k4, k5, k6, r2_max = lens[11], lens[12], lens[13], lens[14]
+    wrong = 0
+    for i in range(xd.size):
+        x = 3.0 * (before_x[2, i] - before_x[1, i]) + before_x[0, i]
+        y = 3.0 * (before_y[2, i] - before_y[1, i]) + before_y[0, i]
+        r2 = x * x + y * y
+        per_den = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * per_den
+        den_slope = k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6)
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - radial * den_slope) * per_den
+        fx = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - xd[i]
+        fy = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - yd
+        a = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        b = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        d = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        per_det = 1.0 / (a * d - b * b)
+        ex, ey = (d * fx - b * fy) * per_det, (a * fy - b * fx) * per_det
+        nx[i], ny[i] = x - ex, y - ey
+        # written so that a NaN is wrong too
+        wrong += not (abs(ex) + abs(ey) < _LAST_STEP)
+        wrong += not (r2 < 0.99 * r2_max)
+    return wrong == 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -250,6 +250,7 @@ def _squares(
     n_j, n_i = squares.shape
     centre_a, centre_b = 0.5 * n_i, 0.5 * n_j
     near = _REACH_SD * sd
+    far = near + par[8] * per_mm  # from the nominal edge no point beyond is touched by the true one
     m = markers.shape[1]
     scale = par[0] * m / par[7] if par[7] > 0.0 else 0.0
     for k in range(s.size):
@@ -261,6 +262,10 @@ def _squares(
             out[k] = behind
             continue
         a, b = sk * per_mm + centre_a, tk * per_mm + centre_b
+        if scale == 0.0 and abs(a - np.floor(a + 0.5)) > far and abs(b - np.floor(b + 0.5)) > far:
+            v = _black(squares, int(np.floor(a)), int(np.floor(b)))
+            out[k] = behind + (paper + (ink - paper) * v - behind) * plate
+            continue
         if par[8] > 0.0:
             # the exact place of what the maker printed here: a fixed point, as errors are small against the pitch
             ex, ey = _error_at(errors, a - 1.0, b - 1.0)
