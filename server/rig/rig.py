@@ -184,7 +184,7 @@ class Rig:
             scene=self.scene,
             trigger=config.rig.trigger,
             max_skew_ms=config.rig.skew_bound_ms,
-            target=NominalTarget.model_validate(config.target.model_dump(mode="json")),
+            target=NominalTarget.model_validate(config.target.plain()),
             calibration_plan=UsualPlan.model_validate(config.calibration.model_dump(mode="json")),
             cameras={cam: self.describe_camera(cam) for cam in CAMERAS},
             stage=self._describe_stage_or_fault(),
