@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Float
+from core.cameras.camera import Camera
 from core.cameras.lens import LensModel, MappedPoints, OpenCVLens, SeidelLens
 from sim.ray import RATIONAL, SEIDEL, scattered_rays
 
@@ -171,6 +172,16 @@ def _own(lens: LensModel) -> SimLens:
 def normalised(lens: LensModel, xy_px: ArrayLike) -> MappedPoints:
     """Map pixels (..., 2) to normalised points (..., 2) by the simulation's own inversion."""
     return lens.normalised_from_image(xy_px) if isinstance(lens, SeidelLens) else _rays_of(flat_lens(lens), xy_px)
+
+
+def image_of(camera: Camera, points_sys_mm: ArrayLike) -> Float:
+    """Return true images (..., 2) of points (..., 3) of the system frame, by the simulation's own formula."""
+    p = camera.cam_from_sys.apply(points_sys_mm)
+    lens = camera.lens
+    skewed = isinstance(lens, OpenCVLens) and lens.skew_px != 0.0
+    own = lens if isinstance(lens, SeidelLens | SimLens) or skewed else _own(lens)
+    n = p[..., :2] / np.where(p[..., 2] > 0.0, p[..., 2], np.nan)[..., None]
+    return own.image_from_normalised(n).xy
 
 
 def _rays_of(flat: Float, xy_px: ArrayLike) -> MappedPoints:

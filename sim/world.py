@@ -138,6 +138,12 @@ class SimWorld:
             bump, share = self._bumps.get(cam, _NO_BUMP), self._warmth(cam, sim)
         return self._camera_now(sim, self._position_mm(sim.stage_axis), bump, share)
 
+    def true_scene(self, cam: CameraName) -> Scene:
+        """Return the scene where the camera's stage axis has taken it; the same as :attr:`scene` if cameras move."""
+        with self._state:
+            scene, sim = self._scene, self._sim_camera(cam)
+        return self._scene_now(scene, sim, self._position_mm(sim.stage_axis))
+
     def _warmth(self, cam: CameraName, sim: SimCamera) -> float:
         return sim.warm_up.share(self._exposures[cam], sim.size_px)
 
