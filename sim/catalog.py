@@ -134,6 +134,10 @@ def target_of(rig: SimRig, name: str, parameters: dict[str, Any]) -> SimTarget:
     kind = rig.target.kind if name == "grid" else name
     changes = {key: value for key, value in parameters.items() if key not in ("pose", "hand", "smear_mm")}
     if kind == rig.target.kind:
+        if "pitch_mm" in changes:  # a larger print, all of it
+            share = float(changes["pitch_mm"]) / rig.target.pitch_mm
+            larger = {"line_width_mm": rig.target.line_width_mm * share, "marker_mm": rig.target.marker_mm * share}
+            changes = larger | changes
         return rig.target.changed(changes)
     # another kind of target than the rig's own: of about its size, where nothing else is asked for
     pitch = float(changes.pop("pitch_mm", rig.target.pitch_mm))

@@ -47,8 +47,8 @@ class WarmUp:
     def share(self, exposures: int, size_px: tuple[int, int]) -> float:
         """Share of the drift after so many exposures, in steps that move no point by more than 0.002 px."""
         reach = float(np.hypot(*self.shift_px)) + abs(self.focal) * 0.5 * float(np.hypot(*size_px))
-        steps = reach / _WARM_STEP_PX
-        return 0.0 if steps == 0.0 else round((1.0 - np.exp(-exposures / self.frames)) * steps) / steps
+        steps = int(np.ceil(reach / _WARM_STEP_PX))
+        return 0.0 if steps == 0 else round((1.0 - np.exp(-exposures / self.frames)) * steps) / steps
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,9 @@ from sim.boards.target import SimTarget
 _TILT_DEG: Final = 40.0
 _ROLL_DEG: Final = 35.0
 _DISTANCE: Final = 0.15
-_INSIDE: Final = 0.02  # of the image, that a board keeps free at its borders
-_DRAWS: Final = 400
+_INSIDE: Final = 0.01  # of the image, that a board keeps free at its borders
+_DRAWS: Final = 200
+_HALVINGS: Final = 12
 _MOST: Final = 1_000_000
 
 
@@ -44,8 +45,9 @@ def hand_pose(
     """Return the pose in which a hand holds the target for the ``number``-th view.
 
     Tilts to 40 degrees in any direction, rolls to 35 degrees (every fourth view on its side, 90 degrees more),
-    distances to 15 % about the place where the cameras look together, and places all over the images, as long as both
-    cameras see the whole print. A target too large for that is held as far inside as the draws find.
+    distances to 15 % about the place where the cameras look together, and places all over the images, every second at
+    their borders, as long as both cameras see the field of points and most of its frame. A target too large for
+    that is held as far inside as the draws find, amid the images.
 
     Parameters
     ----------
@@ -62,32 +64,36 @@ def hand_pose(
         raise ValueError(f"hand must be a number from 0 to {_MOST}, got {number}")
     rng = np.random.default_rng([seed, number])
     centre, view = _common_view(cameras)
-    border = target.pitch_mm * (1.0 if target.kind in ("checkerboard", "charuco") else 0.5)
+    border = target.pitch_mm * (0.6 if target.kind in ("checkerboard", "charuco") else 0.5)
     half_x, half_y = (half + border for half in target.half_field_mm())
     rim = np.array([[i * half_x, j * half_y, 0.0] for j in (-1, 0, 1) for i in (-1, 0, 1)])
-    first, pinhole = cameras[0], np.mean([camera.centre_sys_mm for camera in cameras], axis=0)
+    pinhole = np.mean([camera.centre_sys_mm for camera in cameras], axis=0)
     away = float(np.linalg.norm(centre - pinhole))
-    best: tuple[float, RigidTransform] | None = None
+
+    def room(rotation: Float, at: Float) -> float:
+        points = RigidTransform(rotation, at).apply(rim)
+        return min(_room(camera, size, points) for camera, size in zip(cameras, size_px, strict=True))
+
+    best: tuple[float, RigidTransform] = (-np.inf, RigidTransform(view, centre))
     for _ in range(_DRAWS):
         tilt, about = _TILT_DEG * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
         roll = rng.uniform(-_ROLL_DEG, _ROLL_DEG) + (90.0 if number % 4 == 3 else 0.0)
-        factor = 1.0 + rng.uniform(-_DISTANCE, _DISTANCE)
-        place = rng.uniform(0.0, 1.0, 2) * size_px[0]
+        middle = centre + rng.uniform(-_DISTANCE, _DISTANCE) * away * view[:, 2]
+        towards, share = rng.uniform(0.0, 2.0 * np.pi), 1.0 if number % 2 else np.sqrt(rng.uniform())
         turn = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0]), degrees=True)
-        upright = Rotation.from_rotvec([0.0, 0.0, roll], degrees=True)
-        rotation = view @ (turn * upright).as_matrix()
-        depth_point = pinhole + factor * away * view[:, 2]
-        at = first.back_project_to_plane(place, point_sys_mm=depth_point, normal_sys=view[:, 2])
-        if not at.valid:
+        rotation = view @ (turn * Rotation.from_rotvec([0.0, 0.0, roll], degrees=True)).as_matrix()
+        inside = room(rotation, middle)
+        if inside > best[0]:
+            best = inside, RigidTransform(rotation, middle)
+        if inside < _INSIDE:
             continue
-        pose = RigidTransform(rotation, at.xyz_mm)
-        room = min(_room(camera, size, pose.apply(rim)) for camera, size in zip(cameras, size_px, strict=True))
-        if best is None or room > best[0]:
-            best = room, pose
-        if room >= _INSIDE:
-            return pose_of(pose)
-    if best is None:
-        raise ValueError("the cameras see no place where a hand could hold the target")
+        # sidewards as far as both cameras see it, and back by a share
+        side = view[:, 0] * np.cos(towards) + view[:, 1] * np.sin(towards)
+        near, far = 0.0, away
+        for _ in range(_HALVINGS):
+            half = 0.5 * (near + far)
+            near, far = (half, far) if room(rotation, middle + half * side) >= _INSIDE else (near, half)
+        return pose_of(RigidTransform(rotation, middle + share * near * side))
     return pose_of(best[1])
 
 
