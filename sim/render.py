@@ -26,8 +26,8 @@ from scipy.special import erf
 from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from sim.boards.pattern import BOARD
-from sim.lens import flat_lens, normalised
-from sim.ray import rays
+from sim.optics.lens import flat_lens, normalised
+from sim.optics.ray import rays
 from sim.scene import Scene
 from sim.texture import GRID
 

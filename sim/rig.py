@@ -19,7 +19,7 @@ from core.cameras.camera import ELEVEN_PARAMETER_NAMES, POSE_NAMES, Camera, Rigi
 from core.errors import InputError
 from core.names import CAMERAS, CameraName
 from sim.boards.target import SimTarget, target_from_tables
-from sim.lens import core_lens, lens_from_table
+from sim.optics.lens import core_lens, lens_from_table
 from sim.sensor import Lighting, Sensor
 
 STAGE_MOVES = ("cameras", "target", "both_cameras")

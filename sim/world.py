@@ -24,7 +24,7 @@ from core.errors import InputError
 from core.names import CAMERAS, CameraName
 from sim.boards.poses import transform_of
 from sim.catalog import make_scene
-from sim.lens import warmed
+from sim.optics.lens import warmed
 from sim.render import RenderOptions, render
 from sim.rig import SimCamera, SimRig
 from sim.scene import Scene

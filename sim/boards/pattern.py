@@ -125,12 +125,12 @@ def dots_board(
     marks: bool = False,
     edge_mm: float | None = None,
 ) -> BoardTexture:
-    """Return a grid of round dots; parameters as in :func:`squares_board`.
+    """Return a grid of round dots.
 
     Parameters
     ----------
-    pitch_mm, errors_mm, margin_mm, edge_mm
-        As there; ``errors_mm`` moves whole dots, the margin lies about the outermost dots.
+    pitch_mm, errors_mm, margin_mm
+        As of :func:`squares_board`; ``errors_mm`` moves whole dots, the margin lies about the outermost dots.
     dot_mm
         Diameter of a dot.
     asymmetric
@@ -138,6 +138,8 @@ def dots_board(
     marks
         Three dots are rings of half the inner diameter: three corners of a rectangle about the centre, which tell how
         the board is turned.
+    edge_mm
+        Softness of the edges (sd of the Gaussian); a 150th of the pitch by default.
     """
     rows, columns = errors_mm.shape[:2]
     edge = pitch_mm / 150.0 if edge_mm is None else edge_mm

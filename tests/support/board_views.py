@@ -27,7 +27,7 @@ from core.target import GridTarget
 from sim.boards.pattern import BEHIND
 from sim.boards.poses import hand_pose, pose_of, transform_of
 from sim.boards.target import SimTarget
-from sim.lens import SimLens, core_lens, flat_lens, image_of
+from sim.optics.lens import SimLens, core_lens, flat_lens, image_of
 from sim.render import RenderOptions, render
 from sim.rig import SimRig
 from sim.scene import Scene

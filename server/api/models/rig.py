@@ -132,8 +132,8 @@ class SceneRequest(Request):
     params: dict[str, Number | list[Number] | Annotated[str, Field(max_length=100)]] = Field(
         default_factory=dict,
         description="Further parameters of the scene. Targets: `pose` [rx, ry, rz in degrees, x, y, z in mm], a "
-        "rotation vector and a place in the system frame, or `hand`, the number of a hand's pose; `bow_mm`, `size` and others. "
-        "Any scene: `bump_cam1`, `bump_cam2`, six such numbers that knock a camera from now on.",
+        "rotation vector and a place in the system frame, or `hand`, the number of a hand's pose; `bow_mm`, `size` and "
+        "others. Any scene: `bump_cam1`, `bump_cam2`, six such numbers that knock a camera from now on.",
         max_length=20,
     )
 

@@ -12,7 +12,7 @@ from core.cameras.camera import Camera, RigidTransform
 from sim.boards.pattern import INK, PAPER
 from sim.boards.poses import transform_of
 from sim.boards.target import SimTarget
-from sim.lens import SimLens
+from sim.optics.lens import SimLens
 from sim.render import RenderOptions, material_points, render
 from sim.scene import Scene
 from sim.truth import truth_at

@@ -15,7 +15,7 @@ from core.boards import BoardTarget
 from core.errors import InputError
 from sim.boards.poses import hand_pose, pose_of, transform_of
 from sim.catalog import make_scene
-from sim.lens import image_of
+from sim.optics.lens import image_of
 from sim.render import RenderOptions, render
 from sim.rig import SimRig, SimStage, WarmUp
 from sim.world import SimWorld

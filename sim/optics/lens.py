@@ -7,7 +7,7 @@ fault of theirs:
     N = 1 + k1 r^2 + k2 r^4 + k3 r^6,  D = 1 + k4 r^2 + k5 r^4 + k6 r^6,
     x_img = fx x_d + cx,  y_img = fy y_d + cy.
 
-The way back is Newton's method, point by point, in `sim.ray`.
+The way back is Newton's method, point by point, in `sim.optics.ray`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from core.arrays import Float
 from core.cameras.camera import Camera
 from core.cameras.lens import LensModel, MappedPoints, OpenCVLens, SeidelLens
-from sim.ray import RATIONAL, SEIDEL, scattered_rays
+from sim.optics.ray import RATIONAL, SEIDEL, scattered_rays
 
 LENS_KEYS: Final = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
@@ -144,7 +144,7 @@ def core_lens(lens: SimLens) -> LensModel:
 
 
 def flat_lens(lens: LensModel) -> Float:
-    """Flat (16,) form for `sim.ray`: kind, fx, fy, skew, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, largest r^2, 0.
+    """Flat (16,) form for `sim.optics.ray`: kind, fx, fy, skew, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, largest r^2, 0.
 
     The paper's lens has ``kappa phd^2`` in place of k1. Only attributes are read, never the core's flat form.
     """

@@ -24,7 +24,7 @@ _SHRINK: Final = 0.98
 def rays(lens: Float, x0: float, y0: float, step: float, nx: Float, ny: Float) -> None:
     """Write the directions (nx, ny, 1) of the points (x0 + i step, y0 + j step) into (rows, columns); NaN: no ray.
 
-    ``lens`` is the flat form of :func:`sim.lens.flat_lens`.
+    ``lens`` is the flat form of :func:`sim.optics.lens.flat_lens`.
     """
     fx, fy, skew, cx, cy, k1 = lens[1], lens[2], lens[3], lens[4], lens[5], lens[6]
     columns = nx.shape[1]
