@@ -50,6 +50,7 @@ BLOCK_ROTATION_RAD = (0.01, -0.015, 0.03)
 _LAY_RAD = 0.35  # the steel's lay against the vertical
 _STEEL_SEED, _SPECKLE_SEED = 1, 2  # separate streams of random numbers of one rig
 _BEHIND = 0.04
+_WIDEST_SMEAR_MM = 1e3
 
 
 def make_scene(
@@ -104,7 +105,7 @@ def make_scene(
             sys_from_body=_moved(_mounting(name), *motion),
             background=_BEHIND,
         )
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(
             f"The scene {name!r} cannot be made: {error}.", code="scene_invalid", remedy="Correct load or parameter."
         ) from error
@@ -166,7 +167,7 @@ def _target(rig: SimRig, name: str, motion: _Motion, parameters: dict[str, Any])
     at = RigidTransform.identity() if pose is None else transform_of(pose)
     texture, background = target.texture(rig.seed), target.background
     x, y, z = (float(v) for v in parameters.get("smear_mm", (0.0, 0.0, 0.0)))
-    if not np.isfinite([x, y, z]).all():
+    if not (np.abs([x, y, z]) < _WIDEST_SMEAR_MM).all():
         raise ValueError(f"smear_mm is [{x:g}, {y:g}, {z:g}]")
     half = (np.inf, np.inf) if background is not None else _half_plate(texture)
     return Scene(

@@ -23,12 +23,13 @@ _INSIDE: Final = 0.01  # of the image, that a board keeps free at its borders
 _DRAWS: Final = 200
 _HALVINGS: Final = 12
 _MOST: Final = 1_000_000
+_FARTHEST: Final = 1e6
 
 
 def transform_of(pose: Sequence[float]) -> RigidTransform:
-    """Return sys_from_target of a pose; ValueError if it is not six finite numbers."""
+    """Return sys_from_target of a pose; ValueError if it is not six numbers of less than a million."""
     numbers = np.asarray(pose, dtype=np.float64)
-    if numbers.shape != (6,) or not np.isfinite(numbers).all():
+    if numbers.shape != (6,) or not (np.abs(numbers) < _FARTHEST).all():
         raise ValueError(f"pose must be [rx_deg, ry_deg, rz_deg, x_mm, y_mm, z_mm], got {pose}")
     return RigidTransform(Rotation.from_rotvec(numbers[:3], degrees=True).as_matrix(), numbers[3:])
 

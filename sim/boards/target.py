@@ -16,7 +16,8 @@ from sim.texture import Texture, line_grid
 
 TARGET_KINDS: Final = ("line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric")
 _CHROME, _BACKLIT = 0.03, 0.9
-_MOST, _LEAST = 200, 3
+_MOST, _LEAST, _MOST_LINES = 200, 3, 501
+_LEAST_PITCH_MM, _MOST_PITCH_MM, _MOST_PITCH_ERROR = 1e-3, 1e4, 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,17 +142,23 @@ class SimTarget:
         """
         if self.kind not in TARGET_KINDS:
             raise ValueError(f"target.kind must be one of {', '.join(TARGET_KINDS)}, got {self.kind!r}")
-        if not self.pitch_mm > 0.0:
+        if not _LEAST_PITCH_MM <= self.pitch_mm <= _MOST_PITCH_MM:
             raise ValueError(f"target.pitch_mm is {self.pitch_mm:g}")
         if self.kind == "line_grid":
             if not self.line_width_mm > 0.0:
                 raise ValueError(f"target.line_width_mm is {self.line_width_mm:g}")
+            if not all(2 <= n <= _MOST_LINES for n in self.lines):
+                raise ValueError(f"target.lines must lie between 2 and {_MOST_LINES} each way, got {list(self.lines)}")
         elif not all(_LEAST <= n <= _MOST for n in self.size):
             raise ValueError(f"target.size must lie between {_LEAST} and {_MOST} each way, got {list(self.size)}")
         if self.kind == "charuco" and not 0.0 < self.marker_mm < self.pitch_mm:
             raise ValueError(f"target.marker_mm must lie between 0 and the pitch, got {self.marker_mm:g}")
         if not 0.0 <= self.node_tolerance_mm < 0.1 * self.pitch_mm:
             raise ValueError(f"target.node_tolerance_mm is {self.node_tolerance_mm:g} of a pitch of {self.pitch_mm:g}")
+        if not abs(self.pitch_error) < _MOST_PITCH_ERROR:
+            raise ValueError(f"target.pitch_error is {self.pitch_error:g}")
+        if self.edge_mm is not None and not self.edge_mm > 0.0:
+            raise ValueError(f"target.edge_mm is {self.edge_mm:g}")
         return self
 
     def changed(self, parameters: Mapping[str, Any]) -> SimTarget:

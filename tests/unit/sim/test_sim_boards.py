@@ -255,6 +255,9 @@ def test_a_target_that_makes_no_sense_is_refused() -> None:
         ({"kind": "charuco", "size": (9, 6), "marker_mm": 9.0}, "marker_mm"),
         ({"kind": "circles", "size": (9, 6), "node_tolerance_mm": 3.0}, "node_tolerance_mm"),
         ({"kind": "circles", "size": (9, 6), "bow_mm": float("nan")}, "bow_mm"),
+        ({"kind": "circles", "size": (9, 6), "pitch_error": 0.5}, "pitch_error"),
+        ({"lines": (100_000, 100_000), "line_width_mm": 0.1}, "lines"),
+        ({"pitch_mm": 1e-300, "kind": "circles", "size": (9, 6)}, "pitch_mm"),
         ({"colour": 3}, "colour"),
     ):
         with pytest.raises(ValueError, match=word):
