@@ -9,8 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from core.arrays import Float
+from sim.boards.dots import dots_board
 from sim.boards.markers import charuco_squares, checkerboard_squares
-from sim.boards.pattern import dots_board, field_points, squares_board
+from sim.boards.pattern import field_points
+from sim.boards.squares import squares_board
 from sim.surface import Surface, bowl, flat
 from sim.texture import Texture, line_grid
 
@@ -40,7 +42,7 @@ class SimTarget:
         Rise of the bent board at half the longer side of its field of points, positive away from the viewer.
     dot_mm, margin_mm, edge_mm
         Diameter of a dot (half the pitch if None), white margin (one pitch if None), softness of the edges (see
-        `sim.boards.pattern` if None).
+        `sim.boards.squares` if None).
     marks
         Three dots of a symmetric grid are rings.
     """
