@@ -14,13 +14,7 @@ from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 
-CHANGE_NAMES = (
-    "rotation_x_rad",
-    "rotation_y_rad",
-    "rotation_z_rad",
-    "baseline_forward_rad",
-    "baseline_sideways_rad",
-)
+CHANGE_NAMES = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "baseline_forward_rad", "baseline_sideways_rad")
 LEVER = 0.3
 """Shift of a pinhole over baseline and turn: cameras turn about their mounts, some tenths of a baseline away."""
 _STEP_RAD = 1e-5

@@ -12,6 +12,7 @@ from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
 from core.orientation.change import point_slopes
 from core.orientation.matched import MatchedPoints
+from core.robust import spread_indices
 
 _AT_MOST = 2000
 
@@ -61,7 +62,9 @@ def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covar
     Consequence or None
         None if fewer than ten points can be triangulated.
     """
-    some = np.unique(np.linspace(0, len(points.xy1_px) - 1, _AT_MOST).astype(int)) if len(points.xy1_px) else []
+    if len(points.xy1_px) == 0:
+        return None
+    some = np.unique(spread_indices(len(points.xy1_px), _AT_MOST))
     xy1, xy2 = points.xy1_px[some], points.xy2_px[some]
     xyz = pair.triangulate(xy1, xy2).xyz_mm
     slopes = point_slopes(pair, xy1, xy2)

@@ -16,7 +16,7 @@ from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
 from core.orientation.change import changed, offset_slopes, plausible_bump
 from core.orientation.matched import MatchedPoints
-from core.orientation.noise import blocks_of, robust_weights, effective_variance
+from core.orientation.noise import blocks_of, effective_variance, robust_weights
 
 #: smallest and largest bump that the prior takes for plausible, rad
 _SMALLEST_RAD, _LARGEST_RAD = 2e-5, 0.1
@@ -60,11 +60,7 @@ class OrientationEstimate:
 
 
 def estimate_change(
-    pair: StereoPair,
-    points: MatchedPoints,
-    offset_px: Float | None = None,
-    *,
-    bump_rad: float | None = None,
+    pair: StereoPair, points: MatchedPoints, offset_px: Float | None = None, *, bump_rad: float | None = None
 ) -> OrientationEstimate:
     """Estimate the change of the relative orientation.
 

@@ -217,9 +217,7 @@ def judge_offsets(
     return _with_text(finding)
 
 
-def _less(
-    points: MatchedPoints, offset_px: Float, earlier: MatchedPoints, earlier_px: Float
-) -> tuple[Float, Float]:
+def _less(points: MatchedPoints, offset_px: Float, earlier: MatchedPoints, earlier_px: Float) -> tuple[Float, Float]:
     """Offsets less the smooth part of earlier ones at the same place of the image, and its covariance (6, 6).
 
     At the same place: an error of the calibration belongs to the image, not to the point of the specimen.

@@ -48,4 +48,4 @@ def effective_variance(design: Float, weights: Float, values: Float, blocks: NDA
     sums = np.stack([np.bincount(blocks, weights=column, minlength=count) for column in (basis * left[:, None]).T])
     shared = float((sums**2).sum()) / max(k, 1) * count / max(count - k, 1)
     own = float(left @ left) / max(float(weights.sum()) - k, 1.0)
-    return max(shared, own, _FLOOR_PX**2)
+    return float(max(shared, own, _FLOOR_PX**2))

@@ -20,7 +20,7 @@ from core.field.region.region import PointGrid
 from core.field.seeding.search_region import box_around
 from core.field.settings import MeasureOptions
 from core.measure import measure_shape
-from core.orientation.change import LEVER, changed, changes_between
+from core.orientation.change import changed, changes_between
 from core.orientation.coarse import coarse_change, feature_matches
 from core.orientation.consequence import Consequence, consequence_of
 from core.orientation.estimate import OrientationEstimate, estimate_change
@@ -29,6 +29,9 @@ from core.orientation.structure import structure_left_px
 from core.progress import CancelToken, Progress, no_progress
 
 _ROUNDS = 2
+_FORWARD_OVER_TURN = 1.5
+"""A turn of camera 1 turns the baseline by as much, one of camera 2 not at all. A lens that is focused anew magnifies,
+which looks like a camera that came nearer without turning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,18 +162,20 @@ def _checked(
             f"Offsets of {structure:.3f} px across the epipolar lines are left that no orientation explains, "
             f"at most {limits.structure_px:g} px are allowed.",
             code="repair_structure",
-            remedy="A lens, its focus or its aperture has changed, or the calibration is another rig's: calibrate again.",
+            remedy="A lens or its focus has changed, or the calibration is another rig's: calibrate again.",
             structure_px=structure,
         )
-    forward, turn = float(change[3]), float(np.abs(change[:3]).max())
+    forward, turn = float(change[3]), float(np.linalg.norm(change[:3]))
     sigma = float(np.sqrt(estimate.covariance[3, 3]))
-    if abs(forward) - 3.0 * sigma > 0.5 * LEVER * 10.0 * max(turn, 0.0):
+    if abs(forward) - 3.0 * sigma > _FORWARD_OVER_TURN * turn:
         raise CalibrationError(
             f"Only a camera that came {abs(forward) * new.baseline_mm:.2g} mm nearer or went farther, "
             "with hardly a turn, explains the offsets.",
             code="repair_structure",
             remedy="That is how a changed focus or lens shows: calibrate again.",
         )
+    # about the new pair: what is done with the estimate is done there
+    estimate = estimate_change(new, points, bump_rad=estimate.bump_rad)
     consequence = consequence_of(new, points, change, estimate.covariance)
     if consequence is None or consequence.strain_sigma_microstrain * 1e-6 > limits.strain:
         sigma_text = "unknown" if consequence is None else f"{consequence.strain_sigma_microstrain:.3g} microstrain"
@@ -187,7 +192,7 @@ def _check_size(change: Float, limits: RepairLimits) -> None:
     turn = float(np.degrees(max(np.linalg.norm(change[:3]), np.linalg.norm(change[3:]))))
     if turn > limits.turn_deg:
         raise CalibrationError(
-            f"The cameras have turned by {turn:.2f} degrees against each other, at most {limits.turn_deg:g} are allowed.",
+            f"The cameras turned by {turn:.2f} degrees against each other, {limits.turn_deg:g} are allowed.",
             code="repair_too_large",
             remedy="Calibrate again, or check that calibration and images belong together.",
         )

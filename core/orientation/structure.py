@@ -27,7 +27,9 @@ def structure_left_px(points: MatchedPoints, offset_px: Float, *, order: int) ->
             terms = terms[:, :1]
         weights = np.ones(len(values))
         for _ in range(4):
-            smooth = terms @ np.linalg.lstsq(terms * np.sqrt(weights)[:, None], values * np.sqrt(weights), rcond=1e-9)[0]
+            smooth = (
+                terms @ np.linalg.lstsq(terms * np.sqrt(weights)[:, None], values * np.sqrt(weights), rcond=1e-9)[0]
+            )
             weights, _ = robust_weights(values - smooth)
         blocks = blocks_of(points.xy1_px[of_step], points.step[of_step])
         by_noise = effective_variance(terms, weights, values, blocks) * terms.shape[1]
