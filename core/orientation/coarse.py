@@ -45,7 +45,7 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
     sigma = _FEATURE_SIGMA_PX * max(1.0, float(scale))
     if len(xy1) < MIN_MATCHES:
         raise _no_match(len(xy1), 0)
-    prior: Float = np.linalg.inv(plausible_bump(pair)) / _BUMP_RAD**2
+    prior = np.asarray(np.linalg.inv(plausible_bump(pair)) / _BUMP_RAD**2, dtype=np.float64)
     inliers = _most_agreeing(pair, xy1, xy2, prior, sigma)
     change = np.zeros(5)
     for limit in (_WIDE_PX, _WIDE_PX, 5.0, 4.0, 3.0, 3.0, 3.0):
