@@ -32,6 +32,20 @@ def feature_matches(image1: MeasureImage, image2: MeasureImage, box: Box, step: 
     return MatchedPoints.of(one.xy_px[pairs[:, 0]], two.xy_px[pairs[:, 1]], step), scale
 
 
+def features_off_px(pair: StereoPair, image1: MeasureImage, image2: MeasureImage) -> float | None:
+    """Return how far feature matches that agree with one orientation lie off their epipolar lines, px, their median.
+
+    None where no orientation agrees with enough of them.
+    """
+    matches, scale = feature_matches(image1, image2, (0, 0, image1.shape[1], image1.shape[0]), 0)
+    try:
+        moved = changed(pair, coarse_change(pair, matches, scale=scale))
+    except CalibrationError:
+        return None
+    on_line = np.abs(moved.epipolar_residual_px(matches.xy1_px, matches.xy2_px)) < 3.0 * _FEATURE_SIGMA_PX * scale
+    return float(np.median(np.abs(pair.epipolar_residual_px(matches.xy1_px, matches.xy2_px)[on_line])))
+
+
 def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -> Float:
     """Return the change (5,) that most feature matches agree with, within some tenths of a pixel.
 

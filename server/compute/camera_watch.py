@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.cameras.stereo import StereoPair
+from core.errors import SeedError
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.settings import MeasureOptions
 from core.orientation import judge_offsets
+from core.orientation.coarse import features_off_px
 from core.orientation.finding import Against
 from core.orientation.matched import MatchedPoints, matched_points
 from core.orientation.step import SAMPLE, step_points
 from server.formats.results.camera_motion import CameraMotion
 
 _KEPT = 3
+_FAR_PX = 3.0  # the matcher finds points up to there
 Images = tuple[MeasureImage, MeasureImage]
 
 
@@ -47,6 +51,30 @@ class CameraWatch:
     own_px: float | None
     imported: bool
     _points: dict[int, MatchedPoints | None] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def explaining(self, n: int, images: Images) -> Iterator[None]:
+        """Say so where a step has no start because a camera turned too far for its epipolar lines.
+
+        Raises
+        ------
+        SeedError
+            ``camera_moved`` in place of ``not_seeded``.
+        """
+        try:
+            yield
+        except SeedError as error:
+            off_px = features_off_px(self.pair, *images)
+            if off_px is None or off_px < _FAR_PX or self.imported:
+                raise
+            raise SeedError(
+                f"Step {n}: most feature matches between both cameras lie about {off_px:.0f} px off their epipolar "
+                "lines: a camera moved, or the calibration belongs to another set-up.",
+                code="camera_moved",
+                remedy="Repair the calibration from steps taken since (stereorig calibration repair), or calibrate "
+                "again.",
+                offset_px=off_px,
+            ) from error
 
     def judge(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +93,9 @@ def repair_from_files(
         progress=progress,
         cancel=cancel,
     )
-    used = [
+    used: list[dict[str, Any]] = [
         {
-            cam: {"file": f"{path.parent.name}/{path.name}", "sha256": sha256}
+            cam: {"file": str(Path(*path.parts[-2:])), "sha256": sha256}
             for cam, path, sha256 in zip(CAMERAS, step.files, step.sha256, strict=True)
         }
         for step in steps
@@ -143,7 +143,7 @@ def repair_calibration(task: RepairTask) -> dict[str, Any]:
         mask=None if task.mask is None else read_mask(task.mask),
         subset_px=task.subset_px,
         spacing_px=task.spacing_px,
-        limits=RepairLimits(**task.limits),
+        limits=replace(RepairLimits(), **task.limits),
         progress=channel.progress,
         cancel=channel,
     )

@@ -29,6 +29,7 @@ from core.settings import StoredSettings
 from core.strain import StrainOptions
 from server.compute.camera_watch import CameraWatch
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
+from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import own_px_of, rbe_of, volume_of
 from server.formats.files import sha256_of, write_bytes
@@ -111,7 +112,7 @@ class SequenceMeasurement:
             self.calibration.pair,
             self.options,
             self.reference.n,
-            None if self._volume is None else self._volume.covariance,
+            covariance_in(self.calibration.details, name="calibration.json"),
             own_px_of(self.calibration),
             self.calibration.imported,
         )
@@ -166,14 +167,16 @@ class SequenceMeasurement:
             more["seeds"] = seeds
         self.steps[step.n] = step
         if step.n == self.reference.n:
-            result = self.pair.shape(self.grid, self.options, **more)
+            with self._watch.explaining(step.n, (self.pair.image1, self.pair.image2)):
+                result = self.pair.shape(self.grid, self.options, **more)
         else:
             shape = self._field(self.reference.n)
             previous_step = None
             if previous is not None and previous != self.reference.n:
                 previous_step = PreviousStep(previous, self._field(previous))
             images = images or self.read(step)
-            result = self._updating(shape).measure(images, previous_step, **more)
+            with self._watch.explaining(step.n, images):
+                result = self._updating(shape).measure(images, previous_step, **more)
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
         self._motions[step.n] = self._watch.judge(
             step.n,

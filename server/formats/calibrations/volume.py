@@ -54,6 +54,6 @@ def rbe_of(calibration: LoadedCalibration) -> float | None:
 
 
 def own_px_of(calibration: LoadedCalibration) -> float | None:
-    """Return the calibration's own epipolar offset at most, px: of both images' reprojection errors; None if unknown."""
+    """Return the calibration's own epipolar offset at most, px: from both images' residuals; None if unknown."""
     rbe = rbe_of(calibration)
     return None if rbe is None else 2.0 * rbe

@@ -8,6 +8,7 @@ from server.api.models import CalibrationAccepted, RepairRequest
 from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
+from server.base.models import Ids
 from server.workflows.calibration_repair import begin
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
@@ -22,7 +23,7 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 def repair_calibration(
     service: ServiceDep, calibration_id: CalibrationId, body: RepairRequest, key: KeyHeader = None
 ) -> CalibrationAccepted:
-    """Estimate the cameras' relative orientation from the speckle of steps taken after the bump; make a new calibration.
+    """Make a new calibration: the cameras' relative orientation is estimated from the speckle of steps after the bump.
 
     The old one is kept as it is; `plan.repaired_from` of the new one names it, `repair` has the finding. The length of
     the baseline is kept, the covariance widened. The job fails with a `repair_...` code where it does not hold.
@@ -30,7 +31,7 @@ def repair_calibration(
     request = mark(f"calibrations/{calibration_id}:repair", key, body)
     region = body.region
 
-    def make() -> dict[str, str]:
+    def make() -> Ids:
         return begin(
             service,
             calibration_id,
