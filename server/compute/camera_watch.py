@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -52,21 +51,16 @@ class CameraWatch:
     imported: bool
     _points: dict[int, MatchedPoints | None] = field(default_factory=dict)
 
-    @contextlib.contextmanager
-    def explaining(self, n: int, images: Images) -> Iterator[None]:
-        """Say so where a step has no start because a camera turned too far for its epipolar lines.
+    def refuse_moved(self, n: int, images: Images, cause: Exception | None = None) -> None:
+        """Raise an error for a step without a match, if a camera turned too far for its epipolar lines.
 
         Raises
         ------
         SeedError
-            ``camera_moved`` in place of ``not_seeded``.
+            ``camera_moved``.
         """
-        try:
-            yield
-        except SeedError as error:
-            off_px = features_off_px(self.pair, *images)
-            if off_px is None or off_px < _FAR_PX or self.imported:
-                raise
+        off_px = None if self.imported else features_off_px(self.pair, *images)
+        if off_px is not None and off_px > _FAR_PX:
             raise SeedError(
                 f"Step {n}: most feature matches between both cameras lie about {off_px:.0f} px off their epipolar "
                 "lines: a camera moved, or the calibration belongs to another set-up.",
@@ -74,7 +68,7 @@ class CameraWatch:
                 remedy="Repair the calibration from steps taken since (stereorig calibration repair), or calibrate "
                 "again.",
                 offset_px=off_px,
-            ) from error
+            ) from cause
 
     def judge(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ def repair_calibration(task: RepairTask) -> dict[str, Any]:
         mask=None if task.mask is None else read_mask(task.mask),
         subset_px=task.subset_px,
         spacing_px=task.spacing_px,
-        limits=replace(RepairLimits(), **task.limits),
+        limits=RepairLimits(turn_deg=task.limits["turn_deg"], strain=task.limits["strain"]),
         progress=channel.progress,
         cancel=channel,
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError
+from core.errors import FileFormatError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
@@ -167,16 +167,15 @@ class SequenceMeasurement:
             more["seeds"] = seeds
         self.steps[step.n] = step
         if step.n == self.reference.n:
-            with self._watch.explaining(step.n, (self.pair.image1, self.pair.image2)):
-                result = self.pair.shape(self.grid, self.options, **more)
+            own = self.pair.image1, self.pair.image2
+            result = self._matched(step.n, own, lambda: self.pair.shape(self.grid, self.options, **more))
         else:
             shape = self._field(self.reference.n)
             previous_step = None
             if previous is not None and previous != self.reference.n:
                 previous_step = PreviousStep(previous, self._field(previous))
             images = images or self.read(step)
-            with self._watch.explaining(step.n, images):
-                result = self._updating(shape).measure(images, previous_step, **more)
+            result = self._matched(step.n, images, lambda: self._updating(shape).measure(images, previous_step, **more))
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
         self._motions[step.n] = self._watch.judge(
             step.n,
@@ -187,6 +186,17 @@ class SequenceMeasurement:
             before=lambda n: (self._field(n), self._previous_images(n)),
         )
         self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
+        return result
+
+    def _matched(self, n: int, images: Pair, measure: Callable[[], Field]) -> Field:
+        """Return what is measured; where nothing matches, say so if a camera turned too far."""
+        try:
+            result = measure()
+        except SeedError as error:
+            self._watch.refuse_moved(n, images, error)
+            raise
+        if not result.valid.any():
+            self._watch.refuse_moved(n, images)
         return result
 
     def finish(
