@@ -35,7 +35,7 @@ def feature_matches(image1: MeasureImage, image2: MeasureImage, box: Box, step: 
 def features_off_px(pair: StereoPair, image1: MeasureImage, image2: MeasureImage) -> float | None:
     """Return how far feature matches that agree with one orientation lie off their epipolar lines, px, their median.
 
-    None where no orientation agrees with enough of them.
+    Of reduced images less, by the factor that features are found less well. None where no orientation agrees with enough of them.
     """
     matches, scale = feature_matches(image1, image2, (0, 0, image1.shape[1], image1.shape[0]), 0)
     try:
@@ -43,7 +43,8 @@ def features_off_px(pair: StereoPair, image1: MeasureImage, image2: MeasureImage
     except CalibrationError:
         return None
     on_line = np.abs(moved.epipolar_residual_px(matches.xy1_px, matches.xy2_px)) < 3.0 * _FEATURE_SIGMA_PX * scale
-    return float(np.median(np.abs(pair.epipolar_residual_px(matches.xy1_px, matches.xy2_px)[on_line])))
+    off = np.abs(pair.epipolar_residual_px(matches.xy1_px, matches.xy2_px)[on_line])
+    return float(np.median(off)) / max(1.0, scale / 2.0)
 
 
 def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -> Float:

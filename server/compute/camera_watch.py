@@ -21,7 +21,7 @@ from core.orientation.step import SAMPLE, step_points
 from server.formats.results.camera_motion import CameraMotion
 
 _KEPT = 3
-_FAR_PX = 3.0  # the matcher finds points up to there
+_FAR_PX = 1.0  # starts are looked for within 1.5 px of the epipolar line, features found to 0.7 px
 Images = tuple[MeasureImage, MeasureImage]
 
 
@@ -62,7 +62,7 @@ class CameraWatch:
         off_px = None if self.imported else features_off_px(self.pair, *images)
         if off_px is not None and off_px > _FAR_PX:
             raise SeedError(
-                f"Step {n}: most feature matches between both cameras lie about {off_px:.0f} px off their epipolar "
+                f"Step {n}: most feature matches between both cameras lie about {off_px:.1f} px off their epipolar "
                 "lines: a camera moved, or the calibration belongs to another set-up.",
                 code="camera_moved",
                 remedy="Repair the calibration from steps taken since (stereorig calibration repair), or calibrate "
