@@ -35,7 +35,8 @@ def feature_matches(image1: MeasureImage, image2: MeasureImage, box: Box, step: 
 def features_off_px(pair: StereoPair, image1: MeasureImage, image2: MeasureImage) -> float | None:
     """Return how far feature matches that agree with one orientation lie off their epipolar lines, px, their median.
 
-    Of reduced images less, by the factor that features are found less well. None where no orientation agrees with enough of them.
+    Of reduced images less, by the factor that features are found less well. None where no orientation agrees with
+    enough of them.
     """
     matches, scale = feature_matches(image1, image2, (0, 0, image1.shape[1], image1.shape[0]), 0)
     try:
