@@ -11,6 +11,7 @@ from core.field.points.features import Box, detect, match
 from core.field.points.images import MeasureImage
 from core.field.seeding.search_region import scales
 from core.orientation.change import changed, offset_slopes, plausible_bump
+from core.orientation.estimate import estimate_change
 from core.orientation.matched import MatchedPoints
 
 _BUMP_RAD = 0.05
@@ -78,7 +79,9 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
     by_chance = len(xy1) * 6.0 * sigma / max(float(np.ptp(xy2[:, 1])), 1.0)
     if inliers.sum() < 3.0 * by_chance:
         raise _no_match(len(xy1), int(inliers.sum()))
-    return change
+    # what the matches do not determine is as small as what they do
+    agreeing = MatchedPoints(xy1[inliers], xy2[inliers], matches.step[finite][inliers])
+    return estimate_change(pair, agreeing).change
 
 
 def _most_agreeing(pair: StereoPair, xy1: Float, xy2: Float, prior: Float, sigma: float) -> Bool:

@@ -20,7 +20,7 @@ from core.field.region.region import PointGrid
 from core.field.seeding.search_region import box_around
 from core.field.settings import MeasureOptions
 from core.measure import measure_shape
-from core.orientation.change import changed, changes_between
+from core.orientation.change import changed
 from core.orientation.coarse import coarse_change, feature_matches
 from core.orientation.consequence import Consequence, consequence_of
 from core.orientation.estimate import OrientationEstimate, estimate_change
@@ -131,7 +131,6 @@ def repair_orientation(
     report("features", 1, 1)
     matches = MatchedPoints.joined([m for m, _ in found])
     now = changed(pair, coarse_change(pair, matches, scale=max(scale for _, scale in found)))
-    _check_size(changes_between(pair, now), limits)
     for _ in range(_ROUNDS):
         parts = [
             matched_points(now, measure_shape(now, one, two, grid, options, progress=progress, cancel=cancel), k)
