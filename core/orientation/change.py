@@ -81,6 +81,22 @@ def plausible_bump(pair: StereoPair) -> Float:
     return np.asarray(sum(J @ J.T for J in (of_camera1, of_camera2, of_shift)))
 
 
+def pinhole_shift(pair: StereoPair, change: Float) -> tuple[Float, Float]:
+    """Return the shift (2,) of a pinhole across the baseline, over its length, and its derivatives (2, 5).
+
+    The smaller one of two: camera 2 alone was bumped, or camera 1 alone, whose turn turns the baseline's direction.
+    """
+    centre, axes = _baseline(pair)
+    unit = centre / np.linalg.norm(centre)
+    of_2 = np.zeros((2, 5))
+    of_2[:, 3:] = np.eye(2)
+    of_1 = of_2.copy()
+    back = -pair.cam2_from_cam1.rotation.T  # camera 1's turn, in its own frame, that looks like camera 2's
+    of_1[:, :3] = -np.array([[axis @ np.cross(turn, unit) for turn in np.eye(3)] for axis in axes]) @ back
+    ways = [(J @ change, J) for J in (of_2, of_1)]
+    return min(ways, key=lambda way: float(np.linalg.norm(way[0])))
+
+
 def _baseline(pair: StereoPair) -> tuple[Float, Float]:
     """Camera 2's pinhole in camera 1's frame (3,), and the unit vectors (2, 3) of its two turns."""
     centre = np.array(pair.cam2_from_cam1.inverse().translation_mm)

@@ -62,6 +62,10 @@ def repaired_covariance(
         axis=1,
     )
     out[np.ix_(pose, pose)] += own @ repair.estimate.covariance @ own.T
+    length = (_with_length(repair.pair, 1.0 + _STEP_RAD) - _with_length(repair.pair, 1.0 - _STEP_RAD)) / (
+        2.0 * _STEP_RAD
+    )
+    out[np.ix_(pose, pose)] += repair.length_sigma**2 * np.outer(length, length)
     return np.asarray(0.5 * (out + out.T))
 
 
@@ -74,6 +78,13 @@ def _pose_slope(repair: Repair, ahead: StereoPair, back: StereoPair) -> Float:
     difference = poses[0] - poses[1]
     difference[:3] = (difference[:3] + np.pi) % (2.0 * np.pi) - np.pi
     return np.asarray(difference)
+
+
+def _with_length(pair: StereoPair, factor: float) -> Float:
+    """Camera 2's pose with the baseline's length multiplied."""
+    relative = pair.cam2_from_cam1
+    scaled = RigidTransform(relative.rotation, relative.translation_mm * factor)
+    return pose_parameters(StereoPair(pair.cam1, Camera(pair.cam2.lens, scaled @ pair.cam1.cam_from_sys)))
 
 
 def _with_relative_pose(repaired: StereoPair, old: StereoPair) -> StereoPair:

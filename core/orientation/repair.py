@@ -7,7 +7,7 @@ matches give a coarse orientation, the correlation at the points the final one, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from core.field.region.region import PointGrid
 from core.field.seeding.search_region import box_around
 from core.field.settings import MeasureOptions
 from core.measure import measure_shape
-from core.orientation.change import changed
+from core.orientation.change import changed, pinhole_shift
 from core.orientation.coarse import coarse_change, feature_matches
 from core.orientation.consequence import Consequence, consequence_of
 from core.orientation.estimate import OrientationEstimate, estimate_change
@@ -74,6 +74,9 @@ class Repair:
         Root mean square of the smooth offset, with the old pair and with the new one.
     structure_px
         Of ``after_px``, what lies beyond noise and is of no orientation.
+    length_sigma
+        Standard uncertainty of the baseline's length from the bump, 1 = 100 %: a pinhole is taken to have shifted along
+        the baseline, where the offsets do not show it, as far as it is seen to have shifted across.
     consequence
         Of the change; its standard deviations are those of the repaired pair.
     """
@@ -85,6 +88,7 @@ class Repair:
     before_px: float
     after_px: float
     structure_px: float
+    length_sigma: float
     consequence: Consequence
 
 
@@ -176,15 +180,36 @@ def _checked(
     # about the new pair: what is done with the estimate is done there
     estimate = estimate_change(new, points, bump_rad=estimate.bump_rad)
     consequence = consequence_of(new, points, change, estimate.covariance)
+    shift, slopes = pinhole_shift(old, change)
+    seen = float(shift @ shift) - float(np.trace(slopes @ estimate.covariance @ slopes.T))
+    length_sigma = float(np.sqrt(0.5 * max(seen, 0.0)))
+    if consequence is not None:
+        consequence = _with_length(consequence, new, points, length_sigma)
     if consequence is None or consequence.strain_sigma_microstrain * 1e-6 > limits.strain:
         sigma_text = "unknown" if consequence is None else f"{consequence.strain_sigma_microstrain:.3g} microstrain"
         raise CalibrationError(
             f"The repaired orientation would leave shapes with an uncertainty of {sigma_text}, at most "
-            f"{limits.strain * 1e6:g} are allowed: over so narrow a field the offsets do not determine it.",
+            f"{limits.strain * 1e6:g} are allowed: the view is too narrow for the offsets to tell, or a pinhole shifted.",
             code="repair_uncertain",
             remedy="Give a larger region and steps at other depths and tilts, or calibrate again.",
         )
-    return Repair(new, change, estimate, points, before, after, structure, consequence)
+    return Repair(new, change, estimate, points, before, after, structure, length_sigma, consequence)
+
+
+def _with_length(found: Consequence, pair: StereoPair, points: MatchedPoints, length_sigma: float) -> Consequence:
+    """Add the uncertainty of the common scale to that of the change."""
+    xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
+    depth = pair.cam1.cam_from_sys.apply(xyz)[:, 2]
+    size = float(np.sqrt(np.nanmean(((xyz - np.nanmean(xyz, axis=0)) ** 2).sum(axis=1))))
+    far = float(np.sqrt(np.nanmean(depth**2)))
+    um = 1e3 * length_sigma
+    return replace(
+        found,
+        shape_sigma_um=float(np.hypot(found.shape_sigma_um, um * size)),
+        z_sigma_um=float(np.hypot(found.z_sigma_um, um * far)),
+        displacement_sigma_um=float(np.hypot(found.displacement_sigma_um, um * far)),
+        strain_sigma_microstrain=float(np.hypot(found.strain_sigma_microstrain, 1e6 * length_sigma)),
+    )
 
 
 def _check_size(change: Float, limits: RepairLimits) -> None:

@@ -30,7 +30,8 @@ ROI = (60, 60, 740, 580)
 
 @lru_cache(maxsize=8)
 def seen(camera: int, *, bumped: bool, pose: int = 0) -> np.ndarray:
-    return picture(CAM1 if camera == 1 else BUMPED if bumped else CAM2, pose, seed=10 * pose + camera + 100 * bumped)
+    who = CAM1 if camera == 1 else BUMPED if bumped else CAM2
+    return picture(who, pose, seed=10 * pose + camera + 100 * bumped, n=2)
 
 
 def calibration() -> dict[str, Any]:

@@ -89,15 +89,13 @@ def core_pair(cam1: PlainCamera, cam2: PlainCamera) -> StereoPair:
 POSES = (((0.0, 0.0), (0.0, 0.0, 0.0)), ((0.15, -0.1), (3.0, 2.0, 6.0)), ((-0.12, 0.14), (-2.0, 3.0, -8.0)))
 
 
-def picture(
-    camera: PlainCamera, pose: int, *, seed: int, noise: float = 2.0, shift_mm: tuple[float, float, float] = (0, 0, 0)
-) -> NDArray[np.uint8]:
-    """The speckled specimen in one of its poses, as a camera sees it."""
+def picture(camera: PlainCamera, pose: int, *, seed: int, noise: float = 2.0, n: int = 3) -> NDArray[np.uint8]:
+    """The speckled specimen in one of its poses, as a camera sees it, from n x n rays a pixel."""
     (rx, ry), place = POSES[pose]
     frame = rotation(np.array([rx, ry, 0.0]))[:, :2]
-    origin = np.array(place) + np.array(shift_mm)
     wavelength = 2.6 * SIZE[0] / camera.size[0]
-    return render(camera, Waves(wavelength, seed=3), frame=frame, origin=origin, n=3, noise=noise, seed=seed)
+    texture = Waves(wavelength, seed=3)
+    return render(camera, texture, frame=frame, origin=np.array(place), n=n, noise=noise, seed=seed)
 
 
 def pose_points(camera: PlainCamera, pose: int, xy_px: Array) -> Array:
@@ -136,4 +134,4 @@ def false_strain(true_mm: Array, found_mm: Array) -> Array:
     h = 1e-3 * half
     tangents = np.stack([(terms(ab + d) - terms(ab - d)) @ coefficients / (2 * h) for d in np.eye(2) * h], axis=2)
     metric = np.swapaxes(tangents, 1, 2) @ tangents
-    return np.abs(np.linalg.eigvalsh(0.5 * (metric - np.eye(2)))).max(axis=1)
+    return np.asarray(np.abs(np.linalg.eigvalsh(0.5 * (metric - np.eye(2)))).max(axis=1))

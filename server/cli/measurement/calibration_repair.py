@@ -124,7 +124,7 @@ def _print(found: dict[str, Any]) -> None:
     print("camera 2 turned against camera 1, degrees: " + ", ".join(f"{a} {v:+.4f} +- {s:.4f}" for a, v, s in turns))
     (forward, sideways), (s1, s2) = found["change_deg"][3:], found["change_sigma_deg"][3:]
     print(f"baseline turned, degrees: forward {forward:+.4f} +- {s1:.4f}, sideways {sideways:+.4f} +- {s2:.4f}")
-    print(f"its length is kept: {found['baseline_mm']:.6g} mm")
+    print(f"its length is kept: {found['baseline_mm']:.6g} +- {found['baseline_sigma_mm']:.2g} mm from the bump")
     print(
         f"epipolar offset over {found['points']} points: {found['offset_before_px']:.3f} px before, "
         f"{found['offset_after_px']:.4f} px after, noise {found['noise_px']:.4f} px"

@@ -118,6 +118,7 @@ def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, Any]:
         "offset_after_px": repair.after_px,
         "structure_px": repair.structure_px,
         "baseline_mm": repair.pair.baseline_mm,
+        "baseline_sigma_mm": repair.length_sigma * repair.pair.baseline_mm,
         "consequence": cost.document(),
         "limits": vars(limits),
     }

@@ -218,7 +218,7 @@ def test_the_repaired_parameters_covariance_is_that_of_many_repairs() -> None:
         estimate = estimate_change(new, seen, bump_rad=0.003)
         cost = consequence_of(new, seen, estimate.change, estimate.covariance)
         assert cost is not None
-        return Repair(new, changes_between(old, new), estimate, seen, 0.0, 0.0, 0.0, cost)
+        return Repair(new, changes_between(old, new), estimate, seen, 0.0, 0.0, 0.0, 0.0, cost)
 
     steps = 1e-2 * SIGMA
     stepped = []
