@@ -189,7 +189,7 @@ def _checked(
         sigma_text = "unknown" if consequence is None else f"{consequence.strain_sigma_microstrain:.3g} microstrain"
         raise CalibrationError(
             f"The repaired orientation would leave shapes with an uncertainty of {sigma_text}, at most "
-            f"{limits.strain * 1e6:g} are allowed: the view is too narrow for the offsets to tell, or a pinhole shifted.",
+            f"{limits.strain * 1e6:g} are allowed: too narrow a view to tell, or a pinhole shifted.",
             code="repair_uncertain",
             remedy="Give a larger region and steps at other depths and tilts, or calibrate again.",
         )
