@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
@@ -14,8 +17,9 @@ from core.orientation.change import changed, offset_slopes, plausible_bump
 from core.orientation.estimate import estimate_change
 from core.orientation.matched import MatchedPoints
 
-_BUMP_RAD = 0.05
-_TRIES = 1500
+_BUMPS_RAD = (1e-3, 1e-2, 0.05)
+_CLEARLY_MORE = 1.1
+_TRIES = 1000
 _SAMPLE = 6
 _FEATURE_SIGMA_PX = 0.7
 _WIDE_PX = 6.0
@@ -62,29 +66,45 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
     sigma = _FEATURE_SIGMA_PX * max(1.0, float(scale))
     if len(xy1) < MIN_MATCHES:
         raise _no_match(len(xy1), 0)
-    prior = np.asarray(np.linalg.inv(plausible_bump(pair)) / _BUMP_RAD**2, dtype=np.float64)
-    inliers = _most_agreeing(pair, xy1, xy2, prior, sigma)
-    change = np.zeros(5)
-    for limit in (_WIDE_PX, _WIDE_PX, 5.0, 4.0, 3.0, 3.0, 3.0):
-        J = offset_slopes(pair, change, xy1[inliers], xy2[inliers])
-        residual = changed(pair, change).epipolar_residual_px(xy1[inliers], xy2[inliers])
-        normal = J.T @ J / sigma**2 + prior
-        change = change - np.linalg.solve(normal, J.T @ residual / sigma**2 + prior @ change)
-        left = np.abs(changed(pair, change).epipolar_residual_px(xy1, xy2))
-        with np.errstate(invalid="ignore"):
-            inliers = left < limit * sigma
-        if inliers.sum() < MIN_MATCHES:
-            raise _no_match(len(xy1), int(inliers.sum()))
+    best: tuple[Float, Bool] | None = None
+    # over a narrow view a wide prior leaves changes far beyond what is linear in them: the smallest that does is taken
+    for size in _BUMPS_RAD:
+        found = _agreeing(pair, xy1, xy2, np.linalg.inv(plausible_bump(pair)) / size**2, sigma)
+        if best is None or found[1].sum() > _CLEARLY_MORE * best[1].sum():
+            best = found
+    assert best is not None
+    change, inliers = best
+    if inliers.sum() < MIN_MATCHES:
+        raise _no_match(len(xy1), int(inliers.sum()))
     # wrong matches lie on a line by chance: as many as on any other strip of that width
     by_chance = len(xy1) * 6.0 * sigma / max(float(np.ptp(xy2[:, 1])), 1.0)
     if inliers.sum() < 3.0 * by_chance:
         raise _no_match(len(xy1), int(inliers.sum()))
     # what the matches do not determine is as small as what they do
     agreeing = MatchedPoints(xy1[inliers], xy2[inliers], matches.step[finite][inliers])
-    return estimate_change(pair, agreeing).change
+    return estimate_change(pair, agreeing, start=change).change
 
 
-def _most_agreeing(pair: StereoPair, xy1: Float, xy2: Float, prior: Float, sigma: float) -> Bool:
+def _agreeing(
+    pair: StereoPair, xy1: Float, xy2: Float, prior: NDArray[np.floating[Any]], sigma: float
+) -> tuple[Float, Bool]:
+    """Change under a prior's inverse covariance, and the matches that agree with it."""
+    inliers = _most_agreeing(pair, xy1, xy2, prior, sigma)
+    change = np.zeros(5)
+    for limit in (_WIDE_PX, _WIDE_PX, 5.0, 4.0, 3.0, 3.0, 3.0):
+        if inliers.sum() < MIN_MATCHES:
+            break
+        J = offset_slopes(pair, change, xy1[inliers], xy2[inliers])
+        residual = changed(pair, change).epipolar_residual_px(xy1[inliers], xy2[inliers])
+        normal = J.T @ J / sigma**2 + prior
+        change = change - np.linalg.solve(normal, J.T @ residual / sigma**2 + prior @ change)
+        left = np.abs(changed(pair, change).epipolar_residual_px(xy1, xy2))
+        with np.errstate(invalid="ignore"):
+            inliers = np.asarray(left < limit * sigma)
+    return change, inliers
+
+
+def _most_agreeing(pair: StereoPair, xy1: Float, xy2: Float, prior: NDArray[np.floating[Any]], sigma: float) -> Bool:
     """Matches that agree with the best of many small samples, the offsets taken as linear in the change."""
     offset = pair.epipolar_residual_px(xy1, xy2)
     J = offset_slopes(pair, np.zeros(5), xy1, xy2)

@@ -20,6 +20,7 @@ from core.orientation.noise import blocks_of, effective_variance, robust_weights
 
 #: smallest and largest bump that the prior takes for plausible, rad
 _SMALLEST_RAD, _LARGEST_RAD = 2e-5, 0.1
+_FIRST_RAD = 0.01
 _ITERATIONS = 60
 SYSTEMATIC_PX = 0.001
 """Standard deviation of smooth errors of the offsets that do not average out (interpolation, lens), a term."""
@@ -60,7 +61,12 @@ class OrientationEstimate:
 
 
 def estimate_change(
-    pair: StereoPair, points: MatchedPoints, offset_px: Float | None = None, *, bump_rad: float | None = None
+    pair: StereoPair,
+    points: MatchedPoints,
+    offset_px: Float | None = None,
+    *,
+    bump_rad: float | None = None,
+    start: Float | None = None,
 ) -> OrientationEstimate:
     """Estimate the change of the relative orientation.
 
@@ -74,6 +80,8 @@ def estimate_change(
         (n,) the offsets to explain, small, where they are not the points' own: a difference to an earlier step.
     bump_rad
         Size of the bump, where it is known; else from the offsets.
+    start
+        (5,) a change to start from; none if left out.
 
     Returns
     -------
@@ -81,9 +89,9 @@ def estimate_change(
         ``changed(pair, estimate.change)`` is the pair after the change.
     """
     xy1, xy2 = points.xy1_px, points.xy2_px
-    unit, size = plausible_bump(pair), _LARGEST_RAD if bump_rad is None else bump_rad
+    unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
     blocks = blocks_of(xy1, points.step)
-    change = np.zeros(5)
+    change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
     J = offset_slopes(pair, change, xy1, xy2)
 
     def left_at(at: Float) -> Float:

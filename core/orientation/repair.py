@@ -134,7 +134,8 @@ def repair_orientation(
     found = [feature_matches(one, two, box_around(at, 16.0, one.shape), k) for k, (one, two) in enumerate(taken)]
     report("features", 1, 1)
     matches = MatchedPoints.joined([m for m, _ in found])
-    now = changed(pair, coarse_change(pair, matches, scale=max(scale for _, scale in found)))
+    change = coarse_change(pair, matches, scale=max(scale for _, scale in found))
+    now = changed(pair, change)
     for _ in range(_ROUNDS):
         parts = [
             matched_points(now, measure_shape(now, one, two, grid, options, progress=progress, cancel=cancel), k)
@@ -147,8 +148,9 @@ def repair_orientation(
                 code="repair_too_few_points",
                 remedy="Give a larger region, more steps, or images with more texture.",
             )
-        now = changed(pair, estimate_change(pair, points).change)
-    estimate = estimate_change(pair, points)
+        change = estimate_change(pair, points, start=change).change
+        now = changed(pair, change)
+    estimate = estimate_change(pair, points, start=change)
     return _checked(pair, changed(pair, estimate.change), estimate, points, limits)
 
 
