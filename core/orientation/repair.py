@@ -112,10 +112,12 @@ def repair_orientation(
         Both cameras' images of each step, all taken after the bump.
     grid
         Points in camera 1's images.
-    options, progress, cancel
+    options
         As in :func:`core.measure.measure_shape`.
     limits
         Defaults to ``RepairLimits()``.
+    progress, cancel
+        As in :func:`core.measure.measure_shape`.
 
     Raises
     ------
