@@ -72,6 +72,11 @@ CALIBRATION = {
     "settings": "settings of the fit",
     "provenance": "software version, localiser, hashes of the views, identity of the cameras",
 }
+#: what `calibration repair` adds to it
+REPAIRED = {
+    "repair": "of a repaired calibration alone: the change of camera 2's orientation (`change_deg`, its covariance), images and old file with "
+    "their SHA-256, offset before and after, consequence, limits"
+}
 _HEAD = """# Result files
 
 A measurement writes one folder: `step_0000.nc` (shape of the reference step), `step_0001.nc` and so on (displacement since
@@ -196,7 +201,7 @@ def pages() -> dict[str, str]:
     lines += [f"| {s.value} | `{s.name.lower()}` | {cell(text)} |" for s, text in STRAIN_STATUS_MEANINGS.items()]
     lines += ["", "## `summary.json`", "", *_summary()]
     lines += ["", "## `calibration.json`", "", "| key | content |", "| --- | --- |"]
-    lines += [f"| `{key}` | {cell(text)} |" for key, text in CALIBRATION.items()]
+    lines += [f"| `{key}` | {cell(text)} |" for key, text in (CALIBRATION | REPAIRED).items()]
     lines += [
         "",
         "A file with `cam1` and `cam2` alone is enough to measure with. The verdict goes by the held-out reprojection error: `good` to 0.1 px,",
