@@ -26,8 +26,9 @@ CORNER, DOT = 0, 1
 N_CORNER, N_DOT = 9, 10
 # geometry of a corner: inverse axes (4), reach in pitches, bends of the edges (2) in 1/px, the distances of a marker
 # from both edges in px (0: none), one unused; of a dot: unused, widths of the band outside and inside its rim.
-# Last, of both: standard deviation of the slopes of the ground about their start, as part of the amplitude, 1/px
-N_GEOMETRY = 11
+# Last, of both: standard deviation of the slopes of the ground about their start, as part of the amplitude, 1/px, and
+# the slopes of the amplitude (2), as part of it, 1/px
+N_GEOMETRY = 13
 _STEPS = 30
 _LEAST_BLUR = 0.2
 _BAND_BLURS = 4.0
@@ -69,7 +70,7 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     u, v = dy * cu - dx * su - g[5] * tu * tu, dy * cv - dx * sv - g[6] * tv * tv
     eu, gu = _edge(u, s)
     ev, gv = _edge(v, s)
-    amplitude = p[5]
+    amplitude = p[5] * (1.0 + g[11] * dx + g[12] * dy)
     picture = eu * ev
     by_u, by_v, by_r = gu * ev, eu * gv, 0.0
     r, skew = cu * cv + su * sv, cu * sv - su * cv
@@ -99,7 +100,7 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     J[2] = -du * tu + amplitude * by_r * skew
     J[3] = -dv * tv - amplitude * by_r * skew
     J[4] = 1.0
-    J[5] = picture
+    J[5] = picture * (1.0 + g[11] * dx + g[12] * dy)
     J[6] = amplitude * by_s
     J[7] = dx
     J[8] = dy
@@ -107,7 +108,7 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _dot(p: Float, x: float, y: float, J: Float) -> float:
+def _dot(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     s = max(abs(p[7]), _LEAST_BLUR)
     a, b, c = p[2], p[3], p[4]
     dx, dy = x - p[0], y - p[1]
@@ -116,7 +117,7 @@ def _dot(p: Float, x: float, y: float, J: Float) -> float:
     # distance to the ellipse, to first order: (rho - 1) over the slope of rho
     steep = max(hypot(a * m + b * n, b * m + c * n), 1e-12) / rho
     e, slope = _edge((rho - 1.0) / steep, s)
-    inside = 0.5 * (1.0 - e)
+    inside = 0.5 * (1.0 - e) * (1.0 + g[11] * dx + g[12] * dy)
     by_rho = -0.5 * p[6] * slope / steep
     J[0] = -by_rho * (m * a + n * b) / rho - p[8]
     J[1] = -by_rho * (m * b + n * c) / rho - p[9]
@@ -159,7 +160,7 @@ def _used(kind: int, p: Float, g: Float, x: float, y: float) -> bool:
 
 @njit(cache=True, nogil=True)
 def _model(kind: int, p: Float, g: Float, x: float, y: float, J: Float) -> float:
-    return _dot(p, x, y, J) if kind == DOT else _corner(p, g, x, y, J)
+    return _dot(p, g, x, y, J) if kind == DOT else _corner(p, g, x, y, J)
 
 
 @njit(cache=True, nogil=True)

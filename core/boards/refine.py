@@ -99,8 +99,11 @@ def refine_corners(grey: Float32, coarse_px: Float, target: BoardTarget) -> Refi
         places = coarse_px.copy()
         places[usable] = start[:, :2]
         level = np.full(shape, np.nan)
-        level[usable] = np.where(good, start[:, 4], np.nan)
+        alike = good & _alike(good, fit[:, 5], fit[:, -1])
+        level[usable] = np.where(alike, start[:, 4], np.nan)
         start[:, 7:9] = slopes(places, level)[usable]
+        level[usable] = np.where(alike, np.abs(start[:, 5]), np.nan)
+        geometry[:, 11:13] = slopes(places, level)[usable] / np.abs(start[:, [5]])
         geometry[:, 10] = _KNOWN_SLOPE / step
     good &= _alike(good, fit[:, 5], fit[:, -1])
     return _refined(shape, usable, fit, N_CORNER, good, blur=fit[:, 6], contrast=2.0 * np.abs(fit[:, 5]))
@@ -123,8 +126,10 @@ def refine_dots(
         (columns, rows) True for dots whose middle is not of their own colour.
     """
     shape = coarse_px.shape[:2]
-    xy0 = coarse_px.reshape(-1, 2)
-    pitch = neighbour_distances_px(coarse_px, target).ravel()
+    known = np.isfinite(coarse_px).all(axis=-1).ravel()
+    xy0 = np.where(known[:, None], coarse_px.reshape(-1, 2), 0.0)
+    pitch = np.where(known, neighbour_distances_px(coarse_px, target).ravel(), np.nan)
+    pitch = np.where(np.isfinite(pitch), pitch, np.nanmedian(pitch))
     # a uniform ellipse has second moments of a quarter of its squared axes: M = (4 moments)^(-1/2)
     values, vectors = np.linalg.eigh(4.0 * moments_px2.reshape(-1, 2, 2))
     axes = np.sqrt(np.maximum(values, 0.25))
@@ -149,13 +154,17 @@ def refine_dots(
         fit = fit_points(grey, DOT, start, geometry, half, settled_px=settled_px)
         a, b, c = fit[:, 2], fit[:, 3], fit[:, 4]
         with np.errstate(invalid="ignore"):
-            good = np.isfinite(fit).all(axis=1) & (a * c - b * b > 0.0)
+            good = known & np.isfinite(fit).all(axis=1) & (a * c - b * b > 0.0)
             good &= np.linalg.norm(fit[:, :2] - xy0, axis=1) < 0.5 * axes[:, 1]
         start = np.where(good[:, None], fit[:, :N_DOT], start)
         blur = np.full(len(xy0), float(np.median(np.abs(start[:, 7]))))
-        level = np.where(good, start[:, 5] + 0.5 * start[:, 6], np.nan).reshape(shape)
-        start[:, 8:10] = slopes(start[:, :2].reshape(*shape, 2), level).reshape(-1, 2)
-        geometry[:, 10] = _KNOWN_SLOPE / np.where(np.isfinite(pitch), pitch, np.nanmedian(pitch))
+        alike = good & _alike(good, fit[:, 6], fit[:, -1])
+        level = np.where(alike, start[:, 5], np.nan).reshape(shape)
+        places = start[:, :2].reshape(*shape, 2)
+        start[:, 8:10] = slopes(places, level).reshape(-1, 2)
+        level = np.where(alike, np.abs(start[:, 6]), np.nan).reshape(shape)
+        geometry[:, 11:13] = slopes(places, level).reshape(-1, 2) / np.maximum(np.abs(start[:, [6]]), 1e-6)
+        geometry[:, 10] = _KNOWN_SLOPE / pitch
     good &= _alike(good, fit[:, 6], fit[:, -1])
     everywhere = np.ones(shape, dtype=bool)
     ellipse = np.full((len(xy0), 2, 2), np.nan)
@@ -195,7 +204,7 @@ def slopes(xy_px: Float, level: Float) -> Float:
     """
     out = np.zeros((*level.shape, 2))
     for i, j in np.argwhere(np.isfinite(level)):
-        near = np.s_[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+        near = np.s_[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
         values, places = level[near].ravel(), xy_px[near].reshape(-1, 2)
         known = np.isfinite(values)
         if known.sum() < 4:
