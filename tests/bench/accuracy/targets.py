@@ -231,7 +231,7 @@ def _drawing(path: Path, results: dict[str, list[Measured]]) -> None:
         labels = [
             f"{c.pitch_px:g} px\n{c.blur_px:g} px\n{c.tilt_deg:g}°{' lens' if any(c.lens) else ''}" for c in CASES
         ]
-        ax.set_xticks(x, labels, fontsize=7)
+        ax.set_xticks(np.arange(len(CASES)), labels, fontsize=7)
         ax.legend(fontsize=7)
     axes[0].set_ylabel("rms error over the bound")
     figure.tight_layout()
