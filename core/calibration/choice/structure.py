@@ -37,8 +37,8 @@ class Structure:
     Attributes
     ----------
     name
-        ``decentring``, ``radial``, ``higher radial``, ``thin prism``, ``aspect``, ``skew``, ``bow``, ``unequal pitch``
-        or ``smooth``.
+        ``decentring``, ``radial``, ``higher radial``, ``thin prism``, ``aspect``, ``skew``, ``bow``, ``unequal
+        pitch``, ``target points`` or ``smooth``.
     camera
         ``cam1`` or ``cam2``; None for the target.
     terms
@@ -58,6 +58,12 @@ class Structure:
     @property
     def text(self) -> str:
         """The finding in one sentence."""
+        if self.name == "target points":
+            within, across = (1e3 * self.terms[key][0] for key in ("within_mm", "across_mm"))
+            return (
+                f"The target was declared exact, but its points lie about {within:.2g} um off within its plane and "
+                f"{across:.2g} um across it. Declare node_tolerance_mm and flatness_mm."
+            )
         who = "the target" if self.camera is None else self.camera
         values = ", ".join(f"{n} = {v:.2g} +- {s:.1g}" for n, (v, s) in self.terms.items())
         what = f"{self.name}: {values}" if values else "a smooth field over the image of no known lens term"
