@@ -55,8 +55,8 @@ class Chosen:
 def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     """Fit under the lens model that the options ask for, or find the simplest that leaves no structure.
 
-    Where all views of free poses agree that points of a target declared exact lie elsewhere, they are corrected, with
-    a prior from the residuals, and the lens is chosen anew.
+    Where all views agree that points of a target declared exact lie elsewhere, the lens is chosen anew with these
+    errors as unknowns, with a prior from the residuals. With free poses they are corrected, too.
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     half_side_mm = float(np.abs(problem.nodes_mm).max())
     check_flatness(chosen.structure, chosen.screened.adjustment, half_side_mm)
     fit = chosen.screened
-    if fit.adjustment.priors.nodes_free or problem.options.estimate_nodes is False or not problem.frames:
+    if fit.adjustment.priors.nodes_free:
         return chosen
-    errors = find_target_errors(fit.adjustment, fit.rows, problem.flat_nodes_mm)
+    errors = find_target_errors(fit.adjustment, fit.rows, problem.flat_nodes_mm, in_space=bool(problem.frames))
     if errors is None:
         return chosen
     found, node_sigma_mm = errors
@@ -85,7 +85,13 @@ def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     except CalibrationError:
         # these views do not determine both; the finding stays, and lowers the verdict
         return replace(chosen, structure=(found, *chosen.structure))
-    return replace(corrected, structure=(found, *corrected.structure))
+    if problem.frames and problem.options.estimate_nodes is not False:
+        return replace(corrected, structure=(found, *corrected.structure))
+    if corrected.model != chosen.model:
+        # a lens must not take up the target's errors, which every position repeats
+        held_lens = replace(problem, options=replace(problem.options, lens=corrected.model))
+        chosen = replace(_choose(held_lens, held), reasons=corrected.reasons)
+    return replace(chosen, structure=(found, *chosen.structure))
 
 
 def _choose(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:

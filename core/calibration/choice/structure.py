@@ -59,10 +59,10 @@ class Structure:
     def text(self) -> str:
         """The finding in one sentence."""
         if self.name == "target points":
-            within, across = (1e3 * self.terms[key][0] for key in ("within_mm", "across_mm"))
+            sizes = [f"{1e3 * value:.2g} um {key.removesuffix('_mm')}" for key, (value, _) in self.terms.items()]
             return (
-                f"The target was declared exact, but its points lie about {within:.2g} um off within its plane and "
-                f"{across:.2g} um across it. Declare node_tolerance_mm and flatness_mm."
+                f"The target's points were held as nominal, but all views show them off by about {' and '.join(sizes)} "
+                "its plane. Declare node_tolerance_mm (and flatness_mm) to have them corrected."
             )
         who = "the target" if self.camera is None else self.camera
         values = ", ".join(f"{n} = {v:.2g} +- {s:.1g}" for n, (v, s) in self.terms.items())
