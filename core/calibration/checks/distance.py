@@ -161,7 +161,7 @@ def check_target_scale(
     """
     flat = [np.asarray(xy, dtype=np.float64).reshape(-1, 2) for xy in (xy1_px, xy2_px)]
     nominal = np.asarray(nominal_mm, dtype=np.float64).reshape(-1, 2)
-    found: Bool = np.isfinite(np.concatenate(flat, axis=1)).all(axis=1)
+    found: Bool = np.asarray(np.isfinite(np.concatenate(flat, axis=1)).all(axis=1))
     if found.sum() < _MIN_TARGET_POINTS or np.linalg.matrix_rank(nominal[found] - nominal[found].mean(axis=0)) < 2:
         raise CalibrationInputError(
             f"Both cameras see {int(found.sum())} points of the target in common; {_MIN_TARGET_POINTS} in two "

@@ -81,4 +81,4 @@ def _sigma_px(view: GridView | BoardView) -> Float:
     if isinstance(view, BoardView):
         return view.sigma_px
     shared = correlation_of_lines(view.target, view.line_model)
-    return np.sqrt(0.5 * np.trace(view.covariance_px2, axis1=-2, axis2=-1) * shared)
+    return np.asarray(np.sqrt(0.5 * np.trace(view.covariance_px2, axis1=-2, axis2=-1) * shared))
