@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.plausibility import image_sizes, shared_points
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import volume_of
+from server.formats.version import software_version
 
 KNOWN_DISTANCE = "known_distance"
 Images = tuple[NDArray[Any], NDArray[Any]]
@@ -133,9 +135,17 @@ def aspect_of_images(
     return measure_aspect_normal(views, standoff_mm=standoff_mm, names=[image.name for image in images])
 
 
+def kept_distance(found: DistanceCheck, how: Mapping[str, object]) -> dict[str, object]:
+    """Return what is kept of a known distance: the finding, its numbers, what it was measured on, and when."""
+    made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    return {**plain(found), "measured_on": dict(how), "checked_utc": made, "software_version": software_version()}
+
+
 def plain(found: object) -> dict[str, Any]:
     """Return a check's numbers as plain values: what is not known is null."""
-    return dict(_plain(asdict(found)))  # type: ignore[call-overload]
+    assert is_dataclass(found)
+    assert not isinstance(found, type)
+    return dict(_plain(asdict(found)))
 
 
 def _plain(value: Any) -> Any:
