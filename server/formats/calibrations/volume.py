@@ -97,3 +97,9 @@ def rbe_of(calibration: LoadedCalibration) -> float | None:
         if value is not None and math.isfinite(value) and value >= 0.0:
             return value
     return None
+
+
+def own_px_of(calibration: LoadedCalibration) -> float | None:
+    """Return the calibration's own epipolar offset at most, px: from both images' residuals; None if unknown."""
+    rbe = rbe_of(calibration)
+    return None if rbe is None else 2.0 * rbe

@@ -17,6 +17,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from tests.bench.accuracy import adversarial as accuracy_adversarial
+from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import cracks as accuracy_cracks
 from tests.bench.accuracy import curved, gauges, matching, sequence
@@ -51,6 +52,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "noise-model": accuracy_noise.camera_noise,
     "prefilter": accuracy_prefilter.prefilter,
     "smoothing": accuracy_smoothing.smoothing,
+    "bumps": accuracy_bumps.bumps,
     "plate": accuracy_experiments.plate,
     "steel": accuracy_experiments.steel,
     "panel": accuracy_experiments.panel,
