@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget, dictionary_id
 from core.calibration import CalibrationOptions, NominalCamera
@@ -94,7 +94,7 @@ def read_target(path: Path) -> GridTarget | BoardTarget:
     return target_of(table, where)
 
 
-def target_of(table: Mapping[str, object], where: str) -> GridTarget | BoardTarget:
+def target_of(table: Mapping[str, Any], where: str) -> GridTarget | BoardTarget:
     """Build the target that a table describes; ``where`` names the table in messages.
 
     Raises
