@@ -23,6 +23,8 @@ _AGREE_SIGMA = 3.0
 _MIN_TARGET_POINTS = 6
 #: of the nearest points' distance: indices that disagree between the cameras leave more, a bent board less
 _MISFIT = 0.2
+#: imported calibrations miss by some tenths of a pixel; exchanged images or a camera that moved by more
+_EPIPOLAR_PX = 2.0
 _NODE_BOUND = float(np.sqrt(3.0))  # of a bound over the standard deviation within it
 
 
@@ -175,6 +177,15 @@ def check_target_scale(
         sigma2 = np.full(xy.shape[:2], MARK_SIGMA_PX**2)
     else:
         sigma2 = np.stack([np.asarray(s, dtype=np.float64).reshape(-1)[found] ** 2 for s in sigmas_px])
+    offset = float(np.sqrt(np.mean(pair.epipolar_residual_px(xy[0], xy[1]) ** 2)))
+    if offset > _EPIPOLAR_PX:
+        raise CalibrationInputError(
+            f"The points lie {offset:.3g} px rms off their epipolar lines; a pair that the calibration holds for has "
+            f"{_EPIPOLAR_PX:g} px at most.",
+            code="known_distance_mismatch",
+            remedy="Check that the images are not exchanged, that both show the target at one moment, and that no "
+            "camera moved since the calibration.",
+        )
     points = _triangulated(pair, xy)
     scale, pose, left = _similarity(board, points)
     if dot_radius_mm is not None:
