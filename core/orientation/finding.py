@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -9,6 +10,8 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from core.arrays import Float
+from core.calibration import COVARIANCE_NAMES
+from core.calibration.uncertainty import image_derivatives
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
 from core.orientation.consequence import Consequence, consequence_of
@@ -86,8 +89,8 @@ class OffsetFinding:
         return {**vars(self), **lists, "pattern_px": dict(self.pattern_px), "consequence": consequence}
 
 
-def calibration_slopes(pair: StereoPair, points: MatchedPoints) -> Float:
-    """Return d(epipolar offset, px) / d(both cameras' ten parameters), (n, 20), at matched points.
+def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES) -> Float:
+    """Return d(epipolar offset, px) / d(both cameras' parameters by name), (n, len(names)), at matched points.
 
     The point that camera 1 sees stays on its pixel's ray; its image in camera 2 moves off the position that was
     measured. What moves along the line counts for nothing.
@@ -95,10 +98,9 @@ def calibration_slopes(pair: StereoPair, points: MatchedPoints) -> Float:
     xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
     across = across_line(pair, points.xy1_px, points.xy2_px)
     A1, A2 = pair.cam1.point_jacobian(xyz), pair.cam2.point_jacobian(xyz)
-    shift = np.linalg.pinv(A1) @ pair.cam1.ten_parameter_jacobian(xyz)
-    of_camera1 = np.einsum("nj,njk->nk", across, A2 @ shift)
-    of_camera2 = -np.einsum("nj,njk->nk", across, pair.cam2.ten_parameter_jacobian(xyz))
-    return np.concatenate([of_camera1, of_camera2], axis=1)
+    by_parameters = image_derivatives(pair, xyz, names)
+    in_camera2 = A2 @ np.linalg.pinv(A1) @ by_parameters[:, :2] - by_parameters[:, 2:]
+    return np.asarray(np.einsum("nj,njk->nk", across, in_camera2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +139,7 @@ def judge_offsets(
     before: tuple[MatchedPoints, Float] | None = None,
     against: Against = "calibration",
     covariance: Float | None = None,
+    names: Sequence[str] = COVARIANCE_NAMES,
     own_px: float | None = None,
     imported: bool = False,
 ) -> OffsetFinding | None:
@@ -153,8 +156,8 @@ def judge_offsets(
         both, cancels then.
     against
         What the offsets are held against.
-    covariance
-        (20, 20) of the cameras' parameters.
+    covariance, names
+        (n, n) of the cameras' parameters, and their names.
     own_px
         The calibration's own offset at most, where it is known.
     imported
@@ -179,7 +182,7 @@ def judge_offsets(
     C = smooth.covariance + unsure + _FLOOR_PX[against] ** 2 * np.eye(6)
     known = against != "calibration"
     if against == "calibration" and covariance is not None:
-        J = smooth.projector @ calibration_slopes(pair, points)
+        J = smooth.projector @ calibration_slopes(pair, points, names)
         C = C + J @ covariance @ J.T
         known = True
     c = smooth.coefficients

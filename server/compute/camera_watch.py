@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from core.calibration import COVARIANCE_NAMES
 from core.cameras.stereo import StereoPair
 from core.errors import SeedError
 from core.field.points.images import MeasureImage
@@ -36,7 +37,7 @@ class CameraWatch:
     reference
         Number of the reference step.
     covariance
-        (20, 20) of the cameras' parameters, where it is known.
+        Names and covariance (n, n) of the cameras' parameters, where it is known.
     own_px
         The calibration's own offset at most, where it is known.
     imported
@@ -46,7 +47,7 @@ class CameraWatch:
     pair: StereoPair
     options: MeasureOptions
     reference: int
-    covariance: NDArray[np.float64] | None
+    covariance: tuple[tuple[str, ...], NDArray[np.float64]] | None
     own_px: float | None
     imported: bool
     _points: dict[int, MatchedPoints | None] = field(default_factory=dict)
@@ -101,8 +102,9 @@ class CameraWatch:
         points = self._of(n, lambda: (result, images))
         if points is None:
             return None
+        names, covariance = (COVARIANCE_NAMES, None) if self.covariance is None else self.covariance
         against_calibration = judge_offsets(
-            self.pair, points, covariance=self.covariance, own_px=self.own_px, imported=self.imported
+            self.pair, points, covariance=covariance, names=names, own_px=self.own_px, imported=self.imported
         )
         if n == self.reference:
             return CameraMotion.of(against_calibration, None, None)

@@ -72,7 +72,7 @@ def repair_from_files(
     CalibrationError
         Where it does not hold, see :func:`core.orientation.repair_orientation`.
     FileFormatError
-        ``repair_imported``; calibration or images cannot be read.
+        Calibration or images cannot be read.
     RegionError, ImageError, SeedError, Cancelled
         As a measurement.
     """

@@ -112,7 +112,7 @@ class SequenceMeasurement:
             self.calibration.pair,
             self.options,
             self.reference.n,
-            covariance_in(self.calibration.details, name="calibration.json"),
+            covariance_in(self.calibration.details, name="calibration.json", pair=self.calibration.pair),
             own_px_of(self.calibration),
             self.calibration.imported,
         )

@@ -10,22 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration import COVARIANCE_NAMES
 from core.calibration.uncertainty import volume_uncertainty
-from core.cameras.camera import POSE_NAMES, TEN_PARAMETER_NAMES
+from core.cameras.camera import POSE_NAMES, Camera
 from core.cameras.stereo import StereoPair
-from core.errors import FileFormatError, TargetError
 from core.names import CAMERAS
 from core.orientation import Repair, RepairLimits
 from core.orientation.change import CHANGE_NAMES
 from core.orientation.propagate import pose_parameters, repaired_covariance
-from core.target import GridTarget
 from server.formats.calibrations.export import convert_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, parse_calibration
+from server.formats.calibrations.record import CalibrationRecord
+from server.formats.calibrations.volume import target_of
+from server.formats.results.summary import to_json
 from server.formats.version import software_version
 
 _STEP = 1e-3  # of a parameter's standard uncertainty
-_N_CAMERA = 12  # parameters of a camera in core.calibration: the ten and two tilts of its stage axis
 
 
 def native_content(loaded: LoadedCalibration, original: bytes) -> dict[str, Any]:
@@ -33,21 +32,18 @@ def native_content(loaded: LoadedCalibration, original: bytes) -> dict[str, Any]
 
     Raises
     ------
-    FileFormatError
-        ``repair_imported`` if another program's lenses have no form here that is exact.
+    CalibrationError
+        ``lens_unfittable`` where an imported pair sees nothing in common.
     """
     if not loaded.imported:
         return copy.deepcopy(loaded.details)
-    converted = convert_calibration(loaded, "paper", original)
-    if not converted.report.exact:
-        worst = max(fit.max_px for fit in converted.report.lens.values())
-        raise FileFormatError(
-            f"The imported lenses have no exact form in a calibration.json: up to {worst:.2g} px would be lost.",
-            code="repair_imported",
-            remedy="Repair it in the program that made it, calibrate with this program, or accept the loss: "
-            "'stereorig calibration convert --to paper', then repair that file.",
-        )
-    content: dict[str, Any] = json.loads(converted.data)
+    content: dict[str, Any] = json.loads(convert_calibration(loaded, "paper", original).data)
+    # in the frame of that form, which lies before the cameras, with the lenses as they were
+    framed = parse_calibration(to_json(content), name="The calibration").pair
+    for cam, camera, placed in zip(
+        CAMERAS, (loaded.pair.cam1, loaded.pair.cam2), (framed.cam1, framed.cam2), strict=True
+    ):
+        content[cam] = Camera(camera.lens, placed.cam_from_sys).values()
     return content
 
 
@@ -156,17 +152,10 @@ def _uncertainty(
     old = content.get("uncertainty") if isinstance(content.get("uncertainty"), dict) else {}
     assert isinstance(old, dict)
     out = {**old, **dict.fromkeys(("shape_rms_mm", "scale", "centre_z_mm", "corner_z_mm"))}
-    target = content.get("target")
-    if not isinstance(target, dict) or list(names) != list(COVARIANCE_NAMES):
+    target = target_of(CalibrationRecord.model_validate(content).target)
+    if target is None:
         return out
-    try:
-        grid = GridTarget(**{k: target[k] for k in ("pitch_mm", "line_width_mm")}, lines=tuple(target["lines"]))
-    except (TargetError, KeyError, TypeError):
-        return out
-    whole = np.zeros((2 * _N_CAMERA, 2 * _N_CAMERA))
-    ten = [c * _N_CAMERA + k for c in range(2) for k in range(len(TEN_PARAMETER_NAMES))]
-    whole[np.ix_(ten, ten)] = matrix
-    found = volume_uncertainty(pair, whole, grid)
+    found = volume_uncertainty(pair, matrix, target, names)
     return out | {
         "shape_rms_mm": found.shape_rms_mm,
         "scale": found.scale,

@@ -15,11 +15,10 @@ from core.calibration.fit.lens_form import LENS_CHOICES, LensChoice
 from core.calibration.inputs import MOVES, Moves
 from core.errors import FileFormatError, InputError
 from core.names import CAMERAS
-from core.target import GridTarget
+from core.target import LINE_GRID, GridTarget
 
 _MAX_BYTES = 1 << 20
 _MAX_SIDE_PX = 32_767
-LINE_GRID = "line_grid"
 DEFAULTS = CalibrationOptions()
 
 

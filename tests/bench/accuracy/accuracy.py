@@ -28,12 +28,14 @@ from tests.bench.accuracy import prefilter as accuracy_prefilter
 from tests.bench.accuracy import smoothing as accuracy_smoothing
 from tests.bench.accuracy import specimen as accuracy_specimen
 from tests.bench.accuracy import strain as accuracy_strain
+from tests.bench.accuracy import targets as accuracy_targets
 from tests.bench.accuracy.pages import FIGURES, write_headlines, write_section
 from tests.bench.accuracy.table import Section
 
 SECTIONS: dict[str, Callable[[Path], Section]] = {
     "calibration": accuracy_calibration.calibration,
     "aspect": accuracy_calibration.aspect,
+    **accuracy_targets.SECTIONS,
     "plane": matching.plane,
     "translation": matching.translation,
     "strain": matching.strain,
