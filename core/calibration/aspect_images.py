@@ -108,7 +108,7 @@ def measure_aspect_normal(
     largest = int(np.argmax(tilt))
     effect = float(result.aspect * 0.5 * np.mean(tilt**2))
     text = (
-        f"aspect ratio {result.aspect:.6f} +- {result.sigma:.6f} from {len(views)} images; tilt "
+        f"aspect ratio {result.aspect:.6f} +- {result.sigma:.6f} from {len(views)} image{'s' if len(views) > 1 else ''}; tilt "
         f"{'at most ' if standoff_mm is None else ''}{np.degrees(tilt[largest]):.2f} +- "
         f"{np.degrees(tilt_sigma[largest]):.2f} degrees, which changes it by {effect:.1e} at most"
     )
