@@ -107,8 +107,9 @@ def measure_aspect_normal(
         )
     largest = int(np.argmax(tilt))
     effect = float(result.aspect * 0.5 * np.mean(tilt**2))
+    count = f"{len(views)} image{'s' if len(views) > 1 else ''}"
     text = (
-        f"aspect ratio {result.aspect:.6f} +- {result.sigma:.6f} from {len(views)} image{'s' if len(views) > 1 else ''}; tilt "
+        f"aspect ratio {result.aspect:.6f} +- {result.sigma:.6f} from {count}; tilt "
         f"{'at most ' if standoff_mm is None else ''}{np.degrees(tilt[largest]):.2f} +- "
         f"{np.degrees(tilt_sigma[largest]):.2f} degrees, which changes it by {effect:.1e} at most"
     )
