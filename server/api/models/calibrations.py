@@ -9,6 +9,7 @@ from typing_extensions import TypedDict
 
 from core.settings import SUBSET_PX, Real, SpacingPx, SubsetPx, Whole
 from server.api.models.analyses import Region
+from server.api.models.calibration_checks import KeptCheck
 from server.api.models.jobs import Accepted, JobProblem
 from server.base.json_values import Nested
 from server.base.models import Label, Listing, Number, Reply, Request, StepNumber
@@ -211,6 +212,9 @@ class CalibrationReply(Reply):
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Problem that left no calibration.")
     review: Review | None = Field(None, description="The operator's decision; null: none yet.")
+    kept_checks: dict[str, KeptCheck] | None = Field(
+        None, description="Checks made since, by name, `known_distance` among them; null: none."
+    )
 
 
 class CalibrationFile(Reply):

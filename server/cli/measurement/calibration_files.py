@@ -1,4 +1,4 @@
-"""``stereorig calibration``: files in other programs' forms, a check of their plausibility, repair after a bump."""
+"""``stereorig calibration``: files in other programs' forms, checks of them, repair after a bump."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from pathlib import Path
 
 from core.errors import InputError
 from server.cli.measurement import calibration_repair
+from server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
+from server.formats.calibrations.kept_checks import read_checks
 from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
@@ -47,10 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action.add_argument(
             "--measured-with", metavar="FILE", type=Path, help="the calibration of those results (that of their test)"
         )
+    add_check_actions(actions)
 
 
 def run(args: argparse.Namespace) -> int:
     """Convert, check or repair; print what was found."""
+    if args.action in ACTIONS:
+        return run_check(args)
     if args.action == "repair":
         return calibration_repair.run(args)
     loaded = load_calibration(args.file)
@@ -68,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
         write_bytes(args.out.with_name(f"{args.out.name}.report.json"), (json.dumps(report, indent=1) + "\n").encode())
         _print_conversion(made.report)
     _print_check(checked, points)
+    for name, finding in read_checks(args.file, loaded.sha256).items():
+        print(f"{name}: {finding.get('text')}")
     if args.action == "convert":
         print(f"written: {args.out}")
     return 0

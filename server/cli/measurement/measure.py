@@ -33,6 +33,7 @@ from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.images import decode_image, read_file
 from server.formats.noise_json import load_noise
+from server.results.projected_pattern import check_settings
 from server.store.durable import read_json
 from server.worker.tasks import StepImages
 from server.workflows.camera_identity import check_same_cameras
@@ -99,7 +100,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
     add(
         "--strain",
-        default=str(STRAIN_WINDOW.default),
         metavar="WINDOW|off",
         help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide "
         f"({STRAIN_WINDOW.default})",
@@ -115,10 +115,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--reference-update",
         choices=REFERENCE_UPDATES,
-        default=DEFAULT_REFERENCE_UPDATE,
         help="never: match every step against the first (total); always: against the step before (incremental); auto: "
         "against the first, or a later reference where that fails, with a note; displacements are totals in any case "
         f"({DEFAULT_REFERENCE_UPDATE})",
+    )
+    add(
+        "--projected",
+        action="store_true",
+        help="the pattern is projected and does not move with the surface: the shape of each pair is measured by "
+        "itself, no displacement",
     )
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
@@ -138,9 +143,9 @@ def _missing(option: str) -> InputError:
 
 
 def _strain(args: argparse.Namespace) -> dict[str, object] | None:
-    if args.strain == "off":
+    if args.strain == "off" or (args.strain is None and args.projected):
         return None
-    window = check_whole("--strain", args.strain, STRAIN_WINDOW)
+    window = check_whole("--strain", str(STRAIN_WINDOW.default) if args.strain is None else args.strain, STRAIN_WINDOW)
     return {"window": window, "order": int(args.strain_order), "tensor": args.strain_tensor}
 
 
@@ -227,12 +232,14 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "seeds": None if seeds is None else [seed.xy_px for seed in seeds],
             "seeds_cam2": None if seeds is None else [seed.xy2_px for seed in seeds],
             "smoothing_window": _smoothing_window(args),
-            "reference_update": args.reference_update,
+            "pattern": "projected" if args.projected else "surface",
+            "reference_update": args.reference_update or ("never" if args.projected else DEFAULT_REFERENCE_UPDATE),
             "strain": strain,
             "reference": steps[0].n,
             "noise": None if noise is None else noise.record(),
         }
     )
+    check_settings(settings, displacement=False)
     return MeasureJob(
         calibration=calibration,
         calibration_file=calibration_file,

@@ -134,3 +134,4 @@ class CalibrationRecord(Record):
     target: TargetRecord | None = None
     provenance: OriginRecord = OriginRecord()
     settings: SettingsRecord = SettingsRecord()
+    kept_checks: dict[str, MadeCheck] = Field(default={})
