@@ -218,6 +218,11 @@ def aligned_rms_um(got_mm: Array, true_mm: Array) -> float:
     return 1e3 * float(np.sqrt(np.mean((a @ turn - b) ** 2)))
 
 
+def seen_from(pose: Pose, cameras: Sequence[TrueCamera]) -> list[TrueCamera]:
+    """Return the cameras in the system frame that a pose of the target defines."""
+    return [replace(c, R=c.R @ pose.R, t_mm=c.R @ pose.t_mm + c.t_mm) for c in cameras]
+
+
 def shape_error_um(pair: StereoPair, cameras: Sequence[TrueCamera], points_mm: Array) -> float:
     """Error of the shape of points (n, 3) that a calibrated pair finds where the true cameras see them."""
     xyz = pair.triangulate(*(c.project(points_mm) for c in cameras)).xyz_mm
@@ -259,9 +264,8 @@ def opencv_pair(K: Sequence[Array], lens: Sequence[Array], R: Array, T: Array) -
     for k, d in zip(K, lens, strict=True):
         terms = np.zeros(8)
         terms[: min(len(d.ravel()), 8)] = d.ravel()[:8]
-        lenses.append(
-            OpenCVLens(k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0.0, *terms[:5], **dict(zip(("k4", "k5", "k6"), terms[5:], strict=True)))
-        )
+        more = dict(zip(("k4", "k5", "k6"), terms[5:], strict=True))
+        lenses.append(OpenCVLens(k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0.0, *terms[:5], **more))
     return StereoPair(
         Camera(lenses[0], RigidTransform(np.eye(3), np.zeros(3))), Camera(lenses[1], RigidTransform(R, T.ravel()))
     )

@@ -13,24 +13,24 @@ import numpy as np
 given = np.load(sys.argv[1])
 n_frames = len(given["frames"])
 index = np.array([(k, c, c - 1) for k in range(n_frames) for c in range(2)], dtype=np.int32)
-inputs = dict(
-    intrinsics=given["intrinsics"].copy(),
-    extrinsics_rt_fromref=given["rt21"].reshape(1, 6).copy(),
-    frames_rt_toref=given["frames"].copy(),
-    points=None,
-    observations_board=given["observations"].copy(),
-    indices_frame_camintrinsics_camextrinsics=index,
-    observations_point=None,
-    indices_point_camintrinsics_camextrinsics=None,
-    lensmodel=str(given["lensmodel"]),
-    imagersizes=given["sizes"].astype(np.int32),
-    calobject_warp=np.zeros(2) if given["warp"] else None,
-    do_optimize_calobject_warp=bool(given["warp"]),
-    calibration_object_spacing=float(given["spacing"]),
-    do_apply_regularization=False,
-    do_apply_outlier_rejection=False,
-    verbose=False,
-)
+inputs = {
+    "intrinsics": given["intrinsics"].copy(),
+    "extrinsics_rt_fromref": given["rt21"].reshape(1, 6).copy(),
+    "frames_rt_toref": given["frames"].copy(),
+    "points": None,
+    "observations_board": given["observations"].copy(),
+    "indices_frame_camintrinsics_camextrinsics": index,
+    "observations_point": None,
+    "indices_point_camintrinsics_camextrinsics": None,
+    "lensmodel": str(given["lensmodel"]),
+    "imagersizes": given["sizes"].astype(np.int32),
+    "calobject_warp": np.zeros(2) if given["warp"] else None,
+    "do_optimize_calobject_warp": bool(given["warp"]),
+    "calibration_object_spacing": float(given["spacing"]),
+    "do_apply_regularization": False,
+    "do_apply_outlier_rejection": False,
+    "verbose": False,
+}
 mrcal.optimize(**inputs)
 J = mrcal.optimizer_callback(**inputs)[2].toarray()
 mrcal.pack_state(J, **inputs)

@@ -1,4 +1,4 @@
-"""mrcal as a witness: the same views calibrated by it (Debian's mrcal and python3-mrcal), and what it says of points."""
+"""mrcal as a witness: the same views calibrated by it (from Debian's packages), and what it says of points."""
 
 from __future__ import annotations
 
@@ -82,7 +82,9 @@ def calibrate_by_mrcal(
     # mrcal counts from the first corner
     one = images["cam1"][0]
     shift = -0.5 * pitch_mm * np.array([one.shape[0] - 1.0, one.shape[1] - 1.0, 0.0])
-    frames = [np.concatenate([r, cv2.Rodrigues(r)[0] @ shift + t]) for r, t in zip(start.rvecs, start.tvecs, strict=True)]
+    frames = [
+        np.concatenate([r, cv2.Rodrigues(r)[0] @ shift + t]) for r, t in zip(start.rvecs, start.tvecs, strict=True)
+    ]
     observations = []
     for k in range(len(frames)):
         for c, name in enumerate(CAMERAS):
@@ -101,7 +103,9 @@ def calibrate_by_mrcal(
             sizes=np.array(sizes_px),
             warp=warp,
         )
-        done = subprocess.run([PYTHON, str(PROGRAM), str(given), str(found)], capture_output=True, check=False, text=True)
+        done = subprocess.run(
+            [PYTHON, str(PROGRAM), str(given), str(found)], capture_output=True, check=False, text=True
+        )
         if done.returncode:
             raise RuntimeError(f"mrcal: {done.stderr[-500:]}")
         with np.load(found) as data:

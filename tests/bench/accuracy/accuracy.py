@@ -18,6 +18,7 @@ mpl.use("Agg")
 
 from tests.bench.accuracy import adversarial as accuracy_adversarial
 from tests.bench.accuracy import calibration as accuracy_calibration
+from tests.bench.accuracy import calibration_beside as accuracy_beside
 from tests.bench.accuracy import cracks as accuracy_cracks
 from tests.bench.accuracy import curved, gauges, matching, sequence
 from tests.bench.accuracy import experiments as accuracy_experiments
@@ -33,6 +34,7 @@ from tests.bench.accuracy.table import Section
 SECTIONS: dict[str, Callable[[Path], Section]] = {
     "calibration": accuracy_calibration.calibration,
     "aspect": accuracy_calibration.aspect,
+    "beside": accuracy_beside.beside,
     "plane": matching.plane,
     "translation": matching.translation,
     "strain": matching.strain,
