@@ -20,7 +20,7 @@ from tests.bench.accuracy import adversarial as accuracy_adversarial
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import calibration_beside as accuracy_beside
 from tests.bench.accuracy import cracks as accuracy_cracks
-from tests.bench.accuracy import curved, gauges, matching, sequence
+from tests.bench.accuracy import curved, gauges, matching, real_boards, rig_campaign, sequence
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import noise as accuracy_noise
@@ -35,6 +35,8 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "calibration": accuracy_calibration.calibration,
     "aspect": accuracy_calibration.aspect,
     "beside": accuracy_beside.beside,
+    "rigs": rig_campaign.rigs,
+    "real-boards": real_boards.real_boards,
     "plane": matching.plane,
     "translation": matching.translation,
     "strain": matching.strain,
