@@ -32,6 +32,42 @@ def meet_plane(par: Float, pose: Float, nx: Float, ny: Float, s: Float, t: Float
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def meet_bowl(par: Float, pose: Float, nx: Float, ny: Float, s: Float, t: Float) -> None:
+    """Meet rays with the paraboloid z = c (x^2 + y^2), ``par`` = [c]; of two points the one next to the plane z = 0.
+
+    The ray in the body's frame is o + m d: a quadratic equation in m, solved in the form that does not cancel.
+    """
+    c = par[0]
+    ox = -(pose[0, 0] * pose[0, 3] + pose[1, 0] * pose[1, 3] + pose[2, 0] * pose[2, 3])
+    oy = -(pose[0, 1] * pose[0, 3] + pose[1, 1] * pose[1, 3] + pose[2, 1] * pose[2, 3])
+    oz = -(pose[0, 2] * pose[0, 3] + pose[1, 2] * pose[1, 3] + pose[2, 2] * pose[2, 3])
+    for i in range(nx.size):
+        dx = pose[0, 0] * nx[i] + pose[1, 0] * ny[i] + pose[2, 0]
+        dy = pose[0, 1] * nx[i] + pose[1, 1] * ny[i] + pose[2, 1]
+        dz = pose[0, 2] * nx[i] + pose[1, 2] * ny[i] + pose[2, 2]
+        m0 = -oz / dz  # to the plane; the bowl lies a little off it
+        x0, y0 = ox + m0 * dx, oy + m0 * dy
+        f = c * (x0 * x0 + y0 * y0)
+        g = 2.0 * c * (x0 * dx + y0 * dy) - dz
+        h = c * (dx * dx + dy * dy)
+        q = g * g - 4.0 * h * f
+        m = m0 - 2.0 * f / (g + np.copysign(np.sqrt(q), g)) if q >= 0.0 else np.nan
+        if not m > 0.0:
+            m = np.nan
+        s[i] = ox + m * dx
+        t[i] = oy + m * dy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bowl(par: Float, s: Float, t: Float, out: Float) -> None:
+    """The paraboloid z = c (x^2 + y^2), ``par`` = [c], over x = s, y = t."""
+    for i in range(s.size):
+        out[0, i], out[1, i], out[2, i] = s[i], t[i], par[0] * (s[i] * s[i] + t[i] * t[i])
+        out[3, i], out[4, i], out[5, i] = 1.0, 0.0, 2.0 * par[0] * s[i]
+        out[6, i], out[7, i], out[8, i] = 0.0, 1.0, 2.0 * par[0] * t[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def newton_step(pose: Float, nx: Float, ny: Float, at: Float, s: Float, t: Float, step: Float) -> float:
     """Move (s, t) by one Newton step from the positions and tangents ``at``; return the longest, NaN excluded.
 

@@ -14,7 +14,7 @@ contrast.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import Final
 
@@ -24,12 +24,17 @@ from numpy.typing import ArrayLike
 from scipy.special import erf
 
 from core.arrays import Float
-from core.cameras.camera import Camera
-from sim.ray import rays
+from core.cameras.camera import Camera, RigidTransform
+from sim.boards.pattern import BOARD
+from sim.optics.lens import flat_lens, normalised
+from sim.optics.ray import rays
 from sim.scene import Scene
 from sim.texture import GRID
 
 _BLUR_REACH: Final = 5.0  # the Gaussian is cut at five sd, where 6e-7 of it is left
+_EDGE_CYCLES: Final = 0.53  # exp(-2 (pi 0.53)^2) = 4e-3, of an edge's own content there, which is 1 / (2 pi cycles)
+_MOST_SAMPLES: Final = 12
+_SMEAR_NODES: Final = 4  # enough for a way of a few pixels
 _BAND_ROWS: Final = 32  # rows of one piece of work: small enough for the cache, large against the blur
 
 
@@ -42,7 +47,8 @@ class RenderOptions:
     blur_px
         Standard deviation of the lens's Gaussian blur.
     samples
-        Sample points across a pixel; None takes 4, and 8 for line grids, whose edges are finer.
+        Sample points across a pixel; None takes 4, 8 for line grids, whose edges are finer, and for boards what their
+        edges need at the board's distance.
     threads
         Threads to use; the kernel holds no lock.
     """
@@ -81,7 +87,9 @@ def render(
         (rows, columns) brightness in [0, 1]; the scene's background where a ray meets nothing.
     """
     opts = RenderOptions() if options is None else options
-    samples = opts.samples if opts.samples is not None else (8 if scene.texture.kind == GRID else 4)
+    if any(scene.smear_mm):
+        return _smeared(scene, camera, size_px, opts, window)
+    samples = opts.samples if opts.samples is not None else _samples_needed(scene, camera)
     if samples < 4:
         raise ValueError(f"samples must be at least 4, got {samples}")
     x0, y0, x1, y1 = window if window is not None else (0, 0, size_px[0], size_px[1])
@@ -104,6 +112,33 @@ def render(
     return out
 
 
+def _samples_needed(scene: Scene, camera: Camera) -> int:
+    if scene.texture.kind != BOARD:
+        return 8 if scene.texture.kind == GRID else 4
+    # a Gaussian edge's content near that many cycles a pixel stays below 1e-4 of the contrast
+    depth = float((camera.cam_from_sys @ scene.sys_from_body).translation_mm[2])
+    edge_px = scene.texture.finest_mm * float(flat_lens(camera.lens)[1]) / max(depth, 1.0)
+    return int(np.clip(ceil(0.5 + _EDGE_CYCLES / max(edge_px, 1e-6)), 4, _MOST_SAMPLES))
+
+
+def _smeared(
+    scene: Scene,
+    camera: Camera,
+    size_px: tuple[int, int],
+    options: RenderOptions,
+    window: tuple[int, int, int, int] | None,
+) -> Float:
+    """Mean over the body's way during the exposure, by Gauss's rule, about its pose."""
+    places, weights = np.polynomial.legendre.leggauss(_SMEAR_NODES)
+    way, pose = 0.5 * np.asarray(scene.smear_mm), scene.sys_from_body
+    views = []
+    for place, weight in zip(places, weights, strict=True):
+        there = RigidTransform(pose.rotation, pose.translation_mm + place * way)
+        still = replace(scene, sys_from_body=there, smear_mm=(0.0, 0.0, 0.0))
+        views.append(0.5 * weight * render(still, camera, size_px, options=options, window=window))
+    return np.asarray(np.sum(views, axis=0))
+
+
 def _samples(
     scene: Scene, camera: Camera, samples: int, n_weights: int, x0: int, x1: int, row0: int, row1: int
 ) -> Float:
@@ -113,7 +148,7 @@ def _samples(
     first = (0.5 - pad) * step - 0.5
     nx = np.empty(((row1 - row0) * samples + 2 * pad, (x1 - x0) * samples + 2 * pad))
     ny = np.empty_like(nx)
-    rays(camera.lens.kernel_parameters(), x0 + first, row0 + first, step, nx, ny)
+    rays(flat_lens(camera.lens), x0 + first, row0 + first, step, nx, ny)
     s, t, _ = scene.surface.hit(cam_from_body(scene, camera), nx.reshape(-1), ny.reshape(-1))
     for coordinate, half in zip((s, t), scene.half_size_mm, strict=True):
         if np.isfinite(half):
@@ -143,7 +178,7 @@ def pixel_weights(samples: int, blur_px: float) -> Float:
 def material_points(scene: Scene, camera: Camera, xy_px: ArrayLike) -> tuple[Float, Float]:
     """Return material points (..., 2) at pixels (..., 2), NaN where there is none, and the crack's lip (...), +-1."""
     xy = np.asarray(xy_px, dtype=np.float64)
-    n = camera.lens.normalised_from_image(xy).xy.reshape(-1, 2)
+    n = normalised(camera.lens, xy).xy.reshape(-1, 2)
     s, t, lip = scene.surface.hit(
         cam_from_body(scene, camera), np.ascontiguousarray(n[:, 0]), np.ascontiguousarray(n[:, 1])
     )

@@ -35,6 +35,8 @@ class Scene:
         The body ends at |s|, |t| of this; endless by default, so that it fills the views.
     background
         Brightness seen where a ray meets nothing.
+    smear_mm
+        Way of the body during one exposure, system frame, its middle at ``sys_from_body``.
     """
 
     name: str
@@ -43,3 +45,4 @@ class Scene:
     sys_from_body: RigidTransform = field(default_factory=RigidTransform.identity)
     half_size_mm: tuple[float, float] = (np.inf, np.inf)
     background: float = 0.05
+    smear_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)

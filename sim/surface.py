@@ -29,6 +29,7 @@ HEIGHT: Final = 1
 PLATE: Final = 2
 PANEL: Final = 3
 SPHERE: Final = 4
+BOWL: Final = 5
 _NO_TABLE: Final = np.zeros((4, 4))
 _STEPS: Final = 30
 # a Newton step shorter than this leaves an error of half the curvature times its square: 1e-10 mm at 0.02 per mm
@@ -43,7 +44,7 @@ class Surface:
     Attributes
     ----------
     kind
-        ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL`` or ``SPHERE``.
+        ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL``, ``SPHERE`` or ``BOWL``.
     parameters
         Numbers of that kind, see `sim.formulas`.
     coarse, fine
@@ -77,6 +78,9 @@ class Surface:
         s, t = np.empty_like(nx), np.empty_like(nx)
         if self.kind == FLAT:
             kernels.meet_plane(self.parameters, pose, nx, ny, s, t)
+            return s, t, np.broadcast_to(np.float64(1.0), nx.shape)
+        if self.kind == BOWL:
+            kernels.meet_bowl(self.parameters, pose, nx, ny, s, t)
             return s, t, np.broadcast_to(np.float64(1.0), nx.shape)
         lip = np.ones_like(nx)
         for a in range(0, nx.size, _CHUNK):
@@ -138,6 +142,7 @@ _SMOOTH: Final[dict[int, Callable[[Float, Float, Float, Float], None]]] = {
     FLAT: kernels.plane,
     PLATE: kernels.circular_plate,
     SPHERE: kernels.sphere,
+    BOWL: kernels.bowl,
 }
 
 
@@ -149,3 +154,13 @@ def flat(in_plane: ArrayLike = ((1.0, 0.0), (0.0, 1.0))) -> Surface:
 def sphere(radius_mm: float) -> Surface:
     """Return a sphere whose pole touches z = 0 and bulges towards the cameras; (s, t) are arc lengths from the pole."""
     return Surface(kind=SPHERE, parameters=np.array([radius_mm]))
+
+
+def bowl(rise_mm: float, half_mm: float) -> Surface:
+    """Return a slightly bent plate, z = ``rise_mm`` (x^2 + y^2) / ``half_mm``^2, with (s, t) = (x, y).
+
+    A plate bends without stretching; that its points draw together by ``rise_mm``^2 / ``half_mm`` is left out.
+    """
+    if not (half_mm > 0.0 and abs(rise_mm) < half_mm):
+        raise ValueError(f"a rise of {rise_mm:g} mm over {half_mm:g} mm is no slightly bent plate")
+    return Surface(kind=BOWL, parameters=np.array([rise_mm / half_mm**2]))

@@ -1,7 +1,8 @@
 """The simulated world: cameras on their stages before a scene, exposed on demand.
 
 It connects grabbers and controllers. It takes the stages' true positions, renders each camera's view from there, and
-adds fresh noise to every exposure. Brightness is kept per camera, scene and position, so that further frames of a
+adds fresh noise to every exposure. A camera may be knocked (``bump``), and its lens drifts with its exposures where the
+rig file says so. Brightness is kept per camera, scene and position, so that further frames of a
 resting rig need new noise only.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,11 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.arrays import Float32
-from core.cameras.camera import Camera
+from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 from core.errors import InputError
 from core.names import CAMERAS, CameraName
+from sim.boards.poses import transform_of
 from sim.catalog import make_scene
+from sim.optics.lens import warmed
 from sim.render import RenderOptions, render
 from sim.rig import SimCamera, SimRig
 from sim.scene import Scene
@@ -29,6 +32,20 @@ from sim.truth import Truth, truth_at
 
 _KEY_MM = 1e-7  # positions closer than this are one: a ten-thousandth of a micrometre
 _CACHE_BYTES = 256 << 20
+_NO_BUMP = (0.0,) * 6
+
+
+def _six(bump: Sequence[float]) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(v) for v in bump)
+        transform_of(numbers)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"A bump of {bump!r} is not [rx_deg, ry_deg, rz_deg, x_mm, y_mm, z_mm].",
+            code="scene_invalid",
+            remedy="Give six numbers.",
+        ) from error
+    return numbers
 
 
 class SimWorld:
@@ -57,6 +74,8 @@ class SimWorld:
         self._scene = make_scene(rig, "grid")
         self._scene_key: tuple[Any, ...] = ("grid", 0.0)
         self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERAS}
+        self._bumps: dict[CameraName, tuple[float, ...]] = {}
+        self._exposures = dict.fromkeys(CAMERAS, 0)
         self._cache: OrderedDict[tuple[Any, ...], Float32] = OrderedDict()
 
     @property
@@ -71,10 +90,16 @@ class SimWorld:
             return self._scene
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> None:
-        """Put another scene, or another state of it, before the cameras; see :func:`sim.catalog.make_scene`."""
+        """Put another scene, or another state of it, before the cameras; see :func:`sim.catalog.make_scene`.
+
+        ``bump_cam1`` and ``bump_cam2``, six numbers [rx_deg, ry_deg, rz_deg, x_mm, y_mm, z_mm], knock a camera at the
+        same moment, see :meth:`bump`; the next scenes find it so.
+        """
+        bumps = {cam: _six(params.pop(f"bump_{cam}")) for cam in CAMERAS if f"bump_{cam}" in params}
         scene = make_scene(self._rig, name, load=load, **params)
         with self._state:
             self._scene = scene
+            self._bumps |= bumps
             # the renderings of a state are found again when it returns
             self._scene_key = (name, float(load), *sorted((k, repr(v)) for k, v in params.items()))
 
@@ -83,11 +108,64 @@ class SimWorld:
         with self._state:
             self._cameras[cam] = replace(self._cameras[cam], axis_tilt_rad=tilt_rad)
 
+    def bump(
+        self,
+        cam: CameraName,
+        *,
+        rotation_deg: Sequence[float] = (0.0, 0.0, 0.0),
+        shift_mm: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Knock a camera: from now on its pose differs from the rig file's by this, which replaces an earlier bump.
+
+        Parameters
+        ----------
+        cam
+            Which camera.
+        rotation_deg
+            Rotation vector about the pinhole, camera's frame: the scene's turn as the camera sees it.
+        shift_mm
+            Displacement of the scene in the camera's frame.
+        """
+        six = _six((*rotation_deg, *shift_mm))
+        with self._state:
+            self._sim_camera(cam)
+            self._bumps[cam] = six
+
     def true_camera(self, cam: CameraName) -> Camera:
-        """Return the camera at its stage's present position."""
+        """Return the camera at its stage's present position, with its bump and its drift."""
         with self._state:
             sim = self._sim_camera(cam)
-        return sim.at(self._position_mm(sim.stage_axis))
+            bump, share = self._bumps.get(cam, _NO_BUMP), self._warmth(cam, sim)
+        return self._camera_now(sim, self._position_mm(sim.stage_axis), bump, share)
+
+    def true_scene(self, cam: CameraName) -> Scene:
+        """Return the scene where the camera's stage axis has taken it; the same as :attr:`scene` if cameras move."""
+        with self._state:
+            scene, sim = self._scene, self._sim_camera(cam)
+        return self._scene_now(scene, sim, self._position_mm(sim.stage_axis))
+
+    def _warmth(self, cam: CameraName, sim: SimCamera) -> float:
+        return sim.warm_up.share(self._exposures[cam], sim.size_px)
+
+    def _camera_now(self, sim: SimCamera, position_mm: float, bump: tuple[float, ...], share: float) -> Camera:
+        stage = self._rig.stage
+        camera = sim.at(position_mm) if stage.moves == "cameras" else sim.camera
+        pose, lens = camera.cam_from_sys, camera.lens
+        if stage.moves == "both_cameras":
+            pose = pose @ RigidTransform(np.eye(3), stage.travel_mm(sim.dz_mm(position_mm)))
+        if bump != _NO_BUMP:
+            pose = transform_of(bump) @ pose
+        if share:
+            warm = sim.warm_up
+            lens = warmed(lens, (share * warm.shift_px[0], share * warm.shift_px[1]), share * warm.focal)
+        return Camera(lens, pose)
+
+    def _scene_now(self, scene: Scene, sim: SimCamera, position_mm: float) -> Scene:
+        stage = self._rig.stage
+        if stage.moves != "target":
+            return scene
+        moved = RigidTransform(np.eye(3), stage.travel_mm(sim.dz_mm(position_mm)))
+        return replace(scene, sys_from_body=moved @ scene.sys_from_body)
 
     def true_pair(self) -> StereoPair:
         """Return the true pair with both stages at their zero: the truth of a calibration."""
@@ -119,14 +197,17 @@ class SimWorld:
         with self._rendering[cam]:
             with self._state:
                 scene, state, sim = self._scene, self._scene_key, self._sim_camera(cam)
+                bump, share = self._bumps.get(cam, _NO_BUMP), self._warmth(cam, sim)
+                self._exposures[cam] += 1
             position = self._position_mm(sim.stage_axis)
-            key = (cam, state, round(position / _KEY_MM), sim.axis_tilt_rad)
+            key = (cam, state, round(position / _KEY_MM), sim.axis_tilt_rad, bump, share)
             with self._state:
                 known = self._cache.get(key)
                 if known is not None:
                     self._cache.move_to_end(key)
             if known is None:
-                known = sim.lighting.apply(render(scene, sim.at(position), sim.size_px, options=self._options))
+                camera, there = self._camera_now(sim, position, bump, share), self._scene_now(scene, sim, position)
+                known = sim.lighting.apply(render(there, camera, sim.size_px, options=self._options))
                 known.setflags(write=False)
                 self._remember(key, known)
         return known, sim

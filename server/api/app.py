@@ -18,7 +18,7 @@ from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
 from server.api.routes.analyses import analyses, exports, gauges, picking, previews, report, results
-from server.api.routes.calibrations import calibrations, noise, review
+from server.api.routes.calibrations import calibrations, noise, repair, review
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
@@ -114,6 +114,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         stage,
         noise,
         calibrations,
+        repair,
         calibration_exports,
         review,
         tests,

@@ -216,18 +216,59 @@ class StageSection(_Closed):
         return self if own is None else self.model_copy(update=own.model_dump(exclude_none=True))
 
 
-class TargetSection(_Closed):
-    """[target]: the precision line grid."""
+Lines = Annotated[int, Field(ge=3, le=201)]
+Points = Annotated[int, Field(ge=3, le=200)]
+_LINE_GRID_FIELDS = ("lines", "line_width_mm")
+_CHARUCO_FIELDS = ("marker_mm", "dictionary")
 
-    pitch_mm: Positive = Field(description="Distance of neighbouring lines.")
-    lines: tuple[Annotated[int, Field(ge=3, le=201)], Annotated[int, Field(ge=3, le=201)]] = Field(
-        description="Number of lines crossed when walking along X_sys and along Y_sys."
+
+class TargetSection(_Closed):
+    """[target]: the calibration target, a line grid or a board of squares or dots."""
+
+    kind: Literal["line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric"] = Field(
+        "line_grid", description="What it shows."
     )
-    line_width_mm: Positive = Field(description="Width of a line.")
+    pitch_mm: Positive = Field(
+        description="Distance of neighbouring lines or dots, side of a square; of an asymmetric grid, distance of "
+        "neighbouring rows: dots of one row lie two pitches apart."
+    )
+    lines: tuple[Lines, Lines] | None = Field(
+        None, description="Line grid: number of lines crossed when walking along X_sys and along Y_sys."
+    )
+    line_width_mm: Positive | None = Field(None, description="Line grid: width of a line.")
     node_tolerance_mm: Annotated[float, Field(ge=0.0)] = Field(
-        0.0, description="Maker's tolerance of the line positions."
+        0.0, description="Maker's tolerance of the positions of lines, corners or dots."
     )
-    dark_lines: bool = Field(True, description="Dark lines on a bright ground, or the other way round.")
+    dark_lines: bool = Field(True, description="Line grid: dark lines on a bright ground, or the other way round.")
+    size: tuple[Points, Points] | None = Field(None, description="Boards: inner corners or dots a row, then a column.")
+    marker_mm: Positive | None = Field(None, description="ChArUco: side of a marker.")
+    dictionary: Annotated[str, Field(pattern=r"^DICT_[A-Z0-9_]+$", max_length=40)] | None = Field(
+        None, description="ChArUco: OpenCV's name of the markers' dictionary; DICT_5X5_100 if left out."
+    )
+
+    @model_validator(mode="after")
+    def _fields_of_its_kind(self) -> Self:
+        grid = self.kind == "line_grid"
+        needed = _LINE_GRID_FIELDS if grid else ("size", "marker_mm") if self.kind == "charuco" else ("size",)
+        missing = [name for name in needed if getattr(self, name) is None]
+        if missing:
+            raise ValueError(f"a target of kind {self.kind!r} needs {', '.join(missing)}")
+        strange: tuple[str, ...] = ("size", *_CHARUCO_FIELDS) if grid else (*_LINE_GRID_FIELDS, "dark_lines")
+        if not grid and self.kind != "charuco":
+            strange = (*strange, *_CHARUCO_FIELDS)
+        found = [name for name in strange if name in self.model_fields_set and getattr(self, name) is not None]
+        if found:
+            raise ValueError(f"a target of kind {self.kind!r} has no {', '.join(found)}")
+        if self.marker_mm is not None and not self.marker_mm < self.pitch_mm:
+            raise ValueError(f"marker_mm {self.marker_mm:g} must be smaller than pitch_mm {self.pitch_mm:g}")
+        return self
+
+    def plain(self) -> dict[str, Any]:
+        """Return the fields of its kind, as JSON; of a line grid without the kind, as files have had them ever."""
+        fields = self.model_dump(mode="json", exclude_none=True)
+        for name in ("kind",) if self.kind == "line_grid" else ("dark_lines",):
+            fields.pop(name)
+        return fields
 
 
 class CalibrationSection(_Closed):

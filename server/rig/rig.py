@@ -81,6 +81,7 @@ class Rig:
         # what the cameras were last set to, so that a reconnected one gets it again
         self._settings = {cam: first_settings(config, cam) for cam in CAMERAS}
         self.scene: SceneReply | None = None
+        self._knocks: dict[str, object] = {}
         self._watch: ReconnectWatch | None = None
         self._stage_reading = SharedReading(self._read_stage)
         self.controls = StageControls(lambda: self._ready().stage)
@@ -129,7 +130,7 @@ class Rig:
         if self._fault is not None:
             raise DeviceError(self._fault.cause, code=self._fault.code, remedy=self._fault.remedy)
         if self.scene is not None:
-            self.set_scene(self.scene.scene, load=self.scene.load, params=self.scene.model_extra)
+            self.set_scene(self.scene.scene, load=self.scene.load, params=self._knocks | (self.scene.model_extra or {}))
 
     def _lost(self, cam: CameraName, error: CameraError) -> None:
         _log.warning("%s was lost: %s", cam, error)
@@ -184,7 +185,7 @@ class Rig:
             scene=self.scene,
             trigger=config.rig.trigger,
             max_skew_ms=config.rig.skew_bound_ms,
-            target=NominalTarget.model_validate(config.target.model_dump(mode="json")),
+            target=NominalTarget.model_validate(config.target.plain()),
             calibration_plan=UsualPlan.model_validate(config.calibration.model_dump(mode="json")),
             cameras={cam: self.describe_camera(cam) for cam in CAMERAS},
             stage=self._describe_stage_or_fault(),
@@ -284,6 +285,8 @@ class Rig:
             world.set_scene(name, load=load, **more)
         except (TypeError, ValueError) as error:
             raise InputError(f"Scene {name!r}: {error}.", code="scene_invalid") from error
+        # a knocked camera is not put right by what comes before it next
+        self._knocks |= {key: value for key, value in more.items() if key.startswith("bump_")}
         self.scene = SceneReply.model_validate({"scene": name, "load": load, **more})
         return self.scene
 

@@ -68,6 +68,16 @@ class CalibrationStore:
         write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
         return calibration_id
 
+    def create_repaired(self, plan: Mapping[str, object], mask: bytes | None) -> str:
+        """Make the folder of a calibration that is to be repaired from another one; return its id."""
+        calibration_id = self._folder.ids.new("c")
+        path = self._folder.calibrations / calibration_id
+        make_folder(path)
+        if mask is not None:
+            write_bytes(path / "mask.png", mask)
+        write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
+        return calibration_id
+
     def put_view(self, calibration_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
         """Store one view; return its file name and checksum."""
         name = f"{index:03d}_{cam}.tif"

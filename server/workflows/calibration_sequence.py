@@ -102,7 +102,7 @@ def begin(service: Service, plan: CalibrationPlan, request: RequestMark) -> Ids:
 
     def prepare(job: Job) -> Ids:
         document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
-        made["calibration_id"] = service.calibrations.create(document, service.config.target.model_dump(mode="json"))
+        made["calibration_id"] = service.calibrations.create(document, service.config.target.plain())
         return dict(made)
 
     job = service.jobs.submit(
@@ -176,7 +176,7 @@ def rig_metadata(config: RigConfig) -> dict[str, Any]:
     """Entries of the rig file that the fit needs."""
     return {
         "name": config.rig.name,
-        "target": config.target.model_dump(mode="json"),
+        "target": config.target.plain(),
         "axis_tilt_sigma_rad": config.calibration.axis_tilt_sigma_rad,
         "cam1": config.cam1.model_dump(mode="json"),
         "cam2": config.cam2.model_dump(mode="json"),

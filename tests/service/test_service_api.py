@@ -8,6 +8,7 @@ import json
 import time
 from pathlib import Path
 
+import cv2
 import httpx
 import numpy as np
 import pytest
@@ -198,6 +199,32 @@ def test_scene_changes_what_the_cameras_see(client: httpx.Client) -> None:
     for params in ({"colour": 3}, {"load": 3}, {"name": 3}):
         refused = client.put(f"{API}/sim/scene", json={"scene": "plate", "params": params})
         assert_problem(refused, 422, "scene_invalid")
+
+
+def test_a_board_in_a_hand_is_put_before_the_cameras_and_a_bumped_camera_stays_so(client: httpx.Client) -> None:
+    params = {"pitch_mm": 1.6, "size": [6, 5], "hand": 2}
+    scene = client.put(f"{API}/sim/scene", json={"scene": "checkerboard", "params": params})
+    assert scene.json() == {"scene": "checkerboard", "load": 0.0, **params}, scene.text
+    time.sleep(0.15)
+    for cam in ("cam1", "cam2"):
+        image = decode_image(client.get(f"{API}/cameras/{cam}/frame", params={"format": "tiff"}).content)
+        assert cv2.findChessboardCornersSB(image.astype(np.uint8), (6, 5), flags=cv2.CALIB_CB_EXHAUSTIVE)[0]
+    before = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content).astype(float)
+    bump = [0.0, 0.3, 0.0, 0.0, 0.0, 0.0]
+    knocked = client.put(f"{API}/sim/scene", json={"scene": "checkerboard", "params": {**params, "bump_cam1": bump}})
+    assert knocked.status_code == 200, knocked.text
+    client.put(f"{API}/sim/scene", json={"scene": "checkerboard", "params": params})
+    for _ in range(2):
+        time.sleep(0.15)
+        after = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content).astype(float)
+        assert np.abs(after - before).mean() > 5.0
+        job = client.post(f"{API}/rig/reconnect").json()["job"]
+        assert wait_for_job(client, job)["state"] == "succeeded"
+        wait_for_rig(client)
+    for wrong in ({"hand": -1}, {"pose": [1.0]}, {"size": [1e9, 1e9]}, {"dictionary": "DICT_1"}, {"bump_cam1": [1.0]}):
+        refused = client.put(f"{API}/sim/scene", json={"scene": "charuco", "params": wrong})
+        assert_problem(refused, 422, "scene_invalid")
+    client.put(f"{API}/sim/scene", json={"scene": "grid", "params": {"bump_cam1": [0.0] * 6}})
 
 
 # tests and steps ------------------------------------------------------------------------------------------------

@@ -277,6 +277,9 @@ def _test(session: Session, calibration: str) -> str:
     call("rate_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
     call("check_seeds", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
     call("delete_step", test, imported)
+    # one step of a narrow view: whether it is repaired or refused is the job's to say
+    repair = {"test_id": test, "steps": [0], "region": {"rectangle": [60, 60, 200, 180]}}
+    wait_for_job(client, call("repair_calibration", calibration, summary="From one step", body=repair).json()["job"])
     return test
 
 

@@ -10,7 +10,7 @@ from core.calibration.choice.structure import Structure
 from core.calibration.fit.adjust import Adjustment
 from core.errors import CalibrationError
 
-_SHARE = 1.0  # of the noise: a bow that moves the points by more rules the fit
+_SHARE = 0.7  # of all residuals: a bow of more than this is half of their squares
 _LEAST_PX = 0.05  # less than this does no harm worth a refusal; the verdict names it
 
 

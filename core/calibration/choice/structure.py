@@ -19,7 +19,7 @@ from core.arrays import Float
 from core.calibration.fit.adjust import Adjustment
 from core.calibration.fit.layout import camera_of
 from core.calibration.fit.lens_form import LensName
-from core.calibration.fit.model import linearise
+from core.calibration.fit.model import linearise_all
 from core.calibration.fit.normal import Extra, Normal, assemble, inverse
 from core.calibration.fit.observations import ViewRows
 from core.calibration.inputs import NominalCamera
@@ -233,9 +233,8 @@ def _extras(
     half = np.abs(nominal_nodes_mm[:, :2]).max()
     X, Y = (nominal_nodes_mm[:, :2] / half).T
     extras = []
-    for view in views:
+    for view, lin in zip(views, linearise_all(layout, state, views, nominal_nodes_mm), strict=True):
         c = view.camera
-        lin = linearise(layout, state, view, nominal_nodes_mm)
         values = state.x[layout.lens(c)]
         size = nominals[c].image_size_px
         fields = [_lens_term(t, lin.normalised, float(values[0])) for t in per_camera[c]]

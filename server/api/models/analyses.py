@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from core import settings
 from core.settings import StoredSettings, disagreement
+from server.api.models.cameras_moved import CameraMotion
 from server.api.models.jobs import Accepted, JobProblem
 from server.api.models.tests import AnalysisEntry
 from server.base.json_values import Nested
@@ -109,6 +110,9 @@ class StepFigures(Reply):
     valid: int | None = Field(None, description="Points with values.")
     valid_fraction: float | None = Field(None, description="Their share.")
     status: dict[str, int] | None = Field(None, description="Points by status.")
+    camera_motion: CameraMotion | None = Field(
+        None, description="Whether a camera moved, by the epipolar offset; null: too few points to tell."
+    )
     wall_s: float | None = Field(None, description="Seconds that the step took.")
 
 

@@ -112,14 +112,29 @@ class StopReply(Reply):
 class SceneRequest(Request):
     """The scene before a simulated rig's cameras."""
 
-    scene: Literal["grid", "steel", "plate", "panel", "block", "strip", "sphere"] = Field(
-        description="Name of the scene."
-    )
+    scene: Literal[
+        "grid",
+        "steel",
+        "plate",
+        "panel",
+        "block",
+        "strip",
+        "sphere",
+        "line_grid",
+        "checkerboard",
+        "charuco",
+        "circles",
+        "circles_asymmetric",
+    ] = Field(description="Name of the scene; `grid` is the rig's own target, the last five are targets of that kind.")
     load: Number = Field(
         0.0, description="kPa for `plate`, kN for `panel`, per cent for `strip`, share of the motion for `block`."
     )
-    params: dict[str, Number | list[Number]] = Field(
-        default_factory=dict, description="Further parameters of the scene.", max_length=20
+    params: dict[str, Number | list[Number] | Annotated[str, Field(max_length=100)]] = Field(
+        default_factory=dict,
+        description="Further parameters of the scene. Targets: `pose` [rx, ry, rz in degrees, x, y, z in mm], a "
+        "rotation vector and a place in the system frame, or `hand`, the number of a hand's pose; `bow_mm`, `size` and "
+        "others. Any scene: `bump_cam1`, `bump_cam2`, six such numbers that knock a camera from now on.",
+        max_length=20,
     )
 
 

@@ -1,4 +1,4 @@
-"""``stereorig calibration``: calibration files in other programs' forms, and a check of their plausibility."""
+"""``stereorig calibration``: files in other programs' forms, a check of their plausibility, repair after a bump."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from core.errors import InputError
+from server.cli.measurement import calibration_repair
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
 from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
@@ -33,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     check = actions.add_parser("check", help="epipolar residuals: over the volume, and over measured points")
     check.add_argument("file", metavar="FILE", type=Path, help=known)
+    calibration_repair.add_arguments(
+        actions.add_parser("repair", help="estimate the cameras' orientation anew after a bump, from speckle images")
+    )
     for action in (convert, check):
         action.add_argument(
             "--points",
@@ -46,7 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert or check; print what was found."""
+    """Convert, check or repair; print what was found."""
+    if args.action == "repair":
+        return calibration_repair.run(args)
     loaded = load_calibration(args.file)
     checked, points = check_calibration(loaded), None
     if args.points is not None:

@@ -195,9 +195,9 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     if folder is not None and not args.calibration:
         _check_calibration(folder, calibration)
     for pair in files:
-        _check_cameras(pair, calibration_file)
+        check_cameras(pair, calibration_file)
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
-    shapes = _checked_shapes(files[0], calibration)
+    shapes = checked_shapes(files[0], calibration)
     if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
         rows, cols = shapes[0]
         margin = float(subset // 2 + 2)
@@ -215,7 +215,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         holes=args.hole,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
-    steps = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    steps = [check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     settings = StoredSettings.model_validate(
         {
             "region": region,
@@ -259,14 +259,14 @@ def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
         )
 
 
-def _check_cameras(pair: ImagePair, calibration_file: Path) -> None:
+def check_cameras(pair: ImagePair, calibration_file: Path) -> None:
     """Refuse a pair that was taken with other cameras than were calibrated, by its record."""
     record = pair.cam1.parent / "step.json"
     if record.is_file() and calibration_file.suffix == ".json":
         check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")
 
 
-def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
+def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
     """(rows, cols) of both cameras' images, which the calibration must agree with where it states a size."""
     shapes = []
     for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
@@ -276,7 +276,7 @@ def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[t
     return shapes[0], shapes[1]
 
 
-def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
+def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
     """Read both images of a step once, so that a bad one is found before hours of work on the others."""
     hashes, images = [], []
     for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):

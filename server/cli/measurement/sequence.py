@@ -40,6 +40,16 @@ _SEEDS_SHARE = 0.15  # of a step's time, as a rule
 _RESULT = re.compile(r"step_\d{4}\.nc")
 
 
+def _camera_offset(motion: dict[str, Any] | None) -> str:
+    """Return what the step's epipolar offset says about the cameras, for its line."""
+    found = None if motion is None else motion["reference"] or motion["calibration"]
+    if found is None:
+        return ""
+    since = "the reference" if found["against"] == "reference" else "the calibration"
+    moved = {True: "a camera moved", False: "no camera moved", None: "not judged"}[found["camera_moved"]]
+    return f"offset {found['offset_rms_px']:.3f} px since {since} ({found['sigmas']:.1f} sigma, {moved}), "
+
+
 def _strain_noise(strain: dict[str, Any] | None) -> str:
     """Return the part of a step's line on its strain."""
     if strain is None:
@@ -148,6 +158,7 @@ class _Runner:
         self._matched = job.steps[0].n
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
+        self._moved: bool | None = False
         self._smoothing_noted = False
         self._done = 0.0
 
@@ -190,7 +201,7 @@ class _Runner:
         residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
             f"step {k} of {len(self._job.steps) - 1}: {summary['valid']} of {summary['points']} points, "
-            f"{residual}{_strain_noise(summary['strain'])}{duration(seconds)}"
+            f"{residual}{_camera_offset(summary['camera_motion'])}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
         self._note_patch(k, finished.field)
         self._note_reference(k, finished.field)
@@ -199,6 +210,10 @@ class _Runner:
         if check is not None and check["level"] != self._checked:
             self._checked = check["level"]
             self._progress.note(f"{check['level']}: step {k}: {check['reason']}")
+        motion = summary["camera_motion"]
+        if motion is not None and motion["camera_moved"] is not self._moved:
+            self._moved = motion["camera_moved"]
+            self._progress.note(f"{'warning' if self._moved else 'note'}: step {k}: {motion['text']}")
         return summary
 
     def _note_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:

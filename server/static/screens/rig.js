@@ -298,7 +298,7 @@ function stage(ends) {
 
 /** @param {Rig} rig */
 function scene(rig) {
-  const which = select(["grid", "steel", "plate", "panel", "block", "strip", "sphere"].map((s) => [s, s]), rig.scene?.scene);
+  const which = select(["grid", "steel", "plate", "panel", "block", "strip", "sphere", "line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric"].map((s) => [s, s]), rig.scene?.scene);
   const load = number(rig.scene?.load ?? 0);
   return h("details", h("summary", "Simulated scene"),
     field("Scene", which), field("Load", load, "", "kPa for plate, kN for panel, per cent for strip, share of the motion for block"),

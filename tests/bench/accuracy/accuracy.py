@@ -17,6 +17,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from tests.bench.accuracy import adversarial as accuracy_adversarial
+from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import calibration_beside as accuracy_beside
 from tests.bench.accuracy import cracks as accuracy_cracks
@@ -28,6 +29,7 @@ from tests.bench.accuracy import prefilter as accuracy_prefilter
 from tests.bench.accuracy import smoothing as accuracy_smoothing
 from tests.bench.accuracy import specimen as accuracy_specimen
 from tests.bench.accuracy import strain as accuracy_strain
+from tests.bench.accuracy import targets as accuracy_targets
 from tests.bench.accuracy.pages import FIGURES, write_headlines, write_section
 from tests.bench.accuracy.table import Section
 
@@ -37,6 +39,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "beside": accuracy_beside.beside,
     "rigs": rig_campaign.rigs,
     "real-boards": real_boards.real_boards,
+    **accuracy_targets.SECTIONS,
     "plane": matching.plane,
     "translation": matching.translation,
     "strain": matching.strain,
@@ -55,6 +58,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "noise-model": accuracy_noise.camera_noise,
     "prefilter": accuracy_prefilter.prefilter,
     "smoothing": accuracy_smoothing.smoothing,
+    "bumps": accuracy_bumps.bumps,
     "plate": accuracy_experiments.plate,
     "steel": accuracy_experiments.steel,
     "panel": accuracy_experiments.panel,

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from core.errors import FileFormatError
 from server.cli import main
 from server.config.reference import json_schema, markdown
 from server.config.rig_file import RigConfig, load_config, parse_config
@@ -110,7 +111,9 @@ def test_the_laboratory_file_explains_every_key() -> None:
     for section in json_schema()["$defs"].values():
         for key in section.get("properties", {}):
             assert (
-                re.search(rf"^(# )?{key} = ", text, re.MULTILINE) or f"[stage.{key}." in text or f"[cam1.{key}]" in text
+                re.search(rf"^(# +)?{key} = ", text, re.MULTILINE)
+                or f"[stage.{key}." in text
+                or f"[cam1.{key}]" in text
             ), key
 
 
@@ -119,6 +122,57 @@ def test_keys_behind_a_comment_sign_may_be_taken_in() -> None:
     text = re.sub(r"^# (\w+ = )", r"\1", path.read_text(), flags=re.MULTILINE)
     assert text != path.read_text()
     parse_config(text)
+
+
+BOARD = (ROOT / "config" / "sim_board.toml").read_text()
+GRID = (ROOT / "config" / "sim_paper.toml").read_text()
+
+
+def test_a_target_keeps_the_fields_of_its_kind() -> None:
+    grid = parse_config(GRID).target
+    # what is kept with calibrations of a line grid is what has always been
+    assert grid.plain() == {
+        "pitch_mm": 1.0,
+        "lines": [11, 11],
+        "line_width_mm": 0.03,
+        "node_tolerance_mm": 0.004,
+        "dark_lines": True,
+    }
+    assert parse_config(BOARD).target.plain() == {
+        "kind": "charuco",
+        "pitch_mm": 8.0,
+        "size": [9, 6],
+        "marker_mm": 6.0,
+        "dictionary": "DICT_5X5_100",
+        "node_tolerance_mm": 0.01,
+    }
+    dots = BOARD.replace('kind = "charuco"', 'kind = "circles_asymmetric"')
+    dots = re.sub(r"^(marker_mm|dictionary) = .*$", "", dots, flags=re.MULTILINE)
+    assert parse_config(dots).target.kind == "circles_asymmetric"
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "cause"),
+    [
+        (GRID, "lines = [11, 11]", "", "needs lines"),
+        (GRID, "line_width_mm = 0.03", "", "needs line_width_mm"),
+        (GRID, "lines = [11, 11]", "lines = [11, 11]\nsize = [9, 6]", "has no size"),
+        (BOARD, "size = [9, 6] ", "# ", "needs size"),
+        (BOARD, "marker_mm = 6.0", "", "needs marker_mm"),
+        (BOARD, "marker_mm = 6.0", "marker_mm = 8.0", "smaller than pitch_mm"),
+        (BOARD, "marker_mm = 6.0", "marker_mm = 6.0\ndark_lines = true", "has no dark_lines"),
+        (BOARD, 'kind = "charuco"', 'kind = "circles"', "has no marker_mm, dictionary"),
+        (BOARD, 'kind = "charuco"', 'kind = "tomato"', "target.kind"),
+        (BOARD, "size = [9, 6]", "size = [2, 6]", "target.size"),
+        (BOARD, "DICT_5X5_100", "5X5", "target.dictionary"),
+    ],
+)
+def test_a_target_with_the_fields_of_another_kind_is_refused(text: str, old: str, new: str, cause: str) -> None:
+    assert old in text
+    with pytest.raises(FileFormatError) as caught:
+        parse_config(text.replace(old, new))
+    assert caught.value.code == "config_invalid"
+    assert cause in caught.value.cause
 
 
 def test_a_file_of_the_time_of_retention_is_taken_and_says_so(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,0 +1,1 @@
+"""Optics of the simulated cameras: lenses and the rays of image points."""
