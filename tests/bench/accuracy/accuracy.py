@@ -19,8 +19,9 @@ mpl.use("Agg")
 from tests.bench.accuracy import adversarial as accuracy_adversarial
 from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
+from tests.bench.accuracy import calibration_beside as accuracy_beside
 from tests.bench.accuracy import cracks as accuracy_cracks
-from tests.bench.accuracy import curved, gauges, matching, sequence
+from tests.bench.accuracy import curved, gauges, lenses_motions, matching, real_boards, rig_campaign, sequence
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import noise as accuracy_noise
@@ -35,6 +36,11 @@ from tests.bench.accuracy.table import Section
 SECTIONS: dict[str, Callable[[Path], Section]] = {
     "calibration": accuracy_calibration.calibration,
     "aspect": accuracy_calibration.aspect,
+    "lenses": lenses_motions.lenses,
+    "motions": lenses_motions.motions,
+    "beside": accuracy_beside.beside,
+    "rigs": rig_campaign.rigs,
+    "real-boards": real_boards.real_boards,
     **accuracy_targets.SECTIONS,
     "plane": matching.plane,
     "translation": matching.translation,

@@ -25,6 +25,9 @@ class Topic:
 
 TOPICS = (
     Topic("calibration", "Calibration", ("calibration", "aspect", "epipolar")),
+    Topic(
+        "any_rig", "Any lens, target and motion", ("lenses", "motions", "line-grid", "beside", "rigs", "real-boards")
+    ),
     Topic("targets", "Targets", ("targets",)),
     Topic("shape_and_motion", "Shape and motion", ("plane", "translation", "strain", "rotation")),
     Topic("noise", "Random error and its bound", ("noise-random", "noise-model")),
