@@ -106,7 +106,18 @@ class Information:
         for c, xy in enumerate(seen_px):
             found = np.isfinite(xy[kept]).all(axis=-1)
             correlation = float(np.mean([r.correlation for r in e.rows if r.camera == c] or [1.0]))
-            rows.append(ViewRows(c, None, _NEW, "", xy[kept], found, found.astype(np.float64), correlation=correlation))
+            rows.append(
+                ViewRows(
+                    c,
+                    None,
+                    _NEW,
+                    "",
+                    xy[kept],
+                    np.asarray(found),
+                    np.asarray(found, dtype=np.float64),
+                    correlation=correlation,
+                )
+            )
         k = e.priors.nodes_free
         blank = Priors(
             np.zeros(layout.size),
