@@ -36,6 +36,10 @@ class GridTarget:
         Width of a line.
     node_tolerance_mm
         The maker's bound on the error of an intersection's position, per axis; 0 for an exact grid.
+    pitch_scale_sigma
+        Relative standard deviation of the pitch as a whole; 0 where it is exact.
+    flatness_mm
+        Bound on the grid's departure from a plane; None: as ``node_tolerance_mm``. It shows in free poses only.
     dark_lines
         Dark lines on bright ground, or bright lines on dark ground.
 
@@ -50,6 +54,8 @@ class GridTarget:
     line_width_mm: float
     node_tolerance_mm: float = 0.0
     dark_lines: bool = True
+    pitch_scale_sigma: float = 0.0
+    flatness_mm: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lines", two_whole_numbers("lines", self.lines))
@@ -62,6 +68,7 @@ class GridTarget:
                 f" got {self.line_width_mm!r}"
             )
         check_tolerance(self.node_tolerance_mm, self.pitch_mm)
+        check_errors(self.pitch_scale_sigma, self.flatness_mm)
 
     @property
     def inner_shape(self) -> tuple[int, int]:
@@ -108,6 +115,14 @@ def check_tolerance(node_tolerance_mm: float, pitch_mm: float) -> None:
             f"node_tolerance_mm must lie between 0 and a quarter of the pitch ({0.25 * pitch_mm:g} mm),"
             f" got {node_tolerance_mm!r}"
         )
+
+
+def check_errors(pitch_scale_sigma: float, flatness_mm: float | None) -> None:
+    """Raise ``target_invalid`` for errors of a target that no calibration could stand."""
+    if not (0.0 <= pitch_scale_sigma < 0.1):
+        raise invalid(f"pitch_scale_sigma must lie between 0 and 0.1, got {pitch_scale_sigma!r}")
+    if flatness_mm is not None and not (np.isfinite(flatness_mm) and flatness_mm >= 0.0):
+        raise invalid(f"flatness_mm must be positive or 0, got {flatness_mm!r}")
 
 
 def invalid(cause: str) -> TargetError:

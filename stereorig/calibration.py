@@ -41,16 +41,18 @@ def calibrate(
     localiser: Localiser = "profile",
     out: str | Path | None = None,
 ) -> LoadedCalibration:
-    """Calibrate a pair of cameras from images of the line grid (Helm, McNeill and Sutton 1996, doi:10.1117/1.600624).
+    """Calibrate a pair of cameras from images of a target (Helm, McNeill and Sutton 1996, doi:10.1117/1.600624).
 
     Parameters
     ----------
     views
-        Folder of images with camera and travel in the name, as ``cam2_+5.000mm.tif``.
+        Folder of images with camera and travel in the name, as ``cam2_+5.000mm.tif``, or camera and number of a free
+        pose, as ``cam2_005.tif``.
     target, rig
-        TOML files: the grid of lines (``pitch_mm``, ``lines`` ...); the nominal cameras.
+        TOML files: the target (``kind``, ``pitch_mm``, ``lines`` or ``size`` ...); the nominal cameras, and in
+        ``[calibration]`` what moves and the lens model.
     hold_out_mm
-        Travels that are left out of the fit, to check it with.
+        Travels, or numbers of free poses, that are left out of the fit, to check it with.
     localiser
         How intersections are found: ``profile`` or the paper's (``paper``).
     out
@@ -64,9 +66,9 @@ def calibrate(
     Raises
     ------
     StereorigError
-        Files that cannot be used, a grid that is not found; ``calibration_rejected`` if the verdict is failed.
+        Files that cannot be used, a target that is not found; ``calibration_rejected`` if the verdict is failed.
     """
-    found = calibrate_folder(Path(views), Path(target), Path(rig), hold_out_mm=hold_out_mm, localiser=localiser)
+    found = calibrate_folder(Path(views), Path(target), Path(rig), hold_out=hold_out_mm, localiser=localiser)
     found.check()
     if out is not None:
         found.write(Path(out))

@@ -14,7 +14,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.errors import TargetError
-from core.target import check_pitch, check_tolerance, invalid, two_whole_numbers
+from core.target import check_errors, check_pitch, check_tolerance, invalid, two_whole_numbers
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "circles_asymmetric"]
 BOARD_KINDS: tuple[BoardKind, ...] = get_args(BoardKind)
@@ -42,6 +42,10 @@ class BoardTarget:
         ChArUco: side of a marker, and the name of its dictionary.
     dot_diameter_mm
         Diameter of a dot where it is known; None: it is measured in the images.
+    pitch_scale_sigma
+        Relative standard deviation of the pitch as a whole; 0 where it is exact.
+    flatness_mm
+        Bound on the board's departure from a plane; None: as ``node_tolerance_mm``. It shows in free poses only.
 
     Raises
     ------
@@ -56,6 +60,8 @@ class BoardTarget:
     marker_mm: float | None = None
     dictionary: str = DEFAULT_DICTIONARY
     dot_diameter_mm: float | None = None
+    pitch_scale_sigma: float = 0.0
+    flatness_mm: float | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in BOARD_KINDS:
@@ -65,6 +71,7 @@ class BoardTarget:
             raise invalid(f"size must lie between {_MIN_SIZE} and {_MAX_SIZE} each way, got {list(self.size)}")
         check_pitch(self.pitch_mm)
         check_tolerance(self.node_tolerance_mm, self.pitch_mm)
+        check_errors(self.pitch_scale_sigma, self.flatness_mm)
         if self.kind == "charuco" and (self.marker_mm is None or not 0.0 < self.marker_mm < self.pitch_mm):
             raise invalid(f"marker_mm must lie between 0 and the pitch ({self.pitch_mm:g} mm), got {self.marker_mm!r}")
         if self.dot_diameter_mm is not None and not 0.0 < self.dot_diameter_mm < self.nearest_mm:

@@ -1,4 +1,4 @@
-"""Calibration from grid images, for the command line and the service."""
+"""Calibration from images of the target, for the command line and the service."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera
-from core.calibration.prepare import check_hold_out
+from core.boards import BoardTarget, BoardView, detect_target
+from core.calibration.choice.screening import DroppedView
+from core.calibration.fit.free_start import MIN_POSES
+from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, place
+from core.calibration.prepare import check_both, check_hold_out
 from core.calibration.result import CalibrationResult
 from core.calibration.solve import calibrate
-from core.errors import ImageError, StereorigError
-from core.grid import GridOptions, GridView, Localiser, detect_grid
+from core.errors import CalibrationInputError, ImageError, StereorigError
+from core.grid import GridOptions, GridView, Localiser
 from core.names import CAMERAS, CameraName
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.target import GridTarget
@@ -26,36 +29,41 @@ class ImageOfTarget:
 
     Attributes
     ----------
-    camera, dz_mm
-        The camera, and its read-back travel along its own optical axis, mm, positive away from the target.
+    camera
+        The camera.
+    dz_mm
+        Read-back position of the stage, mm, positive where target and cameras move apart; None for a free pose.
     pixels
         (rows, columns).
     name
         Used in messages.
+    frame
+        Number of the free pose; None at a stage position.
     """
 
     camera: CameraName
-    dz_mm: float
+    dz_mm: float | None
     pixels: NDArray[Any]
     name: str = ""
+    frame: int | None = None
 
     @property
     def label(self) -> str:
         """Name for messages."""
-        return self.name or f"{self.camera} at {self.dz_mm:+.3f} mm"
+        return self.name or place(self.camera, self.dz_mm, self.frame)
 
 
 @dataclass(frozen=True)
 class CalibrationFromImages:
-    """The grids detected in the images, in their order, and the calibration from them."""
+    """The targets detected, in the images' order, None where a free pose's was not; and the calibration from them."""
 
-    grids: tuple[GridView, ...]
+    grids: tuple[GridView | BoardView | None, ...]
     result: CalibrationResult
 
 
 def calibrate_views(
     images: Sequence[ImageOfTarget],
-    target: GridTarget,
+    target: GridTarget | BoardTarget,
     nominals: tuple[NominalCamera, NominalCamera],
     options: CalibrationOptions | None = None,
     *,
@@ -64,12 +72,12 @@ def calibrate_views(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> CalibrationFromImages:
-    """Find the grid in every image and calibrate.
+    """Find the target in every image and calibrate.
 
     Parameters
     ----------
     images
-        Images of both cameras, held-out positions included.
+        Images of both cameras, held-out ones included.
     target, nominals, options
         See :func:`core.calibration.solve.calibrate`.
     localiser, grid_options
@@ -83,47 +91,114 @@ def calibrate_views(
     Raises
     ------
     ImageError, TargetError
-        The image named cannot be used; ``image_size_mismatch`` where its size is not the rig's.
+        The image named cannot be used; ``image_size_mismatch`` where its size is not the rig's. A free pose whose
+        target is not found is left out, unless too few remain.
     CalibrationInputError, CalibrationError
         See :func:`core.calibration.solve.calibrate`.
     """
     options = options or CalibrationOptions()
-    check_hold_out([[i.dz_mm for i in images if i.camera == name] for name in CAMERAS], options)
+    check_both([[i for i in images if i.camera == name] for name in CAMERAS])
+    staged = [[i.dz_mm for i in images if i.camera == name and i.dz_mm is not None] for name in CAMERAS]
+    check_hold_out(staged, options)
     for image in images:
         _check_size(image, nominals[CAMERAS.index(image.camera)])
-    grid_options = grid_options or GridOptions()
-    if (
-        localiser == "profile"
-        and grid_options.line_model is None
-        and target.node_tolerance_mm > 0.0
-        and options.estimate_nodes is not False
-    ):
-        grid_options = replace(grid_options, line_model="local")
-    grids: list[GridView] = []
-    views: list[CalibrationView] = []
+    grid_options = _grid_options(target, options, localiser, grid_options or GridOptions())
+    found: list[GridView | BoardView | None] = []
+    failed: list[tuple[ImageOfTarget, StereorigError]] = []
     total = len(images) + 1
     for k, image in enumerate(images):
         raise_if_cancelled(cancel)
         progress("grid", k, total)
         try:
-            grid = detect_grid(image.pixels, target, localiser=localiser, options=grid_options)
+            found.append(detect_target(image.pixels, target, localiser=localiser, options=grid_options))
         except StereorigError as error:
-            raise type(error)(
-                f"{image.label}: {error.cause}",
-                code=error.code,
-                remedy=error.remedy,
-                **{**error.context, "view": image.label},
-            ) from error
-        grids.append(grid)
-        # one figure for both axes: the adjustment weighs nodes, not directions
-        sigma = np.sqrt(0.5 * np.trace(grid.covariance_px2, axis1=-2, axis2=-1))
-        shared = _coordinates_per_independent_one(grid)
-        views.append(CalibrationView(image.camera, image.dz_mm, grid.xy_px, sigma, image.label, shared))
+            if image.frame is None:
+                raise _of_view(error, image) from error
+            found.append(None)
+            failed.append((image, error))
+    _check_enough(images, found, failed)
     raise_if_cancelled(cancel)
     progress("calibration", len(images), total)
+    radius_mm = _dot_radius_mm(target, found)
+    views = [_view(image, grid, radius_mm) for image, grid in zip(images, found, strict=True) if grid is not None]
     result = calibrate(views, target, nominals, options)
+    lost = tuple(DroppedView(i.label, i.camera, int(i.frame or 0), error.cause) for i, error in failed)
     progress("calibration", total, total)
-    return CalibrationFromImages(tuple(grids), result)
+    return CalibrationFromImages(tuple(found), replace(result, dropped=(*lost, *result.dropped)))
+
+
+def _grid_options(
+    target: GridTarget | BoardTarget, options: CalibrationOptions, localiser: Localiser, given: GridOptions
+) -> GridOptions:
+    estimated = target.node_tolerance_mm > 0.0 and options.estimate_nodes is not False
+    if localiser == "profile" and given.line_model is None and estimated and isinstance(target, GridTarget):
+        return replace(given, line_model="local")
+    return given
+
+
+def _of_view(error: StereorigError, image: ImageOfTarget) -> StereorigError:
+    return type(error)(
+        f"{image.label}: {error.cause}", code=error.code, remedy=error.remedy, **{**error.context, "view": image.label}
+    )
+
+
+def _check_enough(
+    images: Sequence[ImageOfTarget],
+    found: Sequence[GridView | BoardView | None],
+    failed: Sequence[tuple[ImageOfTarget, StereorigError]],
+) -> None:
+    """Raise the commonest cause where the target is found in too few free poses."""
+    if not failed or any(i.frame is None for i in images):
+        return
+    seen = [{i.frame for i, g in zip(images, found, strict=True) if g is not None and i.camera == n} for n in CAMERAS]
+    both = len(seen[0] & seen[1])
+    if both >= MIN_POSES:
+        return
+    codes = [error.code for _, error in failed]
+    image, error = failed[codes.index(max(codes, key=codes.count))]
+    if len(failed) > len(images) // 2:
+        raise _of_view(error, image) from error
+    raise CalibrationInputError(
+        f"The target was found by both cameras in {both} poses; {MIN_POSES} are needed. {image.label}: {error.cause}",
+        code="too_few_poses",
+        remedy="Take at least three sharp views that show the whole target, tilted differently; better fifteen.",
+        view=image.label,
+    ) from error
+
+
+def _dot_radius_mm(target: GridTarget | BoardTarget, found: Sequence[GridView | BoardView | None]) -> float | None:
+    if not isinstance(target, BoardTarget) or target.kind not in ("circles", "circles_asymmetric"):
+        return None
+    if target.dot_diameter_mm is not None:
+        return 0.5 * target.dot_diameter_mm
+    # one dot size for all views: each view's own estimate is good to a per cent, the correction needs no more
+    radii = [view.dot_radius_mm for view in found if isinstance(view, BoardView)]
+    return float(np.median([r for r in radii if r is not None]))
+
+
+def _view(image: ImageOfTarget, grid: GridView | BoardView, radius_mm: float | None) -> CalibrationView:
+    if isinstance(grid, BoardView):
+        return CalibrationView(
+            image.camera,
+            image.dz_mm,
+            grid.xy_px,
+            grid.sigma_px,
+            image.label,
+            frame=image.frame,
+            dot_radius_mm=radius_mm,
+        )
+    # one figure for both axes: the adjustment weighs nodes, not directions
+    sigma = np.sqrt(0.5 * np.trace(grid.covariance_px2, axis1=-2, axis2=-1))
+    return CalibrationView(
+        image.camera,
+        image.dz_mm,
+        grid.xy_px,
+        sigma,
+        image.label,
+        _coordinates_per_independent_one(grid),
+        frame=image.frame,
+        offsets=grid.line_offsets,
+    )
 
 
 def _coordinates_per_independent_one(grid: GridView) -> float:

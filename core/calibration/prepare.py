@@ -94,7 +94,7 @@ def check_hold_out(positions_mm: Sequence[Sequence[float]], options: Calibration
             )
 
 
-def check_both(per_camera: Views) -> None:
+def check_both(per_camera: Sequence[Sequence[object]]) -> None:
     """Raise ``view_missing`` where a camera has no view."""
     for name, own in zip(CAMERAS, per_camera, strict=True):
         if not own:

@@ -67,8 +67,8 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
         progress=channel.progress,
         cancel=channel,
     )
-    known = {view["file"]: grid for view, grid in zip(measured, found.grids, strict=True)}
-    like = replace(grid_options, line_model=found.grids[0].line_model)
+    known = {view["file"]: grid for view, grid in zip(measured, found.grids, strict=True) if isinstance(grid, GridView)}
+    like = replace(grid_options, line_model=next(iter(known.values())).line_model)
     drift = _drift(
         folder, task.views, known, lambda image: detect_grid(image, target, localiser=plan["localiser"], options=like)
     )
@@ -76,7 +76,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
         "software_version": software_version(),
         "rig": rig["name"],
         "localiser": plan["localiser"],
-        "line_model": found.grids[0].line_model,
+        "line_model": next((g.line_model for g in found.grids if isinstance(g, GridView)), None),
         "frames": plan["frames"],
         "views_sha256": {Path(v["file"]).name: v["sha256"] for v in task.views},
         "cameras": {view["camera"]: view["device"] for view in task.views if "device" in view},

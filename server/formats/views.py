@@ -1,4 +1,7 @@
-"""A folder of calibration views: ``cam1_+0.000mm.tif``, ``cam2_+5.000mm.tif`` and so on, dZ in the name."""
+"""A folder of calibration views: dZ in the name where something moves by it, else the number of a free pose.
+
+``cam1_+0.000mm.tif``, ``cam2_+5.000mm.tif`` and so on; ``cam1_000.tif``, ``cam2_000.tif``; both for mixtures.
+"""
 
 from __future__ import annotations
 
@@ -13,27 +16,31 @@ from core.names import CAMERAS, CameraName
 
 # read-back positions of the two stages may differ by some micrometres at one nominal position
 PAIR_TOLERANCE_MM = 0.05
-_NAME = re.compile(r"(?i)(cam[12])_([+-]?(?:\d+\.?\d*|\.\d+))mm\.(?:tif|tiff|png)")
-_EXAMPLE = "Name the views cam1_+0.000mm.tif, cam2_+0.000mm.tif, cam1_+5.000mm.tif and so on."
+_NAME = re.compile(r"(?i)(cam[12])_(?:([+-]?(?:\d+\.?\d*|\.\d+))mm|(\d{1,9}))\.(?:tif|tiff|png)")
+_EXAMPLE = (
+    "Name the views cam1_+0.000mm.tif, cam2_+0.000mm.tif, cam1_+5.000mm.tif and so on; those of free poses "
+    "cam1_000.tif, cam2_000.tif, cam1_001.tif and so on."
+)
 
 
 @dataclass(frozen=True)
 class ViewFile:
-    """One view's file."""
+    """One view's file: at a stage position, or of a free pose by its number."""
 
     camera: CameraName
-    dz_mm: float
+    dz_mm: float | None
     path: Path
+    frame: int | None = None
 
 
 def find_views(folder: Path) -> list[ViewFile]:
-    """List the views in a folder, by camera and ascending dZ; files of other names are left alone.
+    """List the views in a folder, by camera, ascending dZ, then ascending numbers; other names are left alone.
 
     Raises
     ------
     InputError
         ``folder_missing``, ``views_missing`` (none there), ``view_duplicate`` (a position twice),
-        ``view_missing`` (a position that only one camera has).
+        ``view_missing`` (a position that only one camera has, or no free pose of one camera).
     """
     try:
         entries = sorted(folder.iterdir())
@@ -52,30 +59,49 @@ def find_views(folder: Path) -> list[ViewFile]:
         match = _NAME.fullmatch(path.name)
         if match and path.is_file():
             camera: CameraName = "cam1" if match[1].lower() == "cam1" else "cam2"
-            views.append(ViewFile(camera, float(match[2]), path))
+            dz_mm = None if match[2] is None else float(match[2])
+            views.append(ViewFile(camera, dz_mm, path, None if match[3] is None else int(match[3])))
     if not views:
         raise InputError(
             f"The folder {folder} holds {len(entries)} entries, but no view.", code="views_missing", remedy=_EXAMPLE
         )
-    views.sort(key=lambda v: (v.camera, v.dz_mm))
+    views.sort(key=lambda v: (v.camera, v.dz_mm is None, v.dz_mm or 0.0, v.frame or 0))
     for a, b in pairwise(views):
-        if a.camera == b.camera and abs(a.dz_mm - b.dz_mm) < 1e-9:
+        if a.camera == b.camera and _same_place(a, b):
+            what = "position" if a.frame is None else "pose"
             raise InputError(
-                f"{a.path.name} and {b.path.name} name the same position.",
+                f"{a.path.name} and {b.path.name} name the same {what}.",
                 code="view_duplicate",
-                remedy="Keep one view of each camera and position.",
+                remedy=f"Keep one view of each camera and {what}.",
             )
-    by_camera = {name: [v for v in views if v.camera == name] for name in CAMERAS}
-    _check_pairs(by_camera["cam1"], by_camera["cam2"], "cam2", folder)
-    _check_pairs(by_camera["cam2"], by_camera["cam1"], "cam1", folder)
+    staged = {name: [v for v in views if v.camera == name and v.dz_mm is not None] for name in CAMERAS}
+    _check_pairs(staged["cam1"], staged["cam2"], "cam2", folder)
+    _check_pairs(staged["cam2"], staged["cam1"], "cam1", folder)
+    # a free pose may be seen by one camera only, but not every one
+    free = {name: [v for v in views if v.camera == name and v.frame is not None] for name in CAMERAS}
+    for name, other in zip(CAMERAS, CAMERAS[::-1], strict=True):
+        if free[name] and not free[other]:
+            raise InputError(
+                f"{folder} holds {free[name][0].path.name}, but no free pose of {other}.",
+                code="view_missing",
+                remedy="Take every pose with both cameras.",
+                camera=other,
+            )
     return views
+
+
+def _same_place(a: ViewFile, b: ViewFile) -> bool:
+    if a.dz_mm is not None and b.dz_mm is not None:
+        return abs(a.dz_mm - b.dz_mm) < 1e-9
+    return a.frame is not None and a.frame == b.frame
 
 
 def _check_pairs(own: Sequence[ViewFile], others: Sequence[ViewFile], other: str, folder: Path) -> None:
     for view in own:
-        if not any(abs(view.dz_mm - o.dz_mm) <= PAIR_TOLERANCE_MM for o in others):
+        dz_mm = view.dz_mm or 0.0
+        if not any(abs(dz_mm - (o.dz_mm or 0.0)) <= PAIR_TOLERANCE_MM for o in others):
             raise InputError(
-                f"{folder} holds {view.path.name}, but no view of {other} at {view.dz_mm:+.3f} mm.",
+                f"{folder} holds {view.path.name}, but no view of {other} at {dz_mm:+.3f} mm.",
                 code="view_missing",
                 remedy="Take every position with both cameras.",
                 camera=other,

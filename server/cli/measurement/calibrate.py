@@ -22,24 +22,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "views",
         metavar="VIEWS",
         type=Path,
-        help="folder with cam1_+0.000mm.tif, cam2_+5.000mm.tif and so on (dZ in the name)",
+        help="folder with cam1_+0.000mm.tif, cam2_+5.000mm.tif and so on (dZ in the name); of free poses cam1_000.tif, "
+        "cam2_000.tif and so on; of both for mixtures",
     )
     parser.add_argument(
         "--target",
         required=True,
         metavar="TARGET.toml",
         type=Path,
-        help="pitch_mm, lines, line_width_mm, node_tolerance_mm, dark_lines",
+        help="kind (line_grid, checkerboard, charuco, circles, circles_asymmetric), pitch_mm, lines or size, and so on",
     )
     parser.add_argument(
         "--rig",
         required=True,
         metavar="RIG.toml",
         type=Path,
-        help="[cam1] and [cam2]: image_size_px, phd_px, standoff_mm, angle_deg, aspect",
+        help="[cam1] and [cam2]: image_size_px, phd_px, standoff_mm, angle_deg, aspect; [calibration]: moves (cameras, "
+        "both_cameras, target, free), lens (auto, paper, opencv5, opencv8)",
     )
     parser.add_argument(
-        "--hold-out", default="", metavar="2,4", help="positions in mm to leave out of the fit and check with"
+        "--hold-out",
+        default="",
+        metavar="2,4",
+        help="positions in mm, or numbers of free poses, to leave out of the fit and check with",
     )
     parser.add_argument(
         "--localiser",
@@ -61,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
             args.views,
             args.target,
             args.rig,
-            hold_out_mm=held_out,
+            hold_out=held_out,
             localiser=args.localiser,
             progress=lambda phase, done, total: line.show(phase, done / total),
         )
@@ -116,10 +121,29 @@ def report(result: CalibrationResult) -> str:
     lines.append(
         f"predicted shape uncertainty in the target's volume: {1e3 * result.uncertainty.shape_rms_mm:.3f} um rms"
     )
+    lines.extend(_found(result))
     lines.extend(f"{'checked' if c.made else 'NOT checked'}: {c.name}: {c.text}" for c in result.checks)
     lines.append(f"verdict: {result.verdict.level}")
     lines.extend(f"  {reason}" for reason in result.verdict.reasons)
     return "\n".join(lines)
+
+
+def _found(result: CalibrationResult) -> list[str]:
+    """Lines about the lens model, the stage, the pitch and the views left out."""
+    lines = [f"lens model: {result.lens.model}"]
+    lines.extend(f"  {reason}" for reason in result.lens.reasons)
+    stage = result.stage
+    if stage.direction_sys is not None and stage.direction_sigma_rad is not None:
+        x, y, z = stage.direction_sys
+        spread = 1e3 * float(max(stage.direction_sigma_rad))
+        lines.append(f"the stage moves along ({x:.5f}, {y:.5f}, {z:.5f}) in the system frame, +- {spread:.2g} mrad")
+    for axis, (scale, sigma) in enumerate(zip(stage.scale, stage.scale_sigma, strict=True)):
+        if sigma > 0.0:
+            lines.append(f"scale of stage axis {axis + 1}: {1e6 * scale:+.0f} +- {1e6 * sigma:.0f} ppm")
+    if result.pitch_scale_sigma > 0.0:
+        lines.append(f"scale of the pitch: {1e6 * result.pitch_scale:+.0f} +- {1e6 * result.pitch_scale_sigma:.0f} ppm")
+    lines.extend(f"left out: {view.name}: {view.reason}" for view in result.dropped)
+    return lines
 
 
 def _row(label: str, m: Measures) -> str:

@@ -7,14 +7,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from typing import TypedDict
 
-from core.calibration import NominalCamera
+from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget, dictionary_id
+from core.calibration import CalibrationOptions, NominalCamera
+from core.calibration.fit.lens_form import LENS_CHOICES, LensChoice
+from core.calibration.inputs import MOVES, Moves
 from core.errors import FileFormatError, InputError
 from core.names import CAMERAS
 from core.target import GridTarget
 
 _MAX_BYTES = 1 << 20
 _MAX_SIDE_PX = 32_767
+LINE_GRID = "line_grid"
+DEFAULTS = CalibrationOptions()
 
 
 @dataclass(frozen=True)
@@ -25,13 +31,29 @@ class NominalRig:
     ----------
     cam1, cam2
         Nominal cameras.
-    axis_tilt_sigma_rad
-        ``axis_tilt_sigma_rad`` of ``[calibration]``, 0 where the file does not declare it.
+    moves, lens, axis_tilt_sigma_rad, stage_scale_sigma, stage_step_sigma_mm
+        Of ``[calibration]``, as :class:`core.calibration.CalibrationOptions` has them.
     """
 
     cam1: NominalCamera
     cam2: NominalCamera
-    axis_tilt_sigma_rad: float = 0.0
+    moves: Moves = DEFAULTS.moves
+    lens: LensChoice = DEFAULTS.lens
+    axis_tilt_sigma_rad: float = DEFAULTS.axis_tilt_sigma_rad
+    stage_scale_sigma: float = DEFAULTS.stage_scale_sigma
+    stage_step_sigma_mm: float = DEFAULTS.stage_step_sigma_mm
+
+    def options(self, held_out_mm: tuple[float, ...], held_out_frames: tuple[int, ...]) -> CalibrationOptions:
+        """Return the settings of a calibration with these positions and poses kept for the check."""
+        return CalibrationOptions(
+            moves=self.moves,
+            lens=self.lens,
+            held_out_mm=held_out_mm,
+            held_out_frames=held_out_frames,
+            axis_tilt_sigma_rad=self.axis_tilt_sigma_rad,
+            stage_scale_sigma=self.stage_scale_sigma,
+            stage_step_sigma_mm=self.stage_step_sigma_mm,
+        )
 
 
 def load_toml(path: Path, *, kind: str) -> dict[str, object]:
@@ -56,7 +78,7 @@ def load_toml(path: Path, *, kind: str) -> dict[str, object]:
         raise _malformed(path, kind, f"it is no valid TOML ({error})") from error
 
 
-def read_target(path: Path) -> GridTarget:
+def read_target(path: Path) -> GridTarget | BoardTarget:
     """Read TARGET.toml: the fields at top level, or in a table ``[target]``.
 
     Raises
@@ -69,31 +91,67 @@ def read_target(path: Path) -> GridTarget:
     where = f"{path}, [target]" if "target" in content else str(path)
     if not isinstance(table, Mapping):
         raise _field(where, "target", "is not a table")
-    pitch = _number(table, "pitch_mm", where, positive=True)
-    width = _number(table, "line_width_mm", where, positive=True)
-    tolerance = _number(table, "node_tolerance_mm", where, default=0.0)
-    lines = table.get("lines")
-    if lines is None:
-        raise _field(where, "lines", "is missing")
-    if not (isinstance(lines, list) and len(lines) == 2 and all(type(n) is int for n in lines)):
-        raise _field(where, "lines", f"is {lines!r}, not two whole numbers such as [11, 11]")
-    dark = table.get("dark_lines", True)
-    if not isinstance(dark, bool):
-        raise _field(where, "dark_lines", f"is {dark!r}, neither true nor false")
+    kind = table.get("kind", LINE_GRID)
+    if kind not in (LINE_GRID, *BOARD_KINDS):
+        raise _field(where, "kind", f"is {kind!r}, not one of {', '.join((LINE_GRID, *BOARD_KINDS))}")
+    common = _Common(
+        pitch_mm=_number(table, "pitch_mm", where, positive=True),
+        node_tolerance_mm=_number(table, "node_tolerance_mm", where, default=0.0),
+        pitch_scale_sigma=_number(table, "pitch_scale_sigma", where, default=0.0),
+        flatness_mm=_optional(table, "flatness_mm", where),
+    )
     try:
-        return GridTarget(
-            pitch_mm=pitch,
-            lines=(lines[0], lines[1]),
-            line_width_mm=width,
-            node_tolerance_mm=tolerance,
-            dark_lines=dark,
-        )
+        return _grid(table, where, common) if kind == LINE_GRID else _board(kind, table, where, common)
+    except FileFormatError:
+        raise
     except InputError as error:
         raise FileFormatError(f"{where}: {error.cause}", code="field_invalid", remedy=error.remedy) from error
 
 
+class _Common(TypedDict):
+    pitch_mm: float
+    node_tolerance_mm: float
+    pitch_scale_sigma: float
+    flatness_mm: float | None
+
+
+def _grid(table: Mapping[str, object], where: str, common: _Common) -> GridTarget:
+    width = _number(table, "line_width_mm", where, positive=True)
+    dark = table.get("dark_lines", True)
+    if not isinstance(dark, bool):
+        raise _field(where, "dark_lines", f"is {dark!r}, neither true nor false")
+    lines = _two(table, "lines", where, "[11, 11]")
+    return GridTarget(lines=lines, line_width_mm=width, dark_lines=dark, **common)
+
+
+def _board(kind: BoardKind, table: Mapping[str, object], where: str, common: _Common) -> BoardTarget:
+    dictionary = table.get("dictionary", DEFAULT_DICTIONARY)
+    if not isinstance(dictionary, str):
+        raise _field(where, "dictionary", f"is {dictionary!r}, not the name of a dictionary")
+    if kind == "charuco":
+        _number(table, "marker_mm", where, positive=True)
+        dictionary_id(dictionary)
+    return BoardTarget(
+        kind=kind,
+        size=_two(table, "size", where, "[9, 6]"),
+        marker_mm=_optional(table, "marker_mm", where),
+        dictionary=dictionary,
+        dot_diameter_mm=_optional(table, "dot_diameter_mm", where),
+        **common,
+    )
+
+
+def _two(table: Mapping[str, object], key: str, where: str, example: str) -> tuple[int, int]:
+    value = table.get(key)
+    if value is None:
+        raise _field(where, key, "is missing")
+    if not (isinstance(value, list) and len(value) == 2 and all(type(n) is int for n in value)):
+        raise _field(where, key, f"is {value!r}, not two whole numbers such as {example}")
+    return value[0], value[1]
+
+
 def read_rig(path: Path) -> NominalRig:
-    """Read ``[cam1]`` and ``[cam2]`` of RIG.toml; other tables and keys are left alone.
+    """Read ``[cam1]``, ``[cam2]`` and ``[calibration]`` of RIG.toml; other tables and keys are left alone.
 
     Raises
     ------
@@ -101,35 +159,54 @@ def read_rig(path: Path) -> NominalRig:
         ``file_missing``, ``toml_malformed``, or ``field_invalid`` naming the field.
     """
     content = load_toml(path, kind="rig description")
+    where = f"{path}, [calibration]"
+    plan = content.get("calibration", {})
+    if not isinstance(plan, Mapping):
+        plan = {}
+    moves, lens = plan.get("moves", "cameras"), plan.get("lens", "auto")
+    for key, value, known in (("moves", moves, MOVES), ("lens", lens, LENS_CHOICES)):
+        if value not in known:
+            raise _field(where, key, f"is {value!r}, not one of {', '.join(known)}")
     cameras = []
     for name in CAMERAS:
         table = content.get(name)
         if not isinstance(table, Mapping):
             raise _field(str(path), f"[{name}]", "is missing" if table is None else "is not a table")
-        cameras.append(_camera(table, f"{path}, [{name}]"))
-    plan = content.get("calibration", {})
-    tilt = 0.0
-    if isinstance(plan, Mapping):
-        tilt = _number(plan, "axis_tilt_sigma_rad", f"{path}, [calibration]", default=0.0)
-    return NominalRig(cameras[0], cameras[1], tilt)
+        cameras.append(_camera(table, f"{path}, [{name}]", free=moves == "free"))
+    return NominalRig(
+        cam1=cameras[0],
+        cam2=cameras[1],
+        moves=moves,
+        lens=lens,
+        axis_tilt_sigma_rad=_number(plan, "axis_tilt_sigma_rad", where, default=DEFAULTS.axis_tilt_sigma_rad),
+        stage_scale_sigma=_number(plan, "stage_scale_sigma", where, default=DEFAULTS.stage_scale_sigma),
+        stage_step_sigma_mm=_number(plan, "stage_step_sigma_mm", where, default=DEFAULTS.stage_step_sigma_mm),
+    )
 
 
-def _camera(table: Mapping[str, object], where: str) -> NominalCamera:
+def _camera(table: Mapping[str, object], where: str, *, free: bool) -> NominalCamera:
     size = table.get("image_size_px")
     if size is None:
         raise _field(where, "image_size_px", "is missing")
     if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and 0 < n <= _MAX_SIDE_PX for n in size)):
         raise _field(where, "image_size_px", f"is {size!r}, not [width, height]")
-    angle = _number(table, "angle_deg", where)
-    if abs(angle) >= 90.0:
+    angle = None if free and "angle_deg" not in table else _number(table, "angle_deg", where)
+    if angle is not None and abs(angle) >= 90.0:
         raise _field(where, "angle_deg", f"is {angle:g}, not between -90 and 90")
+    # stage positions need all of them; free poses show the aspect ratio too
+    standoff = _optional(table, "standoff_mm", where) if free else _number(table, "standoff_mm", where, positive=True)
+    aspect = _optional(table, "aspect", where) if free else _number(table, "aspect", where, positive=True)
     return NominalCamera(
         image_size_px=(size[0], size[1]),
         phd_px=_number(table, "phd_px", where, positive=True),
-        standoff_mm=_number(table, "standoff_mm", where, positive=True),
+        standoff_mm=standoff,
         angle_deg=angle,
-        aspect=_number(table, "aspect", where, positive=True),
+        aspect=1.0 if aspect is None else aspect,
     )
+
+
+def _optional(table: Mapping[str, object], key: str, where: str) -> float | None:
+    return None if table.get(key) is None else _number(table, key, where, positive=key != "flatness_mm")
 
 
 def _number(

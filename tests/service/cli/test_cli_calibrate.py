@@ -59,7 +59,7 @@ def each_image_once(monkeypatch: pytest.MonkeyPatch) -> None:
             FOUND[key] = detect_grid(image, target, **how)
         return FOUND[key]
 
-    monkeypatch.setattr(from_images, "detect_grid", remembered)
+    monkeypatch.setattr(from_images, "detect_target", remembered)
 
 
 @pytest.fixture

@@ -16,7 +16,8 @@ from core.cameras.stereo import StereoPair
 from core.matching import MatchOptions, fit_motion, fit_shape
 from core.matching.geometry import motion_geometry, shape_geometry
 from core.matching.kernels.warp import NODES, lens_jacobian, set_up_nodes, undistort
-from sim.ray import rays
+from sim.optics.lens import flat_lens
+from sim.optics.ray import rays
 from tests.support.matching_scene import Plane, Texture, digitise, grid, rational_pair, render, true_g, true_w
 
 LENSES = {
@@ -73,7 +74,7 @@ def test_kernels_and_simulated_rays_invert_what_opencv_projects(lens: OpenCVLens
     x0, y0 = xy.min(axis=0)
     nx, ny = np.empty((40, 60)), np.empty((40, 60))
     step = (xy.max(axis=0) - (x0, y0)).min() / 60.0
-    rays(flat, x0, y0, step, nx, ny)
+    rays(flat_lens(lens), x0, y0, step, nx, ny)
     column, row = np.meshgrid(np.arange(60), np.arange(40))
     seen = OpenCVsOwn(lens).image_from_normalised(np.stack([nx, ny], -1)).xy
     ours = lens.normalised_from_image(np.stack([x0 + step * column, y0 + step * row], -1))
@@ -93,7 +94,7 @@ def test_pixels_beyond_a_rational_lens_have_no_ray() -> None:
     assert np.isfinite(back).all(axis=1).tolist() == [True, True, False, False, False]
     assert back[0, 0] == pytest.approx((1.0 - np.sqrt(1.0 - 4.0 * 0.495**2)) / (2.0 * 0.495), abs=1e-9)  # the near root
     nx, ny = np.empty((1, 101)), np.empty((1, 101))
-    rays(flat, 0.0, 0.0, 7.9, nx, ny)
+    rays(flat_lens(lens), 0.0, 0.0, 7.9, nx, ny)
     assert np.isfinite(nx[0]).tolist() == [7.9 * i < 400.0 for i in range(101)]
 
 
