@@ -15,7 +15,7 @@ _DEFAULTS = CalibrationOptions()
 
 def target_of(table: dict[str, Any]) -> GridTarget | BoardTarget:
     """Return the target of a rig file's table, see :meth:`server.config.rig_file.TargetSection.plain`."""
-    fields: dict[str, Any] = {name: tuple(value) if name in ("lines", "size") else value for name, value in table.items()}
+    fields: dict[str, Any] = {k: tuple(value) if k in ("lines", "size") else value for k, value in table.items()}
     return BoardTarget(**fields) if fields.get("kind", "line_grid") != "line_grid" else _grid(fields)
 
 

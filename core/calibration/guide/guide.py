@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from core.arrays import Float
+from core.calibration.choice.held_out import MIN_FRAMES
 from core.calibration.guide.coverage import Coverage, coverage_of
 from core.calibration.guide.estimate import Estimate, estimate
 from core.calibration.guide.information import Spread, information
@@ -18,7 +19,6 @@ from core.calibration.uncertainty import volume_points_mm
 from core.errors import CalibrationError
 
 Quantity = Literal["z", "shape"]
-_LEAST_FOR_GOAL = 5  # poses: with fewer no view could be left out to check the others
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,7 +112,7 @@ def guide(
     reached = (
         options.goal_um is not None
         and found.adjusted
-        and count >= _LEAST_FOR_GOAL
+        and count >= MIN_FRAMES  # so that some can be left out to check the others
         and now is not None
         and now <= options.goal_um
     )

@@ -74,7 +74,7 @@ class GuideProposal(Reply):
     tilt_deg: float = Field(description="By how much.")
     part: str = Field(description="Part of the images.", examples=["in the upper left"])
     pose: list[float] = Field(
-        description="Rotation vector in degrees and place in mm of the target in the system frame, that of the first view."
+        description="Rotation vector in degrees and place in mm of the target, in the frame of the first view."
     )
     outlines_px: dict[str, list[list[float]]] = Field(description="By camera, the corners of its points, to draw.")
     predicted: GuideUncertainty | None = Field(description="With this view added; null: not determined.")

@@ -30,8 +30,8 @@ def begin_guide(
 ) -> CalibrationAccepted:
     """Hold the cameras, find the target in live pairs, and take a view whenever it stands still in a new pose.
 
-    Whatever the rig file says of the stage, nothing moves: the target is shown by hand in free poses. Hold it first where
-    the specimen will be: that pose is the system frame.
+    Whatever the rig file says of the stage, nothing moves: the target is shown by hand in free poses. Hold it first
+    where the specimen will be: that pose is the system frame.
     """
     body = body or GuideRequest.model_validate({})
     plan = GuidePlan(
