@@ -176,7 +176,7 @@ def look_first(service: Service, job: Job, calibration_id: str, plan: Calibratio
     """
     rig = service.rig
     job.progress("target", 0, 1)
-    captured = rig.pair.capture(1, job.check)
+    captured = rig.pair.capture(plan.frames, job.check)
     full_scale: dict[str, float] = {cam: float((2 ** captured.bit_depth[cam] - 1) * captured.scale) for cam in CAMERAS}
     positions_mm = rig.positions_mm()
     task = LookTask(rig_metadata(service.config), plan.localiser, captured.pixels, full_scale)
@@ -194,7 +194,7 @@ def look_first(service: Service, job: Job, calibration_id: str, plan: Calibratio
                 "dz_mm": rig.dz_of(cam, positions_mm[axis]),
                 "axis": axis,
                 "position_mm": positions_mm[axis],
-                "frames": 1,
+                "frames": captured.frames,
                 "full_scale": full_scale[cam],
                 "skew_ms": captured.skew_ms,
             }
