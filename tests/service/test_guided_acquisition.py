@@ -13,30 +13,15 @@ import pytest
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.problems import assert_problem
-from tests.support.requirements import ROOT
 from tests.support.service_rig import data_of, served, wait_for_job, wait_for_rig
+from tests.support.small_board_rig import SMALL_BOARD
 
 API = "/api/v1"
-BOARD = (
-    (ROOT / "config" / "sim_board.toml")
-    .read_text(encoding="utf-8")
-    # half the pixels: a fifth of the time to render a pose
-    .replace("[1224, 1024]", "[612, 512]")
-    .replace("phd_px = 2000.0", "phd_px = 1000.0")
-    .replace("fx_px = 2006.0", "fx_px = 1003.0")
-    .replace("fy_px = 2007.0", "fy_px = 1003.5")
-    .replace("fx_px = 1995.0", "fx_px = 997.5")
-    .replace("fy_px = 1995.5", "fy_px = 997.8")
-    .replace("cx_px = 618.3", "cx_px = 308.9")
-    .replace("cy_px = 505.9", "cy_px = 252.7")
-    .replace("cx_px = 605.1", "cx_px = 302.3")
-    .replace("cy_px = 519.2", "cy_px = 259.3")
-)
 
 
 @pytest.fixture
 def client(tmp_path: Path) -> Iterator[httpx.Client]:
-    with Service(parse_config(BOARD), data_of(tmp_path)) as service, served(service) as client:
+    with Service(parse_config(SMALL_BOARD), data_of(tmp_path)) as service, served(service) as client:
         wait_for_rig(client)
         yield client
 
