@@ -140,6 +140,11 @@ def expect(
     covariance = named_covariance(layout, priors, x, covariance_at(problem, layout, state, noise_px=noise_px))
     pair = StereoPair(*(camera_of(layout, x, c) for c in range(2)))
     volume = volume_uncertainty(pair, covariance, target, names)
+    # a declared tilt of the stage axis makes the centre uncertain at any travel: only what the travel leaves is judged
+    travel_only = problem_of(views, target, nominals, replace(options, axis_tilt_sigma_rad=0.0))
+    held = travel_only.priors(layout)
+    travel = named_covariance(layout, held, x, covariance_at(travel_only, layout, state, noise_px=noise_px))
+    centre_px = volume_uncertainty(pair, travel, target, names).centre_px
     points = np.concatenate([np.zeros((1, 3)), _corners(volume.points_mm)])
     G = point_derivatives(pair, points, names)
     spread = np.diagonal(G @ covariance @ np.swapaxes(G, 1, 2), axis1=1, axis2=2)
@@ -152,7 +157,7 @@ def expect(
         points_mm=points,
         sigma_mm=np.sqrt(np.maximum(spread, 0.0)),
         seen=(seen[0], seen[1]),
-        reasons=_reasons(volume, target, options),
+        reasons=_reasons(volume, centre_px, target, options),
     )
 
 
@@ -161,7 +166,9 @@ def _corners(points_mm: Float) -> Float:
     return np.array([[x, y, z] for z in (low[2], high[2]) for y in (low[1], high[1]) for x in (low[0], high[0])])
 
 
-def _reasons(volume: VolumeUncertainty, target: AnyTarget, options: CalibrationOptions) -> tuple[str, ...]:
+def _reasons(
+    volume: VolumeUncertainty, centre_px: float, target: AnyTarget, options: CalibrationOptions
+) -> tuple[str, ...]:
     limits = (
         (
             volume.relative_shape,
@@ -171,9 +178,9 @@ def _reasons(volume: VolumeUncertainty, target: AnyTarget, options: CalibrationO
         ),
         (
             # of a single stage the direction is unknown, and one with the centre
-            volume.centre_px if options.moves == "cameras" else 0.0,
+            centre_px if options.moves == "cameras" else 0.0,
             options.max_centre_sigma_px,
-            f"An image centre would be uncertain by {volume.centre_px:.3g} px; allowed are "
+            f"An image centre would be uncertain by {centre_px:.3g} px; allowed are "
             f"{options.max_centre_sigma_px:g} px.",
         ),
         (

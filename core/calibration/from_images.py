@@ -102,7 +102,7 @@ def calibrate_views(
     check_hold_out(staged, options)
     for image in images:
         _check_size(image, nominals[CAMERAS.index(image.camera)])
-    grid_options = _grid_options(target, options, localiser, grid_options or GridOptions())
+    grid_options = grid_options_for(target, options, localiser, grid_options or GridOptions())
     found: list[GridView | BoardView | None] = []
     failed: list[tuple[ImageOfTarget, StereorigError]] = []
     total = len(images) + 1
@@ -120,16 +120,17 @@ def calibrate_views(
     raise_if_cancelled(cancel)
     progress("calibration", len(images), total)
     radius_mm = _dot_radius_mm(target, found)
-    views = [_view(image, grid, radius_mm) for image, grid in zip(images, found, strict=True) if grid is not None]
+    views = [view_of(image, grid, radius_mm) for image, grid in zip(images, found, strict=True) if grid is not None]
     result = calibrate(views, target, nominals, options)
     lost = tuple(DroppedView(i.label, i.camera, int(i.frame or 0), error.cause) for i, error in failed)
     progress("calibration", total, total)
     return CalibrationFromImages(tuple(found), replace(result, dropped=(*lost, *result.dropped)))
 
 
-def _grid_options(
+def grid_options_for(
     target: GridTarget | BoardTarget, options: CalibrationOptions, localiser: Localiser, given: GridOptions
 ) -> GridOptions:
+    """Return the options of a line grid's detection for a calibration; those given where they say more."""
     estimated = target.node_tolerance_mm > 0.0 and options.estimate_nodes is not False
     if localiser == "profile" and given.line_model is None and estimated and isinstance(target, GridTarget):
         return replace(given, line_model="local")
@@ -176,7 +177,8 @@ def _dot_radius_mm(target: GridTarget | BoardTarget, found: Sequence[GridView | 
     return float(np.median([r for r in radii if r is not None]))
 
 
-def _view(image: ImageOfTarget, grid: GridView | BoardView, radius_mm: float | None) -> CalibrationView:
+def view_of(image: ImageOfTarget, grid: GridView | BoardView, radius_mm: float | None) -> CalibrationView:
+    """Return what the adjustment takes of a target detected; ``radius_mm`` is that of its dots."""
     if isinstance(grid, BoardView):
         return CalibrationView(
             image.camera,

@@ -18,7 +18,7 @@ from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
 from server.api.routes.analyses import analyses, exports, gauges, picking, previews, report, results
-from server.api.routes.calibrations import calibrations, noise, repair, review
+from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
@@ -26,6 +26,7 @@ from server.api.routes.service import jobs, session, system
 from server.api.routes.tests import metadata, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
+from server.workflows.guided_acquisition import Guides
 from server.workflows.service import Service
 from server.workflows.watch import Watches
 
@@ -79,6 +80,7 @@ def create_app(
     app.state.service = service
     app.state.sessions = sessions
     app.state.watches = Watches(service)
+    app.state.guides = Guides(service)
     app.state.view_limiter = CapacityLimiter(4)
     app.add_api_route("/healthz", system.healthz, include_in_schema=False)
     app.add_api_route("/readyz", system.readyz, include_in_schema=False)
@@ -119,6 +121,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         calibration_exports,
         calibration_checks,
         review,
+        guide,
         tests,
         metadata,
         watch,

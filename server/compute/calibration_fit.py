@@ -1,4 +1,4 @@
-"""The fit of a calibration, in the worker: grid in every view, adjustment, drift check, ``calibration.json``."""
+"""The fit of a calibration, in the worker: target in every view, adjustment, drift check, ``calibration.json``."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration import CalibrationOptions, CalibrationResult, NominalCamera
+from core.boards import BoardView, detect_target
+from core.calibration import CalibrationResult
 from core.calibration.from_images import ImageOfTarget, calibrate_views
 from core.errors import CalibrationError
-from core.grid import GridOptions, GridView, detect_grid
+from core.grid import GridOptions, GridView
 from core.names import CAMERAS
-from core.target import GridTarget
+from server.compute.calibration_inputs import nominals_of, options_of, target_of
 from server.formats.calibrations.native import calibration_content, view_record
 from server.formats.images import GrayImage, read_image
 from server.formats.results.netcdf import written_dataset
@@ -26,6 +27,8 @@ from server.store.durable import write_json
 from server.worker.process import current_task
 from server.worker.tasks import FitTask
 
+TargetView = GridView | BoardView
+
 #: mean shift of the grid between the first and the last view at zero: above the first a warning, above the second no
 #: calibration. The detector repeats to 0.002 px; 0.1 px of epipolar error shows as micrometres of false motion.
 DRIFT_WARNING_PX = 0.05
@@ -33,7 +36,7 @@ MAX_DRIFT_PX = 0.1
 
 
 def fit_calibration(task: FitTask) -> dict[str, Any]:
-    """Find the grid in every view and fit both cameras.
+    """Find the target in every view and fit both cameras.
 
     Returns
     -------
@@ -43,40 +46,47 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     Raises
     ------
     TargetError
-        The grid was not found in a view; ``view`` and ``camera`` name the image.
+        The target was not found in a view; ``view`` and ``camera`` name the image.
     CalibrationError
         No usable minimum, ``calibration_rejected`` by its verdict, or ``grid_moved`` while the views were taken.
     """
     channel = current_task()
     folder = Path(task.folder)
     rig, plan = task.plan["rig"], task.plan
-    target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
-    measured = [view for view in task.views if view["role"] in ("fitted", "held_out")]
+    target = target_of(rig["target"])
+    measured = [view for view in task.views if view["role"] in ("fitted", "held_out", "free")]
     # averages are scaled: the type's maximum is not the level at which the sensor saturates
     grid_options = GridOptions(saturation=float(min(view["full_scale"] for view in task.views)))
     found = calibrate_views(
         [
-            ImageOfTarget(view["camera"], view["dz_mm"], read_image(folder / view["file"]), Path(view["file"]).name)
+            ImageOfTarget(
+                view["camera"],
+                view["dz_mm"],
+                read_image(folder / view["file"]),
+                Path(view["file"]).name,
+                view["index"] if view["role"] == "free" else None,
+            )
             for view in measured
         ],
         target,
         nominals_of(rig),
-        CalibrationOptions(held_out_mm=tuple(plan["held_out_mm"]), axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"]),
+        options_of(rig, held_out_mm=tuple(plan.get("held_out_mm", ())), moves=plan.get("moves")),
         localiser=plan["localiser"],
         grid_options=grid_options,
         progress=channel.progress,
         cancel=channel,
     )
-    known = {view["file"]: grid for view, grid in zip(measured, found.grids, strict=True) if isinstance(grid, GridView)}
-    like = replace(grid_options, line_model=next(iter(known.values())).line_model)
+    known = {view["file"]: seen for view, seen in zip(measured, found.grids, strict=True) if seen is not None}
+    line_model = next((g.line_model for g in known.values() if isinstance(g, GridView)), None)
+    like = replace(grid_options, line_model=line_model)
     drift = _drift(
-        folder, task.views, known, lambda image: detect_grid(image, target, localiser=plan["localiser"], options=like)
+        folder, task.views, known, lambda image: detect_target(image, target, localiser=plan["localiser"], options=like)
     )
     provenance = {
         "software_version": software_version(),
         "rig": rig["name"],
         "localiser": plan["localiser"],
-        "line_model": next((g.line_model for g in found.grids if isinstance(g, GridView)), None),
+        "line_model": line_model,
         "frames": plan["frames"],
         "views_sha256": {Path(v["file"]).name: v["sha256"] for v in task.views},
         "cameras": {view["camera"]: view["device"] for view in task.views if "device" in view},
@@ -97,28 +107,15 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     }
 
 
-def nominals_of(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
-    """Return the nominal cameras of a plan's rig."""
-    one, two = (
-        NominalCamera(
-            image_size_px=tuple(rig[cam]["image_size_px"]),
-            phd_px=rig[cam]["phd_px"],
-            standoff_mm=rig[cam]["standoff_mm"],
-            angle_deg=rig[cam]["angle_deg"],
-            aspect=rig[cam]["aspect"],
-        )
-        for cam in CAMERAS
-    )
-    return one, two
-
-
 def _drift(
-    folder: Path, views: list[dict[str, Any]], known: dict[str, GridView], detect: Callable[[GrayImage], GridView]
+    folder: Path, views: list[dict[str, Any]], known: dict[str, TargetView], detect: Callable[[GrayImage], TargetView]
 ) -> dict[str, float]:
-    """Return the mean shift of the intersections between the first and the last view at zero, per camera."""
+    """Return the mean shift of the points between the first and the last view at zero, per camera; empty without."""
     drift: dict[str, float] = {}
     for cam in CAMERAS:
-        at_zero = [v["file"] for v in views if v["camera"] == cam and v["dz_commanded_mm"] == 0.0]
+        at_zero = [v["file"] for v in views if v["camera"] == cam and v.get("dz_commanded_mm") == 0.0]
+        if not at_zero:
+            continue
         first, last = (
             known[file] if file in known else detect(read_image(folder / file)) for file in (at_zero[0], at_zero[-1])
         )
@@ -135,6 +132,8 @@ def _check_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
     CalibrationError
         ``grid_moved``.
     """
+    if not drift:
+        return
     worst = max(drift, key=lambda cam: drift[cam])
     text = f"back at zero, the grid lies {drift[worst]:.4f} px from where {worst} first saw it"
     if drift[worst] > MAX_DRIFT_PX:
@@ -156,15 +155,15 @@ def _three(check: dict[str, Any] | None) -> dict[str, Any] | None:
     return None if check is None else {k: check[k] for k in ("rbe_px", "raz_mm", "nsce")}
 
 
-def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, GridView]) -> None:
-    """Write each intersection's position and its residual, (view, i, j, xy)."""
+def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, TargetView]) -> None:
+    """Write each point's position and its residual, (view, i, j, xy), NaN where it was not found."""
     residuals = np.stack([view.residual_px for view in result.views])
     found = np.stack([grids[view.name].xy_px for view in result.views])
     view_records = [view_record(v) for v in result.views]
     with written_dataset(path, checksum=True) as data:
         for name, size in zip(("view", "i", "j", "xy"), residuals.shape, strict=True):
             data.createDimension(name, size)
-        _put(data, "found_px", found, "position of the intersection in the image")
+        _put(data, "found_px", found, "position of the point in the image")
         _put(data, "residual_px", residuals, "measured minus projected position")
         data.setncatts({"views": json.dumps(view_records), "title": "residuals of a calibration"})
 

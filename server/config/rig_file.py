@@ -88,8 +88,12 @@ class CameraSection(_Closed):
         description="Width and height of the image."
     )
     phd_px: Positive = Field(description="Nominal pinhole distance in column pitches (focal length over pixel pitch).")
-    standoff_mm: Positive = Field(description="Nominal distance from the pinhole to the target.")
-    angle_deg: Annotated[float, Field(gt=-90.0, lt=90.0)] = Field(description="Nominal gamma of Eq. (1).")
+    standoff_mm: Positive | None = Field(
+        None, description="Nominal distance from the pinhole to the target; only free poses do without."
+    )
+    angle_deg: Annotated[float, Field(gt=-90.0, lt=90.0)] | None = Field(
+        None, description="Nominal gamma of Eq. (1); only free poses do without."
+    )
     aspect: Positive = Field(1.0, description="Rows' scale over columns' scale (lambda).")
     bit_depth: Literal[8, 10, 12, 14, 16] = Field(8, description="Significant bits per pixel.")
     driver: Literal["sim", "aravis", "v4l2"] = Field("sim", description="Frame grabber driver.")
@@ -246,6 +250,14 @@ class TargetSection(_Closed):
         None, description="ChArUco: OpenCV's name of the markers' dictionary; DICT_5X5_100 if left out."
     )
 
+    pitch_scale_sigma: Annotated[float, Field(ge=0.0, le=0.05)] | None = Field(
+        None, description="Relative standard deviation of the whole target's scale; exact if left out."
+    )
+    flatness_mm: Annotated[float, Field(ge=0.0)] | None = Field(
+        None, description="Maker's bound on the points' error out of the plane; node_tolerance_mm if left out."
+    )
+    dot_diameter_mm: Positive | None = Field(None, description="Dots: diameter; measured in the images if left out.")
+
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> Self:
         grid = self.kind == "line_grid"
@@ -256,6 +268,8 @@ class TargetSection(_Closed):
         strange: tuple[str, ...] = ("size", *_CHARUCO_FIELDS) if grid else (*_LINE_GRID_FIELDS, "dark_lines")
         if not grid and self.kind != "charuco":
             strange = (*strange, *_CHARUCO_FIELDS)
+        if self.kind not in ("circles", "circles_asymmetric"):
+            strange = (*strange, "dot_diameter_mm")
         found = [name for name in strange if name in self.model_fields_set and getattr(self, name) is not None]
         if found:
             raise ValueError(f"a target of kind {self.kind!r} has no {', '.join(found)}")
@@ -274,13 +288,35 @@ class TargetSection(_Closed):
 class CalibrationSection(_Closed):
     """[calibration]: the usual plan; a request can give another one."""
 
-    positions_mm: tuple[Finite, ...] = Field(description="dZ of the fitted positions.", min_length=1, max_length=100)
+    moves: Literal["cameras", "both_cameras", "target", "free"] = Field(
+        "cameras",
+        description="What the stage moves by dZ: each camera along its own axis, both cameras on one axis, the target "
+        "on one axis; or nothing: the target is shown in free poses, see `stereorig guide`.",
+    )
+    lens: Literal["auto", "paper", "opencv5", "opencv8"] = Field(
+        "auto", description="Lens model; `auto` takes the simplest whose residuals hold no structure."
+    )
+    positions_mm: tuple[Finite, ...] = Field(
+        (), description="dZ of the fitted positions; needed where something moves by dZ.", max_length=100
+    )
     held_out_mm: tuple[Finite, ...] = Field((), description="dZ of the positions kept for the check.", max_length=100)
     frames: int = Field(4, ge=1, le=256, description="Frames averaged at each position.")
     localiser: Literal["profile", "paper"] = Field("profile", description="Grid line localiser.")
     axis_tilt_sigma_rad: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
-        0.0, description="Prior on the angle between stage axis and optical axis; carried into the covariance."
+        1e-3, description="Prior on the angle between stage axis and optical axis; carried into the covariance."
     )
+    stage_scale_sigma: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
+        0.0, description="Prior on the relative error of the stage's scale; 0: exact."
+    )
+    stage_step_sigma_mm: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        0.0, description="Prior on the error of each position read back; 0: exact."
+    )
+
+    @model_validator(mode="after")
+    def _positions_given(self) -> Self:
+        if self.moves != "free" and not self.positions_mm:
+            raise ValueError(f"positions_mm is needed with moves = {self.moves!r}")
+        return self
 
 
 class ServiceSection(_Closed):
@@ -378,6 +414,23 @@ class RigConfig(_Closed):
         unused = sorted(set(self.stage.axes) - set(self.axes))
         if unused:
             raise ValueError(f"stage.axes names {unused}, but the cameras' axes are {list(self.axes)}")
+        return self
+
+    @model_validator(mode="after")
+    def _motion_known(self) -> Self:
+        moves = self.calibration.moves
+        if moves != "free":
+            for name, camera in (("cam1", self.cam1), ("cam2", self.cam2)):
+                for field in ("standoff_mm", "angle_deg"):
+                    if getattr(camera, field) is None:
+                        raise ValueError(f"{name}.{field} is needed with calibration.moves = {moves!r}")
+        if moves in ("target", "both_cameras"):
+            one, two = ((c.stage_axis, c.stage_sign) for c in (self.cam1, self.cam2))
+            if one != two:
+                raise ValueError(
+                    f"calibration.moves = {moves!r} means one stage axis: stage_axis and stage_sign must "
+                    f"be the same for both cameras, cam1 has {list(one)}, cam2 {list(two)}"
+                )
         return self
 
     @property

@@ -78,13 +78,24 @@ class ServiceClient:
         Called with (phase, done, total, seconds left or None) while a job runs.
     transport
         Carries the requests; the network when left out.
+    headers
+        Sent with every request, such as a key.
     """
 
     def __init__(
-        self, base_url: str, on_progress: OnProgress | None = None, *, transport: httpx.BaseTransport | None = None
+        self,
+        base_url: str,
+        on_progress: OnProgress | None = None,
+        *,
+        transport: httpx.BaseTransport | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> None:
         self._http = httpx.Client(
-            base_url=f"{base_url}/api/v1", timeout=_REQUEST_TIMEOUT_S, trust_env=False, transport=transport
+            base_url=f"{base_url}/api/v1",
+            timeout=_REQUEST_TIMEOUT_S,
+            trust_env=False,
+            transport=transport,
+            headers=headers,
         )
         self._on_progress = on_progress
 

@@ -150,13 +150,14 @@ class ViewResiduals:
 
     name: str
     camera: str
-    dz_mm: float
+    dz_mm: float | None
     held_out: bool
     rbe_px: float | None
     raz_mm: float | None
     nsce: float | None
     found_px: list[Any]
     residual_px: list[Any]
+    frame: int | None = None
 
 
 def read_residuals(path: Path) -> list[ViewResiduals]:

@@ -177,6 +177,42 @@ class RepairTask:
     limits: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class LookTask:
+    """The target in one pair of images.
+
+    Parameters
+    ----------
+    rig
+        The plan's rig, with the target.
+    localiser
+        Of line grids.
+    pixels, full_scale
+        By camera.
+    """
+
+    rig: dict[str, Any]
+    localiser: str
+    pixels: dict[str, Any]
+    full_scale: dict[str, float]
+
+
+@dataclass(frozen=True)
+class GuideTask:
+    """A guided acquisition.
+
+    Parameters
+    ----------
+    folder
+        The calibration's folder, with the views taken.
+    plan
+        Content of ``plan.json``, with the goal.
+    """
+
+    folder: str
+    plan: dict[str, Any]
+
+
 def warm_up(threads: int) -> None:
     """Load and compile every kernel once, before the first task needs them."""
     _heavy("server.compute.measurement").warm_up(threads)
@@ -198,6 +234,24 @@ def repair_calibration(task: RepairTask) -> dict[str, Any]:
     """Estimate the cameras' orientation anew; the new ``calibration.json`` is there when this returns."""
     summary: dict[str, Any] = _heavy("server.compute.orientation_repair").repair_calibration(task)
     return summary
+
+
+def find_in_pair(task: LookTask) -> dict[str, int]:
+    """Find the target in both images; raises as the fit would. Returns the number of points found by camera."""
+    found: dict[str, int] = _heavy("server.compute.guide_session").find_in_pair(task)
+    return found
+
+
+def look_at_pair(task: GuideTask, pixels: dict[str, Any], serial: int) -> dict[str, Any]:
+    """Find the target coarsely in a live pair, and say whether it is at rest and new."""
+    seen: dict[str, Any] = _heavy("server.compute.guide_session").look_at_pair(task, pixels, serial)
+    return seen
+
+
+def guide_views(task: GuideTask, views: list[dict[str, Any]]) -> dict[str, Any]:
+    """Take up the views that are new, and say what all cover and which view comes next."""
+    guidance: dict[str, Any] = _heavy("server.compute.guide_session").guide_views(task, views)
+    return guidance
 
 
 def fit_noise(task: NoiseTask) -> dict[str, Any]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from core.calibration import CalibrationOptions
+from core.boards import BoardTarget
 from core.calibration.expect import LineModel, expect
 from core.calibration.prepare import EXPECTED_NOISE_PX
 from core.errors import StateError
-from core.target import GridTarget
-from server.compute.calibration_fit import nominals_of
+from server.compute.calibration_inputs import nominals_of, options_of, target_of
 from server.store.folder import now_utc
 from server.store.index import calibration_entry
 from server.workflows.calibration_sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
@@ -32,13 +31,15 @@ def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None,
     if service.rig.config.stage is not None:
         targets_of(service, plan)
     rig = rig_metadata(service.config)
-    target = GridTarget(**{**rig["target"], "lines": tuple(rig["target"]["lines"])})
+    target = target_of(rig["target"])
     model: LineModel = "parabola"
-    if plan.localiser == "profile":
+    if isinstance(target, BoardTarget):
+        model = "local"  # points are found one by one
+    elif plan.localiser == "profile":
         # as core.calibration.from_images chooses
         model = "local" if target.node_tolerance_mm > 0.0 else "straight"
     noise = EXPECTED_NOISE_PX if noise_px is None else noise_px
-    options = CalibrationOptions(axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"])
+    options = options_of(rig)
     expected = expect(
         plan.positions_mm, target, nominals_of(rig), options, noise_px=noise, roll_deg=roll_deg, line_model=model
     )

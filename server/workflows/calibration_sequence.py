@@ -1,4 +1,4 @@
-"""The calibration sequence: move, settle, average, read back; return to zero and check that the grid is where it was.
+"""The calibration sequence: look for the target, move, settle, average, read back; back at zero, look if it is there.
 
 Each camera travels along its own optical axis. Every position is arrived at from one side (the stage driver takes up
 backlash), positions that enter the computation are read back. The fit runs in the worker once the hardware is free
@@ -12,18 +12,21 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.errors import CalibrationInputError
+from core.errors import CalibrationInputError, StereorigError, TargetError
 from core.names import CAMERAS
 from server.base.models import Ids
 from server.config.rig_file import RigConfig
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.store.index import calibration_entry
-from server.worker.tasks import FitTask, fit_calibration
+from server.worker.tasks import FitTask, LookTask, find_in_pair, fit_calibration
+from server.workflows.capture import OFF_ZERO_MM
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
 
 SAME_POSITION_MM = 1e-6
+#: settings of ``[calibration]`` that the fit needs
+_SETTINGS = ("moves", "lens", "axis_tilt_sigma_rad", "stage_scale_sigma", "stage_step_sigma_mm")
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,12 @@ def begin(service: Service, plan: CalibrationPlan, request: RequestMark) -> Ids:
         ``storage_full``.
     """
     service.require_room()
+    if service.config.calibration.moves == "free":
+        raise CalibrationInputError(
+            'The rig file declares moves = "free": no stage position tells where the target is.',
+            code="moves_undeclared",
+            remedy="POST /calibrations:guide (`stereorig guide`), or declare what the stage moves.",
+        )
     check_plan(plan)
     targets_of(service, plan)
     made: dict[str, str] = {}
@@ -127,6 +136,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
     stops = [*plan.stops_mm(), 0.0]
     views: list[dict[str, object]] = []
     cameras = rig.identities()
+    look_first(service, job, calibration_id, plan)
     for index, dz in enumerate(stops):
         job.check()
         service.require_room()
@@ -156,6 +166,43 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
     return {"calibration_id": calibration_id, "views": len(views)}
 
 
+def look_first(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> None:
+    """Look for the target where the stage stands, before anything moves.
+
+    Raises
+    ------
+    TargetError
+        As the fit would raise it for this view; both images are kept as view 0.
+    """
+    rig = service.rig
+    job.progress("target", 0, 1)
+    captured = rig.pair.capture(plan.frames, job.check)
+    full_scale: dict[str, float] = {cam: float((2 ** captured.bit_depth[cam] - 1) * captured.scale) for cam in CAMERAS}
+    positions_mm = rig.positions_mm()
+    task = LookTask(rig_metadata(service.config), plan.localiser, captured.pixels, full_scale)
+    try:
+        run_task(service.worker, job, find_in_pair, task)
+    except TargetError:
+        views = []
+        for cam in CAMERAS:
+            axis = rig.config.camera(cam).stage_axis
+            view = {
+                "index": 0,
+                "camera": cam,
+                "device": rig.identities()[cam],
+                "role": "first_look",
+                "dz_mm": rig.dz_of(cam, positions_mm[axis]),
+                "axis": axis,
+                "position_mm": positions_mm[axis],
+                "frames": captured.frames,
+                "full_scale": full_scale[cam],
+                "skew_ms": captured.skew_ms,
+            }
+            views.append(view | service.calibrations.put_view(calibration_id, 0, cam, captured.pixels[cam]))
+        service.calibrations.put_views_done(calibration_id, views)
+        raise
+
+
 def _role(plan: CalibrationPlan, dz: float, *, last: bool) -> str:
     if last:
         return "zero_again"
@@ -172,12 +219,32 @@ def fit(service: Service, job: Job, calibration_id: str) -> dict[str, object]:
     return dict(run_task(service.worker, job, fit_calibration, task))
 
 
+def way_back(service: Service) -> dict[str, object] | None:
+    """Return where the stage was left and the request that takes it back; None where it stands at dZ = 0."""
+    rig = service.rig
+    if rig.fault is not None:
+        return None
+    try:
+        positions = rig.positions_mm()
+        dz = {cam: rig.dz_of(cam, positions[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
+    except (StereorigError, KeyError):  # a silent stage says so itself
+        return None
+    if max(abs(v) for v in dz.values()) <= OFF_ZERO_MM:
+        return None
+    where = ", ".join(f"{cam} at dZ = {v:+.3f} mm" for cam, v in dz.items())
+    return {
+        "dz_mm": dz,
+        "move": {"dz_mm": dict.fromkeys(CAMERAS, 0.0)},
+        "text": f"The stage was left off the calibrated place ({where}): POST /stage/moves with `move` takes it back.",
+    }
+
+
 def rig_metadata(config: RigConfig) -> dict[str, Any]:
     """Entries of the rig file that the fit needs."""
     return {
         "name": config.rig.name,
         "target": config.target.plain(),
-        "axis_tilt_sigma_rad": config.calibration.axis_tilt_sigma_rad,
+        **{name: getattr(config.calibration, name) for name in _SETTINGS},
         "cam1": config.cam1.model_dump(mode="json"),
         "cam2": config.cam2.model_dump(mode="json"),
     }
@@ -191,6 +258,10 @@ def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, object]
 def close(service: Service, job: Job, calibration_id: str, state: str) -> None:
     """Leave a record of a calibration that did not come to be, and put the index right."""
     if state != "succeeded" and job.record.problem is not None:
+        back = way_back(service)
+        if back is not None:  # the job's own reply shows it, too
+            problem = job.record.problem
+            job.failed(problem.model_copy(update={"context": {**problem.context, "way_back": back}}))
         service.calibrations.put_failure(calibration_id, {**job.record.problem.plain(), "job_state": state})
     entry = calibration_entry(service.calibrations, calibration_id)
     service.catalog.put_entry("calibration", "", calibration_id, entry)

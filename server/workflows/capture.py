@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from core.errors import ImageError
@@ -58,9 +60,10 @@ def commit_pair(
         check_same_cameras(service.tests.calibration_file(test_id), rig.identities(), "The step")
     depth = {cam: 16 if captured.scale > 1 else captured.bit_depth[cam] for cam in CAMERAS}
     quality = pair_quality(*(image_quality(captured.pixels[cam], depth[cam]) for cam in CAMERAS))
-    dz = {cam: rig.dz_of(cam, positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
-    if quality["code"] == "ok" and max(abs(v) for v in dz.values()) > OFF_ZERO_MM:
-        quality["code"] = "cameras_off_zero"
+    dz: dict[str, float] = {cam: rig.dz_of(cam, positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
+    warnings = off_zero_warnings(rig.config.calibration.moves, dz)
+    if warnings and rig.config.calibration.moves != "target":
+        quality["code"] = "cameras_off_zero"  # whatever else is wrong with the pair, this one cannot be seen in it
     quality |= {"skew_ms": captured.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": captured.pair_counts}
     for cam in CAMERAS:
         quality[cam] |= captured.settings[cam] | {"frames": captured.frame_counts[cam]}
@@ -78,12 +81,26 @@ def commit_pair(
         "bit_depth": captured.bit_depth,
         "frame_sequence": captured.sequence,
         "dz_mm": dz,
+        "warnings": warnings,
         "scene": None if rig.scene is None else rig.scene.model_dump(),
         "quality": quality,
         "image_size_px": sizes,
     }
     images: dict[str, bytes] = {cam: encode_tiff(captured.pixels[cam]) for cam in CAMERAS}
     return _announce(service, test_id, service.tests.add_step(test_id, images, document))
+
+
+def off_zero_warnings(moves: str, dz_mm: Mapping[str, float]) -> list[str]:
+    """Return what to warn of where a stage is off the calibrated place; empty where it is there, or moves nothing."""
+    worst = max(dz_mm, key=lambda cam: abs(dz_mm[cam]))
+    if moves == "free" or abs(dz_mm[worst]) <= OFF_ZERO_MM:
+        return []
+    who = {
+        "cameras": f"{worst} stands at dZ = {dz_mm[worst]:+.3f} mm: the calibration holds at dZ = 0",
+        "both_cameras": f"The cameras stand at dZ = {dz_mm[worst]:+.3f} mm: the calibrated volume moved with them",
+        "target": f"The stage stands at dZ = {dz_mm[worst]:+.3f} mm: a specimen on it is off the calibrated place",
+    }[moves]
+    return [f"{who}. POST /stage/moves with dz_mm 0 for both cameras takes it back."]
 
 
 @timed_capture("import")

@@ -20,7 +20,7 @@ from core.errors import StereorigError
 from core.names import CAMERAS
 
 _FOLDS = 5
-_MIN_FRAMES = 6  # with fewer, leaving some out leaves too little
+MIN_FRAMES = 6  # with fewer, leaving some out leaves too little
 _POSE_STEPS = 15
 
 
@@ -93,7 +93,7 @@ def leave_out_in_turn(screened: Screened) -> list[HeldOutView]:
     """
     problem, adjustment = screened.problem, screened.adjustment
     frames = [k for k in problem.frames if k != problem.system_frame or not problem.staged]
-    if len(frames) < _MIN_FRAMES:
+    if len(frames) < MIN_FRAMES:
         return []
     folds = [frames[i::_FOLDS] for i in range(_FOLDS)]
     out: list[HeldOutView] = []

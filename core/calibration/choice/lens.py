@@ -21,7 +21,7 @@ from core.names import CAMERAS
 
 # by chance a right lens is given more terms once in so many calibrations; they cost a little noise, while terms that
 # are missing bias the shape before their own significance is beyond doubt
-_TAKE_FIVE, _TAKE_EIGHT = 0.01, 1e-3
+LENS_LEVELS: tuple[tuple[LensName, float], ...] = (("opencv5", 0.01), ("opencv8", 1e-3))
 _WORSE = 1.02  # held-out RBE over the simpler lens's beyond which more terms are refused
 
 
@@ -108,7 +108,7 @@ def _choose(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
         return _result(screened, held, (f"The lens model {wanted} was asked for.",))
     reasons: list[str] = []
     best = _Candidate(fit("paper"), held)
-    for model, level in (("opencv5", _TAKE_FIVE), ("opencv8", _TAKE_EIGHT)):
+    for model, level in LENS_LEVELS:
         probability, worst = best.significance
         name = best.screened.adjustment.layout.form.model
         if probability > level:
@@ -119,7 +119,7 @@ def _choose(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
             f"{worst.rms_px:.4f} px rms)."
         )
         try:
-            trial = _Candidate(fit(model), held)  # type: ignore[arg-type]
+            trial = _Candidate(fit(model), held)
         except CalibrationError as error:
             reasons.append(f"{model} is not determined by these views: {error.cause}")
             break

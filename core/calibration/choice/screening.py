@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.fit.adjust import Adjustment, adjust
+from core.calibration.fit.adjust import NOISE_ROUNDS, Adjustment, adjust
 from core.calibration.fit.dots import dot_offsets_px
 from core.calibration.fit.free_start import MIN_POSES
 from core.calibration.fit.layout import Layout, State, camera_seeing
@@ -63,7 +63,15 @@ class Screened:
     dropped: tuple[DroppedView, ...]
 
 
-def fit_screened(problem: Problem, layout: Layout, start: State, odd: Sequence[int] = ()) -> Screened:
+def fit_screened(
+    problem: Problem,
+    layout: Layout,
+    start: State,
+    odd: Sequence[int] = (),
+    *,
+    noise_px: Float | None = None,
+    rounds: int = NOISE_ROUNDS,
+) -> Screened:
     """Adjust, leaving out bad views and points of free poses.
 
     Parameters
@@ -72,6 +80,8 @@ def fit_screened(problem: Problem, layout: Layout, start: State, odd: Sequence[i
         The views, their unknowns, and start values.
     odd
         Free poses that did not fit the cameras' relative pose from the start.
+    noise_px, rounds
+        See :func:`core.calibration.fit.adjust.adjust`.
 
     Raises
     ------
@@ -99,7 +109,7 @@ def fit_screened(problem: Problem, layout: Layout, start: State, odd: Sequence[i
     state = start
     adjustment: Adjustment | None = None
     rows: list[ViewRows] = []
-    noise: Float | None = None
+    noise = noise_px
     for _ in range(_ROUNDS):
         rows = _rows(current, layout, state, excluded, corrected=adjustment is not None)
         adjustment = adjust(
@@ -110,6 +120,7 @@ def fit_screened(problem: Problem, layout: Layout, start: State, odd: Sequence[i
             current.priors(layout),
             max_iterations=current.options.max_iterations,
             noise_px=noise,
+            rounds=rounds,
         )
         state, noise = adjustment.state, adjustment.noise_px
         bad, points = _bad(current, rows, adjustment)
@@ -133,6 +144,7 @@ def fit_screened(problem: Problem, layout: Layout, start: State, odd: Sequence[i
             current.priors(layout),
             max_iterations=current.options.max_iterations,
             noise_px=noise,
+            rounds=rounds,
         )
         state, noise = adjustment.state, adjustment.noise_px
     assert adjustment is not None

@@ -17,7 +17,7 @@ from core.calibration.fit.normal import Normal, assemble, covariance
 from core.calibration.fit.observations import ViewRows
 from core.errors import CalibrationError
 
-_NOISE_ROUNDS = 4
+NOISE_ROUNDS = 4
 _MIN_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
 _LAST, _NEAR = 10, 0.1  # last steps, and what they may still gain: a tenth of what one standard deviation costs
 _LENS_AND_POSE = 10.0  # unknowns of a camera that correlated observations feel
@@ -65,7 +65,7 @@ def adjust(
     *,
     max_iterations: int,
     noise_px: Float | None = None,
-    rounds: int = _NOISE_ROUNDS,
+    rounds: int = NOISE_ROUNDS,
 ) -> Adjustment:
     """Minimise the weighted squares of residuals and priors.
 

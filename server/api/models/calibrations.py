@@ -146,8 +146,14 @@ class ViewReply(Reply):
     index: int = Field(description="Number of the stop, from 0; the second part of the image's path.")
     camera: Literal["cam1", "cam2"] = Field(description="Which camera.")
     device: CameraIdentity | None = Field(None, description="The camera that took it.")
-    role: str = Field(description="`fitted`, `held_out`, `zero` or `zero_again`.", examples=["fitted"])
-    dz_mm: float = Field(description="Travel of the camera from its zero, read back.")
+    role: str = Field(
+        description="`fitted`, `held_out`, `zero` or `zero_again`; `free`: a free pose; `first_look`: the only one, of "
+        "a calibration whose target was not found before anything moved.",
+        examples=["fitted"],
+    )
+    dz_mm: float | None = Field(
+        None, description="Travel from zero, read back, positive where target and cameras part; null for a free pose."
+    )
     dz_commanded_mm: float | None = Field(None, description="Travel that was asked for.")
     axis: int | None = Field(None, description="Stage axis that moved it.")
     position_mm: float | None = Field(None, description="The axis' position, read back.")
@@ -169,7 +175,8 @@ class ViewResiduals(Reply):
 
     name: str = Field(description="Name of the view.", examples=["cam1 dZ 5.000 mm"])
     camera: int | str = Field(description="Which camera.")
-    dz_mm: float = Field(description="Travel of the camera.")
+    dz_mm: float | None = Field(None, description="Travel; null for a free pose.")
+    frame: int | None = Field(None, description="Number of the free pose; null at a stage position.")
     held_out: bool = Field(description="True if it was kept for the check.")
     rbe_px: float | None = Field(description="Rms residual.")
     raz_mm: float | None = Field(description="Rms error in space.")

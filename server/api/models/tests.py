@@ -187,6 +187,9 @@ class BurstIndex(Reply):
 class StepReply(Reply):
     """A step: durable on disk when this is sent."""
 
+    warnings: list[str] = Field(
+        default_factory=list, description="What should be put right before this step is measured; mostly empty."
+    )
     n: int = Field(description="Number; 0 is the reference.")
     test_id: str = Field(description="Its test.")
     label: str = Field(description="Free text.")

@@ -1,12 +1,13 @@
 // Calibrations: plan with its expected uncertainty, run, review (accept or discard), import, compare.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
+import { guidePanel } from "./calibrate/guide.js";
 import { calibrationViews } from "./calibrate/views.js";
 import { h, numeric, pen, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends, Part } from "#dom" */
-/** @import { Model, Reply } from "#routes" */
+/** @import { Body, Model, Reply } from "#routes" */
 /** @typedef {Model<"CalibrationReply">} Calibration */
 /** @typedef {Reply<"get", "/calibrations">["calibrations"]} Entries */
 /** @typedef {Model<"ExpectReply">} Expected */
@@ -18,8 +19,10 @@ const LEVEL = { good: "good", warning: "warn", failed: "bad" };
 const DECISION = { accepted: "good", discarded: "bad" };
 const NAMES = ["phd_px", "cx_px", "cy_px", "kappa_per_px2", "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm"];
 /** @type {Record<string, string>} */
-const PHASES = { views: "taking views", grid: "finding the grid", calibration: "adjusting" };
+const PHASES = { target: "looking for the target", views: "taking views", grid: "finding the target", calibration: "adjusting" };
 const CAMERAS = /** @type {const} */ (["cam1", "cam2"]);
+/** @type {Record<string, string>} */
+const MOVES = { cameras: "Each camera moves along its own axis.", both_cameras: "One stage moves both cameras.", target: "One stage moves the target.", free: "" };
 /** @type {Record<string, string>} */
 const UNIT = { phd_px: "px", cx_px: "px", cy_px: "px", kappa_per_px2: "px⁻²", alpha_rad: "rad", beta_rad: "rad", gamma_rad: "rad", x0_mm: "mm", y0_mm: "mm", z0_mm: "mm" };
 const symbol = (/** @type {string} */ name) => name.replace(/_(px|rad|mm|per_px2)$/, "");
@@ -116,7 +119,7 @@ export async function open(root, { path }) {
     // one with the verdict failed is shown like any other: its residuals show the cause
     if (document_.state !== "complete" && !document_.verdict) {
       return { nodes: h("section.panel", heading,
-        problem ? problemText(api.problemOf(problem)) : h("p.quiet", "Not complete yet; the progress is shown above, or under Jobs."),
+        wayBack(problem), problem ? problemText(api.problemOf(problem)) : h("p.quiet", "Not complete yet; the progress is shown above, or under Jobs."),
         document_.state === "unfinished" ? null : decide, viewsOf(document_)), close: () => {} };
     }
     /** @type {Reply<"get", "/calibrations/{calibration_id}/residuals">["views"] | null} */
@@ -149,13 +152,24 @@ export async function open(root, { path }) {
 
   ends.push(events.on("calibration", () => { refresh().then(() => show()).catch(notify); }));
   const running = run(rig, ends, async (id) => { chosen = id; await refresh(); await show(); });
+  const guided = guidePanel(rig, ends, async (id) => { chosen = id; await refresh(); await show(true); });
   const compare = action("Compare the two chosen", () => comparison(list));
   await refresh();
   await show();
   replace(root, h("h1", "Calibrate"),
-    h("div.grid.side", h("div.grid", running, shown),
+    h("div.grid.side", h("div.grid", rig.calibration_plan?.moves === "free" ? null : running, guided, shown),
       h("section.panel", list, h("div.row", { style: { marginTop: "0.5rem" } }, compare), importer(async (id) => { chosen = id; await refresh(); await show(); }))));
   return () => { closeShown?.(); ends.forEach((end) => end()); };
+}
+
+/**
+ * Button that takes the stage back to the calibrated place, where a calibration left it elsewhere.
+ * @param {Calibration["problem"]} problem
+ */
+function wayBack(problem) {
+  const back = /** @type {{ text: string, move: Body<"post", "/stage/moves"> } | undefined} */ (problem?.context?.way_back);
+  if (!back) return null;
+  return h("div.problem", h("p", h("strong", back.text.split(":")[0]), "."), action("Go back to dZ = 0", () => api.post("/stage/moves", back.move)));
 }
 
 /**
@@ -247,13 +261,19 @@ function run(rig, ends, done) {
 
   const { target } = rig;
   return h("section.panel", { "aria-label": "New calibration" }, h("h2", "New calibration"),
-    h("p.quiet", `Target of the rig file: ${target.lines?.join(" × ")} lines, ${target.dark_lines ? "dark" : "bright"}, pitch ${quantity(target.pitch_mm, "mm")}, line width ${quantity(target.line_width_mm, "mm")}, positions known to ±${um(target.node_tolerance_mm)}.`),
+    h("p.quiet", `Target of the rig file: ${targetText(target)}, pitch ${quantity(target.pitch_mm, "mm")}, positions known to ±${um(target.node_tolerance_mm)}. ${MOVES[usual.moves ?? "cameras"]}`),
     h("div.fields",
       field("Fitted positions", positions, "mm", "dZ, away from the target"), field("Held-out positions", held, "mm", "for an independent check"),
       field("Frames averaged", frames), field("Localiser", localiser), field("Label", label)),
     h("details", { open: true }, h("summary", "Expected uncertainty"),
       h("div.fields", field("Assumed noise of an intersection", noise, "px"), field("Rotation of the grid", roll, "°", "in the images; 45 for a grid on its corner")), expected),
     h("div.row", start), progress);
+}
+
+/** @param {Model<"RigReply">["target"]} target */
+function targetText(target) {
+  if ((target.kind ?? "line_grid") !== "line_grid") return `${target.kind}, ${target.size?.join(" × ")} points`;
+  return `${target.lines?.join(" × ")} lines, ${target.dark_lines ? "dark" : "bright"}, line width ${quantity(target.line_width_mm, "mm")}`;
 }
 
 /** @param {Expected} estimated */

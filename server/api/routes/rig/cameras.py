@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import AsyncIterator, Mapping
 from dataclasses import asdict
 from typing import Annotated, Literal
@@ -34,6 +35,7 @@ from server.base.models import Ids
 from server.formats.images import encode_tiff
 from server.jobs.job import Job, Phase
 from server.results.quality import image_quality
+from server.workflows.guided_acquisition import GUIDED_PURPOSE
 
 router = APIRouter(tags=["rig"])
 _BOUNDARY = "frame"
@@ -72,8 +74,11 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
     responses=errors(409, 422, 503),
 )
 def put_scene(service: ServiceDep, body: SceneRequest) -> SceneReply:
-    """Put the grid, a plate, a panel ... before the cameras; only on simulated rigs."""
-    with service.hardware.hold("a change of the scene"):
+    """Put the grid, a plate, a panel ... before the cameras; on simulated rigs, during a guided acquisition too."""
+    # a hand that holds the target before the cameras is no other client of them
+    holder = service.hardware.holder
+    guided = holder is not None and holder.purpose == GUIDED_PURPOSE
+    with contextlib.nullcontext() if guided else service.hardware.hold("a change of the scene"):
         scene = service.rig.set_scene(body.scene, load=body.load, params=body.params)
     service.hub.publish("scene", scene.model_dump())
     return scene

@@ -1,0 +1,76 @@
+"""What the views taken cover: the images' parts, the depths and the target's tilts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.arrays import Float
+from core.calibration.guide.estimate import Estimate
+from core.calibration.guide.sightline import Sightline, sightline
+
+CELLS = (8, 6)  # columns, rows
+_DEPTHS = (0.8, 0.9, 0.97, 1.03, 1.1, 1.2)  # of the specimen's distance
+_FACING_RAD = np.radians(10.0)  # a tilt below it is none
+TILTS = ("facing", "right", "lower right", "down", "lower left", "left", "upper left", "up", "upper right")
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """What the views taken cover.
+
+    Attributes
+    ----------
+    cells
+        (2, rows, columns) number of the target's points that each part of either camera's image has shown.
+    share
+        (2,) share of the parts with at least one.
+    depth_edges
+        Distances over the specimen's between the classes of ``depths``; the outermost classes are open.
+    depths
+        Number of poses in each class, nearest first.
+    tilts
+        Number of poses tilted in each direction of :data:`TILTS`, as the images show it.
+    """
+
+    cells: Float
+    share: Float
+    depth_edges: tuple[float, ...]
+    depths: tuple[int, ...]
+    tilts: dict[str, int]
+
+
+def coverage_of(estimate: Estimate, sizes_px: tuple[tuple[int, int], tuple[int, int]]) -> Coverage:
+    """Count where the target's points were seen, and the poses' depths and tilts.
+
+    Parameters
+    ----------
+    estimate
+        Cameras, poses and views.
+    sizes_px
+        (width, height) of each camera's image.
+    """
+    cells = np.zeros((2, CELLS[1], CELLS[0]))
+    for row in estimate.rows:
+        xy = row.xy_px[row.found]
+        width, height = sizes_px[row.camera]
+        counts, _, _ = np.histogram2d(
+            xy[:, 1], xy[:, 0], bins=CELLS[::-1], range=((-0.5, height - 0.5), (-0.5, width - 0.5))
+        )
+        cells[row.camera] += counts
+    line = sightline(estimate)
+    depths, tilts = np.zeros(len(_DEPTHS) + 1, dtype=int), dict.fromkeys(TILTS, 0)
+    for pose in estimate.sys_from_target.values():
+        depths[int(np.searchsorted(_DEPTHS, line.distance_mm(pose.translation_mm) / line.depth_mm))] += 1
+        tilts[tilt_name(line, pose.rotation)] += 1
+    return Coverage(cells, (cells > 0).mean(axis=(1, 2)), _DEPTHS, tuple(depths.tolist()), tilts)
+
+
+def tilt_name(line: Sightline, rotation: Float) -> str:
+    """Direction in which the target's face is turned, as the images show it."""
+    face = -rotation[:, 2]
+    if float(np.arccos(np.clip(face @ line.towards, -1.0, 1.0))) < _FACING_RAD:
+        return TILTS[0]
+    angle = np.arctan2(face @ line.down, face @ line.right)
+    return TILTS[1 + int(np.round(angle / (np.pi / 4.0))) % 8]

@@ -1,0 +1,211 @@
+"""What views say of the cameras, as normal equations to which further views can be added one at a time.
+
+Each free pose is eliminated from its own views; what is left, cameras, pitch and the target's corrections, adds up from
+pose to pose. The covariance after a further view is so had without a new adjustment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from core.arrays import Bool, Float
+from core.calibration.fit.layout import Layout, Priors, State
+from core.calibration.fit.named import named_derivatives, parameter_names
+from core.calibration.fit.normal import Normal, assemble, inverse
+from core.calibration.fit.observations import ViewRows
+from core.calibration.guide.estimate import Estimate
+from core.calibration.uncertainty import point_derivatives
+from core.cameras.camera import RigidTransform
+
+_MOST_POINTS = 100  # of a target: of more, every other stands for its neighbours too
+_NEW = -1  # number of a pose that is only thought of
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Standard deviations over the specimen's volume, the rigid motion common to all points taken out.
+
+    Attributes
+    ----------
+    z_um
+        Rms of Z.
+    shape_um
+        Rms of X, Y and Z.
+    """
+
+    z_um: float
+    shape_um: float
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Normal equations of what all poses share.
+
+    Attributes
+    ----------
+    estimate
+        Where they were built.
+    points
+        Indices of the target's points that stand for all.
+    matrix
+        (s + n k, s + n k) of the shared unknowns that are free, then of the points' corrections.
+    free
+        (shared,) which of the unknowns before the steps and poses are free.
+    q_z, q_shape
+        (s, s): the trace of their product with the covariance is a mean variance over the volume, mm^2.
+    """
+
+    estimate: Estimate
+    points: NDArray[np.intp]
+    matrix: Float
+    free: Bool
+    q_z: Float
+    q_shape: Float
+
+    def spread(self, added: Float | None = None) -> Spread:
+        """Return the uncertainty over the volume, with further information added.
+
+        Raises
+        ------
+        CalibrationError
+            ``calibration_singular``.
+        """
+        matrix = self.matrix if added is None else self.matrix + added
+        s = int(self.free.sum())
+        reduced = matrix[:s, :s]
+        if len(matrix) > s:
+            coupling = matrix[:s, s:]
+            reduced = reduced - coupling @ cho_solve(cho_factor(matrix[s:, s:]), coupling.T)
+        C = inverse(reduced)
+        z, shape = (float(np.sqrt(max(np.sum(C * q), 0.0))) for q in (self.q_z, self.q_shape))
+        return Spread(1e3 * z, 1e3 * shape)
+
+    def of_pose(self, pose: RigidTransform, seen_px: Sequence[Float]) -> Float:
+        """Return what both cameras' views of the target in one further pose would add to ``matrix``.
+
+        Parameters
+        ----------
+        pose
+            ``sys_from_target``.
+        seen_px
+            (n, 2) image positions of all points in each camera, NaN where not seen.
+        """
+        e, kept = self.estimate, self.points
+        first = e.problem.system_frame is None
+        layout = replace(e.layout, frames=() if first else (_NEW,), steps=())
+        shared = len(self.free)
+        x = np.zeros(layout.size)
+        x[:shared] = e.state.x[:shared]
+        state = State(x, {} if first else {_NEW: pose}, e.state.nodes_mm[kept])
+        rows = []
+        for c, xy in enumerate(seen_px):
+            found = np.isfinite(xy[kept]).all(axis=-1)
+            correlation = float(np.mean([r.correlation for r in e.rows if r.camera == c] or [1.0]))
+            rows.append(
+                ViewRows(
+                    c,
+                    None,
+                    _NEW,
+                    "",
+                    xy[kept],
+                    np.asarray(found),
+                    np.asarray(found, dtype=np.float64),
+                    correlation=correlation,
+                )
+            )
+        k = e.priors.nodes_free
+        blank = Priors(
+            np.zeros(layout.size),
+            np.zeros(layout.size),
+            np.ones(layout.size, dtype=bool),
+            np.where(np.arange(3) < k, 0.0, np.inf),
+        )
+        normal = assemble(layout, state, rows, e.problem.flat_nodes_mm[kept], blank, _thinned(e.noise_px, e, kept))
+        return _without_poses(normal, shared, self.free)
+
+
+def information(estimate: Estimate, volume_mm: Float) -> Information:
+    """Return the information of the views taken.
+
+    Parameters
+    ----------
+    estimate
+        Cameras and poses.
+    volume_mm
+        (p, 3) points of the specimen's volume, system frame.
+    """
+    e = estimate
+    n = len(e.problem.flat_nodes_mm)
+    kept = np.arange(n) if n <= _MOST_POINTS else np.linspace(0, n - 1, _MOST_POINTS).round().astype(int)
+    shared = e.layout.motion + 5
+    free = e.priors.free[:shared]
+    rows = [_part(row, kept) if len(kept) < n else row for row in e.rows]
+    priors = replace(e.priors, node_weight=e.priors.node_weight * (n / len(kept)))
+    state = replace(e.state, nodes_mm=e.state.nodes_mm[kept])
+    normal = assemble(e.layout, state, rows, e.problem.flat_nodes_mm[kept], priors, _thinned(e.noise_px, e, kept))
+    q_z, q_shape = _volume_forms(e, volume_mm, free)
+    return Information(e, kept, _without_poses(normal, shared, free), free, q_z, q_shape)
+
+
+def _thinned(noise_px: Float, e: Estimate, kept: NDArray[np.intp]) -> Float:
+    """Noise with which some points tell as much as all do."""
+    return np.asarray(noise_px * np.sqrt(len(kept) / len(e.problem.flat_nodes_mm)))
+
+
+def _part(row: ViewRows, kept: NDArray[np.intp]) -> ViewRows:
+    # along lines the covariance would have to be thinned as well; as many independent points tell about as much
+    return replace(row, xy_px=row.xy_px[kept], found=row.found[kept], weight=row.weight[kept], lines=None)
+
+
+def _without_poses(normal: Normal, shared: int, free: Bool) -> Float:
+    """Eliminate the poses; return the matrix of the free shared unknowns and the corrections."""
+    U, W, k = normal.all_of_both, normal.coupling, normal.h.shape[1]
+    here = np.flatnonzero(free)
+    poses = np.flatnonzero(normal.free[shared:]) + shared
+    flat = np.swapaxes(W, 0, 1).reshape(len(U), -1)  # (m, n k)
+    if k == 0:
+        M, coupling = U[np.ix_(here, here)], U[np.ix_(here, poses)]
+    else:
+        V = _dense(normal)
+        M = np.block([[U[np.ix_(here, here)], flat[here]], [flat[here].T, V]])
+        coupling = np.concatenate([U[np.ix_(here, poses)], flat[poses].T])
+    if not len(poses):
+        return np.asarray(M)
+    # poses meet each other in no view, and six numbers of one lie beside each other
+    left = coupling.T.reshape(-1, 6, len(M))
+    index = poses.reshape(-1, 6)
+    blocks = U[index[:, :, None], index[:, None, :]]
+    solved = np.linalg.solve(blocks, left).reshape(-1, len(M))
+    return np.asarray(M - coupling @ solved)
+
+
+def _dense(normal: Normal) -> Float:
+    nodes = normal.nodes
+    if nodes.together:
+        return nodes.matrix
+    n, k = len(nodes.matrix), nodes.k
+    V = np.zeros((n, k, n, k))
+    V[np.arange(n), :, np.arange(n), :] = nodes.matrix
+    return V.reshape(n * k, n * k)
+
+
+def _volume_forms(e: Estimate, volume_mm: Float, free: Bool) -> tuple[Float, Float]:
+    layout: Layout = replace(e.layout, frames=(), steps=())
+    x = e.state.x[: layout.size]
+    names = parameter_names(layout, e.priors)
+    rows = point_derivatives(e.pair, volume_mm, names) @ named_derivatives(layout, e.priors, x)
+    flat = rows.reshape(-1, layout.size)[:, free]
+    middle = volume_mm.mean(axis=0)
+    rigid = np.zeros((len(volume_mm), 3, 6))
+    rigid[:, range(3), range(3)] = 1.0
+    for axis in range(3):
+        rigid[:, :, 3 + axis] = np.cross(np.eye(3)[axis], volume_mm - middle)
+    design = rigid.reshape(-1, 6)
+    flat = flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]
+    z = flat[2::3]
+    return z.T @ z / len(z), flat.T @ flat / len(flat)
