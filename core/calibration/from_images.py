@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from core.grid import GridOptions, GridView, Localiser
 from core.names import CAMERAS, CameraName
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.target import GridTarget
+from core.threads import run_ranges
 
 
 @dataclass(frozen=True)
@@ -103,19 +106,18 @@ def calibrate_views(
     for image in images:
         _check_size(image, nominals[CAMERAS.index(image.camera)])
     grid_options = grid_options_for(target, options, localiser, grid_options or GridOptions())
-    found: list[GridView | BoardView | None] = []
-    failed: list[tuple[ImageOfTarget, StereorigError]] = []
     total = len(images) + 1
-    for k, image in enumerate(images):
-        raise_if_cancelled(cancel)
-        progress("grid", k, total)
-        try:
-            found.append(detect_target(image.pixels, target, localiser=localiser, options=grid_options))
-        except StereorigError as error:
-            if image.frame is None:
-                raise _of_view(error, image) from error
-            found.append(None)
-            failed.append((image, error))
+    detected = _detect_all(
+        images,
+        lambda pixels: detect_target(pixels, target, localiser=localiser, options=grid_options),
+        lambda done: progress("grid", done, total),
+        cancel,
+    )
+    found = [None if isinstance(each, StereorigError) else each for each in detected]
+    failed = [(i, each) for i, each in zip(images, detected, strict=True) if isinstance(each, StereorigError)]
+    for image, error in failed:
+        if image.frame is None:
+            raise _of_view(error, image) from error
     _check_enough(images, found, failed)
     raise_if_cancelled(cancel)
     progress("calibration", len(images), total)
@@ -125,6 +127,32 @@ def calibrate_views(
     lost = tuple(DroppedView(i.label, i.camera, int(i.frame or 0), error.cause) for i, error in failed)
     progress("calibration", total, total)
     return CalibrationFromImages(tuple(found), replace(result, dropped=(*lost, *result.dropped)))
+
+
+def _detect_all(
+    images: Sequence[ImageOfTarget],
+    detect: Callable[[NDArray[Any]], GridView | BoardView],
+    progress: Callable[[int], None],
+    cancel: CancelToken | None,
+) -> list[GridView | BoardView | StereorigError]:
+    """Find the target in all images, on all threads; where it is not found, the error."""
+    out: list[GridView | BoardView | StereorigError | None] = [None] * len(images)
+    done = count(1)
+    telling = threading.Lock()
+    progress(0)
+
+    def work(first: int, last: int) -> None:
+        for k in range(first, last):
+            raise_if_cancelled(cancel)
+            try:
+                out[k] = detect(images[k].pixels)
+            except StereorigError as error:
+                out[k] = error
+            with telling:
+                progress(next(done))
+
+    run_ranges(work, len(images), 1)
+    return [each for each in out if each is not None]
 
 
 def grid_options_for(
