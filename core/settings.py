@@ -23,6 +23,7 @@ REFERENCE_UPDATES: tuple[ReferenceUpdate, ...] = get_args(ReferenceUpdate)
 StrainTensor = Literal["green_lagrange", "infinitesimal", "hencky"]
 STRAIN_TENSORS: tuple[StrainTensor, ...] = get_args(StrainTensor)
 StartFrom = Literal["previous", "reference"]
+Pattern = Literal["surface", "projected"]
 DEFAULT_PATCH: PatchSetting = "auto"
 DEFAULT_INTERPOLATION: Interpolation = "quintic"
 DEFAULT_REFERENCE_UPDATE: ReferenceUpdate = "auto"
@@ -185,6 +186,12 @@ class AnalysisSettings(Settings):
         "after another. reference: the reference alone; steps need one another for nothing, and a cluster measures as "
         "many at once as it has workers. It needs reference_update = never, which is then the default.",
     )
+    pattern: Pattern = Field(
+        "surface",
+        description="What the cameras see. surface: a texture that moves with the surface. projected: light that stays "
+        "where it is as the surface moves through it: the shape of every step can be measured, displacement and strain "
+        "cannot, and are refused.",
+    )
     strain: StrainSettings | None = Field(
         default_factory=lambda: StrainSettings.model_validate({}), description="Strain of a displacement; null: none."
     )
@@ -194,6 +201,14 @@ class AnalysisSettings(Settings):
         "gauges then take its value. null: as measured.",
         json_schema_extra=ODD,
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shape_alone(cls, given: Any) -> Any:
+        # what is left out is what a projected pattern allows; what is asked for against it is refused with the reason
+        if isinstance(given, dict) and given.get("pattern") == "projected":
+            return {"strain": None, "reference_update": "never", **given}
+        return given
 
     @model_validator(mode="before")
     @classmethod

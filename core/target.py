@@ -13,12 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from core.arrays import Float
 from core.errors import TargetError
 
+LINE_GRID: Final = "line_grid"
+"""Kind of a line grid, beside those of :data:`core.boards.board.BOARD_KINDS`."""
 _MIN_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
 
 

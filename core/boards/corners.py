@@ -24,7 +24,7 @@ def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bo
     for picture, factor in pictures.scales()[: 1 if coarsely else None]:
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if found:
-            grid = _arranged(np.asarray(corners), size, factor)
+            grid = _arranged(_settled(picture, np.asarray(corners), size), size, factor)
             if _alternates(pictures.grey, grid):
                 return grid
     return None
@@ -39,7 +39,7 @@ def search_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | No
             flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
             found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
         if found:
-            grid = _arranged(np.asarray(corners), size, factor)
+            grid = _arranged(_settled(picture, np.asarray(corners), size), size, factor)
             if _alternates(pictures.grey, grid):
                 return grid
     return None
@@ -67,30 +67,42 @@ def find_charuco(pictures: Pictures, target: BoardTarget, *, coarsely: bool = Fa
 
     ``coarsely``: on the smallest picture only, if it shows any.
     """
-    dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(target.dictionary))
-    columns, rows = target.size
-    squares = (columns + 1, rows + 1)
     best: Float | None = None
-    seen = 0
     for side in (COARSE_SIDE_PX, FINE_SIDE_PX):
         picture, factor = pictures.reduced(side)
-        for legacy in (False, True):
-            board = cv2.aruco.CharucoBoard(squares, float(target.pitch_mm), float(target.marker_mm or 0.0), dictionary)
-            board.setLegacyPattern(legacy)
-            corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
-            if ids is None or len(ids) < max(_LEAST_SEEN, seen + 1):
-                continue
-            seen = len(ids)
-            best = np.full((columns, rows, 2), np.nan)
-            index = np.asarray(ids).ravel()
-            best[index % columns, index // columns] = full_scale(
-                np.asarray(corners, dtype=np.float64).reshape(-1, 2), factor
-            )
-            if seen == columns * rows:
-                return best
+        best = _charuco(picture, factor, target, best)
+        if best is not None and np.isfinite(best).all():
+            break
         if factor == 1.0 or (coarsely and best is not None):
             break
+    if best is None and not coarsely and max(pictures.size_px) <= FINE_SIDE_PX:
+        # markers of few pixels a cell are read in a picture twice as large
+        picture, _ = pictures.reduced(FINE_SIDE_PX)
+        return _charuco(cv2.resize(picture, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 0.5, target, None)
     return best
+
+
+def _charuco(picture: NDArray[Any], factor: float, target: BoardTarget, known: Float | None) -> Float | None:
+    """Return the corners seen in one picture where they are more than those known, else these."""
+    dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(target.dictionary))
+    columns, rows = target.size
+    seen = 0 if known is None else int(np.isfinite(known[..., 0]).sum())
+    for legacy in (False, True):
+        board = cv2.aruco.CharucoBoard(
+            (columns + 1, rows + 1), float(target.pitch_mm), float(target.marker_mm or 0.0), dictionary
+        )
+        board.setLegacyPattern(legacy)
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
+        if ids is None or len(ids) < max(_LEAST_SEEN, seen + 1):
+            continue
+        seen = len(ids)
+        known = np.full((columns, rows, 2), np.nan)
+        index = np.asarray(ids).ravel()
+        flat = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        known[index % columns, index // columns] = full_scale(flat, factor)
+        if seen == columns * rows:
+            break
+    return known
 
 
 def dark_at_start(grey: Float32, xy_px: Float) -> bool:
@@ -130,6 +142,17 @@ def _squares(grey: Float32, xy_px: Float) -> tuple[Float, Float]:
 def _lightness(squares: Float) -> float:
     """Level of squares (n, m) that may hold markers."""
     return float(np.median(np.percentile(squares, 80.0, axis=-1)))
+
+
+def _settled(picture: NDArray[np.uint8], corners: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
+    """Return corners moved to the saddles near them: findChessboardCornersSB leaves them up to half a pixel off."""
+    grid = corners.reshape(size[1], size[0], 2).astype(np.float64)
+    steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=k), axis=-1).ravel() for k in (0, 1)])
+    half = int(np.clip(0.2 * np.min(steps), 2, 10))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+    start = corners.reshape(-1, 1, 2).astype(np.float32)
+    moved = np.asarray(cv2.cornerSubPix(picture, start.copy(), (half, half), (-1, -1), criteria))
+    return np.where(np.linalg.norm(moved - start, axis=-1, keepdims=True) < half, moved, start)
 
 
 def _arranged(corners: NDArray[Any], size: tuple[int, int], factor: float) -> Float:

@@ -248,7 +248,7 @@ def _other_size(
 ) -> TargetError:
     """Return the error for a board of other counts: cut by the image's border, or another one."""
     found, declared = sorted(counts), sorted(target.size)
-    fewer = found[0] <= declared[0] and found[1] <= declared[1]
+    fewer = len(outline_px) < target.size[0] * target.size[1]
     if fewer and found != declared and _reaches_border(outline_px, counts, pictures.size_px):
         return TargetError(
             f"The board leaves the image: {counts[0]} x {counts[1]} {what} are seen, declared are {target.size[0]} x"

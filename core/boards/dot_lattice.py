@@ -228,4 +228,10 @@ def missing_positions(centres: Float, way: Numbers, target: BoardTarget) -> Floa
         known = [g for g in guesses if np.isfinite(g).all()]
         if known:
             xy[i, j] = np.mean(known, axis=0)
+            continue
+        for di, dj in ((1, 0), (-1, 0), (0, step), (0, -step)):  # at the border, going on from two dots
+            a, b = (i + di, j + dj), (i + 2 * di, j + 2 * dj)
+            if all(0 <= p[k] < xy.shape[k] for p in (a, b) for k in (0, 1)) and np.isfinite(xy[a]).all():
+                xy[i, j] = 2.0 * xy[a] - xy[b]
+                break
     return np.asarray(xy)

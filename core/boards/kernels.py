@@ -1,8 +1,10 @@
 """Least-squares fit of one small picture a point: crossed edges of a checkerboard, or the rim of a dot.
 
-Corner: ``I = B + G d + A E(u) E(v)``, E(u) = erf(u / (sqrt 2 s)), with u and v the distances to two edges that the lens
-bends by a known amount. On a ChArUco board the white squares hold markers, whose dark border begins at a known
-distance from both edges. Dot: ``I = B + G d + A (1 - E(rho)) / 2`` with the distance rho to an ellipse.
+Corner: ``I = B + G d + A E(u, v)`` with u and v the distances to two edges that the lens bends by a known amount, and E
+the mean of sgn(u) sgn(v) under a Gaussian of standard deviation s: erf(u / (sqrt 2 s)) erf(v / (sqrt 2 s)) where the
+edges are perpendicular, and for edges at an angle, whose distances are correlated by r = cos of it, Plackett's integral
+of the bivariate normal density over r more. On a ChArUco board the white squares hold markers, whose dark border begins
+at a known distance from both edges. Dot: ``I = B + G d + A (1 - E(rho)) / 2`` with the distance rho to an ellipse.
 
 d is the distance from the point, so that a slope of the lighting moves no point. But for this slope all terms are even
 about the point and its position is odd: another blur, or markers a little larger than described, move no point either.
@@ -23,17 +25,23 @@ CORNER, DOT = 0, 1
 # blur and slopes of the ground
 N_CORNER, N_DOT = 9, 10
 # geometry of a corner: inverse axes (4), reach in pitches, bends of the edges (2) in 1/px, the distances of a marker
-# from both edges in px (0: none), width of its border; of a dot: unused, widths of the band outside and inside its rim
-N_GEOMETRY = 10
+# from both edges in px (0: none), one unused; of a dot: unused, widths of the band outside and inside its rim.
+# Last, of both: standard deviation of the slopes of the ground about their start, as part of the amplitude, 1/px, and
+# the slopes of the amplitude (2), as part of it, 1/px
+N_GEOMETRY = 13
 _STEPS = 30
-_SETTLED_PX = 1e-5
 _LEAST_BLUR = 0.2
 _BAND_BLURS = 4.0
 _BAND_PX = 1.5
 _RIM_BLURS = 2.0
-_SLOPE_PRIOR = 0.01  # of the amplitude, a px: far beyond any lighting, and it bounds what a small window cannot show
+_LEAST_FREE_PX = 0.5
 _R2 = 0.7071067811865476
 _ROOT = 0.7978845608028654
+_TWO_PI = 6.283185307179586
+_PERPENDICULAR = 0.01
+# Gauss and Legendre's five points on [0, 1]
+_GAUSS_X = (0.046910077030668, 0.230765344947158, 0.5, 0.769234655052842, 0.953089922969332)
+_GAUSS_W = (0.118463442528095, 0.239314335249683, 0.284444444444444, 0.239314335249683, 0.118463442528095)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -47,6 +55,13 @@ def _edge(u: float, s: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
+def _density(h: float, k: float, r: float) -> float:
+    """Bivariate normal density with correlation r."""
+    q = 1.0 - r * r
+    return exp(-0.5 * (h * h - 2.0 * r * h * k + k * k) / q) / (_TWO_PI * sqrt(q))
+
+
+@njit(cache=True, nogil=True)
 def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     s = max(abs(p[6]), _LEAST_BLUR)
     dx, dy = x - p[0], y - p[1]
@@ -55,9 +70,16 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     u, v = dy * cu - dx * su - g[5] * tu * tu, dy * cv - dx * sv - g[6] * tv * tv
     eu, gu = _edge(u, s)
     ev, gv = _edge(v, s)
-    amplitude = p[5]
+    amplitude = p[5] * (1.0 + g[11] * dx + g[12] * dy)
     picture = eu * ev
-    by_u, by_v = gu * ev, eu * gv
+    by_u, by_v, by_r = gu * ev, eu * gv, 0.0
+    r, skew = cu * cv + su * sv, cu * sv - su * cv
+    if gu > 0.0 and gv > 0.0 and abs(r) > _PERPENDICULAR and abs(skew) > 0.05:
+        by_u = gu * _edge((v - r * u) / abs(skew), s)[0]
+        by_v = gv * _edge((u - r * v) / abs(skew), s)[0]
+        for k in range(5):
+            picture += 4.0 * r * _GAUSS_W[k] * _density(u / s, v / s, r * _GAUSS_X[k])
+        by_r = 4.0 * _density(u / s, v / s, r)
     by_s = -(by_u * u + by_v * v) / s
     if g[7] > 0.0 and amplitude * u * v > 0.0:
         # a white square: its marker's border is as dark as the dark squares
@@ -75,10 +97,10 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     du, dv = amplitude * by_u, amplitude * by_v
     J[0] = du * su + dv * sv - p[7]
     J[1] = -du * cu - dv * cv - p[8]
-    J[2] = -du * tu
-    J[3] = -dv * tv
+    J[2] = -du * tu + amplitude * by_r * skew
+    J[3] = -dv * tv - amplitude * by_r * skew
     J[4] = 1.0
-    J[5] = picture
+    J[5] = picture * (1.0 + g[11] * dx + g[12] * dy)
     J[6] = amplitude * by_s
     J[7] = dx
     J[8] = dy
@@ -86,7 +108,7 @@ def _corner(p: Float, g: Float, x: float, y: float, J: Float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _dot(p: Float, x: float, y: float, J: Float) -> float:
+def _dot(p: Float, g: Float, x: float, y: float, J: Float) -> float:
     s = max(abs(p[7]), _LEAST_BLUR)
     a, b, c = p[2], p[3], p[4]
     dx, dy = x - p[0], y - p[1]
@@ -95,7 +117,7 @@ def _dot(p: Float, x: float, y: float, J: Float) -> float:
     # distance to the ellipse, to first order: (rho - 1) over the slope of rho
     steep = max(hypot(a * m + b * n, b * m + c * n), 1e-12) / rho
     e, slope = _edge((rho - 1.0) / steep, s)
-    inside = 0.5 * (1.0 - e)
+    inside = 0.5 * (1.0 - e) * (1.0 + g[11] * dx + g[12] * dy)
     by_rho = -0.5 * p[6] * slope / steep
     J[0] = -by_rho * (m * a + n * b) / rho - p[8]
     J[1] = -by_rho * (m * b + n * c) / rho - p[9]
@@ -130,17 +152,19 @@ def _used(kind: int, p: Float, g: Float, x: float, y: float) -> bool:
     if near > _BAND_BLURS * s + _BAND_PX:
         return False
     if g[7] > 0.0 and p[5] * u * v > 0.0:
-        return bool(min(abs(u) - g[7], abs(v) - g[8]) < g[9] - _RIM_BLURS * s)
+        # up to the rim of the marker: where perspective or lens put it is not known as well as the point itself
+        free = min(g[7], g[8])
+        return bool(min(abs(u) - g[7], abs(v) - g[8]) < max(-_RIM_BLURS * s, _LEAST_FREE_PX - free))
     return True
 
 
 @njit(cache=True, nogil=True)
 def _model(kind: int, p: Float, g: Float, x: float, y: float, J: Float) -> float:
-    return _dot(p, x, y, J) if kind == DOT else _corner(p, g, x, y, J)
+    return _dot(p, g, x, y, J) if kind == DOT else _corner(p, g, x, y, J)
 
 
 @njit(cache=True, nogil=True)
-def _fit_one(image: Float32, kind: int, p: Float, g: Float, half: int, out: Float) -> None:
+def _fit_one(image: Float32, kind: int, p: Float, g: Float, half: int, settled_px: float, out: Float) -> None:
     n = N_DOT if kind == DOT else N_CORNER
     blur_at, amplitude_at = (7, 6) if kind == DOT else (6, 5)
     out[:] = np.nan
@@ -181,13 +205,13 @@ def _fit_one(image: Float32, kind: int, p: Float, g: Float, half: int, out: Floa
             fall = cost - total
             cost = total
             best[:] = trial
-            prior = cost / (count - n) / (_SLOPE_PRIOR * max(abs(best[amplitude_at]), 1e-6)) ** 2
+            prior = cost / (count - n) / (g[10] * max(abs(best[amplitude_at]), 1e-6)) ** 2
             for i in range(n):
                 for j in range(i):
                     N[j, i] = N[i, j]
             for i in range(n - 2, n):
                 N[i, i] += prior
-                gradient[i] -= prior * best[i]
+                gradient[i] -= prior * (best[i] - p[i])
             kept[:] = N
             kept_gradient[:] = gradient
             damping *= 0.1
@@ -211,7 +235,7 @@ def _fit_one(image: Float32, kind: int, p: Float, g: Float, half: int, out: Floa
         for i in range(n):
             trial[i] = best[i] + step[i]
         trial[blur_at] = min(max(abs(trial[blur_at]), _LEAST_BLUR), 2.0 * abs(best[blur_at]) + 0.5)
-        settled = max(abs(step[0]), abs(step[1])) < _SETTLED_PX
+        settled = max(abs(step[0]), abs(step[1])) < settled_px
     variance = cost / (count - n)
     for j in range(2):
         M = kept.copy()
@@ -230,12 +254,16 @@ def _fit_one(image: Float32, kind: int, p: Float, g: Float, half: int, out: Floa
 
 
 @njit(cache=True, nogil=True)
-def _fit_all(image: Float32, kind: int, start: Float, geometry: Float, half: int, out: Float) -> None:
+def _fit_all(
+    image: Float32, kind: int, start: Float, geometry: Float, half: int, settled_px: float, out: Float
+) -> None:
     for k in range(start.shape[0]):
-        _fit_one(image, kind, start[k], geometry[k], half, out[k])
+        _fit_one(image, kind, start[k], geometry[k], half, settled_px, out[k])
 
 
-def fit_points(image: Float32, kind: int, start: Float, geometry: Float, half_px: int) -> Float:
+def fit_points(
+    image: Float32, kind: int, start: Float, geometry: Float, half_px: int, *, settled_px: float = 1e-5
+) -> Float:
     """Fit every point.
 
     Parameters
@@ -248,6 +276,8 @@ def fit_points(image: Float32, kind: int, start: Float, geometry: Float, half_px
         (n, :data:`N_CORNER` or :data:`N_DOT`) and (n, :data:`N_GEOMETRY`), see the module.
     half_px
         Half side of the windows.
+    settled_px
+        Step of a point below which its fit ends after one more.
 
     Returns
     -------
@@ -257,7 +287,7 @@ def fit_points(image: Float32, kind: int, start: Float, geometry: Float, half_px
     """
     out = np.empty((len(start), start.shape[1] + 4))
     table = np.ascontiguousarray(start, dtype=np.float64)
-    _fit_all(image, kind, table, np.ascontiguousarray(geometry, dtype=np.float64), half_px, out)
+    _fit_all(image, kind, table, np.ascontiguousarray(geometry, dtype=np.float64), half_px, settled_px, out)
     return out
 
 

@@ -32,15 +32,16 @@ class Pictures:
         self._kept: dict[int, tuple[NDArray[np.uint8], float]] = {}
 
     def reduced(self, side_px: int) -> tuple[NDArray[np.uint8], float]:
-        """Return the picture with a longer side of at most ``side_px``, and the image's pixels per pixel of it."""
+        """Return the picture with a longer side of about ``side_px``, and the image's pixels per pixel of it."""
         if side_px not in self._kept:
-            factor = max(max(self.size_px) / side_px, 1.0)
-            picture = self.grey
-            if factor > 1.0:
-                size = (round(self.size_px[0] / factor), round(self.size_px[1] / factor))
-                picture = np.asarray(cv2.resize(self.grey, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+            # whole blocks of pixels, so that the picture's own pixels lie where the factor says
+            factor = max(round(max(self.size_px) / side_px), 1)
+            size = (self.size_px[0] // factor, self.size_px[1] // factor)
+            picture = self.grey[: size[1] * factor, : size[0] * factor]
+            if factor > 1:
+                picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
             eight = np.clip((picture - self._low) * self._scale, 0.0, 255.0).astype(np.uint8)
-            self._kept[side_px] = eight, factor
+            self._kept[side_px] = eight, float(factor)
         return self._kept[side_px]
 
     def scales(self) -> list[tuple[NDArray[np.uint8], float]]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
-from core.boards.board import BoardTarget, dictionary_id
+from core.boards.board import BoardTarget
 from core.boards.kernels import CORNER, DOT, N_CORNER, N_DOT, N_GEOMETRY, fit_points
 from core.boards.view import neighbour_distances_px, steps_px
 
@@ -22,7 +21,11 @@ _RIM_BLURS, _RIM_PX = 4.0, 1.5  # about a dot's rim
 _MISFIT = 3.0  # of the other points' residuals
 _MISFIT_SHARE = 0.06  # of the contrast, that a good point's residuals may have
 _LEAST_CONTRAST = 0.25  # of the other points'
+# standard deviation of the ground's slope, as part of the contrast: of any lighting, a px, and about the slope that the
+# neighbours' levels show, a distance of neighbours; a dot alone tells its place and a slope apart poorly
+_FREE_SLOPE, _KNOWN_SLOPE = 0.01, 0.0015
 _PIXEL_VARIANCE = 1.0 / 12.0
+_SETTLED_PX = (0.03, 1e-5)  # of the first fit, and of the second from there
 
 
 @dataclass(frozen=True)
@@ -81,12 +84,13 @@ def refine_corners(grey: Float32, coarse_px: Float, target: BoardTarget) -> Refi
     geometry[:, 4] = np.minimum(_REACH, _MAX_REACH_PX / step)
     half = int(np.clip(np.ceil(float(np.max(geometry[:, 4] * (np.abs(ex) + np.abs(ey)).max(axis=1)))), 3, 90))
     if target.kind == "charuco":
-        geometry[:, 7:] = _markers(target, ex, ey)
+        geometry[:, 7:9] = _markers(target, ex, ey)
+    geometry[:, 10] = _FREE_SLOPE
     fit = np.zeros((len(first), 0))
     places = coarse_px
-    for _ in range(2):  # the second time about the corner found, so that its pixels are symmetric about it
+    for settled_px in _SETTLED_PX:  # the second time about the corner found, so that its pixels are symmetric about it
         geometry[:, 5], geometry[:, 6] = (bends(places, axis)[usable] for axis in (0, 1))
-        fit = fit_points(grey, CORNER, start, geometry, half)
+        fit = fit_points(grey, CORNER, start, geometry, half, settled_px=settled_px)
         moved = np.linalg.norm(fit[:, :2] - first, axis=1)
         with np.errstate(invalid="ignore"):
             good = np.isfinite(fit).all(axis=1) & (moved < np.maximum(_MAX_MOVE * step, 1.0))
@@ -94,6 +98,13 @@ def refine_corners(grey: Float32, coarse_px: Float, target: BoardTarget) -> Refi
         start = np.where(good[:, None], fit[:, :N_CORNER], start)
         places = coarse_px.copy()
         places[usable] = start[:, :2]
+        level = np.full(shape, np.nan)
+        alike = good & _alike(good, fit[:, 5], fit[:, -1])
+        level[usable] = np.where(alike, start[:, 4], np.nan)
+        start[:, 7:9] = slopes(places, level)[usable]
+        level[usable] = np.where(alike, np.abs(start[:, 5]), np.nan)
+        geometry[:, 11:13] = slopes(places, level)[usable] / np.abs(start[:, [5]])
+        geometry[:, 10] = _KNOWN_SLOPE / step
     good &= _alike(good, fit[:, 5], fit[:, -1])
     return _refined(shape, usable, fit, N_CORNER, good, blur=fit[:, 6], contrast=2.0 * np.abs(fit[:, 5]))
 
@@ -115,8 +126,10 @@ def refine_dots(
         (columns, rows) True for dots whose middle is not of their own colour.
     """
     shape = coarse_px.shape[:2]
-    xy0 = coarse_px.reshape(-1, 2)
-    pitch = neighbour_distances_px(coarse_px, target).ravel()
+    known = np.isfinite(coarse_px).all(axis=-1).ravel()
+    xy0 = np.where(known[:, None], coarse_px.reshape(-1, 2), 0.0)
+    pitch = np.where(known, neighbour_distances_px(coarse_px, target).ravel(), np.nan)
+    pitch = np.where(np.isfinite(pitch), pitch, np.nanmedian(pitch))
     # a uniform ellipse has second moments of a quarter of its squared axes: M = (4 moments)^(-1/2)
     values, vectors = np.linalg.eigh(4.0 * moments_px2.reshape(-1, 2, 2))
     axes = np.sqrt(np.maximum(values, 0.25))
@@ -129,21 +142,29 @@ def refine_dots(
     start[:, 6] = inside - start[:, 5]
     start[:, 7] = _FIRST_BLUR_PX
     geometry = np.zeros((len(xy0), N_GEOMETRY))
+    geometry[:, 10] = _FREE_SLOPE
     half = int(np.clip(np.ceil(np.nanmax(axes[:, 1]) + _RIM_BLURS * 2.0 + _RIM_PX + 1.0), 4, 400))
     blur = np.full(len(xy0), _FIRST_BLUR_PX)
     fit = np.zeros((len(xy0), 0))
-    for _ in range(2):
+    for settled_px in _SETTLED_PX:
         band = _RIM_BLURS * blur + _RIM_PX
         # half of the way to the next dot's rim outside; inside, the middle, or half of a ring's width
         geometry[:, 1] = np.minimum(band, np.maximum(0.5 * pitch - axes[:, 1], 1.0))
         geometry[:, 2] = np.where(ring, np.minimum(band, 0.3 * axes[:, 0]), np.minimum(band, axes[:, 0]))
-        fit = fit_points(grey, DOT, start, geometry, half)
+        fit = fit_points(grey, DOT, start, geometry, half, settled_px=settled_px)
         a, b, c = fit[:, 2], fit[:, 3], fit[:, 4]
         with np.errstate(invalid="ignore"):
-            good = np.isfinite(fit).all(axis=1) & (a * c - b * b > 0.0)
+            good = known & np.isfinite(fit).all(axis=1) & (a * c - b * b > 0.0)
             good &= np.linalg.norm(fit[:, :2] - xy0, axis=1) < 0.5 * axes[:, 1]
         start = np.where(good[:, None], fit[:, :N_DOT], start)
         blur = np.full(len(xy0), float(np.median(np.abs(start[:, 7]))))
+        alike = good & _alike(good, fit[:, 6], fit[:, -1])
+        level = np.where(alike, start[:, 5], np.nan).reshape(shape)
+        places = start[:, :2].reshape(*shape, 2)
+        start[:, 8:10] = slopes(places, level).reshape(-1, 2)
+        level = np.where(alike, np.abs(start[:, 6]), np.nan).reshape(shape)
+        geometry[:, 11:13] = slopes(places, level).reshape(-1, 2) / np.maximum(np.abs(start[:, [6]]), 1e-6)
+        geometry[:, 10] = _KNOWN_SLOPE / pitch
     good &= _alike(good, fit[:, 6], fit[:, -1])
     everywhere = np.ones(shape, dtype=bool)
     ellipse = np.full((len(xy0), 2, 2), np.nan)
@@ -176,14 +197,32 @@ def bends(xy_px: Float, axis: int) -> Float:
     return out.T if axis == 0 else out
 
 
+def slopes(xy_px: Float, level: Float) -> Float:
+    """Slope of levels (columns, rows) across the image, by the plane through each point and its neighbours, 1/px.
+
+    Returns (columns, rows, 2), 0 where too few neighbours are known.
+    """
+    out = np.zeros((*level.shape, 2))
+    for i, j in np.argwhere(np.isfinite(level)):
+        near = np.s_[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
+        values, places = level[near].ravel(), xy_px[near].reshape(-1, 2)
+        known = np.isfinite(values)
+        if known.sum() < 4:
+            continue
+        d = places[known] - places[known].mean(axis=0)
+        N = d.T @ d
+        if np.linalg.det(N) > 1e-3 * np.trace(N) ** 2:
+            out[i, j] = np.linalg.solve(N, d.T @ values[known])
+    return out
+
+
 def _markers(target: BoardTarget, ex: Float, ey: Float) -> Float:
-    """Distances (n, 3), px, of a ChArUco board's markers from the edges along X and Y, and their borders' width."""
+    """Distances (n, 2), px, of a ChArUco board's markers from the edges along X and along Y."""
     marker = float(target.marker_mm or 0.0) / target.pitch_mm
-    cells = cv2.aruco.getPredefinedDictionary(dictionary_id(target.dictionary)).markerSize + 2
     area = np.abs(ex[:, 0] * ey[:, 1] - ex[:, 1] * ey[:, 0])
     across_x, across_y = area / np.linalg.norm(ex, axis=1), area / np.linalg.norm(ey, axis=1)
     frame = 0.5 * (1.0 - marker)
-    return np.stack([frame * across_x, frame * across_y, marker / cells * np.minimum(across_x, across_y)], axis=-1)
+    return frame * np.stack([across_x, across_y], axis=-1)
 
 
 def _alike(good: Bool, amplitude: Float, noise: Float) -> Bool:

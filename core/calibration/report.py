@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.checks.flatness import check_flatness
 from core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from core.calibration.checks.positions import PositionCheck
 from core.calibration.choice.held_out import HeldOutView, held_out_view
@@ -42,7 +41,7 @@ def build_result(
     Raises
     ------
     CalibrationError
-        Code ``calibration_not_finite`` where a number that would be stored is not finite, ``target_not_flat``.
+        Code ``calibration_not_finite`` where a number that would be stored is not finite.
     """
     adjustment, problem = chosen.screened.adjustment, chosen.screened.problem
     layout, state = adjustment.layout, adjustment.state
@@ -64,7 +63,6 @@ def build_result(
     results.sort(key=lambda v: (v.camera, v.dz_mm is None, v.frame if v.dz_mm is None else v.dz_mm))
     fitted = _check(fitted_views, points, nominal_points)
     held_out = _check(chosen.held_out, points, nominal_points) if chosen.held_out else None
-    check_flatness(chosen.structure, adjustment)
     pair = StereoPair(*(camera_of(layout, state.x, c) for c in range(2)))
     names = parameter_names(layout, adjustment.priors)
     covariance = named_covariance(layout, adjustment.priors, state.x, adjustment.covariance)
@@ -81,7 +79,8 @@ def build_result(
         held_out=held_out,
         views=results,
         uncertainty=uncertainty,
-        node_corrections_mm=corrections[..., :2] if free_nodes else None,
+        # of a target declared exact, the finding itself speaks
+        node_corrections_mm=corrections[..., :2] if free_nodes and target.node_tolerance_mm > 0.0 else None,
         node_tolerance_mm=target.node_tolerance_mm,
         options=options,
         centres=[(c.lens, n.image_size_px) for c, n in zip((pair.cam1, pair.cam2), nominals, strict=True)],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +25,7 @@ from core.grid.lattice import Lattice, find_lattice, not_found, oriented, pitch_
 from core.grid.lines import LineFit, fit_lines
 from core.grid.piece_table import PieceTable, line_points, piece_table
 from core.grid.profile import OUT, fit_pieces
-from core.grid.threshold import checked_image, coarse_factors, line_picture
+from core.grid.threshold import LinePicture, checked_image, coarse_factors, line_picture
 from core.grid.view import GridOptions, GridView, LineModel, Localiser
 from core.robust import MAD_TO_SIGMA
 from core.target import GridTarget
@@ -33,6 +34,7 @@ _OUTLIER = 6.0  # standard deviations at which a line point is an outlier
 _ROUNDS = 3
 _CLEAR_DEPTH = 3.0  # of the noise, at which lines are lines whatever the target
 _LEAST_SHOWN = 5  # lines each way
+_LINED = 0.8  # of the pieces between a line grid's intersections must be lines, and of its cells must not
 
 
 def detect_grid(
@@ -176,9 +178,26 @@ def lines_shown(image: NDArray[Any]) -> Float | None:
                     nodes = find_lattice(picture, directions(picture)).nodes_px
                 except (TargetError, np.linalg.LinAlgError):
                     continue
-                if min(nodes.shape[:2]) >= _LEAST_SHOWN:
+                if min(nodes.shape[:2]) >= _LEAST_SHOWN and _lines_between(picture, nodes):
                     return nodes
     return None
+
+
+def _lines_between(picture: LinePicture, nodes_px: Float) -> bool:
+    """Return True where nearly all pieces between intersections are dark and nearly all cells are not."""
+    middles = [0.5 * (nodes_px[1:] + nodes_px[:-1]), 0.5 * (nodes_px[:, 1:] + nodes_px[:, :-1])]
+    cells = 0.25 * (nodes_px[1:, 1:] + nodes_px[1:, :-1] + nodes_px[:-1, 1:] + nodes_px[:-1, :-1])
+    # a coarse line may lie a pixel off
+    mask = cv2.dilate(picture.mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+
+    def share(places: Float, values: Bool) -> float:
+        at = np.rint((places.reshape(-1, 2) + 0.5) / picture.factor - 0.5).astype(int)
+        inside = ((at >= 0) & (at < np.array(values.shape[::-1]))).all(axis=1)
+        x, y = at[inside].T
+        return float(values[y, x].mean()) if inside.any() else 0.0
+
+    lined = min(share(middle, mask) for middle in middles)
+    return lined > _LINED and share(cells, picture.mask) < 1.0 - _LINED
 
 
 def _coarse(grey: Float32, target: GridTarget, options: GridOptions) -> tuple[Lattice, float]:

@@ -18,7 +18,8 @@ from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
 from server.api.routes.analyses import analyses, exports, gauges, picking, previews, report, results
-from server.api.routes.calibrations import calibrations, guide, noise, review
+from server.api.routes.calibrations import calibrations, guide, noise, repair, review
+from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
@@ -116,7 +117,9 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         stage,
         noise,
         calibrations,
+        repair,
         calibration_exports,
+        calibration_checks,
         review,
         guide,
         tests,

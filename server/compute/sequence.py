@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError
+from core.errors import FileFormatError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
@@ -27,12 +27,15 @@ from core.measure import PreviousStep, ReferencePair, Updating
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
+from server.compute.camera_watch import CameraWatch
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
+from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.volume import rbe_of, volume_of
+from server.formats.calibrations.volume import own_px_of, rbe_of, volume_of
 from server.formats.files import sha256_of, write_bytes
 from server.formats.images import read_image
 from server.formats.noise_json import LoadedNoise
+from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.reading import read_measured
 from server.formats.results.starts import starts_file, with_starts, write_starts
 from server.formats.results.summary import summarise, to_json
@@ -104,6 +107,15 @@ class SequenceMeasurement:
         self._fields: dict[int, Field] = {}
         self._last_images: tuple[int, Pair] | None = None
         self._sequence: Updating | None = None
+        self._motions: dict[int, CameraMotion | None] = {}
+        self._watch = CameraWatch(
+            self.calibration.pair,
+            self.options,
+            self.reference.n,
+            covariance_in(self.calibration.details, name="calibration.json", pair=self.calibration.pair),
+            own_px_of(self.calibration),
+            self.calibration.imported,
+        )
         images = self.read(self.reference)
         sizes = (self.calibration.image_size1_px, self.calibration.image_size2_px)
         for cam, image, size in zip(("cam1", "cam2"), images, sizes, strict=True):
@@ -155,16 +167,36 @@ class SequenceMeasurement:
             more["seeds"] = seeds
         self.steps[step.n] = step
         if step.n == self.reference.n:
-            result = self.pair.shape(self.grid, self.options, **more)
+            own = self.pair.image1, self.pair.image2
+            result = self._matched(step.n, own, lambda: self.pair.shape(self.grid, self.options, **more))
         else:
             shape = self._field(self.reference.n)
             previous_step = None
             if previous is not None and previous != self.reference.n:
                 previous_step = PreviousStep(previous, self._field(previous))
             images = images or self.read(step)
-            result = self._updating(shape).measure(images, previous_step, **more)
+            result = self._matched(step.n, images, lambda: self._updating(shape).measure(images, previous_step, **more))
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
+        self._motions[step.n] = self._watch.judge(
+            step.n,
+            result,
+            images or (self.pair.image1, self.pair.image2),
+            shape=lambda: self._field(self.reference.n),
+            previous=previous,
+            before=lambda n: (self._field(n), self._previous_images(n)),
+        )
         self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
+        return result
+
+    def _matched(self, n: int, images: Pair, measure: Callable[[], Field]) -> Field:
+        """Return what is measured; where nothing matches, say so if a camera turned too far."""
+        try:
+            result = measure()
+        except SeedError as error:
+            self._watch.refuse_moved(n, images, error)
+            raise
+        if not result.valid.any():
+            self._watch.refuse_moved(n, images)
         return result
 
     def finish(
@@ -198,7 +230,13 @@ class SequenceMeasurement:
             "n": step.n,
             "step": step.n,
             "file": path.name,
-            **summarise(shown, rbe_px=self._rbe_px, reference=self.reference.n).document(),
+            **summarise(
+                shown,
+                rbe_px=self._rbe_px,
+                reference=self.reference.n,
+                imported=self.calibration.imported,
+                camera_motion=self._motions.pop(step.n, None),
+            ).document(),
             "strain": None if strain is None else summarise_strain(strain).document(),
         }
         if in_service:  # first: where the result is, they are

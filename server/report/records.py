@@ -80,6 +80,7 @@ class TestRecord(Record):
 
     id: str = ""
     name: str = ""
+    calibration_id: str | None = None
     specimen: str = ""
     notes: str = ""
     metadata: dict[str, object] = Field(default={}, validation_alias=AliasChoices(*METADATA_NAMES))

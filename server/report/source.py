@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.errors import InputError, StereorigError
 from core.names import CameraName
 from server.base.errors import NotFoundError
+from server.formats.calibrations.kept_checks import read_checks, with_checks
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import known_sha256
 from server.formats.images import read_image
@@ -155,6 +156,8 @@ def find_source(
     made = AnalysisRecord.model_validate(known_json(folder / "analysis.json") or known_json(folder / "summary.json"))
     doubts: list[str] = []
     loaded, file = _calibration(calibration, home, made, heads, doubts)
+    if loaded is not None and file is not None:
+        loaded = _with_kept_checks(loaded, file, home, test_record)
     return Source(
         files=dict(sorted(files.items())),
         heads=heads,
@@ -170,6 +173,17 @@ def find_source(
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
     )
+
+
+def _with_kept_checks(
+    loaded: LoadedCalibration, file: Path, home: Path | None, test_record: TestRecord
+) -> LoadedCalibration:
+    """Add the checks made of a calibration since: beside its file, or beside the one that a test's is a copy of."""
+    kept = read_checks(file, loaded.sha256)
+    if home is not None and test_record.calibration_id:
+        folder = home.parent.parent / "calibrations" / Path(test_record.calibration_id).name
+        kept = {**read_checks(folder / "calibration.json", loaded.sha256), **kept}
+    return replace(loaded, details=with_checks(loaded.details, kept)) if kept else loaded
 
 
 def _results_folder(origin: Path, test: str | None, analysis: str | None) -> Path:

@@ -147,6 +147,7 @@ def read_steps(source: Source) -> Measured:
     labels = {n: _label(source, n) for n in source.files}
     static, static_source = static_steps(source.metadata.static_steps, labels, source.reference)
     rbe = None if source.calibration is None else rbe_of(source.calibration)
+    imported = source.calibration is not None and source.calibration.imported
     keeper = FloorKeeper()
     figures: list[StepFigures] = []
     reference: Field | None = None
@@ -160,7 +161,7 @@ def read_steps(source: Source) -> Measured:
         field, strain = read_field(path), read_strain(path)
         if n in static:
             keeper.add(n, field, strain)
-        step = _figures(source, n, field, strain, rbe, labels[n], static=n in static)
+        step = _figures(source, n, field, strain, rbe, labels[n], static=n in static, imported=imported)
         figures.append(step)
         if reference is None:
             reference = field
@@ -206,7 +207,15 @@ def _load(source: Source, n: int) -> float | None:
 
 
 def _figures(
-    source: Source, n: int, field: Field, strain: StrainField | None, rbe: float | None, label: str, *, static: bool
+    source: Source,
+    n: int,
+    field: Field,
+    strain: StrainField | None,
+    rbe: float | None,
+    label: str,
+    *,
+    static: bool,
+    imported: bool,
 ) -> StepFigures:
     record = source.steps[n]
     return StepFigures(
@@ -216,7 +225,7 @@ def _figures(
         channels=record.channels,
         seconds=_seconds(source, n),
         captured_utc=record.captured_utc,
-        summary=summarise(field, rbe_px=rbe, reference=source.reference),
+        summary=summarise(field, rbe_px=rbe, reference=source.reference, imported=imported),
         strain=None if strain is None else summarise_strain(strain),
         skew_ms=record.skew_ms,
         quality=record.quality,

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError, InputError
+from core.orientation.matched import seen_by_camera2
 from server.formats.calibrations.plausibility import Residual
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.results.provenance import calibration_of
@@ -60,24 +59,9 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
     variables = step.variables
     xy1 = np.stack([variables[n].values[ok] for n in ("x_px", "y_px")], axis=1)
     xyz = np.stack([variables[n].values[ok] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
-    xy2 = _visible_in_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
+    xy2 = seen_by_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
     return EpipolarComparison(
         results=files[0].name,
         measured_with=Residual.of(own.pair.epipolar_residual_px(xy1, xy2)),
         this_calibration=Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2)),
     )
-
-
-def _visible_in_camera2(pair: StereoPair, xy1: Float, xyz_mm: Float, offset_px: Float) -> Float:
-    """Positions of the points in camera 2: off the epipolar line by the offset that was measured."""
-    on_line = pair.cam2.project(xyz_mm).xy
-    h = 0.01
-    gradient = np.stack(
-        [
-            (pair.epipolar_residual_px(xy1, on_line + d) - pair.epipolar_residual_px(xy1, on_line - d)) / (2 * h)
-            for d in (np.array([h, 0.0]), np.array([0.0, h]))
-        ],
-        axis=1,
-    )
-    left = offset_px - pair.epipolar_residual_px(xy1, on_line)
-    return np.asarray(on_line + gradient * (left / (gradient**2).sum(axis=1))[:, None])

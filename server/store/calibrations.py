@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from server.base.errors import NotFoundError
+from server.formats.calibrations.kept_checks import checks_file, keep_check, read_checks, with_checks
 from server.formats.files import known_sha256, mismatch, require_recorded, sha256_of
 from server.formats.images import GrayImage, encode_tiff
 from server.store.documents import CalibrationRecord
@@ -68,6 +70,16 @@ class CalibrationStore:
         write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
         return calibration_id
 
+    def create_repaired(self, plan: Mapping[str, object], mask: bytes | None) -> str:
+        """Make the folder of a calibration that is to be repaired from another one; return its id."""
+        calibration_id = self._folder.ids.new("c")
+        path = self._folder.calibrations / calibration_id
+        make_folder(path)
+        if mask is not None:
+            write_bytes(path / "mask.png", mask)
+        write_json(path / "plan.json", {"id": calibration_id, "created_utc": now_utc(), **plan})
+        return calibration_id
+
     def put_view(self, calibration_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
         """Store one view; return its file name and checksum."""
         name = f"{index:03d}_{cam}.tif"
@@ -87,6 +99,15 @@ class CalibrationStore:
         path = self.path(calibration_id) / _REVIEWS[0]
         write_json(path, {"decision": None} if document is None else document)
 
+    def checks(self, calibration_id: str) -> dict[str, dict[str, Any]]:
+        """Findings of the checks made since, by their names; empty without any."""
+        path = self.path(calibration_id) / "calibration.json"
+        return read_checks(path, self.checksum(calibration_id)) if checks_file(path).exists() else {}
+
+    def put_check(self, calibration_id: str, name: str, finding: Mapping[str, object]) -> None:
+        """Keep a check's finding beside the calibration; an earlier one of the same name is replaced."""
+        keep_check(self.path(calibration_id) / "calibration.json", self.checksum(calibration_id), name, finding)
+
     def read(self, calibration_id: str) -> CalibrationRecord:
         """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``).
 
@@ -104,7 +125,8 @@ class CalibrationStore:
                 path / "calibration.json", f"calibration {calibration_id}", f"calibrations/{calibration_id}"
             )
             # a file from elsewhere may hold anything; the service's own entries come last
-            document = {**read_json(path / "calibration.json"), **document, "state": "complete", "problem": None}
+            made = with_checks(read_json(path / "calibration.json"), self.checks(calibration_id))
+            document = {**made, **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
             document |= {"state": "failed", "problem": read_json(path / "failure.json")}
             if (path / REJECTED).exists():  # a rejected calibration is kept for inspection

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from core.errors import FileFormatError, StorageError
 from core.names import CAMERAS
+from server.formats.calibrations.kept_checks import KEPT_CHECKS
 from server.formats.files import recorded_sha256, sha256_of, storage_error
 from server.store.durable import read_json
 from server.store.folder import check_format, is_id, is_in_use
@@ -28,7 +29,7 @@ _OURS = frozenset(
 # Names that the service writes into a folder of each kind
 _KNOWN = {
     "calibration": r"(plan|target|view|review|judgement|failure|rejected)\.json|"
-    r"(calibration\.json|residuals\.nc)(\.sha256)?|views",
+    r"(calibration\.json|residuals\.nc)(\.sha256)?|calibration\.checks\.json|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
     "test": r"(test|calibration|watch)\.json|steps|analyses|exports",
     "step": r"step\.json|cam[12]\.tif",
@@ -146,6 +147,7 @@ class _Walk:
         self.there.add(("calibration", "", path.name))
         self.strangers(path, "calibration")
         self.documents(path, "target.json", "failure.json", "rejected.json", "review.json", "judgement.json")
+        self.documents(path, KEPT_CHECKS)
         if self.document(path / "plan.json") is None:
             return
         taken = self.document(path / "view.json") if (path / "view.json").is_file() else None

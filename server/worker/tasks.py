@@ -145,6 +145,38 @@ class FitTask:
     views: list[dict[str, Any]]
 
 
+@dataclass(frozen=True, kw_only=True)
+class RepairTask:
+    """The repair of one calibration.
+
+    Parameters
+    ----------
+    folder
+        Folder of the new calibration; ``calibration.json`` goes there.
+    original
+        File of the old one, which is only read.
+    steps
+        Images taken after the bump.
+    region
+        Where points lie in camera 1's images, as :class:`core.settings.Region`; None: all of them.
+    mask
+        Image file, white where points may lie, or None.
+    subset_px, spacing_px
+        As for a measurement.
+    limits
+        Of :class:`core.orientation.RepairLimits`, by name.
+    """
+
+    folder: Path
+    original: Path
+    steps: list[StepImages]
+    region: dict[str, Any] | None
+    mask: Path | None
+    subset_px: int
+    spacing_px: int | None
+    limits: dict[str, float] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class LookTask:
     """The target in one pair of images.
@@ -195,6 +227,12 @@ def measure_step(task: StepTask) -> dict[str, Any]:
 def fit_calibration(task: FitTask) -> dict[str, Any]:
     """Find the grid in every view and fit both cameras; ``calibration.json`` is there when this returns."""
     summary: dict[str, Any] = _heavy("server.compute.calibration_fit").fit_calibration(task)
+    return summary
+
+
+def repair_calibration(task: RepairTask) -> dict[str, Any]:
+    """Estimate the cameras' orientation anew; the new ``calibration.json`` is there when this returns."""
+    summary: dict[str, Any] = _heavy("server.compute.orientation_repair").repair_calibration(task)
     return summary
 
 

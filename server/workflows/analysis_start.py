@@ -16,6 +16,7 @@ from server.formats.noise_json import load_noise
 from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
+from server.results.projected_pattern import check_settings
 from server.results.staleness import stale_inputs
 from server.store.documents import AnalysisRecord
 from server.store.index import analysis_entry
@@ -135,6 +136,7 @@ def begin(
     Ids
         ``analysis_id`` and ``job_id``.
     """
+    check_settings(settings, displacement=kind == "displacement")
     calibration = service.tests.calibration_file(test_id)
     check_calibration(service, test_id, calibration)
     measured = steps_to_measure(service, test_id, settings.reference, steps)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from core.calibration.aspect import block_ratios, measure_aspect
+from core.calibration.aspect_images import measure_aspect_normal
 from core.errors import CalibrationInputError
 from core.grid import GridView, detect_grid
 from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera, truth_px
@@ -118,3 +120,45 @@ def test_images_moved_about_without_known_travel_average_the_noise_and_the_disto
     assert result.aspect == pytest.approx(TRUE_ASPECT, abs=3e-5)  # half of 0.3 degrees squared is 1.4e-5
     assert result.first_estimate == pytest.approx(TRUE_ASPECT, abs=1e-4)
     assert result.tilt_rad is None
+
+
+@pytest.mark.parametrize("standoff_mm", [400.0, None])
+def test_images_along_the_normal_give_lambda_and_its_doubt(standoff_mm: float | None) -> None:
+    cameras = [
+        paper_camera(0.2, beta_deg=0.2, alpha_deg=a, offset_mm=(0.3 * k, 0.0)) for k, a in enumerate((44, 45, 46))
+    ]
+    views = [detect_grid(grid_image(c, seed=k), PAPER_TARGET) for k, c in enumerate(cameras)]
+    found = measure_aspect_normal(views, standoff_mm=standoff_mm)
+    assert found.images == 3
+    assert found.standoff_known is (standoff_mm is not None)
+    # the noise, and what the grid's tilt of 0.28 degrees may do
+    assert found.aspect == pytest.approx(TRUE_ASPECT, abs=4.0 * found.sigma + found.tilt_effect)
+    assert found.tilt_effect < 1e-4
+
+
+@pytest.mark.parametrize("axis", ["beta_deg", "gamma_deg"])
+def test_a_tilted_grid_is_refused_by_its_perspective(axis: str) -> None:
+    camera = paper_camera(**{"gamma_deg": 0.0, "beta_deg": 0.0, axis: 3.0})
+    view = detect_grid(grid_image(camera, seed=3), PAPER_TARGET)
+    with pytest.raises(CalibrationInputError, match=r"grid tilted by [23]\.\d") as caught:
+        measure_aspect_normal([view], standoff_mm=400.0)
+    assert caught.value.code == "aspect_not_normal"
+    with pytest.raises(CalibrationInputError, match="longest lens in use"):
+        measure_aspect_normal([view])
+
+
+def test_the_tilt_of_a_grid_is_found_to_its_uncertainty() -> None:
+    errors = []
+    for seed in range(8):
+        view = _view_at_truth(paper_camera(0.0, beta_deg=0.8), 0.004, seed)
+        found = measure_aspect_normal([view], standoff_mm=400.0)
+        errors.append((found.tilt_rad - np.radians(0.8)) / found.tilt_sigma_rad)
+    # the views' noise is each point's own, the uncertainty that of whole lines, twice as large
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_an_upright_grid_is_refused() -> None:
+    view = _view_at_truth(paper_camera(0.0), 0.002, 0)
+    with pytest.raises(CalibrationInputError, match="45 degrees") as caught:
+        measure_aspect_normal([replace(view, rotation_rad=0.1)])
+    assert caught.value.code == "aspect_not_diagonal"

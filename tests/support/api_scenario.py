@@ -17,6 +17,11 @@ import cv2
 import httpx
 import numpy as np
 
+from core.cameras.camera import Camera
+from core.target import GridTarget
+from server.config.rig_file import parse_config
+from server.formats.calibrations.target_toml import target_of
+from tests.support.grid_images import grid_image, paper_camera
 from tests.support.service_rig import SMALL, true_cameras, wait_for_job, wait_for_rig
 
 API = "/api/v1"
@@ -218,16 +223,41 @@ def _calibration(session: Session) -> str:
     for form in ("paper", "opencv", "matchid", "vic3d"):
         call("export_calibration", calibration, query={"format": form})
     call("report_conversion", calibration, query={"format": "opencv"})
+    cameras = true_cameras(SMALL)
+    marks = {
+        cam: Camera.from_paper(**values).project([[-2.0, 0.5, 0.2], [2.0, 0.5, 0.2]]).xy.round(2).tolist()
+        for cam, values in cameras.items()
+    }
+    call(
+        "check_distance",
+        calibration,
+        summary="Two marks, 4 mm apart",
+        body={"points_px": marks, "distance_mm": 4.0, "distance_sigma_mm": 0.002},
+    )
     decision = {"decision": "accepted", "note": "held-out residuals are small"}
     call("put_review", calibration, summary="Measure with it from now on", body=decision)
-    call(
+    second = call(
         "import_calibration",
         summary="Both cameras as calibration.json",
         form={"label": "from the old rig"},
         files={"file": json.dumps(true_cameras(SMALL)).encode()},
         text_files=True,
+    ).json()
+    call("compare_calibration", calibration, query={"with": second["id"]})
+    call(
+        "measure_aspect",
+        summary="An image along the grid's normal",
+        form={"standoff_mm": 400.0},
+        files={"images": _grid_along_its_normal()},
     )
     return calibration
+
+
+def _grid_along_its_normal() -> bytes:
+    target = target_of(parse_config(SMALL).target.plain(), "target")
+    assert isinstance(target, GridTarget)
+    _, data = cv2.imencode(".png", grid_image(paper_camera(0.2), target))
+    return bytes(data.tobytes())
 
 
 def _test(session: Session, calibration: str) -> str:
@@ -277,6 +307,9 @@ def _test(session: Session, calibration: str) -> str:
     call("rate_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
     call("check_seeds", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
     call("delete_step", test, imported)
+    # one step of a narrow view: whether it is repaired or refused is the job's to say
+    repair = {"test_id": test, "steps": [0], "region": {"rectangle": [60, 60, 200, 180]}}
+    wait_for_job(client, call("repair_calibration", calibration, summary="From one step", body=repair).json()["job"])
     return test
 
 

@@ -116,6 +116,38 @@ class LineGrid:
 FLAT = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 
 
+def picture(
+    camera: PlainCamera,
+    pattern: Waves | LineGrid,
+    *,
+    frame: Array = FLAT,
+    origin: Array | None = None,
+    dz: float = 0.0,
+    n: int = 4,
+    low: float = 40.0,
+    high: float = 210.0,
+    blur_px: float = 0.6,
+) -> Array:
+    """Blur the pattern, integrate it over each pixel, light it unevenly: grey levels without noise, not rounded."""
+    w, h = camera.size
+    fine = np.empty((h * n, w * n), dtype=np.float32)
+    for start in range(0, h, 32):
+        rows = slice(start, min(h, start + 32))
+        rays = camera.sub_pixel_rays(n, rows)
+        ab = material_points(camera, rays, frame=frame, origin=np.zeros(3) if origin is None else origin, dz=dz)
+        samples = pattern(ab).reshape(-1, w, n, n).transpose(0, 2, 1, 3)
+        fine[start * n : rows.stop * n] = samples.reshape(-1, w * n)
+    out = gaussian_filter(fine, blur_px * n).reshape(h, n, w, n).mean((1, 3))
+    yy, xx = np.mgrid[:h, :w]
+    light = 1.0 - 0.08 * ((xx / w - 0.4) ** 2 + (yy / h - 0.6) ** 2)
+    return np.asarray((low + (high - low) * out) * light)
+
+
+def exposed(grey: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Add noise and round to eight bits."""
+    return np.clip(np.round(grey + rng.normal(0.0, noise, grey.shape)), 0, 255).astype(np.uint8)
+
+
 def render(
     camera: PlainCamera,
     pattern: Waves | LineGrid,
@@ -130,17 +162,6 @@ def render(
     blur_px: float = 0.6,
     seed: int = 0,
 ) -> NDArray[np.uint8]:
-    """Blur the pattern, integrate it over each pixel, light it unevenly, add noise, round to eight bits."""
-    w, h = camera.size
-    fine = np.empty((h * n, w * n), dtype=np.float32)
-    for start in range(0, h, 32):
-        rows = slice(start, min(h, start + 32))
-        rays = camera.sub_pixel_rays(n, rows)
-        ab = material_points(camera, rays, frame=frame, origin=np.zeros(3) if origin is None else origin, dz=dz)
-        samples = pattern(ab).reshape(-1, w, n, n).transpose(0, 2, 1, 3)
-        fine[start * n : rows.stop * n] = samples.reshape(-1, w * n)
-    out = gaussian_filter(fine, blur_px * n).reshape(h, n, w, n).mean((1, 3))
-    yy, xx = np.mgrid[:h, :w]
-    light = 1.0 - 0.08 * ((xx / w - 0.4) ** 2 + (yy / h - 0.6) ** 2)
-    grey = (low + (high - low) * out) * light + np.random.default_rng(seed).normal(0.0, noise, (h, w))
-    return np.clip(np.round(grey), 0, 255).astype(np.uint8)
+    """A picture of the pattern with noise, in eight bits."""
+    grey = picture(camera, pattern, frame=frame, origin=origin, dz=dz, n=n, low=low, high=high, blur_px=blur_px)
+    return exposed(grey, noise, np.random.default_rng(seed))

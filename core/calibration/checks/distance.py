@@ -1,4 +1,4 @@
-"""The known-distance check: the only one that shows a wrong pitch."""
+"""Known distances: the only check that shows a wrong pitch."""
 
 from __future__ import annotations
 
@@ -7,12 +7,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 
-from core.arrays import Float
+from core.arrays import Bool, Float
+from core.calibration.fit.dots import dot_offsets_px
 from core.calibration.result import COVARIANCE_NAMES
 from core.calibration.uncertainty import point_derivatives
+from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
+
+MARK_SIGMA_PX = 0.05
+_AGREE_SIGMA = 3.0
+_MIN_TARGET_POINTS = 6
+#: of the nearest points' distance: indices that disagree between the cameras leave more, a bent board less
+_MISFIT = 0.2
+#: imported calibrations miss by some tenths of a pixel; exchanged images or a camera that moved by more
+_EPIPOLAR_PX = 2.0
+_NODE_BOUND = float(np.sqrt(3.0))  # of a bound over the standard deviation within it
 
 
 @dataclass(frozen=True)
@@ -22,15 +35,21 @@ class DistanceCheck:
     Attributes
     ----------
     measured_mm, known_mm
-        The distances.
+        The distances; of a target, those of its two outermost points.
     ratio
         Measured over known; not 1 for a target with another pitch than declared.
     sigma_mm
-        Standard uncertainty of the difference, from calibration and known value.
+        Standard uncertainty of the difference, from calibration, marks and known value.
     agrees
         True if they agree within three sigma.
     text
         The finding in one sentence.
+    points
+        Number of marks measured.
+    residual_mm
+        Rms distance of a target's points from its description, position and size fitted; None of two marks.
+    covariance_known
+        False where the calibration's own uncertainty is not known and does not count.
     """
 
     measured_mm: float
@@ -39,6 +58,9 @@ class DistanceCheck:
     sigma_mm: float
     agrees: bool
     text: str
+    points: int = 2
+    residual_mm: float | None = None
+    covariance_known: bool = True
 
 
 def check_known_distance(
@@ -48,7 +70,7 @@ def check_known_distance(
     *,
     covariance: Float | None = None,
     names: Sequence[str] | None = None,
-    localisation_sigma_px: float = 0.05,
+    localisation_sigma_px: float = MARK_SIGMA_PX,
     distance_sigma_mm: float = 0.0,
 ) -> DistanceCheck:
     """Measure the distance of two marks and compare it with the known one.
@@ -80,6 +102,123 @@ def check_known_distance(
             code="known_distance_unusable",
             remedy="Give both marks' image positions in both cameras and their distance in millimetres.",
         )
+    points = _triangulated(pair, xy)
+    difference = points[1] - points[0]
+    measured = float(np.linalg.norm(difference))
+    if not measured > 0.0:
+        raise CalibrationInputError(
+            "Both marks are at one position.", code="known_distance_unusable", remedy="Give two marks that lie apart."
+        )
+    along = difference / measured
+    rows = np.stack([-along, along])
+    sigma2 = np.full((2, 2), localisation_sigma_px**2)
+    variance = _variance(pair, points, rows, sigma2, covariance, names) + distance_sigma_mm**2
+    return _finding(measured, float(distance_mm), float(np.sqrt(variance)), known=covariance is not None)
+
+
+def check_target_scale(
+    pair: StereoPair,
+    xy1_px: Float,
+    xy2_px: Float,
+    nominal_mm: Float,
+    *,
+    covariance: Float | None = None,
+    names: Sequence[str] | None = None,
+    sigmas_px: tuple[Float, Float] | None = None,
+    node_tolerance_mm: float = 0.0,
+    distance_sigma_mm: float = 0.0,
+    dot_radius_mm: float | None = None,
+) -> DistanceCheck:
+    """Measure all points of a target of known size and compare its scale with the description.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    xy1_px, xy2_px
+        (..., 2) the same points in both cameras, NaN where one was not found.
+    nominal_mm
+        (..., 2) positions on the target.
+    covariance, names
+        As for :func:`check_known_distance`.
+    sigmas_px
+        (...) standard deviation of each point's coordinates, per camera; None: 0.05 px.
+    node_tolerance_mm
+        The maker's bound on the error of a point, per axis.
+    distance_sigma_mm
+        Standard deviation of the known distance of the two outermost points.
+    dot_radius_mm
+        Radius of the target's dots, whose imaged centres are corrected for perspective and lens; None for corners.
+
+    Returns
+    -------
+    DistanceCheck
+        The distance of the two outermost points that both cameras see, from the scale of all.
+
+    Raises
+    ------
+    CalibrationInputError
+        ``known_distance_unusable`` with too few common points; ``known_distance_mismatch`` if the points do not have
+        the shape of the target.
+    """
+    flat = [np.asarray(xy, dtype=np.float64).reshape(-1, 2) for xy in (xy1_px, xy2_px)]
+    nominal = np.asarray(nominal_mm, dtype=np.float64).reshape(-1, 2)
+    found: Bool = np.asarray(np.isfinite(np.concatenate(flat, axis=1)).all(axis=1))
+    if found.sum() < _MIN_TARGET_POINTS or np.linalg.matrix_rank(nominal[found] - nominal[found].mean(axis=0)) < 2:
+        raise CalibrationInputError(
+            f"Both cameras see {int(found.sum())} points of the target in common; {_MIN_TARGET_POINTS} in two "
+            "directions are needed.",
+            code="known_distance_unusable",
+            remedy="Show the target where both cameras see it.",
+        )
+    xy = np.stack([part[found] for part in flat])
+    board = np.column_stack([nominal[found], np.zeros(int(found.sum()))])
+    if sigmas_px is None:
+        sigma2 = np.full(xy.shape[:2], MARK_SIGMA_PX**2)
+    else:
+        sigma2 = np.stack([np.asarray(s, dtype=np.float64).reshape(-1)[found] ** 2 for s in sigmas_px])
+    offset = float(np.sqrt(np.mean(pair.epipolar_residual_px(xy[0], xy[1]) ** 2)))
+    if offset > _EPIPOLAR_PX:
+        raise CalibrationInputError(
+            f"The points lie {offset:.3g} px rms off their epipolar lines; a pair that the calibration holds for has "
+            f"{_EPIPOLAR_PX:g} px at most.",
+            code="known_distance_mismatch",
+            remedy="Check that the images are not exchanged, that both show the target at one moment, and that no "
+            "camera moved since the calibration.",
+        )
+    points = _triangulated(pair, xy)
+    scale, pose, left = _similarity(board, points)
+    if dot_radius_mm is not None:
+        for _ in range(2):
+            offsets = [
+                dot_offsets_px(Camera(c.lens, c.cam_from_sys @ pose), board * scale, dot_radius_mm * scale)
+                for c in (pair.cam1, pair.cam2)
+            ]
+            points = _triangulated(pair, xy - np.stack(offsets))
+            scale, pose, left = _similarity(board, points)
+    residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+    nearest = _nearest_mm(nominal[found])
+    if residual > _MISFIT * nearest:
+        raise CalibrationInputError(
+            f"The points measured do not have the shape of the target: {residual:.3g} mm rms off it, where its points "
+            f"lie {nearest:.3g} mm apart.",
+            code="known_distance_mismatch",
+            remedy="Check that the target is described rightly, that both images show it upright and at one moment, "
+            "and that they are not exchanged.",
+        )
+    # the scale is a sum over the points: each counts by its place on the target
+    about = (board - board.mean(axis=0)) @ pose.rotation.T
+    rows = about / float((about**2).sum())
+    variance = _variance(pair, points, rows, sigma2, covariance, names)
+    variance += float((rows**2).sum()) * (node_tolerance_mm / _NODE_BOUND) ** 2
+    known = _outermost_mm(nominal[found])
+    sigma = float(np.sqrt(variance * known**2 + distance_sigma_mm**2))
+    return _finding(
+        scale * known, known, sigma, known=covariance is not None, points=int(found.sum()), residual_mm=residual
+    )
+
+
+def _triangulated(pair: StereoPair, xy: Float) -> Float:
     space = pair.triangulate(xy[0], xy[1])
     if not space.valid.all():
         raise CalibrationInputError(
@@ -87,23 +226,60 @@ def check_known_distance(
             code="known_distance_unusable",
             remedy="Check that both cameras' positions belong to the same mark.",
         )
-    difference = space.xyz_mm[1] - space.xyz_mm[0]
-    measured = float(np.linalg.norm(difference))
-    along = difference / measured
-    variance = distance_sigma_mm**2
-    A = np.concatenate([pair.cam1.point_jacobian(space.xyz_mm), pair.cam2.point_jacobian(space.xyz_mm)], axis=-2)
-    per_point = np.linalg.inv(np.swapaxes(A, 1, 2) @ A) * localisation_sigma_px**2
-    variance += float(along @ per_point.sum(axis=0) @ along)
+    return space.xyz_mm
+
+
+def _variance(
+    pair: StereoPair, points: Float, rows: Float, sigma2: Float, covariance: Float | None, names: Sequence[str] | None
+) -> float:
+    """Variance of ``sum(rows * points)`` (n, 3) from marks of variance ``sigma2`` (2, n) px^2 and the calibration."""
+    A = np.concatenate([pair.cam1.point_jacobian(points), pair.cam2.point_jacobian(points)], axis=-2)
+    to_point = np.linalg.pinv(A)  # (n, 3, 4)
+    weights = np.einsum("ni,nij->nj", rows, to_point)
+    variance = float(np.einsum("nj,nj->", weights**2, np.repeat(sigma2.T, 2, axis=1)))
     if covariance is not None:
-        G = point_derivatives(pair, space.xyz_mm, COVARIANCE_NAMES if names is None else names)
-        row = along @ (G[1] - G[0])
+        G = point_derivatives(pair, points, COVARIANCE_NAMES if names is None else names)
+        row = np.einsum("ni,nip->p", rows, G)
         variance += float(row @ covariance @ row)
-    sigma = float(np.sqrt(variance))
-    ratio = measured / distance_mm
-    agrees = abs(measured - distance_mm) <= 3.0 * sigma
-    text = f"Measured {measured:.4f} mm against {distance_mm:.4f} mm known ({100.0 * (ratio - 1.0):+.2f} %), " + (
-        f"within 3 sigma = {3.0 * sigma:.4f} mm."
-        if agrees
-        else f"beyond 3 sigma = {3.0 * sigma:.4f} mm: the target's pitch may be wrong by that factor."
+    return variance
+
+
+def _similarity(board: Float, points: Float) -> tuple[float, RigidTransform, Float]:
+    """Scale and pose that carry the board (n, 3) to the points, least squares, and what is left (n, 3)."""
+    middle_b, middle_p = board.mean(axis=0), points.mean(axis=0)
+    a, b = board - middle_b, points - middle_p
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    turned = a @ R.T
+    scale = float((turned * b).sum() / (a**2).sum())
+    pose = RigidTransform(R, middle_p - scale * R @ middle_b)
+    return scale, pose, b - scale * turned
+
+
+def _nearest_mm(nominal: Float) -> float:
+    distances = np.asarray(cKDTree(nominal).query(nominal, k=2)[0])
+    return float(np.median(distances[:, 1]))
+
+
+def _outermost_mm(nominal: Float) -> float:
+    return float(pdist(nominal).max())
+
+
+def _finding(
+    measured: float, known_mm: float, sigma: float, *, known: bool, points: int = 2, residual_mm: float | None = None
+) -> DistanceCheck:
+    ratio = measured / known_mm
+    agrees = abs(measured - known_mm) <= _AGREE_SIGMA * sigma
+    limit = _AGREE_SIGMA * sigma
+    of = "" if points == 2 else f" over {points} points"
+    text = (
+        f"Measured {measured:.4f} mm against {known_mm:.4f} mm known{of}, ratio {ratio:.6f} +- {sigma / known_mm:.6f} "
+        f"({100.0 * (ratio - 1.0):+.3f} %), "
     )
-    return DistanceCheck(measured, float(distance_mm), ratio, sigma, agrees, text)
+    if agrees:
+        text += f"within 3 sigma = {limit:.4f} mm."
+    else:
+        text += f"beyond 3 sigma = {limit:.4f} mm: the pitch of the calibration's target may be wrong by that factor."
+    if not known:
+        text += " The calibration's own uncertainty is not known and does not count."
+    return DistanceCheck(measured, known_mm, ratio, sigma, agrees, text, points, residual_mm, known)

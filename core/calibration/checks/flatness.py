@@ -10,12 +10,15 @@ from core.calibration.choice.structure import Structure
 from core.calibration.fit.adjust import Adjustment
 from core.errors import CalibrationError
 
-_SHARE = 1.0  # of the noise: a bow that moves the points by more rules the fit
+_SHARE = 0.7  # of all residuals: a bow of more than this is half of their squares
+_BENT = 4e-3  # of the half side: a board on glass or aluminium keeps a tenth of it
 _LEAST_PX = 0.05  # less than this does no harm worth a refusal; the verdict names it
 
 
-def check_flatness(structure: Sequence[Structure], adjustment: Adjustment) -> None:
-    """Refuse a calibration whose residuals show above all that the target is bowed.
+def check_flatness(structure: Sequence[Structure], adjustment: Adjustment, half_side_mm: float) -> None:
+    """Refuse a calibration whose residuals show above all that the target is bent.
+
+    A slight bow, as of a printed board, is corrected like other errors of the target's points.
 
     Parameters
     ----------
@@ -23,6 +26,8 @@ def check_flatness(structure: Sequence[Structure], adjustment: Adjustment) -> No
         What the residuals hold.
     adjustment
         The fit, for its noise.
+    half_side_mm
+        Half of the target's longer side.
 
     Raises
     ------
@@ -35,6 +40,8 @@ def check_flatness(structure: Sequence[Structure], adjustment: Adjustment) -> No
             continue
         values = {name: value for name, (value, _) in found.terms.items()}
         bow = max(abs(values["XX_mm"]), abs(values["YY_mm"]), abs(values["XY_mm"]))
+        if bow < _BENT * half_side_mm:
+            continue
         raise CalibrationError(
             f"The target is not flat: it is bowed by about {bow:.2g} mm from its middle to its rim, which moves its "
             f"points by {found.rms_px:.2f} px.",

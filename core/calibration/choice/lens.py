@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from core.calibration.checks.flatness import check_flatness
 from core.calibration.choice.held_out import HeldOutView, held_out_view, held_out_views, leave_out_in_turn
 from core.calibration.choice.screening import Screened, fit_screened, points_mm
 from core.calibration.choice.structure import Structure, find_structure, lens_significance
+from core.calibration.choice.target_errors import find_target_errors
 from core.calibration.fit.layout import camera_seeing
 from core.calibration.fit.lens_form import LensName
 from core.calibration.fit.problem import Problem, converted, started
@@ -53,6 +55,9 @@ class Chosen:
 def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     """Fit under the lens model that the options ask for, or find the simplest that leaves no structure.
 
+    Where all views agree that points of a target declared exact lie elsewhere, the lens is chosen anew with these
+    errors as unknowns, with a prior from the residuals. With free poses they are corrected, too.
+
     Parameters
     ----------
     problem
@@ -63,8 +68,33 @@ def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     Raises
     ------
     CalibrationInputError, CalibrationError
-        Views that do not give a calibration.
+        Views that do not give a calibration; ``target_not_flat``.
     """
+    chosen = _choose(problem, held)
+    half_side_mm = float(np.abs(problem.nodes_mm).max())
+    check_flatness(chosen.structure, chosen.screened.adjustment, half_side_mm)
+    fit = chosen.screened
+    if fit.adjustment.priors.nodes_free:
+        return chosen
+    errors = find_target_errors(fit.adjustment, fit.rows, problem.flat_nodes_mm, in_space=bool(problem.frames))
+    if errors is None:
+        return chosen
+    found, node_sigma_mm = errors
+    try:
+        corrected = _choose(replace(problem, node_sigma_mm=node_sigma_mm), held)
+    except CalibrationError:
+        # these views do not determine both; the finding stays, and lowers the verdict
+        return replace(chosen, structure=(found, *chosen.structure))
+    if problem.frames and problem.options.estimate_nodes is not False:
+        return replace(corrected, structure=(found, *corrected.structure))
+    if corrected.model != chosen.model:
+        # a lens must not take up the target's errors, which every position repeats
+        held_lens = replace(problem, options=replace(problem.options, lens=corrected.model))
+        chosen = replace(_choose(held_lens, held), reasons=corrected.reasons)
+    return replace(chosen, structure=(found, *chosen.structure))
+
+
+def _choose(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     turned, start, odd = started(problem)
     paper = turned.layout("paper")
 

@@ -16,7 +16,7 @@ from core.calibration.fit.adjust import NOISE_ROUNDS, Adjustment, adjust
 from core.calibration.fit.dots import dot_offsets_px
 from core.calibration.fit.free_start import MIN_POSES
 from core.calibration.fit.layout import Layout, State, camera_seeing
-from core.calibration.fit.model import linearise
+from core.calibration.fit.model import linearise_all
 from core.calibration.fit.observations import ViewRows
 from core.calibration.fit.problem import Problem, rebased, restricted
 from core.calibration.inputs import CalibrationView
@@ -203,8 +203,8 @@ def _bad(
 ) -> tuple[list[tuple[CalibrationView, str]], dict[str, Float]]:
     """Views of free poses that lie far off, with the reason, and points to leave out of the others."""
     rms, sizes = np.zeros(len(rows)), []
-    for k, row in enumerate(rows):
-        lin = linearise(adjustment.layout, adjustment.state, row, problem.flat_nodes_mm)
+    lins = linearise_all(adjustment.layout, adjustment.state, rows, problem.flat_nodes_mm)
+    for k, (row, lin) in enumerate(zip(rows, lins, strict=True)):
         size = np.sqrt(row.weight) * np.linalg.norm(lin.residual_px, axis=1) / adjustment.noise_px[row.camera]
         sizes.append(size)
         rms[k] = np.sqrt(np.mean(size[row.found] ** 2)) if row.found.any() else np.inf

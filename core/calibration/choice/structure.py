@@ -19,7 +19,7 @@ from core.arrays import Float
 from core.calibration.fit.adjust import Adjustment
 from core.calibration.fit.layout import camera_of
 from core.calibration.fit.lens_form import LensName
-from core.calibration.fit.model import linearise
+from core.calibration.fit.model import linearise_all
 from core.calibration.fit.normal import Extra, Normal, assemble, inverse
 from core.calibration.fit.observations import ViewRows
 from core.calibration.inputs import NominalCamera
@@ -37,8 +37,8 @@ class Structure:
     Attributes
     ----------
     name
-        ``decentring``, ``radial``, ``higher radial``, ``thin prism``, ``aspect``, ``skew``, ``bow``, ``unequal pitch``
-        or ``smooth``.
+        ``decentring``, ``radial``, ``higher radial``, ``thin prism``, ``aspect``, ``skew``, ``bow``, ``unequal
+        pitch``, ``target points`` or ``smooth``.
     camera
         ``cam1`` or ``cam2``; None for the target.
     terms
@@ -58,6 +58,12 @@ class Structure:
     @property
     def text(self) -> str:
         """The finding in one sentence."""
+        if self.name == "target points":
+            sizes = [f"{1e3 * value:.2g} um {key.removesuffix('_mm')}" for key, (value, _) in self.terms.items()]
+            return (
+                f"The target's points were held as nominal, but all views show them off by about {' and '.join(sizes)} "
+                "its plane. Declare node_tolerance_mm (and flatness_mm) to have them corrected."
+            )
         who = "the target" if self.camera is None else self.camera
         values = ", ".join(f"{n} = {v:.2g} +- {s:.1g}" for n, (v, s) in self.terms.items())
         what = f"{self.name}: {values}" if values else "a smooth field over the image of no known lens term"
@@ -233,9 +239,8 @@ def _extras(
     half = np.abs(nominal_nodes_mm[:, :2]).max()
     X, Y = (nominal_nodes_mm[:, :2] / half).T
     extras = []
-    for view in views:
+    for view, lin in zip(views, linearise_all(layout, state, views, nominal_nodes_mm), strict=True):
         c = view.camera
-        lin = linearise(layout, state, view, nominal_nodes_mm)
         values = state.x[layout.lens(c)]
         size = nominals[c].image_size_px
         fields = [_lens_term(t, lin.normalised, float(values[0])) for t in per_camera[c]]

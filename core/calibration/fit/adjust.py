@@ -19,6 +19,7 @@ from core.errors import CalibrationError
 
 NOISE_ROUNDS = 4
 _MIN_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
+_LAST, _NEAR = 10, 0.1  # last steps, and what they may still gain: a tenth of what one standard deviation costs
 _LENS_AND_POSE = 10.0  # unknowns of a camera that correlated observations feel
 
 
@@ -98,15 +99,22 @@ def adjust(
 
     state = start
     if noise_px is None:
-        noise = _noise(evaluate(state, np.ones(2)), counts - _LENS_AND_POSE)
+        noise = unfit = _noise(evaluate(state, np.ones(2)), counts - _LENS_AND_POSE)
         if priors.nodes_free:
             # the nominal target's residuals are mostly the nodes' errors; start from a localiser's noise
-            noise = np.minimum(noise, 0.01)
+            noise = np.minimum(unfit, 0.01)
     else:
-        noise = noise_px
+        noise = unfit = noise_px
     iterations = 0
     for _ in range(rounds):
-        state, normal, steps = _minimise(layout, state, noise, evaluate, max_iterations)
+        try:
+            state, normal, steps = _minimise(layout, state, noise, evaluate, max_iterations)
+        except CalibrationError:
+            if iterations or np.array_equal(noise, unfit):
+                raise
+            # views that do not fit each other: far from a localiser's noise the minimum is hard to reach, and what is
+            # wrong shows there
+            state, normal, steps = _minimise(layout, start, unfit, evaluate, max_iterations)
         iterations += steps
         redundancy = counts - covariance(normal).taken
         if (redundancy < 1.0).any():
@@ -134,6 +142,7 @@ def _minimise(
 ) -> tuple[State, Normal, int]:
     normal = evaluate(state, noise)
     damping = 1e-6
+    recent: list[float] = []
     for iteration in range(1, max_iterations + 1):
         step, nodes = normal.step(damping)
         moved = np.zeros_like(state.nodes_mm)
@@ -152,6 +161,11 @@ def _minimise(
             return state, normal, iteration
         if damping > 1e12:
             break
+        recent = [*recent[-_LAST + 1 :], max(gain, 0.0)]
+    else:
+        # where a model does not fit, steps shrink slowly, and its misfit, told as noise, is far more than is left
+        if sum(recent) <= _NEAR:
+            return state, normal, max_iterations
     raise CalibrationError(
         f"The adjustment did not settle in {max_iterations} iterations (sum of squares {normal.cost:.3g}).",
         code="calibration_not_converged",

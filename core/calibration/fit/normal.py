@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from core.arrays import Bool, Float
 from core.calibration.fit.layout import Layout, Priors, State
-from core.calibration.fit.model import Linearised, linearise
+from core.calibration.fit.model import Linearised, linearise_all
 from core.calibration.fit.observations import ViewRows
 from core.errors import CalibrationError
 
@@ -200,7 +200,7 @@ def assemble(
 ) -> Normal:
     """Build the normal equations of all views at a state; ``extras`` are held unknowns after the layout's own."""
     n, k, m = len(nominal_nodes_mm), priors.nodes_free, layout.size + n_extra
-    lins = [linearise(layout, state, view, nominal_nodes_mm) for view in views]
+    lins = linearise_all(layout, state, views, nominal_nodes_mm)
     together = k > 0 and any(view.lines is not None for view in views)
     U, g = np.zeros((2, m, m)), np.zeros(m)
     W, h = np.zeros((2, n, m, k)), np.zeros((n, k))
@@ -259,17 +259,17 @@ def _add(
     U[np.ix_(columns, columns)] += weighted_flat.T @ flat
     g[columns] += weighted_flat.T @ r.ravel()
     if k:
-        W[:, columns] += np.einsum("nip,nij->npj", WA, B)
+        W[:, columns] += np.swapaxes(WA, 1, 2) @ B
         h += np.einsum("ni,nij->nj", Wr, B)
         if lines is not None:
             _add_lines(V, lines.precision_a * factor, B[:, 0], lines.shape, k, across=False)
             _add_lines(V, lines.precision_b * factor, B[:, 1], lines.shape, k, across=True)
         elif V.ndim == 2:
-            block = np.einsum("n,nij,nil->njl", factor * view.weight, B, B)
+            block = np.swapaxes(B, 1, 2) @ (factor * view.weight[:, None, None] * B)
             at = np.arange(len(B))[:, None] * k + np.arange(k)
             V[at[:, :, None], at[:, None, :]] += block
         else:
-            V += np.einsum("n,nij,nil->njl", factor * view.weight, B, B)
+            V += np.swapaxes(B, 1, 2) @ (factor * view.weight[:, None, None] * B)
     return float(np.sum(Wr * r) / factor)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration.fit.layout import Layout, State
-from core.calibration.fit.model import linearise
+from core.calibration.fit.model import linearise_all
 from core.calibration.fit.observations import ViewRows
 from core.calibration.inputs import NominalCamera
 from core.errors import CalibrationError
@@ -76,7 +76,7 @@ def fit_single(
         return State(x, {}, empty)
 
     def residuals(p: Float) -> Float:
-        lins = [linearise(layout, state_of(p), v, nodes_mm) for v in views]
+        lins = linearise_all(layout, state_of(p), views, nodes_mm)
         body = np.concatenate(
             [(lin.residual_px * r)[v.found].ravel() for lin, r, v in zip(lins, roots, views, strict=True)]
         )
@@ -89,8 +89,7 @@ def fit_single(
 
     def jacobian(p: Float) -> Float:
         rows = []
-        for v, r in zip(views, roots, strict=True):
-            lin = linearise(layout, state_of(p), v, nodes_mm)
+        for v, r, lin in zip(views, roots, linearise_all(layout, state_of(p), views, nodes_mm), strict=True):
             full = np.zeros((len(v.found), 2, layout.size))
             full[..., lin.columns] = lin.by_unknown
             rows.append(-(full[..., index] * r[..., None])[v.found].reshape(-1, len(index)))
@@ -105,7 +104,7 @@ def fit_single(
     cx, cy = nominal.centre_px
     for start_pose in start_poses:
         start = np.concatenate([[nominal.phd_px, cx, cy, 0.0], start_pose, np.zeros(2 if single else 0)])
-        if not all(linearise(layout, state_of(start), v, nodes_mm).valid for v in views):
+        if not all(lin.valid for lin in linearise_all(layout, state_of(start), views, nodes_mm)):
             continue
         found = least_squares(
             residuals, start, jac=jacobian, method="lm", x_scale="jac", xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=400

@@ -48,7 +48,7 @@ class EpipolarCheck:
         return {"level": self.level, "offset_px": self.offset_px, "own_px": self.own_px, "reason": self.reason}
 
 
-def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
+def check_epipolar(field: Field, rbe_px: float | None, *, imported: bool = False) -> EpipolarCheck | None:
     """Compare a field's epipolar offset with the calibration's.
 
     Parameters
@@ -58,6 +58,9 @@ def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
     rbe_px
         The calibration's reprojection error (RBE), of held-out positions where there are any. It is one image's, both
         have it, and the offset is stated in one: so the calibration's own offset is up to its sum over both.
+    imported
+        True for another program's calibration: its own offset is not known, so that a large one is a warning at most,
+        and no sign that a camera moved.
 
     Returns
     -------
@@ -80,6 +83,9 @@ def check_epipolar(field: Field, rbe_px: float | None) -> EpipolarCheck | None:
     level: Level = "ok" if excess < WARNING_PX else "warning" if excess < FAILED_PX else "failed"
     known = "unknown" if own is None else f"at most {own:.3f} px"
     text = f"camera 2 sees the points {found:.3f} px off their epipolar lines, the calibration's own is {known}"
-    if level != "ok":
+    if level != "ok" and imported:
+        level = "warning"
+        text += "; the imported calibration's own error is not known: hold later steps against the reference"
+    elif level != "ok":
         text += "; a camera was moved since, or the calibration belongs to another set-up: calibrate again"
     return EpipolarCheck(level, found, own, text)

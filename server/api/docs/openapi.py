@@ -48,6 +48,7 @@ _LINKS = {
     "list_analyses": {"test_id": "$request.path.test_id", "analysis_id": "$response.body#/analyses/0/id"},
     "create_calibration": {"calibration_id": "$response.body#/calibration_id", **_JOB},
     "import_calibration": {"calibration_id": "$response.body#/id"},
+    "repair_calibration": {"calibration_id": "$response.body#/calibration_id", **_JOB},
     "list_calibrations": {"calibration_id": "$response.body#/calibrations/0/id"},
     "create_noise": {"noise_id": "$response.body#/noise_id", **_JOB},
     "list_noise": {"noise_id": "$response.body#/noise/0/id"},

@@ -21,6 +21,7 @@ from server.api.models.calibrations import (
     CalibrationReply,
     CalibrationRequest,
     ConversionReply,
+    RepairRequest,
     ResidualsReply,
     ViewList,
 )
@@ -103,6 +104,7 @@ __all__ = [
     "ReadingReply",
     "ReadingRequest",
     "Region",
+    "RepairRequest",
     "Reply",
     "Request",
     "ResidualsReply",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from core import settings
 from core.settings import StoredSettings, disagreement
+from server.api.models.cameras_moved import CameraMotion
 from server.api.models.jobs import Accepted, JobProblem
 from server.api.models.tests import AnalysisEntry
 from server.base.json_values import Nested
@@ -54,7 +55,9 @@ class AnalysisRequest(settings.AnalysisSettings):
     """Analysis over a test's steps."""
 
     kind: Literal["profile", "displacement"] = Field(
-        "displacement", description="Shape only, or shape and displacement."
+        "displacement",
+        description="Shape only, of each step by itself, or shape and displacement. `profile` if left out with a "
+        "projected pattern, which shows no displacement.",
     )
     region: Region = Field(description="Region of interest.")
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
@@ -71,6 +74,13 @@ class AnalysisRequest(settings.AnalysisSettings):
         False, description="Go on with each step of the test as it lands, until the analysis is finished or cancelled."
     )
     label: Label = Field("", description="Free text.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shapes_alone(cls, given: Any) -> Any:
+        if isinstance(given, dict) and given.get("pattern") == "projected":
+            return {"kind": "profile", **given}
+        return given
 
     @model_validator(mode="after")
     def _follows_or_names(self) -> Self:
@@ -109,6 +119,9 @@ class StepFigures(Reply):
     valid: int | None = Field(None, description="Points with values.")
     valid_fraction: float | None = Field(None, description="Their share.")
     status: dict[str, int] | None = Field(None, description="Points by status.")
+    camera_motion: CameraMotion | None = Field(
+        None, description="Whether a camera moved, by the epipolar offset; null: too few points to tell."
+    )
     wall_s: float | None = Field(None, description="Seconds that the step took.")
 
 

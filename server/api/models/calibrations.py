@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, with_config
+from pydantic import Field, StringConstraints, with_config
 from typing_extensions import TypedDict
 
-from core.settings import Real, Whole
+from core.settings import SUBSET_PX, Real, SpacingPx, SubsetPx, Whole
+from server.api.models.analyses import Region
+from server.api.models.calibration_checks import KeptCheck
 from server.api.models.jobs import Accepted, JobProblem
 from server.base.json_values import Nested
-from server.base.models import Label, Listing, Number, Reply, Request
+from server.base.models import Label, Listing, Number, Reply, Request, StepNumber
 
 
 class CalibrationRequest(Request):
@@ -24,6 +26,27 @@ class CalibrationRequest(Request):
     )
     frames: Annotated[Whole, Field(ge=1, le=256)] | None = Field(None, description="Frames averaged at each position.")
     localiser: Literal["profile", "paper"] | None = Field(None, description="Grid line localiser.")
+    label: Label = Field("", description="Free text.")
+
+
+class RepairRequest(Request):
+    """Steps from whose speckle the cameras' relative orientation is estimated anew."""
+
+    test_id: Annotated[str, StringConstraints(max_length=40)] = Field(
+        description="Test that has the steps.", examples=["t000001-0c9f1e"]
+    )
+    steps: Annotated[list[StepNumber], Field(min_length=1, max_length=20)] = Field(
+        description="Steps taken after the bump; several, at other depths and tilts, make it surer.", examples=[[0, 1]]
+    )
+    region: Region | None = Field(None, description="Where points lie in camera 1's images; null: all of them.")
+    subset_px: SubsetPx = SUBSET_PX.default
+    spacing_px: SpacingPx | None = Field(None, description="Distance of the points; null: as many as tell more.")
+    max_turn_deg: Annotated[Real, Field(gt=0.0, le=20.0)] = Field(
+        5.0, description="A larger turn of one camera against the other is refused."
+    )
+    max_strain_microstrain: Annotated[Real, Field(gt=0.0, le=1e5)] = Field(
+        1000.0, description="A larger standard uncertainty of a shape's strain from the new orientation is refused."
+    )
     label: Label = Field("", description="Free text.")
 
 
@@ -182,6 +205,9 @@ class PlanReply(TypedDict, total=False):
     localiser: Annotated[Literal["profile", "paper"], Field(description="Localiser of the lines.")]
     source: Annotated[str | None, Field(description="Format that an imported calibration was read as.")]
     job_id: Annotated[str | None, Field(description="The job that takes or took it.")]
+    repaired_from: Annotated[str | None, Field(description="Calibration that it was repaired from, which is kept.")]
+    test_id: Annotated[str | None, Field(description="Test whose steps it was repaired from.")]
+    steps: Annotated[list[int] | None, Field(description="Those steps.")]
 
 
 class CalibrationReply(Reply):
@@ -193,6 +219,9 @@ class CalibrationReply(Reply):
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Problem that left no calibration.")
     review: Review | None = Field(None, description="The operator's decision; null: none yet.")
+    kept_checks: dict[str, KeptCheck] | None = Field(
+        None, description="Checks made since, by name, `known_distance` among them; null: none."
+    )
 
 
 class CalibrationFile(Reply):

@@ -1,4 +1,4 @@
-"""``stereorig calibration``: calibration files in other programs' forms, and a check of their plausibility."""
+"""``stereorig calibration``: files in other programs' forms, checks of them, repair after a bump."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from core.errors import InputError
+from server.cli.measurement import calibration_repair
+from server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
+from server.formats.calibrations.kept_checks import read_checks
 from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
@@ -33,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     check = actions.add_parser("check", help="epipolar residuals: over the volume, and over measured points")
     check.add_argument("file", metavar="FILE", type=Path, help=known)
+    calibration_repair.add_arguments(
+        actions.add_parser("repair", help="estimate the cameras' orientation anew after a bump, from speckle images")
+    )
     for action in (convert, check):
         action.add_argument(
             "--points",
@@ -43,10 +49,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action.add_argument(
             "--measured-with", metavar="FILE", type=Path, help="the calibration of those results (that of their test)"
         )
+    add_check_actions(actions)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert or check; print what was found."""
+    """Convert, check or repair; print what was found."""
+    if args.action in ACTIONS:
+        return run_check(args)
+    if args.action == "repair":
+        return calibration_repair.run(args)
     loaded = load_calibration(args.file)
     checked, points = check_calibration(loaded), None
     if args.points is not None:
@@ -62,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
         write_bytes(args.out.with_name(f"{args.out.name}.report.json"), (json.dumps(report, indent=1) + "\n").encode())
         _print_conversion(made.report)
     _print_check(checked, points)
+    for name, finding in read_checks(args.file, loaded.sha256).items():
+        print(f"{name}: {finding.get('text')}")
     if args.action == "convert":
         print(f"written: {args.out}")
     return 0

@@ -33,6 +33,7 @@ from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.images import decode_image, read_file
 from server.formats.noise_json import load_noise
+from server.results.projected_pattern import check_settings
 from server.store.durable import read_json
 from server.worker.tasks import StepImages
 from server.workflows.camera_identity import check_same_cameras
@@ -99,7 +100,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--noise", metavar="FILE", help="noise.json of stereorig noise: pixels count by their noise")
     add(
         "--strain",
-        default=str(STRAIN_WINDOW.default),
         metavar="WINDOW|off",
         help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide "
         f"({STRAIN_WINDOW.default})",
@@ -115,10 +115,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--reference-update",
         choices=REFERENCE_UPDATES,
-        default=DEFAULT_REFERENCE_UPDATE,
         help="never: match every step against the first (total); always: against the step before (incremental); auto: "
         "against the first, or a later reference where that fails, with a note; displacements are totals in any case "
         f"({DEFAULT_REFERENCE_UPDATE})",
+    )
+    add(
+        "--projected",
+        action="store_true",
+        help="the pattern is projected and does not move with the surface: the shape of each pair is measured by "
+        "itself, no displacement",
     )
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
@@ -138,9 +143,9 @@ def _missing(option: str) -> InputError:
 
 
 def _strain(args: argparse.Namespace) -> dict[str, object] | None:
-    if args.strain == "off":
+    if args.strain == "off" or (args.strain is None and args.projected):
         return None
-    window = check_whole("--strain", args.strain, STRAIN_WINDOW)
+    window = check_whole("--strain", str(STRAIN_WINDOW.default) if args.strain is None else args.strain, STRAIN_WINDOW)
     return {"window": window, "order": int(args.strain_order), "tensor": args.strain_tensor}
 
 
@@ -195,9 +200,9 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     if folder is not None and not args.calibration:
         _check_calibration(folder, calibration)
     for pair in files:
-        _check_cameras(pair, calibration_file)
+        check_cameras(pair, calibration_file)
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
-    shapes = _checked_shapes(files[0], calibration)
+    shapes = checked_shapes(files[0], calibration)
     if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
         rows, cols = shapes[0]
         margin = float(subset // 2 + 2)
@@ -215,7 +220,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         holes=args.hole,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
-    steps = [_check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    steps = [check_pair(pair, k, shapes) for k, pair in enumerate(files)]
     settings = StoredSettings.model_validate(
         {
             "region": region,
@@ -227,12 +232,14 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "seeds": None if seeds is None else [seed.xy_px for seed in seeds],
             "seeds_cam2": None if seeds is None else [seed.xy2_px for seed in seeds],
             "smoothing_window": _smoothing_window(args),
-            "reference_update": args.reference_update,
+            "pattern": "projected" if args.projected else "surface",
+            "reference_update": args.reference_update or ("never" if args.projected else DEFAULT_REFERENCE_UPDATE),
             "strain": strain,
             "reference": steps[0].n,
             "noise": None if noise is None else noise.record(),
         }
     )
+    check_settings(settings, displacement=False)
     return MeasureJob(
         calibration=calibration,
         calibration_file=calibration_file,
@@ -259,14 +266,14 @@ def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
         )
 
 
-def _check_cameras(pair: ImagePair, calibration_file: Path) -> None:
+def check_cameras(pair: ImagePair, calibration_file: Path) -> None:
     """Refuse a pair that was taken with other cameras than were calibrated, by its record."""
     record = pair.cam1.parent / "step.json"
     if record.is_file() and calibration_file.suffix == ".json":
         check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")
 
 
-def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
+def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
     """(rows, cols) of both cameras' images, which the calibration must agree with where it states a size."""
     shapes = []
     for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
@@ -276,7 +283,7 @@ def _checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[t
     return shapes[0], shapes[1]
 
 
-def _check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
+def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
     """Read both images of a step once, so that a bad one is found before hours of work on the others."""
     hashes, images = [], []
     for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):

@@ -33,11 +33,21 @@ from server.formats.version import software_version
 from server.worker.tasks import StepImages
 
 if TYPE_CHECKING:
-    from server.compute.sequence import Pair
+    from server.compute.sequence import Pair, SequenceMeasurement
 
 _MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
 _RESULT = re.compile(r"step_\d{4}\.nc")
+
+
+def _camera_offset(motion: dict[str, Any] | None) -> str:
+    """Return what the step's epipolar offset says about the cameras, for its line."""
+    found = None if motion is None else motion["reference"] or motion["calibration"]
+    if found is None:
+        return ""
+    since = "the reference" if found["against"] == "reference" else "the calibration"
+    moved = {True: "a camera moved", False: "no camera moved", None: "not judged"}[found["camera_moved"]]
+    return f"offset {found['offset_rms_px']:.3f} px since {since} ({found['sigmas']:.1f} sigma, {moved}), "
 
 
 def _strain_noise(strain: dict[str, Any] | None) -> str:
@@ -85,11 +95,15 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
         WriteBehind[dict[str, Any]]() as written,
     ):
         runner = _Runner(job, progress, written)
-        with ReadAhead(runner.sequence.read, job.steps[1:]) as pairs:
-            runner.measure(None)
-            compilation.wait()
-            for images in pairs:
-                runner.measure(images)
+        if job.settings.pattern == "projected":
+            for _ in job.steps:
+                runner.measure(None)
+        else:
+            with ReadAhead(runner.sequence.read, job.steps[1:]) as pairs:
+                runner.measure(None)
+                compilation.wait()
+                for images in pairs:
+                    runner.measure(images)
         steps = written.finish()
     seconds = round(time.monotonic() - started, 3)
     summary = SequenceSummary(
@@ -129,31 +143,41 @@ class _Runner:
     """Measures the steps in order, and prints a line for each on the terminal."""
 
     def __init__(self, job: MeasureJob, progress: ProgressLine, written: WriteBehind[dict[str, Any]]) -> None:
-        # the kernels' modules take seconds to load: after the input was checked is early enough
-        from server.compute.sequence import SequenceMeasurement
-
         self._job = job
         self._progress = progress
         self._written = written
-        self.sequence = SequenceMeasurement(
-            calibration=job.calibration,
-            settings=job.settings,
-            mask=None if job.mask_file is None else read_mask(job.mask_file),
-            reference=job.steps[0],
-            folder=job.out,
-            noise=job.noise,
-            inputs={} if job.mask_file is None else {"mask": sha256_of(job.mask_file)},
-        )
+        self.sequence = self._sequence(job.steps[0])
         self._index = 0
         self._matched = job.steps[0].n
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
+        self._moved: bool | None = False
         self._smoothing_noted = False
         self._done = 0.0
 
+    def _sequence(self, reference: StepImages) -> SequenceMeasurement:
+        # the kernels' modules take seconds to load: after the input was checked is early enough
+        from server.compute.sequence import SequenceMeasurement
+
+        job = self._job
+        return SequenceMeasurement(
+            calibration=job.calibration,
+            settings=job.settings,
+            mask=None if job.mask_file is None else read_mask(job.mask_file),
+            reference=reference,
+            folder=job.out,
+            noise=job.noise,
+            inputs={} if job.mask_file is None else {"mask": sha256_of(job.mask_file)},
+        )
+
     def measure(self, images: Pair | None) -> None:
-        """Measure the next step, the reference's shape first (no images), and have its file written."""
+        """Measure the next step, the reference's shape first (no images), and have its file written.
+
+        Under a projected pattern every step is its own reference.
+        """
         started, k, steps = time.monotonic(), self._index, self._job.steps
+        if k > 0 and self._job.settings.pattern == "projected":
+            self.sequence = self._sequence(steps[k])
         previous = steps[k - 1].n if k > 1 else None
         result = self.sequence.measure(steps[k], images, previous=previous, progress=self._shower(k))
         compute_s = round(time.monotonic() - started, 3)
@@ -167,15 +191,17 @@ class _Runner:
         if k == 0:
             self._remove_older()
             self._doubt_noise(result)
-        self._written.put(self._write, k, result, started, compute_s)
+        self._written.put(self._write, self.sequence, k, result, started, compute_s)
         self._index += 1
 
-    def _write(self, k: int, result: Field, started: float, compute_s: float) -> dict[str, Any]:
+    def _write(
+        self, sequence: SequenceMeasurement, k: int, result: Field, started: float, compute_s: float
+    ) -> dict[str, Any]:
         """Write the file of a step, print its line, return its summary."""
         step = self._job.steps[k]
         one, two = step.files
         about = {"cam1_file": str(one), "cam2_file": str(two)}
-        finished = self.sequence.finish(step, result, about=about, in_service=False)
+        finished = sequence.finish(step, result, about=about, in_service=False)
         seconds = round(time.monotonic() - started, 3)
         summary = {
             **finished.summary,
@@ -190,7 +216,7 @@ class _Runner:
         residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
             f"step {k} of {len(self._job.steps) - 1}: {summary['valid']} of {summary['points']} points, "
-            f"{residual}{_strain_noise(summary['strain'])}{duration(seconds)}"
+            f"{residual}{_camera_offset(summary['camera_motion'])}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
         self._note_patch(k, finished.field)
         self._note_reference(k, finished.field)
@@ -199,6 +225,10 @@ class _Runner:
         if check is not None and check["level"] != self._checked:
             self._checked = check["level"]
             self._progress.note(f"{check['level']}: step {k}: {check['reason']}")
+        motion = summary["camera_motion"]
+        if motion is not None and motion["camera_moved"] is not self._moved:
+            self._moved = motion["camera_moved"]
+            self._progress.note(f"{'warning' if self._moved else 'note'}: step {k}: {motion['text']}")
         return summary
 
     def _note_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:

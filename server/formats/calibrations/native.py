@@ -24,7 +24,7 @@ from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from core.names import CAMERAS
-from core.target import GridTarget
+from core.target import LINE_GRID, GridTarget
 from server.formats.files import write_bytes
 
 FORMAT_VERSION = 1
@@ -100,7 +100,7 @@ def calibration_content(
 
 def target_record(target: GridTarget | BoardTarget) -> dict[str, Any]:
     """Return a target's description as plain values, its kind among them."""
-    kind = {"kind": "line_grid"} if isinstance(target, GridTarget) else {}
+    kind = {"kind": LINE_GRID} if isinstance(target, GridTarget) else {}
     return {**kind, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(target).items()}}
 
 

@@ -53,6 +53,11 @@ class LoadedCalibration:
     sha256: str
     details: dict[str, Any]
 
+    @property
+    def imported(self) -> bool:
+        """True for another program's calibration, whose own error is not known."""
+        return self.source != "calibration_json"
+
     @cached_property
     def record(self) -> CalibrationRecord:
         """Settings of the calibration; empty where the file does not state them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from core.target import LINE_GRID
 from server.formats.records import Record
 
 
@@ -71,7 +72,7 @@ class ViewRecord(Measures):
 class TargetRecord(Record):
     """The target that was observed: a line grid with ``lines``, another board with ``size``."""
 
-    kind: str = "line_grid"
+    kind: str = LINE_GRID
     lines: tuple[int, int] | None = None
     size: tuple[int, int] | None = None
     pitch_mm: float
@@ -133,3 +134,4 @@ class CalibrationRecord(Record):
     target: TargetRecord | None = None
     provenance: OriginRecord = OriginRecord()
     settings: SettingsRecord = SettingsRecord()
+    kept_checks: dict[str, MadeCheck] = Field(default={})

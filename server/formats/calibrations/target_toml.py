@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget, dictionary_id
 from core.calibration import CalibrationOptions, NominalCamera
@@ -15,11 +15,10 @@ from core.calibration.fit.lens_form import LENS_CHOICES, LensChoice
 from core.calibration.inputs import MOVES, Moves
 from core.errors import FileFormatError, InputError
 from core.names import CAMERAS
-from core.target import GridTarget
+from core.target import LINE_GRID, GridTarget
 
 _MAX_BYTES = 1 << 20
 _MAX_SIDE_PX = 32_767
-LINE_GRID = "line_grid"
 DEFAULTS = CalibrationOptions()
 
 
@@ -91,6 +90,17 @@ def read_target(path: Path) -> GridTarget | BoardTarget:
     where = f"{path}, [target]" if "target" in content else str(path)
     if not isinstance(table, Mapping):
         raise _field(where, "target", "is not a table")
+    return target_of(table, where)
+
+
+def target_of(table: Mapping[str, Any], where: str) -> GridTarget | BoardTarget:
+    """Build the target that a table describes; ``where`` names the table in messages.
+
+    Raises
+    ------
+    FileFormatError
+        ``field_invalid`` naming the field.
+    """
     kind = table.get("kind", LINE_GRID)
     if kind not in (LINE_GRID, *BOARD_KINDS):
         raise _field(where, "kind", f"is {kind!r}, not one of {', '.join((LINE_GRID, *BOARD_KINDS))}")

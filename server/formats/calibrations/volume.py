@@ -8,13 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
-from core.boards.board import BOARD_KINDS, BoardKind, BoardTarget
+from core.boards.board import BOARD_KINDS, BoardTarget
 from core.calibration import COVARIANCE_NAMES
 from core.calibration.volume import CalibratedVolume, calibrated_volume, volume_of_poses
 from core.cameras.camera import RigidTransform
 from core.errors import TargetError
 from core.names import CAMERAS
-from core.target import GridTarget
+from core.target import LINE_GRID, GridTarget
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.record import ChecksRecord, PoseRecord, TargetRecord
@@ -68,20 +68,28 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
     )
 
 
-def _points_mm(target: TargetRecord) -> Float | None:
+def target_of(target: TargetRecord | None) -> GridTarget | BoardTarget | None:
+    """Return the target that a calibration's file describes; None where it does not."""
+    if target is None:
+        return None
     try:
-        if target.kind == "line_grid":
+        if target.kind == LINE_GRID:
             if target.lines is None or target.line_width_mm is None:
                 return None
-            grid = GridTarget(pitch_mm=target.pitch_mm, lines=target.lines, line_width_mm=target.line_width_mm)
-            return grid.all_points_mm()
-        if target.kind not in BOARD_KINDS or target.size is None:
+            return GridTarget(pitch_mm=target.pitch_mm, lines=target.lines, line_width_mm=target.line_width_mm)
+        kind = next((k for k in BOARD_KINDS if k == target.kind), None)
+        if kind is None or target.size is None:
             return None
-        # the points of a board of markers are those of the checkerboard without them
-        kind: BoardKind = "checkerboard" if target.kind == "charuco" else target.kind
-        return BoardTarget(kind=kind, size=target.size, pitch_mm=target.pitch_mm).points_mm()
+        return BoardTarget(kind=kind, size=target.size, pitch_mm=target.pitch_mm, marker_mm=target.marker_mm)
     except TargetError:
         return None
+
+
+def _points_mm(target: TargetRecord) -> Float | None:
+    found = target_of(target)
+    if found is None:
+        return None
+    return found.all_points_mm() if isinstance(found, GridTarget) else found.points_mm()
 
 
 def _transform(pose: PoseRecord) -> RigidTransform:
@@ -97,3 +105,9 @@ def rbe_of(calibration: LoadedCalibration) -> float | None:
         if value is not None and math.isfinite(value) and value >= 0.0:
             return value
     return None
+
+
+def own_px_of(calibration: LoadedCalibration) -> float | None:
+    """Return the calibration's own epipolar offset at most, px: from both images' residuals; None if unknown."""
+    rbe = rbe_of(calibration)
+    return None if rbe is None else 2.0 * rbe

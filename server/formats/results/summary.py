@@ -16,6 +16,7 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
+from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
 
 
@@ -58,6 +59,9 @@ class StepSummary:
         The error left in each image when both cameras share the misfit equally: half of ``epipolar_offset_rms_px``.
     epipolar_check
         Check that the cameras are still as calibrated.
+    camera_motion
+        Whether a camera moved since the calibration, the reference or the step before (`camera_moved`, `text`), with
+        the offset's size and pattern, its significance and its consequence, against each.
     plane_residual_rms_mm
         Of the reference positions.
     zncc_median, sigma_median_mm
@@ -86,6 +90,7 @@ class StepSummary:
     sigma_median_mm: dict[str, float | None]
     smoothing: Smoothing | None
     patch: PatchChoice | None
+    camera_motion: CameraMotion | None = None
     reference_step: int | None = None
     points_by_reference: dict[str, int] | None = None
     displacement_mm: dict[str, Span | None] | None = None
@@ -93,10 +98,19 @@ class StepSummary:
     def document(self) -> dict[str, object]:
         """Return it as plain values; a shape has no entries of displacements."""
         of_motion = ("reference_step", "points_by_reference", "displacement_mm")
-        return {k: v for k, v in asdict(self).items() if self.kind == "displacement" or k not in of_motion}
+        motion = None if self.camera_motion is None else self.camera_motion.document()
+        plain = {**asdict(replace(self, camera_motion=None)), "camera_motion": motion}
+        return {k: v for k, v in plain.items() if self.kind == "displacement" or k not in of_motion}
 
 
-def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0) -> StepSummary:
+def summarise(
+    result: Field,
+    *,
+    rbe_px: float | None = None,
+    reference: int = 0,
+    imported: bool = False,
+    camera_motion: CameraMotion | None = None,
+) -> StepSummary:
     """Summarise one field.
 
     Parameters
@@ -107,6 +121,10 @@ def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0)
         The calibration's own reprojection error, where it is known.
     reference
         Number of the sequence's reference.
+    imported
+        True for another program's calibration, whose own error is not known.
+    camera_motion
+        What was found about the cameras when the step was measured.
     """
     status = result.status
     valid = result.valid
@@ -124,7 +142,7 @@ def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0)
         epipolar_offset_rms_px=_rms(epipolar),
         epipolar_offset_sd_px=float(epipolar.std()) if n else None,
         epipolar_residual_rms_px=_rms(epipolar / 2),
-        epipolar_check=check_epipolar(result, rbe_px),
+        epipolar_check=check_epipolar(result, rbe_px, imported=imported),
         plane_residual_rms_mm=_rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
         zncc_median={
             name: float(np.median(result.zncc[valid][:, k])) if n else None
@@ -136,6 +154,7 @@ def summarise(result: Field, *, rbe_px: float | None = None, reference: int = 0)
         },
         smoothing=result.smoothing,
         patch=result.patch,
+        camera_motion=camera_motion,
     )
     if result.uvw_mm is None:
         return summary

@@ -43,6 +43,7 @@ from server.formats.version import software_version
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
+from server.results.projected_pattern import check_gauges
 from server.results.reader import read_variable
 from server.results.staleness import stale_results
 
@@ -101,6 +102,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     for path in chosen:
         step = _read(path)
         first = step.head if first is None else first
+        check_gauges(request, step.head.settings)
         grid = (step.field.x_px, step.field.y_px) if grid is None else grid
         _check_same(step, first, grid, path, moved_by)
         hashes[path.name] = step.sha256

@@ -17,9 +17,11 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from tests.bench.accuracy import adversarial as accuracy_adversarial
+from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
+from tests.bench.accuracy import calibration_beside as accuracy_beside
 from tests.bench.accuracy import cracks as accuracy_cracks
-from tests.bench.accuracy import curved, gauges, matching, sequence
+from tests.bench.accuracy import curved, gauges, lenses_motions, matching, real_boards, rig_campaign, sequence
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import noise as accuracy_noise
@@ -27,12 +29,19 @@ from tests.bench.accuracy import prefilter as accuracy_prefilter
 from tests.bench.accuracy import smoothing as accuracy_smoothing
 from tests.bench.accuracy import specimen as accuracy_specimen
 from tests.bench.accuracy import strain as accuracy_strain
+from tests.bench.accuracy import targets as accuracy_targets
 from tests.bench.accuracy.pages import FIGURES, write_headlines, write_section
 from tests.bench.accuracy.table import Section
 
 SECTIONS: dict[str, Callable[[Path], Section]] = {
     "calibration": accuracy_calibration.calibration,
     "aspect": accuracy_calibration.aspect,
+    "lenses": lenses_motions.lenses,
+    "motions": lenses_motions.motions,
+    "beside": accuracy_beside.beside,
+    "rigs": rig_campaign.rigs,
+    "real-boards": real_boards.real_boards,
+    **accuracy_targets.SECTIONS,
     "plane": matching.plane,
     "translation": matching.translation,
     "strain": matching.strain,
@@ -51,6 +60,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "noise-model": accuracy_noise.camera_noise,
     "prefilter": accuracy_prefilter.prefilter,
     "smoothing": accuracy_smoothing.smoothing,
+    "bumps": accuracy_bumps.bumps,
     "plate": accuracy_experiments.plate,
     "steel": accuracy_experiments.steel,
     "panel": accuracy_experiments.panel,

@@ -25,6 +25,10 @@ class Topic:
 
 TOPICS = (
     Topic("calibration", "Calibration", ("calibration", "aspect", "epipolar")),
+    Topic(
+        "any_rig", "Any lens, target and motion", ("lenses", "motions", "line-grid", "beside", "rigs", "real-boards")
+    ),
+    Topic("targets", "Targets", ("targets",)),
     Topic("shape_and_motion", "Shape and motion", ("plane", "translation", "strain", "rotation")),
     Topic("noise", "Random error and its bound", ("noise-random", "noise-model")),
     Topic("bias", "Bias over the sub-pixel phase", ("noise-mean", "prefilter")),
@@ -37,6 +41,7 @@ TOPICS = (
     Topic("smoothing", "Smoothing", ("smoothing",)),
     Topic("difficult_images", "Difficult images", ("adversarial",)),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
+    Topic("camera_bumps", "A camera that was bumped", ("bumps",)),
     Topic("specimen", "A real specimen", ("specimen", "strain-specimen")),
 )
 
@@ -111,6 +116,10 @@ HEADLINES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("difficult_images", "Pictures that invite wrong matches"): {
         "all: wrong points per 100,000 valid ones": "wrong points per 100,000 valid ones, spoiled images"
+    },
+    ("camera_bumps", "Bumps repaired from speckle"): {
+        "all bumps, worst: epipolar offset left": "epipolar offset left after the repair of a bump, worst of 12",
+        "all bumps, rms: false strain of shapes": "false strain of shapes after such a repair, rms",
     },
     ("experiments", "Clamped plate"): {
         "centre deflection at 689 kPa: error": "deflection of a clamped plate at 689 kPa, error",

@@ -41,12 +41,19 @@ CALIBRATION = {
     "format": "`stereorig calibration`",
     "format_version": "number of the format",
     "cam1": "camera 1's eleven parameters: `phd_px` pinhole distance (focal length in column pitches), `cx_px`, `cy_px` principal point, "
-    "`kappa_per_px2` distortion, `aspect`, `alpha_rad`, `beta_rad`, `gamma_rad` angles of Eq. (1), `x0_mm`, `y0_mm`, `z0_mm`",
+    "`kappa_per_px2` distortion, `aspect`, `alpha_rad`, `beta_rad`, `gamma_rad` angles of Eq. (1), `x0_mm`, `y0_mm`, `z0_mm`; with OpenCV's lens "
+    "`fx_px`, `fy_px`, `cx_px`, `cy_px`, `skew_px`, `k1` to `k6`, `p1`, `p2` in place of the first five",
     "cam2": "the same of camera 2",
     "image_size_px": "width and height by camera",
-    "covariance": "`names` of 20 parameters (all but the aspects) and their `matrix`, in the units of the names, squared",
+    "lens": "`model` (`paper`, `opencv5`, `opencv8`), `reasons` why it was taken, `structure` that its residuals hold: `name`, `camera` (null: the "
+    "target), `terms` with `value` and `sigma`, `probability` by chance, `rms_px`",
+    "stage": "`moves`; `direction_sys` of a single stage and its `direction_sigma_rad`; `scale` and `scale_sigma` of each axis; `steps` read back, "
+    "with the error found",
+    "pitch_scale": "relative error of the target's pitch: `value`, `sigma`; zero where it was held",
+    "covariance": "`names` of the estimated parameters (with the paper's lens 20: all but the aspects) and their `matrix`, in the units of the "
+    "names, squared",
     "sigma": "standard uncertainty of each parameter, by its name",
-    "noise_px": "standard deviation of a coordinate of a grid intersection, from the residuals, by camera",
+    "noise_px": "standard deviation of a coordinate of a point of the target, from the residuals, by camera",
     "redundancy": "observations beyond the unknowns, by camera",
     "axis_tilt_rad": "angle between stage axis and optical axis, by camera and direction; zero where it was held",
     "axis_tilt_sigma_rad": "its standard uncertainty",
@@ -55,13 +62,20 @@ CALIBRATION = {
     "verdict": "`level`: `good`, `warning` or `failed`, by the held-out reprojection error; `reasons` in sentences",
     "uncertainty": "of a shape, from the covariance: `shape_rms_mm` over the target's volume, `scale` (relative), `centre_z_mm`, `corner_z_mm`; "
     "`predicted_shape_rms_mm` was expected before the fit",
-    "views": "each image: `name`, `camera`, `dz_mm`, `held_out`, `rbe_px`, `raz_mm`, `nsce`",
-    "target": "the grid, as in the target file",
-    "node_corrections_mm": "corrections of the grid's intersections that the fit found, X and Y; null for an exact grid",
+    "views": "each image: `name`, `camera`, `dz_mm` or the free pose's number `frame`, `held_out`, `rbe_px`, `raz_mm`, `nsce`, "
+    "`cam_from_target` (`rotation_vector_rad`, `translation_mm`)",
+    "dropped": "free poses that were left out: `name`, `camera`, `frame`, `reason`",
+    "target": "the target, as in the target file, with its `kind`",
+    "node_corrections_mm": "corrections of the target's points that the fit found, X and Y, with free poses Z; null for an exact target",
     "node_sigma_mm": "their standard uncertainty",
     "nominal": "the nominal cameras that the fit started from",
     "settings": "settings of the fit",
     "provenance": "software version, localiser, hashes of the views, identity of the cameras",
+}
+#: what `calibration repair` adds to it
+REPAIRED = {
+    "repair": "of a repaired calibration alone: the change of camera 2's orientation (`change_deg`, its covariance), images and old file with "
+    "their SHA-256, offset before and after, consequence, limits"
 }
 _HEAD = """# Result files
 
@@ -187,7 +201,7 @@ def pages() -> dict[str, str]:
     lines += [f"| {s.value} | `{s.name.lower()}` | {cell(text)} |" for s, text in STRAIN_STATUS_MEANINGS.items()]
     lines += ["", "## `summary.json`", "", *_summary()]
     lines += ["", "## `calibration.json`", "", "| key | content |", "| --- | --- |"]
-    lines += [f"| `{key}` | {cell(text)} |" for key, text in CALIBRATION.items()]
+    lines += [f"| `{key}` | {cell(text)} |" for key, text in (CALIBRATION | REPAIRED).items()]
     lines += [
         "",
         "A file with `cam1` and `cam2` alone is enough to measure with. The verdict goes by the held-out reprojection error: `good` to 0.1 px,",

@@ -175,13 +175,13 @@ def test_real_boards_are_found_in_both_cameras(shared_dir: Path) -> None:
 @pytest.mark.parametrize("kind", ["corner", "charuco corner", "dot"])
 def test_derivatives_of_the_pictures_are_those_of_differences(kind: str) -> None:
     model, start, geometry = {
-        "corner": (
+        "corner": (CORNER, [10.3, 9.8, 0.2, 1.7, 100.0, 60.0, 1.1, 0.2, -0.1], [0.0] * 5 + [1e-3, -2e-3] + [0.0] * 6),
+        "charuco corner": (
             CORNER,
-            [10.3, 9.8, 0.2, 1.7, 100.0, 60.0, 1.1, 0.2, -0.1],
-            [0.0] * 5 + [1e-3, -2e-3, 0.0, 0.0, 0.0],
+            [10.3, 9.8, 0.2, 1.7, 100.0, -60.0, 1.1, 0.2, -0.1],
+            [0.0] * 7 + [3.0, 3.3] + [0.0] * 4,
         ),
-        "charuco corner": (CORNER, [10.3, 9.8, 0.2, 1.7, 100.0, -60.0, 1.1, 0.2, -0.1], [0.0] * 7 + [3.0, 3.3, 2.0]),
-        "dot": (DOT, [10.3, 9.8, 0.21, 0.03, 0.18, 100.0, -60.0, 1.1, 0.2, -0.1], [0.0] * 10),
+        "dot": (DOT, [10.3, 9.8, 0.21, 0.03, 0.18, 100.0, -60.0, 1.1, 0.2, -0.1], [0.0] * 13),
     }[kind]
     x, y = (g.ravel().astype(np.float64) for g in np.meshgrid(np.arange(21), np.arange(21)))
     p, g = np.array(start), np.array(geometry)

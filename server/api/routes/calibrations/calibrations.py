@@ -68,7 +68,7 @@ def list_calibrations(service: ServiceDep, page: PageDep) -> CalibrationList:
     return CalibrationList.model_validate({"calibrations": calibrations, "next_cursor": page.next_cursor})
 
 
-@router.get("/{calibration_id}", summary="One calibration", responses=errors(404, 409))
+@router.get("/{calibration_id:plain_id}", summary="One calibration", responses=errors(404, 409))
 def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> CalibrationReply:
     """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it.
 

@@ -1,0 +1,136 @@
+"""Consequence of a change of the relative orientation: in shape, position, displacement and strain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from core.arrays import Float
+from core.cameras.stereo import StereoPair
+from core.field.region.trend import smooth_terms
+from core.orientation.change import point_slopes
+from core.orientation.matched import MatchedPoints
+from core.robust import spread_indices
+
+_AT_MOST = 2000
+
+
+@dataclass(frozen=True)
+class Consequence:
+    """What a change makes of the points, were it not known; each with its standard deviation.
+
+    Attributes
+    ----------
+    shape_um, shape_sigma_um
+        Root mean square of the points' difference without a rigid motion.
+    z_um, z_sigma_um
+        Root mean square of Z's difference.
+    displacement_um, displacement_sigma_um
+        Root mean square of the difference: the displacement of a specimen at rest between images before and after.
+    strain_microstrain, strain_sigma_microstrain
+        Largest principal strain of that displacement over the points, its size.
+    """
+
+    shape_um: float
+    shape_sigma_um: float
+    z_um: float
+    z_sigma_um: float
+    displacement_um: float
+    displacement_sigma_um: float
+    strain_microstrain: float
+    strain_sigma_microstrain: float
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain numbers."""
+        return dict(vars(self))
+
+
+def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covariance: Float) -> Consequence | None:
+    """Return what a change makes of points.
+
+    Parameters
+    ----------
+    pair, points
+        The cameras and the points as matched.
+    change, covariance
+        (5,) and (5, 5), :data:`core.orientation.change.CHANGE_NAMES`.
+
+    Returns
+    -------
+    Consequence or None
+        None if fewer than ten points can be triangulated.
+    """
+    if len(points.xy1_px) == 0:
+        return None
+    some = np.unique(spread_indices(len(points.xy1_px), _AT_MOST))
+    xy1, xy2 = points.xy1_px[some], points.xy2_px[some]
+    xyz = pair.triangulate(xy1, xy2).xyz_mm
+    slopes = point_slopes(pair, xy1, xy2)
+    good = np.isfinite(xyz).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
+    if good.sum() < 10:
+        return None
+    xyz, slopes = xyz[good], slopes[good]
+    root = np.linalg.cholesky(covariance + 1e-30 * np.eye(5))
+    moved, spread = slopes @ change, slopes @ root
+    shape = without_rigid_motion(xyz, np.concatenate([moved[..., None], spread], axis=-1))
+    strain = _strain(xyz, np.concatenate([moved[..., None], spread], axis=-1))
+    largest = np.abs(np.linalg.eigvalsh(strain[..., 0].transpose(2, 0, 1))).max(axis=1)
+    sigma = np.sqrt((np.abs(np.linalg.eigvalsh(np.moveaxis(strain[..., 1:], (0, 1), (-2, -1)))).max(-1) ** 2).sum(-1))
+    at = int(np.argmax(largest))
+    um = 1e3
+    return Consequence(
+        shape_um=um * _rms(shape[..., 0]),
+        shape_sigma_um=um * _rms_over(shape[..., 1:]),
+        z_um=um * _rms(moved[:, 2:]),
+        z_sigma_um=um * _rms_over(spread[:, 2:]),
+        displacement_um=um * _rms(moved),
+        displacement_sigma_um=um * _rms_over(spread),
+        strain_microstrain=1e6 * float(largest[at]),
+        strain_sigma_microstrain=1e6 * float(sigma.max()),
+    )
+
+
+def without_rigid_motion(xyz_mm: Float, difference_mm: Float) -> Float:
+    """Return differences (n, 3, k) of points (n, 3) without their best common rigid motion."""
+    centred = xyz_mm - xyz_mm.mean(axis=0)
+    motions = np.zeros((len(xyz_mm), 3, 6))
+    motions[:, range(3), range(3)] = 1.0
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centred)
+    flat, design = difference_mm.reshape(-1, difference_mm.shape[-1]), motions.reshape(-1, 6)
+    return np.asarray((flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]).reshape(difference_mm.shape))
+
+
+def _strain(xyz_mm: Float, difference_mm: Float) -> Float:
+    """In-surface strain (2, 2, n, k) of differences (n, 3, k): both are quadratic over the best plane through it."""
+    centred = xyz_mm - xyz_mm.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    ab = centred @ axes[:2].T
+    spans = np.maximum(np.ptp(ab, axis=0), 1e-12)
+    terms = smooth_terms(ab)
+    x, y = terms[:, 1], terms[:, 2]
+    zero, one = np.zeros(len(x)), np.ones(len(x))
+    slopes = [
+        np.column_stack([zero, one, zero, 2.0 * x, y, zero]) / spans[0],
+        np.column_stack([zero, zero, one, zero, x, 2.0 * y]) / spans[1],
+    ]
+    surface = np.linalg.lstsq(terms, xyz_mm, rcond=None)[0]
+    n, k = len(xyz_mm), difference_mm.shape[-1]
+    shift = np.linalg.lstsq(terms, difference_mm.reshape(n, -1), rcond=None)[0].reshape(6, 3, k)
+    tangents = np.stack([s @ surface for s in slopes], axis=-1)  # (n, 3, 2)
+    gradient = np.stack([np.einsum("nt,tik->nik", s, shift) for s in slopes], axis=2)  # (n, 3, 2, k)
+    # to an orthonormal frame of the tangent plane, from the tangents' triangular factor
+    q, r = np.linalg.qr(tangents)
+    inverse = np.linalg.inv(r)
+    local = np.einsum("nia,nibk,nbc->nack", q, gradient, inverse)
+    return np.moveaxis(0.5 * (local + np.swapaxes(local, 1, 2)), 0, 2)
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean((values**2).reshape(len(values), -1).sum(axis=1))))
+
+
+def _rms_over(columns: Float) -> float:
+    return float(np.sqrt(np.mean((columns**2).reshape(len(columns), -1).sum(axis=1))))

@@ -1,0 +1,146 @@
+"""Change of the relative orientation that explains offsets across epipolar lines, with its covariance.
+
+Robust least squares on the offsets, with a prior of the size of the bump itself: over a narrow field the offsets of
+vergence and of the baseline's direction are nearly alike, and both are then taken no larger than what is determined.
+The size comes from the offsets too (MacKay 1992, doi:10.1162/neco.1992.4.3.415).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.arrays import Float
+from core.cameras.stereo import StereoPair
+from core.field.region.trend import smooth_terms
+from core.orientation.change import changed, offset_slopes, plausible_bump
+from core.orientation.matched import MatchedPoints
+from core.orientation.noise import blocks_of, effective_variance, robust_weights
+
+#: smallest and largest bump that the prior takes for plausible, rad
+_SMALLEST_RAD, _LARGEST_RAD = 2e-5, 0.1
+_FIRST_RAD = 0.01
+_ITERATIONS = 60
+SYSTEMATIC_PX = 0.001
+"""Standard deviation of smooth errors of the offsets that do not average out (interpolation, lens), a term."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationEstimate:
+    """A change of the relative orientation.
+
+    Attributes
+    ----------
+    change
+        (5,) :data:`core.orientation.change.CHANGE_NAMES`, against the pair given.
+    covariance
+        (5, 5) from the offsets' noise, their systematic part and the prior.
+    response
+        (5, n) d(change) / d(offset), for errors of the offsets that come from elsewhere.
+    bump_rad
+        Size of the bump that the prior has, a standard deviation of each camera's turn about each axis.
+    determined
+        How many of the five the offsets determine themselves, 0 to 5.
+    weights
+        (n,) robust weights of the points.
+    residual_px
+        (n,) offsets that are left.
+    noise_px
+        Robust standard deviation of those.
+    """
+
+    change: Float
+    covariance: Float
+    response: Float
+    bump_rad: float
+    determined: float
+    weights: Float
+    residual_px: Float
+    noise_px: float
+
+
+def estimate_change(
+    pair: StereoPair,
+    points: MatchedPoints,
+    offset_px: Float | None = None,
+    *,
+    bump_rad: float | None = None,
+    start: Float | None = None,
+) -> OrientationEstimate:
+    """Estimate the change of the relative orientation.
+
+    Parameters
+    ----------
+    pair
+        The cameras before the change.
+    points
+        Points matched in both images, six or more.
+    offset_px
+        (n,) the offsets to explain, small, where they are not the points' own: a difference to an earlier step.
+    bump_rad
+        Size of the bump, where it is known; else from the offsets.
+    start
+        (5,) a change to start from; none if left out.
+
+    Returns
+    -------
+    OrientationEstimate
+        ``changed(pair, estimate.change)`` is the pair after the change.
+    """
+    xy1, xy2 = points.xy1_px, points.xy2_px
+    unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
+    blocks = blocks_of(xy1, points.step)
+    change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
+    J = offset_slopes(pair, change, xy1, xy2)
+
+    def left_at(at: Float) -> Float:
+        if offset_px is None:
+            return changed(pair, at).epipolar_residual_px(xy1, xy2)
+        return np.asarray(offset_px + J @ at)
+
+    for _ in range(_ITERATIONS):
+        residual = left_at(change)
+        if offset_px is None:
+            J = offset_slopes(pair, change, xy1, xy2)
+        weights, _ = robust_weights(residual - smooth_surface(xy1, residual))
+        variance = effective_variance(J, weights, residual, blocks)
+        information = (J * weights[:, None]).T @ J / variance
+        prior = np.linalg.inv(unit) / size**2
+        posterior = np.linalg.inv(information + prior)
+        step = -posterior @ ((J * weights[:, None]).T @ residual / variance + prior @ change)
+        change = change + step
+        determined = 5.0 - float(np.trace(prior @ posterior))
+        if bump_rad is None:
+            found = float(change @ np.linalg.solve(unit, change)) / max(determined, 1.0)
+            size = float(np.clip(np.sqrt(found), _SMALLEST_RAD, _LARGEST_RAD))
+        if np.abs(step).max() < 1e-8:
+            break
+    residual = left_at(change)
+    weights, noise = robust_weights(residual)
+    variance = effective_variance(J, weights, residual, blocks)
+    information = (J * weights[:, None]).T @ J / variance
+    prior = np.linalg.inv(unit) / size**2
+    posterior = np.linalg.inv(information + prior)
+    response = -posterior @ (J * weights[:, None]).T / variance
+    systematic = response @ smooth_terms(xy1) * SYSTEMATIC_PX
+    return OrientationEstimate(
+        change=change,
+        covariance=posterior + systematic @ systematic.T,
+        response=response,
+        bump_rad=size,
+        determined=5.0 - float(np.trace(prior @ posterior)),
+        weights=weights,
+        residual_px=residual,
+        noise_px=noise,
+    )
+
+
+def smooth_surface(xy_px: Float, values: Float) -> Float:
+    """Quadratic surface through values with outliers: least squares twice, then without those far off."""
+    terms = smooth_terms(xy_px)
+    weights = np.ones(len(values))
+    for _ in range(4):
+        surface = terms @ np.linalg.lstsq(terms * weights[:, None], values * weights, rcond=1e-9)[0]
+        weights = np.sqrt(robust_weights(values - surface)[0])
+    return np.asarray(surface)

@@ -1,0 +1,262 @@
+"""Judgement of offsets across epipolar lines: whether a camera moved, how surely, and what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from core.arrays import Float
+from core.calibration import COVARIANCE_NAMES
+from core.calibration.uncertainty import image_derivatives
+from core.cameras.stereo import StereoPair
+from core.field.region.trend import smooth_terms
+from core.orientation.consequence import Consequence, consequence_of
+from core.orientation.estimate import estimate_change
+from core.orientation.matched import MatchedPoints, across_line
+from core.orientation.noise import blocks_of, effective_variance, robust_weights
+
+Against = Literal["calibration", "reference", "last_step"]
+Pattern = Literal["mean", "slope", "curvature"]
+
+MIN_POINTS = 30
+CHANCE = 1e-4
+"""Probability below which offsets are not called noise: of a test of a hundred steps, one in a hundred is wrong."""
+#: smooth errors of the correlation and of the lenses, a standard deviation of each term; a part of them cancels between
+#: two steps. Offsets of three times that are not called a motion, however small their noise
+_FLOOR_PX: dict[Against, float] = {"calibration": 0.004, "reference": 0.002, "last_step": 0.002}
+_NO_NUMBER = 1e-300
+_PARTS: dict[Pattern, slice] = {"mean": slice(0, 1), "slope": slice(1, 3), "curvature": slice(3, 6)}
+
+
+@dataclass(frozen=True)
+class OffsetFinding:
+    """What the offsets of a step say about the cameras.
+
+    Attributes
+    ----------
+    against
+        The offsets are held against the calibration's, the reference's or those of the step before.
+    camera_moved
+        None where an error of the calibration's own is possible and not known.
+    points
+        Number of points.
+    offset_mean_px, offset_rms_px
+        Of the smooth part of the offsets, over the points; against a step: of its difference.
+    expected_px
+        Root mean square that noise, systematic errors and the calibration's own uncertainty make of it.
+    pattern_px
+        The root mean squares of its mean, its slope and its curvature over the image, which add up in squares.
+    carried_by
+        The largest of these.
+    chi_square, p_value, sigmas
+        Of the smooth part against what is expected, six terms; the chance of so much; the same in standard deviations
+        of a normal distribution.
+    change_deg, change_sigma_deg
+        :data:`core.orientation.change.CHANGE_NAMES` that explain it.
+    determined
+        How many of these five the offsets themselves determine.
+    consequence
+        Of that change; None with too few points.
+    text
+        All of it in a sentence.
+    """
+
+    against: Against
+    camera_moved: bool | None
+    points: int
+    offset_mean_px: float
+    offset_rms_px: float
+    expected_px: float
+    pattern_px: dict[Pattern, float]
+    carried_by: Pattern
+    chi_square: float
+    p_value: float
+    sigmas: float
+    change_deg: tuple[float, ...]
+    change_sigma_deg: tuple[float, ...]
+    determined: float
+    consequence: Consequence | None
+    text: str
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain numbers, lists and texts."""
+        consequence = None if self.consequence is None else self.consequence.document()
+        lists = {name: list(getattr(self, name)) for name in ("change_deg", "change_sigma_deg")}
+        return {**vars(self), **lists, "pattern_px": dict(self.pattern_px), "consequence": consequence}
+
+
+def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES) -> Float:
+    """Return d(epipolar offset, px) / d(both cameras' parameters by name), (n, len(names)), at matched points.
+
+    The point that camera 1 sees stays on its pixel's ray; its image in camera 2 moves off the position that was
+    measured. What moves along the line counts for nothing.
+    """
+    xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
+    across = across_line(pair, points.xy1_px, points.xy2_px)
+    A1, A2 = pair.cam1.point_jacobian(xyz), pair.cam2.point_jacobian(xyz)
+    by_parameters = image_derivatives(pair, xyz, names)
+    in_camera2 = A2 @ np.linalg.pinv(A1) @ by_parameters[:, :2] - by_parameters[:, 2:]
+    return np.asarray(np.einsum("nj,njk->nk", across, in_camera2))
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothOffsets:
+    """Smooth part of offsets: coefficients (6,) over orthonormal terms of the image, and their covariance.
+
+    A coefficient is the root mean square that its term contributes over the points.
+    """
+
+    terms: Float
+    coefficients: Float
+    covariance: Float
+    projector: Float
+
+
+def smooth_offsets(points: MatchedPoints, offset_px: Float) -> SmoothOffsets:
+    """Fit the mean, slope and curvature of offsets (n,) robustly."""
+    plain = smooth_terms(points.xy1_px)
+    n = len(plain)
+    terms = np.linalg.qr(plain)[0] * np.sqrt(n)
+    terms *= np.sign(terms[0, 0])
+    weights = np.ones(n)
+    for _ in range(4):
+        normal = np.linalg.pinv((terms * weights[:, None]).T @ terms)
+        projector = normal @ (terms * weights[:, None]).T
+        coefficients = projector @ offset_px
+        weights, _ = robust_weights(offset_px - terms @ coefficients)
+    variance = effective_variance(terms, weights, offset_px, blocks_of(points.xy1_px, points.step))
+    return SmoothOffsets(terms, coefficients, normal * variance, projector)
+
+
+def judge_offsets(
+    pair: StereoPair,
+    points: MatchedPoints,
+    *,
+    before: tuple[MatchedPoints, Float] | None = None,
+    against: Against = "calibration",
+    covariance: Float | None = None,
+    names: Sequence[str] = COVARIANCE_NAMES,
+    own_px: float | None = None,
+    imported: bool = False,
+) -> OffsetFinding | None:
+    """Judge the offsets of one step.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    points
+        The step's points as matched.
+    before
+        Points of the reference or of another step, and their offsets (m,); the calibration's own error, the same in
+        both, cancels then.
+    against
+        What the offsets are held against.
+    covariance, names
+        (n, n) of the cameras' parameters, and their names.
+    own_px
+        The calibration's own offset at most, where it is known.
+    imported
+        True for another program's calibration, whose own error is not known.
+
+    Returns
+    -------
+    OffsetFinding or None
+        None with fewer than :data:`MIN_POINTS` points.
+    """
+    if len(points.xy1_px) < MIN_POINTS or (before is not None and len(before[1]) < MIN_POINTS):
+        return None
+    offset = pair.epipolar_residual_px(points.xy1_px, points.xy2_px)
+    good = np.isfinite(offset)
+    if good.sum() < MIN_POINTS:
+        return None
+    points, offset = MatchedPoints(points.xy1_px[good], points.xy2_px[good], points.step[good]), offset[good]
+    unsure = np.zeros((6, 6))
+    if before is not None:
+        offset, unsure = _less(points, offset, *before)
+    smooth = smooth_offsets(points, offset)
+    C = smooth.covariance + unsure + _FLOOR_PX[against] ** 2 * np.eye(6)
+    known = against != "calibration"
+    if against == "calibration" and covariance is not None:
+        J = smooth.projector @ calibration_slopes(pair, points, names)
+        C = C + J @ covariance @ J.T
+        known = True
+    c = smooth.coefficients
+    chi_square = float(c @ np.linalg.solve(C, c))
+    p_value = float(chi2.sf(chi_square, 6))
+    expected = float(np.sqrt(np.trace(C)))
+    rms = float(np.sqrt(max(c @ c - np.trace(smooth.covariance), 0.0)))
+    moved: bool | None = p_value < CHANCE and rms > 3.0 * _FLOOR_PX[against]
+    if against == "calibration":
+        if own_px is not None:
+            # the calibration's residuals bound what its model leaves, whatever its covariance says
+            moved, known = moved and rms > own_px, True
+        if imported or not known:
+            moved = None
+    estimate = estimate_change(pair, points, offset)
+    parts = {name: float(np.sqrt(np.sum(c[part] ** 2))) for name, part in _PARTS.items()}
+    finding = OffsetFinding(
+        against=against,
+        camera_moved=moved,
+        points=len(offset),
+        offset_mean_px=float((smooth.terms @ c).mean()),
+        offset_rms_px=rms,
+        expected_px=expected,
+        pattern_px=parts,
+        carried_by=max(parts, key=lambda name: parts[name]),
+        chi_square=chi_square,
+        p_value=p_value,
+        sigmas=float(norm.isf(p_value / 2.0)) if p_value > _NO_NUMBER else float(np.sqrt(chi_square)),
+        change_deg=tuple(float(v) for v in np.degrees(estimate.change)),
+        change_sigma_deg=tuple(float(v) for v in np.degrees(np.sqrt(np.diag(estimate.covariance)))),
+        determined=estimate.determined,
+        consequence=consequence_of(pair, points, estimate.change, estimate.covariance),
+        text="",
+    )
+    return _with_text(finding)
+
+
+def _less(points: MatchedPoints, offset_px: Float, earlier: MatchedPoints, earlier_px: Float) -> tuple[Float, Float]:
+    """Offsets less the smooth part of earlier ones at the same place of the image, and its covariance (6, 6).
+
+    At the same place: an error of the calibration belongs to the image, not to the point of the specimen.
+    """
+    fit = smooth_offsets(earlier, earlier_px)
+    # the earlier terms at the points, through the plain polynomial of all positions together
+    both = smooth_terms(np.concatenate([earlier.xy1_px, points.xy1_px]))
+    there, here = both[: len(earlier_px)], both[len(earlier_px) :]
+    turn = np.linalg.lstsq(there, fit.terms, rcond=None)[0]
+    terms = here @ turn
+    onto = np.linalg.qr(smooth_terms(points.xy1_px))[0].T / np.sqrt(len(offset_px)) @ terms
+    return offset_px - terms @ fit.coefficients, onto @ fit.covariance @ onto.T
+
+
+_SAYS = {
+    "calibration": "off its epipolar lines by",
+    "reference": "against the reference off by",
+    "last_step": "against the step before off by",
+}
+
+
+def _with_text(finding: OffsetFinding) -> OffsetFinding:
+    text = (
+        f"camera 2 sees the points {_SAYS[finding.against]} {finding.offset_rms_px:.3f} px "
+        f"({finding.carried_by}; expected {finding.expected_px:.3f} px, {finding.sigmas:.1f} sigma)"
+    )
+    cost = finding.consequence
+    if finding.camera_moved is None:
+        text += "; the calibration's own error is not known, so that this does not show that a camera moved"
+    elif finding.camera_moved:
+        text += "; a camera moved" + ("" if finding.against != "calibration" else " since the calibration")
+    else:
+        text += "; no camera is seen to have moved"
+    if cost is not None and finding.camera_moved is not False:
+        text += (
+            f": {cost.shape_um:.2g} +- {cost.shape_sigma_um:.2g} um in shape, {cost.z_um:.2g} um in Z, "
+            f"{cost.strain_microstrain:.2g} +- {cost.strain_sigma_microstrain:.2g} microstrain between before and after"
+        )
+    return OffsetFinding(**{**vars(finding), "text": text})

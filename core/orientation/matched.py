@@ -1,0 +1,85 @@
+"""Matched points of both images, taken from a measured field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Float
+from core.cameras.stereo import StereoPair
+from core.field.points.result import Field
+from core.robust import spread_indices
+
+_STEP_PX = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPoints:
+    """Points seen in both images of one or several steps.
+
+    Attributes
+    ----------
+    xy1_px, xy2_px
+        (n, 2) in camera 1 and camera 2.
+    step
+        (n,) number of the image pair, from 0.
+    """
+
+    xy1_px: Float
+    xy2_px: Float
+    step: NDArray[np.int32]
+
+    @staticmethod
+    def of(xy1_px: Float, xy2_px: Float, step: int = 0) -> MatchedPoints:
+        """Return the points of one pair of images."""
+        return MatchedPoints(xy1_px, xy2_px, np.full(len(xy1_px), step, np.int32))
+
+    @staticmethod
+    def joined(parts: Sequence[MatchedPoints]) -> MatchedPoints:
+        """Return the points of several pairs of images."""
+        return MatchedPoints(*(np.concatenate([getattr(p, a) for p in parts]) for a in ("xy1_px", "xy2_px", "step")))
+
+
+def matched_points(pair: StereoPair, shape: Field, step: int = 0, *, at_most: int | None = None) -> MatchedPoints:
+    """Return the valid points of a shape as they were matched.
+
+    Parameters
+    ----------
+    pair
+        The cameras that the shape was measured with.
+    shape
+        Reference positions and epipolar offsets.
+    step
+        Number of its images.
+    at_most
+        Number of points, spread over all, that are enough; all of them if left out.
+    """
+    ok = np.flatnonzero(shape.valid & np.isfinite(shape.epipolar_px))
+    if at_most is not None and len(ok) > 0:
+        ok = ok[np.unique(spread_indices(len(ok), at_most))]
+    xy1 = np.stack([shape.x_px.ravel()[ok], shape.y_px.ravel()[ok]], axis=1)
+    xyz, offset = shape.xyz_mm.reshape(-1, 3)[ok], shape.epipolar_px.ravel()[ok]
+    return MatchedPoints.of(xy1, seen_by_camera2(pair, xy1, xyz, offset), step)
+
+
+def seen_by_camera2(pair: StereoPair, xy1_px: Float, xyz_mm: Float, offset_px: Float) -> Float:
+    """Return positions (n, 2) in camera 2 of measured points: off their epipolar lines by the offset."""
+    on_line = pair.cam2.project(xyz_mm).xy
+    across = across_line(pair, xy1_px, on_line)
+    left = offset_px - pair.epipolar_residual_px(xy1_px, on_line)
+    return np.asarray(on_line + across * (left / (across**2).sum(axis=1))[:, None])
+
+
+def across_line(pair: StereoPair, xy1_px: Float, xy2_px: Float) -> Float:
+    """Return (n, 2) the gradient of the epipolar offset over the position in camera 2: across the line."""
+    h = _STEP_PX
+    return np.stack(
+        [
+            (pair.epipolar_residual_px(xy1_px, xy2_px + d) - pair.epipolar_residual_px(xy1_px, xy2_px - d)) / (2 * h)
+            for d in (np.array([h, 0.0]), np.array([0.0, h]))
+        ],
+        axis=1,
+    )

@@ -1,0 +1,105 @@
+"""Checks of a calibration that a user asks for: known distance, second calibration, aspect ratio from images."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, File, Form, Query, UploadFile
+
+from server.api.models.calibration_checks import AspectReply, ComparisonReply, DistanceReply, DistanceRequest
+from server.api.protocol.dependencies import CalibrationId, ServiceDep
+from server.api.protocol.problems import errors
+from server.api.routes.calibrations.calibrations import complete
+from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.formats.calibrations.target_toml import target_of
+from server.formats.images import decode_image, read_image
+from server.results.calibration_checks import (
+    KNOWN_DISTANCE,
+    NamedImage,
+    aspect_of_images,
+    compare_loaded,
+    distance_of_marks,
+    distance_of_target,
+    kept_distance,
+    plain,
+)
+from server.workflows.service import Service
+
+router = APIRouter(prefix="/calibrations", tags=["calibrations"])
+
+
+def _loaded(service: Service, calibration_id: str) -> LoadedCalibration:
+    return load_calibration(complete(service, calibration_id) / "calibration.json")
+
+
+@router.post(
+    "/{calibration_id}/distance:check", summary="Measure a known distance", responses=errors(404, 409, 413, 422, 507)
+)
+def check_distance(service: ServiceDep, calibration_id: CalibrationId, body: DistanceRequest) -> DistanceReply:
+    """Compare a measured with a known distance: the only check that shows a wrong pitch of the target.
+
+    The finding is kept with the calibration, under `kept_checks` and in reports; a later one replaces it.
+    """
+    loaded = _loaded(service, calibration_id)
+    if body.points_px is not None and body.distance_mm is not None:
+        found = distance_of_marks(
+            loaded,
+            np.array([body.points_px.cam1, body.points_px.cam2]),
+            body.distance_mm,
+            distance_sigma_mm=body.distance_sigma_mm,
+            point_sigma_px=body.point_sigma_px,
+        )
+        how: dict[str, object] = {"points_px": body.points_px.model_dump(mode="json")}
+    else:
+        assert body.step is not None
+        target = target_of(body.step.target.plain(), "step.target")
+        step = service.tests.verified_step(body.step.test_id, body.step.n)
+        images = read_image(step.cam1), read_image(step.cam2)
+        found = distance_of_target(loaded, images, target, distance_sigma_mm=body.distance_sigma_mm)
+        how = body.step.model_dump(mode="json", exclude_none=True)
+    kept = kept_distance(found, how)
+    service.calibrations.put_check(calibration_id, KNOWN_DISTANCE, kept)
+    service.hub.publish("calibration", {"calibration_id": calibration_id})
+    return DistanceReply.model_validate(kept)
+
+
+@router.get(
+    "/{calibration_id}/comparison",
+    summary="Two calibrations of one rig, compared in space",
+    responses=errors(404, 409, 422),
+)
+def compare_calibration(
+    service: ServiceDep,
+    calibration_id: CalibrationId,
+    other: Annotated[str, Query(alias="with", max_length=40, description="Id of the second calibration.")],
+) -> ComparisonReply:
+    """Return shape, scale and epipolar offset of the second against this one, in units of both covariances.
+
+    Points of the common volume are imaged by this one's cameras and measured with the other's.
+    """
+    found = compare_loaded(_loaded(service, calibration_id), _loaded(service, other))
+    return ComparisonReply.model_validate(plain(found))
+
+
+@router.post(":aspect", summary="Aspect ratio from images", responses=errors(413, 422))
+def measure_aspect(
+    service: ServiceDep,
+    images: Annotated[
+        list[UploadFile],
+        File(description="One camera's images of the rig's line grid at 45 degrees, moved about in its plane."),
+    ],
+    standoff_mm: Annotated[
+        float | None, Form(gt=0.0, le=1e9, allow_inf_nan=False, description="Distance of camera and grid, roughly.")
+    ] = None,
+) -> AspectReply:
+    """Measure rows' scale over columns' scale, section 3.2.2; refused where the grid is tilted or not at 45 degrees.
+
+    The target is the rig file's; nothing is kept. GET /cameras/{cam}/frame?format=tiff gives such images.
+    """
+    target = target_of(service.config.target.plain(), "the rig file, [target]")
+    read = [
+        NamedImage(name, decode_image(upload.file.read(), name=name))
+        for name, upload in ((u.filename or f"image {k + 1}", u) for k, u in enumerate(images))
+    ]
+    return AspectReply.model_validate(plain(aspect_of_images(read, target, standoff_mm=standoff_mm)))

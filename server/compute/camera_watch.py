@@ -1,0 +1,139 @@
+"""Whether a camera moved, step by step: since the calibration, since the reference, since the step before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration import COVARIANCE_NAMES
+from core.cameras.stereo import StereoPair
+from core.errors import SeedError
+from core.field.points.images import MeasureImage
+from core.field.points.result import Field
+from core.field.settings import MeasureOptions
+from core.orientation import judge_offsets
+from core.orientation.coarse import features_off_px
+from core.orientation.finding import Against
+from core.orientation.matched import MatchedPoints, matched_points
+from core.orientation.step import SAMPLE, step_points
+from server.formats.results.camera_motion import CameraMotion
+
+_KEPT = 3
+_FAR_PX = 1.0  # starts are looked for within 1.5 px of the epipolar line, features found to 0.7 px
+Images = tuple[MeasureImage, MeasureImage]
+
+
+@dataclass(eq=False)
+class CameraWatch:
+    """The epipolar offsets of a sequence's steps, held against one another.
+
+    Parameters
+    ----------
+    pair, options
+        The calibrated cameras, and the settings of the measurement.
+    reference
+        Number of the reference step.
+    covariance
+        Names and covariance (n, n) of the cameras' parameters, where it is known.
+    own_px
+        The calibration's own offset at most, where it is known.
+    imported
+        True for another program's calibration.
+    """
+
+    pair: StereoPair
+    options: MeasureOptions
+    reference: int
+    covariance: tuple[tuple[str, ...], NDArray[np.float64]] | None
+    own_px: float | None
+    imported: bool
+    _points: dict[int, MatchedPoints | None] = field(default_factory=dict)
+
+    def refuse_moved(self, n: int, images: Images, cause: Exception | None = None) -> None:
+        """Raise an error for a step without a match, if a camera turned too far for its epipolar lines.
+
+        Raises
+        ------
+        SeedError
+            ``camera_moved``.
+        """
+        off_px = None if self.imported else features_off_px(self.pair, *images)
+        if off_px is not None and off_px > _FAR_PX:
+            raise SeedError(
+                f"Step {n}: most feature matches between both cameras lie about {off_px:.1f} px off their epipolar "
+                "lines: a camera moved, or the calibration belongs to another set-up.",
+                code="camera_moved",
+                remedy="Repair the calibration from steps taken since (stereorig calibration repair), or calibrate "
+                "again.",
+                offset_px=off_px,
+            ) from cause
+
+    def judge(
+        self,
+        n: int,
+        result: Field,
+        images: Images,
+        *,
+        shape: Callable[[], Field],
+        previous: int | None,
+        before: Callable[[int], tuple[Field, Images]],
+    ) -> CameraMotion | None:
+        """Judge a step that was measured.
+
+        Parameters
+        ----------
+        n, result, images
+            The step.
+        shape
+            Returns the reference's shape.
+        previous
+            Number of the step measured before, None for the first two.
+        before
+            Returns field and images of an earlier step.
+
+        Returns
+        -------
+        CameraMotion or None
+            None where too few points could be matched.
+        """
+        points = self._of(n, lambda: (result, images))
+        if points is None:
+            return None
+        names, covariance = (COVARIANCE_NAMES, None) if self.covariance is None else self.covariance
+        against_calibration = judge_offsets(
+            self.pair, points, covariance=covariance, names=names, own_px=self.own_px, imported=self.imported
+        )
+        if n == self.reference:
+            return CameraMotion.of(against_calibration, None, None)
+        reference = self._of(self.reference, lambda: (shape(), images))
+        earlier = None
+        if previous is not None and previous != self.reference:
+            earlier = self._of(previous, lambda: before(previous))
+        compared: tuple[tuple[MatchedPoints | None, Against], ...] = ((reference, "reference"), (earlier, "last_step"))
+        against_reference, against_last = (
+            None
+            if other is None
+            else judge_offsets(
+                self.pair,
+                points,
+                before=(other, self.pair.epipolar_residual_px(other.xy1_px, other.xy2_px)),
+                against=name,
+            )
+            for other, name in compared
+        )
+        return CameraMotion.of(against_calibration, against_reference, against_last)
+
+    def _of(self, n: int, step: Callable[[], tuple[Field, Images]]) -> MatchedPoints | None:
+        if n not in self._points:
+            result, images = step()
+            if n == self.reference:
+                self._points[n] = matched_points(self.pair, result, at_most=SAMPLE)
+            else:
+                self._points[n] = step_points(self.pair, result, *images, self.options)
+            others = [k for k in self._points if k != self.reference]
+            for k in others[: max(len(others) - _KEPT, 0)]:
+                del self._points[k]
+        return self._points[n]

@@ -1,0 +1,69 @@
+"""A projected pattern stays where it is as the surface moves: shape can be measured, displacement cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from core.errors import InputError
+from core.settings import AnalysisSettings
+from server.formats.results.layout import COVARIANCE_NAMES
+from server.results.gauges.request import GaugeRequest
+from server.results.gauges.variables import STRAIN_NAMES
+
+_OF_DISPLACEMENT = frozenset({*COVARIANCE_NAMES[3:], *STRAIN_NAMES})
+
+
+def check_settings(settings: AnalysisSettings, *, displacement: bool) -> None:
+    """Refuse settings that need a texture on the surface.
+
+    Parameters
+    ----------
+    settings
+        Those asked for.
+    displacement
+        True if displacements are asked for.
+
+    Raises
+    ------
+    InputError
+        ``pattern_projected``.
+    """
+    if settings.pattern != "projected":
+        return
+    for asked, what in (
+        (displacement, "displacement"),
+        (settings.strain is not None, "strain"),
+        (settings.smoothing_window is not None, "a smoothed displacement"),
+        (settings.reference_update != "never", "a later reference"),
+    ):
+        if asked:
+            raise _refusal(what)
+
+
+def check_gauges(request: GaugeRequest, settings: Mapping[str, object]) -> None:
+    """Refuse gauges on results of a projected pattern that follow points of the surface.
+
+    Raises
+    ------
+    InputError
+        ``pattern_projected``.
+    """
+    if settings.get("pattern") != "projected":
+        return
+    moving = [name for name in request.variables or () if name in _OF_DISPLACEMENT]
+    for asked, what in (
+        (bool(request.extensometers), "an extensometer"),
+        (request.remove_rigid is not None, "a rigid motion"),
+        (bool(moving), ", ".join(moving)),
+    ):
+        if asked:
+            raise _refusal(what)
+
+
+def _refusal(what: str) -> InputError:
+    return InputError(
+        f"The pattern is projected and does not move with the surface: {what} cannot be measured from it.",
+        code="pattern_projected",
+        remedy="Measure the shape of each step (kind = 'profile'; stereorig measure --projected), or put a texture on "
+        "the surface.",
+    )
