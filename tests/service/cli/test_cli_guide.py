@@ -22,7 +22,7 @@ def test_runs_by_itself_to_the_goal_and_says_what_it_does(tmp_path: Path, capsys
         url = str(client.base_url).rstrip("/")
         assert main(["guide", "--url", url, "--goal-um", "6", "--out", str(out)]) == 0
     text = "".join(capsys.readouterr())
-    assert "Hold the target where your specimen will be" in text
+    assert "holds the target where the specimen will be" in text
     assert "the uncertainty of Z at your specimen goes from" in text
     assert "the goal of 6 um is met" in text
     assert "verdict: " in text
