@@ -39,8 +39,8 @@ def test_the_expected_uncertainty_is_that_of_the_calibration_then_made() -> None
     )
     target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03)
     # the views have no tilt of the axis; its prior alone would be most of the angles' uncertainty
-        exact = CalibrationOptions(held_out_mm=held, axis_tilt_sigma_rad=0.0)
-        made = calibrate(views, target, (one, two), exact)
+    exact = CalibrationOptions(held_out_mm=held, axis_tilt_sigma_rad=0.0)
+    made = calibrate(views, target, (one, two), exact)
     expected = expect(positions, target, (one, two), exact, noise_px=noise, roll_deg=45.0)
     assert expected.reasons == ()
     for name, sigma in made.sigma.items():
