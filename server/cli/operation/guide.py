@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         begun = client.call("POST", "/calibrations:guide", json=body).json()
         session = _Session(client, str(begun["calibration_id"]), str(begun["job"]["id"]), args.views, line, hand)
         who = "your hand" if hand is None else "the simulated hand"
-        line.note(f"calibration {session.calibration_id}: {who} holds the target")
+        line.note(f"calibration {session.calibration_id}: {who} holds the target where the specimen will be")
         try:
             session.acquire()
         except BaseException:

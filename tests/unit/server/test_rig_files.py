@@ -182,3 +182,19 @@ def test_a_file_of_the_time_of_retention_is_taken_and_says_so(caplog: pytest.Log
     assert config.service.live_views == 3
     assert not hasattr(config.service, "retention_days")
     assert "retention_days is ignored" in caplog.text
+
+
+def test_one_stage_means_one_axis_and_free_poses_need_no_placing() -> None:
+    one_axis = BOARD.replace("stage_axis = 1              # one axis", "stage_axis = 2              # one axis")
+    with pytest.raises(FileFormatError, match="one stage axis"):
+        parse_config(one_axis)
+    placed = re.sub(r"(?m)^(standoff_mm|angle_deg) = .*\n", "", BOARD)
+    with pytest.raises(FileFormatError, match=r"cam1\.standoff_mm is needed"):
+        parse_config(placed)
+    free = parse_config(
+        placed.replace('moves = "target"', 'moves = "free"').replace("positions_mm = [0.0, 10.0]\n", "")
+    )
+    assert free.cam1.standoff_mm is None
+    assert free.calibration.positions_mm == ()
+    with pytest.raises(FileFormatError, match="positions_mm is needed"):
+        parse_config(BOARD.replace("positions_mm = [0.0, 10.0]\n", ""))
