@@ -21,7 +21,16 @@ from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import calibration_beside as accuracy_beside
 from tests.bench.accuracy import cracks as accuracy_cracks
-from tests.bench.accuracy import curved, gauges, lenses_motions, matching, real_boards, rig_campaign, sequence
+from tests.bench.accuracy import (
+    curved,
+    gauges,
+    lenses_motions,
+    line_grid_covariance,
+    matching,
+    real_boards,
+    rig_campaign,
+    sequence,
+)
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import noise as accuracy_noise
@@ -38,6 +47,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "aspect": accuracy_calibration.aspect,
     "lenses": lenses_motions.lenses,
     "motions": lenses_motions.motions,
+    "line-grid": line_grid_covariance.line_grid,
     "beside": accuracy_beside.beside,
     "rigs": rig_campaign.rigs,
     "real-boards": real_boards.real_boards,
