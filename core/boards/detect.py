@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
+from core.boards.beyond import goes_on_beyond
 from core.boards.board import BoardTarget
 from core.boards.corners import (
     any_checkerboard,
@@ -152,7 +153,24 @@ def _find(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) ->
             code="target_other",
             remedy="Correct kind in the target's description, or use the target declared.",
         )
+    if goes_on_beyond(pictures.grey, corners):
+        raise _larger(pictures, target)
     return _Coarse(corners.reshape(-1, 2)[_upright(corners, pictures.grey)])
+
+
+def _larger(pictures: Pictures, target: BoardTarget) -> TargetError:
+    """Return the error for a checkerboard that has more corners than declared, with their number where it is sure."""
+    seen = any_checkerboard(pictures)
+    size = "" if seen is None else f" of {seen.shape[0]} x {seen.shape[1]} inner corners"
+    if seen is not None and sorted(seen.shape[:2]) == sorted(target.size):
+        size = ""
+    return TargetError(
+        f"The image shows a checkerboard{size} that goes on beyond the {target.size[0]} x {target.size[1]} inner "
+        "corners declared.",
+        code="target_size",
+        remedy="Correct size in the target's description: it counts inner corners.",
+        expected=list(target.size),
+    )
 
 
 def _check(fit: Refined, sigma: Float, coarse_px: Float, target: BoardTarget) -> None:

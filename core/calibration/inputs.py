@@ -281,6 +281,12 @@ def pitch_scale_sigma(target: AnyTarget) -> float:
     return float(getattr(target, "pitch_scale_sigma", 0.0))
 
 
+def flatness_mm(target: AnyTarget) -> float:
+    """Bound on the target's departure from a plane; that of its points' positions where it is not stated."""
+    flatness = getattr(target, "flatness_mm", None)
+    return target.node_tolerance_mm if flatness is None else float(flatness)
+
+
 def half_sides_mm(target: AnyTarget) -> tuple[float, float]:
     """Half of the field of points along X and Y."""
     x, y = np.abs(nodes_of(target)).max(axis=(0, 1))

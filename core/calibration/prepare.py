@@ -20,6 +20,7 @@ from core.calibration.inputs import (
     CalibrationView,
     NominalCamera,
     check_view,
+    flatness_mm,
     is_held_out,
     nodes_of,
     pitch_scale_sigma,
@@ -110,9 +111,7 @@ def node_sigmas_mm(target: AnyTarget, options: CalibrationOptions, *, free: bool
     """
     if options.estimate_nodes is False or not target.node_tolerance_mm > 0.0:
         return 0.0, 0.0
-    within = target.node_tolerance_mm / float(np.sqrt(3.0))
-    flatness = getattr(target, "flatness_mm", None)
-    across = within if flatness is None else float(flatness) / float(np.sqrt(3.0))
+    within, across = (bound / float(np.sqrt(3.0)) for bound in (target.node_tolerance_mm, flatness_mm(target)))
     return within, across if free else 0.0
 
 

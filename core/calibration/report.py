@@ -16,7 +16,7 @@ from core.calibration.fit.adjust import Adjustment
 from core.calibration.fit.layout import camera_of, camera_seeing
 from core.calibration.fit.named import named_covariance, parameter_names
 from core.calibration.fit.unit_vector import direction
-from core.calibration.inputs import AnyTarget, CalibrationOptions, NominalCamera
+from core.calibration.inputs import AnyTarget, CalibrationOptions, NominalCamera, flatness_mm
 from core.calibration.result import CalibrationResult, LensChosen, StageFound, ViewResult
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 from core.calibration.verdict import assess, checks_made
@@ -80,8 +80,8 @@ def build_result(
         views=results,
         uncertainty=uncertainty,
         # of a target declared exact, the finding itself speaks
-        node_corrections_mm=corrections[..., :2] if free_nodes and target.node_tolerance_mm > 0.0 else None,
-        node_tolerance_mm=target.node_tolerance_mm,
+        node_corrections_mm=corrections if free_nodes and target.node_tolerance_mm > 0.0 else None,
+        node_tolerance_mm=(target.node_tolerance_mm, flatness_mm(target)),
         options=options,
         centres=[(c.lens, n.image_size_px) for c, n in zip((pair.cam1, pair.cam2), nominals, strict=True)],
         structure=chosen.structure,

@@ -21,6 +21,8 @@ GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
 CENTRE_SHARE = 0.15
 #: of the fitted RBE: structure of less than this moves the shape by less than the noise does
 STRUCTURE_SHARE = 0.2
+#: of a view's RBE; a mean residual of more is no scatter
+MOVED_SHARE = 0.6
 #: of all views; with more of them left out something is wrong with the way they were taken
 DROPPED_SHARE = 1.0 / 3.0
 _ORDER: tuple[Level, Level, Level] = ("good", "warning", "failed")
@@ -45,7 +47,7 @@ def assess(
     views: Sequence[ViewResult],
     uncertainty: VolumeUncertainty,
     node_corrections_mm: Float | None,
-    node_tolerance_mm: float,
+    node_tolerance_mm: tuple[float, float],
     options: CalibrationOptions,
     centres: Sequence[tuple[LensModel, tuple[int, int]]] = (),
     structure: Sequence[Structure] = (),
@@ -83,6 +85,13 @@ def assess(
     if bad:
         reasons.append("Worst views: " + ", ".join(f"{v.name} {v.rbe_px:.3f} px" for v in bad) + ".")
         level = worst(level, band(bad[0].rbe_px))
+        # the points of a view that a bump moved are off together; those of a blurred or wrongly found one are not
+        together = [v for v in bad if _shift_px(v) > MOVED_SHARE * v.rbe_px]
+        if staged and together:
+            reasons.append(
+                f"All points of {', '.join(v.name for v in together)} are off the same way: a camera, the stage or the "
+                "target moved there."
+            )
     if not uncertainty.relative_shape <= options.max_shape_uncertainty:
         level = "failed"
         reasons.append(
@@ -90,13 +99,20 @@ def assess(
             f"{1e3 * uncertainty.shape_rms_mm / uncertainty.relative_shape * options.max_shape_uncertainty:.2f} um."
         )
     if node_corrections_mm is not None:
-        correction_mm = float(np.abs(node_corrections_mm).max())
+        correction_mm = float(np.abs(node_corrections_mm[..., :2]).max())
         # a bound is a bound; half as much again leaves room for the estimate's own noise
-        if correction_mm > 1.5 * node_tolerance_mm:
+        if correction_mm > 1.5 * node_tolerance_mm[0]:
             level = worst(level, "warning")
             reasons.append(
                 f"Node corrections reach {1e3 * correction_mm:.1f} um against a tolerance of "
-                f"{1e3 * node_tolerance_mm:.1f} um: the target, its tolerance or the aspect ratio may be wrong."
+                f"{1e3 * node_tolerance_mm[0]:.1f} um: the target, its tolerance or the aspect ratio may be wrong."
+            )
+        bent_mm = float(np.abs(node_corrections_mm[..., 2:]).max(initial=0.0))
+        if bent_mm > 1.5 * node_tolerance_mm[1]:
+            level = worst(level, "warning")
+            reasons.append(
+                f"The target departs from a plane by {1e3 * bent_mm:.0f} um, declared are "
+                f"{1e3 * node_tolerance_mm[1]:.0f} um: it was corrected, but it may bend differently from view to view."
             )
     for name, (lens, size) in zip(CAMERAS, centres, strict=False):
         cx, cy = lens.kernel_parameters()[4:6]
@@ -125,6 +141,11 @@ def assess(
             level = worst(level, "warning")
             reasons.append(f"{len(dropped)} of {len(views) + len(dropped)} views had to be left out.")
     return Verdict(level, tuple(reasons))
+
+
+def _shift_px(view: ViewResult) -> float:
+    """Length of the mean residual of a view."""
+    return float(np.linalg.norm(np.nanmean(view.residual_px.reshape(-1, 2), axis=0)))
 
 
 def checks_made(

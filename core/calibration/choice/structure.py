@@ -27,6 +27,7 @@ from core.names import CAMERAS
 
 SIGNIFICANT = 1e-4
 _DEGREE = 5
+_LEAST_LEFT = 1e-3
 _SMOOTH = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i) if i + j >= 2]
 
 
@@ -299,7 +300,8 @@ class _Score:
         q = int(shown.sum())
         cameras = [group.camera] if group.camera is not None else [0, 1]
         redundancy = float(sum(self._redundancy[c] for c in cameras))
-        left = max(redundancy - base - gain, 1e-9)
+        # linear to first order: what a term explains of large residuals leaves no less than a part of them
+        left = max(redundancy - base - gain, _LEAST_LEFT * redundancy)
         freedom = max(redundancy - q, 1.0)
         statistic = (gain / q) / (left / freedom) if q else 0.0
         probability = float(f_distribution.sf(statistic, q, freedom)) if q else 1.0

@@ -216,3 +216,18 @@ def test_a_wrong_description_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(StereorigError) as caught:
         BoardTarget(**{"kind": "checkerboard", "size": (9, 6), "pitch_mm": 10.0, **wrong})  # type: ignore[arg-type]
     assert caught.value.code == "target_invalid"
+
+
+@pytest.mark.parametrize("declared", [(8, 6), (9, 5), (7, 5)])
+def test_a_checkerboard_with_more_corners_than_declared_is_no_board_of_the_declared_size(
+    declared: tuple[int, int],
+) -> None:
+    squares = np.indices((7, 10)).sum(axis=0) % 2
+    picture = np.full((480, 640), 200.0)
+    picture[80:395, 95:545] = 60.0 + 140.0 * np.kron(squares, np.ones((45, 45)))
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.8) + np.random.default_rng(1).normal(0.0, 2.0, picture.shape)
+    found = detect_board(picture, BoardTarget(kind="checkerboard", size=(9, 6), pitch_mm=1.0))
+    assert np.isfinite(found.xy_px).all()
+    with pytest.raises(TargetError) as caught:
+        detect_board(picture, BoardTarget(kind="checkerboard", size=declared, pitch_mm=1.0))
+    assert caught.value.code == "target_size"

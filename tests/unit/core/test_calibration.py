@@ -254,6 +254,7 @@ def test_the_worst_view_is_named() -> None:
     result = calibrate(bumped, Grid(), NOMINAL, HELD)
     assert result.verdict.level == "failed"
     assert any(r.startswith("Worst views: cam2 at +4.000 mm 0.5") for r in result.verdict.reasons)
+    assert any("All points of cam2 at +4.000 mm are off the same way" in r for r in result.verdict.reasons)
 
 
 def test_without_held_out_positions_the_verdict_says_so() -> None:
