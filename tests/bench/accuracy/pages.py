@@ -66,6 +66,19 @@ HEADLINES: dict[tuple[str, str], dict[str, str]] = {
     ("calibration", "A wrong calibration"): {
         "camera 2's cy wrong by 0.1 px: mean false displacement, worst component": "false displacement, camera 2 off by 0.1 px"
     },
+    ("any_rig", "Lenses"): {
+        "p1 p2 of 3e-4: true shape error, rms (20 opencv5, 20 good)": "shape error after calibration of a decentred lens",
+        "p1 p2 of 3e-4: reported over true": "reported over true shape error, the same",
+    },
+    ("any_rig", "Free poses beside OpenCV and mrcal"): {
+        "k1 k2 p1 p2, board of 0.05 mm bowed by 0.3 mm: over OpenCV's, rms": "shape error over OpenCV's, bad board in free poses"
+    },
+    ("any_rig", "Real boards"): {
+        "here: epipolar distance of pairs left out, rms": "real boards: epipolar distance of pairs left out"
+    },
+    ("targets", "Corners and dots"): {
+        "checkerboard, 30 px apart, blur 1 px, tilt 50 degrees: rms error over the bound": "corner of a checkerboard: error over its bound"
+    },
     ("shape_and_motion", "Plane"): {
         "plane, Z rms, 21 px": "Z on a plane, 21 px subset, rms",
         "plane, Z rms, 33 px": "Z on a plane, 33 px subset, rms",
