@@ -154,6 +154,7 @@ def run(client: httpx.Client, description: dict[str, Any]) -> Session:
     _read_everything(session.call)
     _stage(session)
     calibration = _calibration(session)
+    _guided(session)
     noise = session.call("create_noise", summary="Eight frames of what stands still", body={"frames": 8}).json()
     wait_for_job(client, noise["job"])
     session.call("list_noise")
@@ -164,6 +165,25 @@ def run(client: httpx.Client, description: dict[str, Any]) -> Session:
     _results(session.call, test, analysis)
     _ends(session, test, analysis, calibration, noise["noise_id"])
     return session
+
+
+def _guided(session: Session) -> None:
+    """A guided acquisition of one view, ended before it could succeed."""
+    call, client = session.call, session.client
+    goal = {"quantity": "z", "goal_um": 1.0, "automatic": False}
+    begun = call("begin_guide", summary="Until Z is known to 1 um, each view on request", body=goal).json()
+    identity = begun["calibration_id"]
+    call("take_view", identity)
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and _taken(client, identity) == 0:
+        time.sleep(0.1)
+    call("get_guide", identity)
+    wait_for_job(client, call("finish_guide", identity).json()["job"])
+
+
+def _taken(client: httpx.Client, calibration_id: str) -> int:
+    guidance = client.get(f"{API}/calibrations/{calibration_id}/guide").json()["guidance"]
+    return 0 if guidance is None else int(guidance["taken"])
 
 
 def _read_everything(call: Callable[..., httpx.Response]) -> None:
