@@ -90,5 +90,13 @@ def _named(image: NDArray[Any], target: GridTarget, error: TargetError) -> Targe
     if error.code not in _MAY_BE_OTHER:
         return error
     shown = shown_target(Pictures(checked_image(np.asarray(image))), with_lines=False)
-    other = None if shown is None else other_target(shown, target)
-    return error if other is None else other
+    if shown is None or _is_its_own(shown.size, target):
+        return error
+    return other_target(shown, target) or error
+
+
+def _is_its_own(size: tuple[int, int] | None, target: GridTarget) -> bool:
+    """Return True for as many points as the grid's own cells or crossings: a small or blurred grid looks like them."""
+    if size is None:
+        return False
+    return any(sorted(size) == sorted(n - less for n in target.lines) for less in (0, 1, 2))

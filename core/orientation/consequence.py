@@ -72,7 +72,9 @@ def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covar
     if good.sum() < 10:
         return None
     xyz, slopes = xyz[good], slopes[good]
-    root = np.linalg.cholesky(covariance + 1e-30 * np.eye(5))
+    # of points in a narrow view some changes are known only by the prior: a root that takes rounding below zero
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
     moved, spread = slopes @ change, slopes @ root
     shape = without_rigid_motion(xyz, np.concatenate([moved[..., None], spread], axis=-1))
     strain = _strain(xyz, np.concatenate([moved[..., None], spread], axis=-1))

@@ -35,6 +35,10 @@ GUIDED_PURPOSE = "a guided calibration"
 STATE_FILE = "guide.json"
 
 
+UNATTENDED_S = 120.0
+"""An acquisition whose state nobody asks for lets the cameras go after so long; its views are kept."""
+
+
 @dataclass(frozen=True)
 class GuidePlan:
     """Plan of a guided acquisition.
@@ -70,6 +74,7 @@ class _Live:
     look: dict[str, Any] | None = None
     looks: int = 0
     rate_hz: float | None = None
+    asked: float = field(default_factory=time.monotonic)
 
 
 class Guides:
@@ -131,6 +136,8 @@ class Guides:
         path = self._service.calibrations.path(calibration_id) / STATE_FILE
         guidance = read_json(path) if path.is_file() else None
         live = self._live.get(calibration_id)
+        if live is not None:
+            live.asked = time.monotonic()
         acquiring = live is not None and not live.finish.is_set()
         return {
             "calibration_id": calibration_id,
@@ -212,6 +219,12 @@ class Guides:
             while not live.finish.is_set() and not guidance["reached"] and len(views) < 2 * MOST_VIEWS:
                 job.check()
                 begun = time.monotonic()
+                if begun - live.asked > UNATTENDED_S:
+                    raise StateError(
+                        f"Nobody has asked for the acquisition for {UNATTENDED_S:.0f} s: the cameras are let go.",
+                        code="guide_unattended",
+                        remedy="POST /calibrations/{id}/guide:finish fits the views taken; or begin another one.",
+                    )
                 job.progress("views", guidance["used"], 0)
                 try:
                     captured = service.rig.pair.capture(1, job.check)

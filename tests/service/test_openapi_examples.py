@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -151,11 +152,16 @@ def test_the_session_calls_every_operation_and_each_answer_that_has_a_body(sessi
 
 def test_every_example_of_a_request_is_one_that_the_service_took(session: Session, described: Json) -> None:
     """What the session sends was accepted (it asserts so); the description shows just that."""
-    taken = {(sent.operation, sent.media_type, json.dumps(sent.value, sort_keys=True)) for sent in session.requests}
+
+    def without_ids(value: Any) -> str:
+        # an id in a body is another one in each session
+        return re.sub(r"\b([atcnj]\d{6})-[0-9a-f]{6}\b", r"\1", json.dumps(value, sort_keys=True))
+
+    taken = {(sent.operation, sent.media_type, without_ids(sent.value)) for sent in session.requests}
     for name, operation in operations_of(described).items():
         for media, content in operation.get("requestBody", {}).get("content", {}).items():
             for example in content["examples"].values():
-                sent = json.dumps(example["value"], sort_keys=True)
+                sent = without_ids(example["value"])
                 assert (name, media, sent) in taken, (name, example["summary"], COMMAND)
 
 

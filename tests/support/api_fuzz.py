@@ -252,8 +252,8 @@ def fuzz(
 
     @schemathesis.hook
     def after_call(context: Any, case: Any, response: Any) -> None:
-        # a burst may take a step a day, and would keep the cameras from every later case
-        if response.status_code == 202 and case.operation.path.endswith("/steps"):
+        # a burst may take a step a day, a guided acquisition waits for a hand: both keep the cameras from later cases
+        if response.status_code == 202 and case.operation.path.endswith(("/steps", ":guide")):
             with contextlib.suppress(StateError):  # it was a short one
                 service.jobs.cancel(json.loads(response.content)["job"]["id"])
         # and what all cases need comes back from the trash

@@ -103,6 +103,7 @@ class Session:
             value = body
             if files is not None:
                 value = {name: data.decode() if text_files else FILE for name, data in files.items()} | (form or {})
+            value = {name: [given] if name == "images" else given for name, given in value.items()}
             media_sent = "application/json" if files is None else "multipart/form-data"
             self.requests.append(Sent(operation, media_sent, summary, value, answer.status_code))
         replies = self.replies.setdefault(operation, {}).setdefault(str(answer.status_code), {})

@@ -69,7 +69,7 @@ export function guidePanel(rig, ends, done) {
 
   return h("section.panel", { "aria-label": "Guided acquisition" }, h("h2", "Guided acquisition"),
     h("p.quiet", "Nothing moves: hold the target in your hand, first where the specimen will be. A view is taken whenever it stands still in a new pose."),
-    h("div.fields", field("Uncertainty of", quantity), field("Goal", goal, "µm", "ends the acquisition by itself"), field("Frames averaged per view", frames),
+    h("div.fields", field("Uncertainty of", quantity), field("Goal", goal, "µm", "ends the acquisition by itself"), field("Frames per view", frames),
       field("Purpose", label), h("label.row", automatic, " Take views by itself")),
     h("div.row", begin), live);
 }
