@@ -71,12 +71,14 @@ def adjust(
 
     Parameters
     ----------
-    layout, start, priors
-        The unknowns, their start values and what is known of them.
+    layout, start
+        The unknowns and their start values.
     views
         Observations of both cameras.
     nominal_nodes_mm
         (n, 3) nominal points of the target.
+    priors
+        What is known of the unknowns.
     max_iterations
         Of each round.
     noise_px
