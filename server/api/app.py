@@ -26,7 +26,7 @@ from server.api.routes.service import jobs, session, system
 from server.api.routes.tests import metadata, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
-from server.workflows.guided_acquisition import Guides
+from server.workflows.calibration.guided import Guides
 from server.workflows.service import Service
 from server.workflows.watch import Watches
 

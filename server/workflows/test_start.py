@@ -8,7 +8,7 @@ from core.errors import StateError
 from server.base.models import Ids
 from server.jobs.idempotency import RequestMark
 from server.store.index import test_entry
-from server.workflows.calibration_review import check_not_discarded, newest_accepted
+from server.workflows.calibration.review import check_not_discarded, newest_accepted
 from server.workflows.service import Service
 
 

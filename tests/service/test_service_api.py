@@ -552,7 +552,7 @@ def test_a_jammed_axis_ends_move_and_calibration_with_a_fault(
         assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
         axis.faults.jam_mm = (-0.5, 2.5)  # on the way to 5 mm
         # this rig's lines are too thin to be found, and the jam comes after the first look
-        monkeypatch.setattr("server.workflows.calibration_sequence.look_first", lambda *_: None)
+        monkeypatch.setattr("server.workflows.calibration.sequence.look_first", lambda *_: None)
         plan = {"positions_mm": [0, 5], "held_out_mm": [], "frames": 2}
         answer = client.post(f"{API}/calibrations", json=plan)
         assert answer.status_code == 202, answer.text

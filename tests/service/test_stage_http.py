@@ -102,7 +102,7 @@ def test_a_motion_that_goes_wrong_is_stopped_and_no_calibration_comes_of_it(
     homed: StageService, trouble: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # the tiny rig's pixels do not show its grid's lines, and the target is looked for before anything moves
-    monkeypatch.setattr("server.workflows.calibration_sequence.look_first", lambda *_: None)
+    monkeypatch.setattr("server.workflows.calibration.sequence.look_first", lambda *_: None)
 
     def break_it() -> None:
         faults = homed.axis(1).faults

@@ -34,7 +34,7 @@ from server.formats.images import read_image
 from server.results.reader import read_residuals
 from server.store.calibrations import REJECTED
 from server.store.index import calibration_entry
-from server.workflows.calibration_sequence import CalibrationPlan, begin
+from server.workflows.calibration.sequence import CalibrationPlan, begin
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 

@@ -10,7 +10,7 @@ from server.api.models import Accepted, CalibrationAccepted
 from server.api.models.guide import GuideReply, GuideRequest
 from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
 from server.api.protocol.problems import errors
-from server.workflows.guided_acquisition import GuidePlan, Guides
+from server.workflows.calibration.guided import GuidePlan, Guides
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 

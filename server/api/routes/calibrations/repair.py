@@ -9,7 +9,7 @@ from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDe
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
 from server.base.models import Ids
-from server.workflows.calibration_repair import begin
+from server.workflows.calibration.repair import begin
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 

@@ -9,8 +9,8 @@ from server.api.models.calibrations import ExpectReply, ExpectRequest, ReviewReq
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import CalibrationId, ServiceDep, person_name
 from server.api.protocol.problems import errors
-from server.workflows import calibration_review
-from server.workflows.calibration_sequence import CalibrationPlan
+from server.workflows.calibration import review as calibration_review
+from server.workflows.calibration.sequence import CalibrationPlan
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 

@@ -35,7 +35,7 @@ from server.base.models import Ids
 from server.formats.images import encode_tiff
 from server.jobs.job import Job, Phase
 from server.results.quality import image_quality
-from server.workflows.guided_acquisition import GUIDED_PURPOSE
+from server.workflows.calibration.guided import GUIDED_PURPOSE
 
 router = APIRouter(tags=["rig"])
 _BOUNDARY = "frame"

@@ -11,7 +11,7 @@ from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.store.calibrations import REJECTED
 from server.worker.tasks import RepairTask, StepImages, averages_of, repair_calibration
-from server.workflows.calibration_sequence import close
+from server.workflows.calibration.sequence import close
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 from server.workflows.waiting import run_task

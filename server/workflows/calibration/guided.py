@@ -24,7 +24,7 @@ from server.rig.cameras import CapturedPair
 from server.store.durable import read_json, write_json
 from server.worker.embedded import ComputeWorker
 from server.worker.tasks import GuideTask, guide_views, look_at_pair
-from server.workflows.calibration_sequence import close, fit, rig_metadata
+from server.workflows.calibration.sequence import close, fit, rig_metadata
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
 

@@ -11,7 +11,7 @@ from core.errors import StateError
 from server.compute.calibration_inputs import nominals_of, options_of, target_of
 from server.store.folder import now_utc
 from server.store.index import calibration_entry
-from server.workflows.calibration_sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
+from server.workflows.calibration.sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
 from server.workflows.service import Service
 
 Decision = Literal["accepted", "discarded"]
