@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.boards import BoardView, detect_target
 from core.calibration import CalibrationResult
 from core.calibration.from_images import ImageOfTarget, calibrate_views
-from core.errors import CalibrationError
+from core.errors import CalibrationError, CalibrationInputError
 from core.grid import GridOptions, GridView
 from core.names import CAMERAS
 from server.compute.calibration_inputs import nominals_of, options_of, target_of
@@ -56,6 +56,12 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     target = target_of(rig["target"])
     measured = [view for view in task.views if view["role"] in ("fitted", "held_out", "free")]
     # averages are scaled: the type's maximum is not the level at which the sensor saturates
+    if not task.views:
+        raise CalibrationInputError(
+            "No view was taken.",
+            code="too_few_poses",
+            remedy="Take at least three views with the target tilted differently, better fifteen.",
+        )
     grid_options = GridOptions(saturation=float(min(view["full_scale"] for view in task.views)))
     found = calibrate_views(
         [

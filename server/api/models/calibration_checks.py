@@ -23,12 +23,21 @@ class Marks(Request):
     cam2: tuple[Mark, Mark] = Field(description="The same two, in the same order, in camera 2.")
 
 
+class StatedTarget(TargetSection):
+    """A target of known size, as in a rig file; which fields its kind needs is told where it is used."""
+
+    @model_validator(mode="after")
+    def _fields_of_its_kind(self) -> Self:
+        # no schema says which fields go together: such a target is refused as a value, not as a malformed request
+        return self
+
+
 class TargetOfStep(Request):
     """A target of known size in a step's pair of images."""
 
     test_id: Annotated[str, StringConstraints(max_length=40)] = Field(description="Id of the test.")
     n: StepNumber = Field(description="Number of the step.")
-    target: TargetSection = Field(
+    target: StatedTarget = Field(
         description="The target, as in a rig file; another than the one that was calibrated with."
     )
 
