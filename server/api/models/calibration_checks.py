@@ -57,8 +57,6 @@ class DistanceRequest(Request):
     def _one_kind(self) -> Self:
         if (self.points_px is None) == (self.step is None):
             raise ValueError("give points_px or step")
-        if (self.points_px is None) != (self.distance_mm is None):
-            raise ValueError("distance_mm belongs to points_px")
         return self
 
 

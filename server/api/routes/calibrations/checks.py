@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 from fastapi import APIRouter, File, Form, Query, UploadFile
 
+from core.errors import InputError
 from server.api.models.calibration_checks import AspectReply, ComparisonReply, DistanceReply, DistanceRequest
 from server.api.protocol.dependencies import CalibrationId, ServiceDep
 from server.api.protocol.problems import errors
@@ -41,6 +42,12 @@ def check_distance(service: ServiceDep, calibration_id: CalibrationId, body: Dis
 
     The finding is kept with the calibration, under `kept_checks` and in reports; a later one replaces it.
     """
+    if (body.points_px is None) != (body.distance_mm is None):
+        raise InputError(
+            "distance_mm is the known distance of two marks: it belongs to points_px.",
+            code="option_conflict",
+            remedy="Give both, or neither where a step's target is measured.",
+        )
     loaded = _loaded(service, calibration_id)
     if body.points_px is not None and body.distance_mm is not None:
         found = distance_of_marks(
