@@ -122,7 +122,7 @@ class ComputeWorker(TaskExecutor):
         while True:
             task = self._next_task()
             if task is None or self._closing.is_set():
-                if task is not None:
+                if task is not None and task.future.set_running_or_notify_cancel():
                     task.future.set_exception(Cancelled("The service is shutting down."))
                 break
             if task.future.set_running_or_notify_cancel():
