@@ -110,9 +110,9 @@ def fit_screened(
     adjustment: Adjustment | None = None
     rows: list[ViewRows] = []
     noise = noise_px
-    for _ in range(_ROUNDS):
-        rows = _rows(current, layout, state, excluded, corrected=adjustment is not None)
-        adjustment = adjust(
+
+    def adjusted() -> Adjustment:
+        return adjust(
             layout,
             state,
             rows,
@@ -122,6 +122,10 @@ def fit_screened(
             noise_px=noise,
             rounds=rounds,
         )
+
+    for _ in range(_ROUNDS):
+        rows = _rows(current, layout, state, excluded, corrected=adjustment is not None)
+        adjustment = adjusted()
         state, noise = adjustment.state, adjustment.noise_px
         bad, points = _bad(current, rows, adjustment)
         if not bad and not points:
@@ -136,16 +140,7 @@ def fit_screened(
             current, noise = left, None
     for _ in range(_DOT_ROUNDS if any(v.dot_radius_mm for v in current.views) else 0):
         rows = _rows(current, layout, state, excluded, corrected=True)
-        adjustment = adjust(
-            layout,
-            state,
-            rows,
-            current.flat_nodes_mm,
-            current.priors(layout),
-            max_iterations=current.options.max_iterations,
-            noise_px=noise,
-            rounds=rounds,
-        )
+        adjustment = adjusted()
         state, noise = adjustment.state, adjustment.noise_px
     assert adjustment is not None
     return Screened(current, tuple(rows), adjustment, tuple(dropped))

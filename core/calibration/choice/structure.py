@@ -141,22 +141,10 @@ def find_structure(
     views, nominal_nodes_mm, nominals
         As it was fitted to.
     """
-    layout = adjustment.layout
-    groups, extras, n_extra = _extras(adjustment, views, nominal_nodes_mm, nominals)
-    normal = assemble(
-        layout,
-        adjustment.state,
-        views,
-        nominal_nodes_mm,
-        adjustment.priors,
-        adjustment.noise_px,
-        extras=extras,
-        n_extra=n_extra,
-    )
+    groups, score = _scored(adjustment, views, nominal_nodes_mm, nominals)
     named, smooth = [g for g in groups if g.name != "smooth"], [g for g in groups if g.name == "smooth"]
     accepted: list[_Group] = []
     found: list[Structure] = []
-    score = _Score(normal, adjustment, [sum(v.count for v in views if v.camera == c) for c in range(2)])
     for candidates in (named, smooth):
         left = list(candidates)
         while left:
@@ -180,19 +168,7 @@ def lens_significance(
     probability, structure
         The smallest of the groups' (each times the number of groups), and that group.
     """
-    layout = adjustment.layout
-    groups, extras, n_extra = _extras(adjustment, views, nominal_nodes_mm, nominals)
-    normal = assemble(
-        layout,
-        adjustment.state,
-        views,
-        nominal_nodes_mm,
-        adjustment.priors,
-        adjustment.noise_px,
-        extras=extras,
-        n_extra=n_extra,
-    )
-    score = _Score(normal, adjustment, [sum(v.count for v in views if v.camera == c) for c in range(2)])
+    groups, score = _scored(adjustment, views, nominal_nodes_mm, nominals)
     chosen = [g for g in groups if g.name in LENS_TERMS]
     tests = [score.test(g, []) for g in chosen]
     joint = [
@@ -209,6 +185,24 @@ def lens_significance(
     ]
     best = min([*tests, *joint], key=lambda s: s.probability)
     return min(1.0, best.probability * len(tests)), best
+
+
+def _scored(
+    adjustment: Adjustment, views: Sequence[ViewRows], nominal_nodes_mm: Float, nominals: Sequence[NominalCamera]
+) -> tuple[list[_Group], _Score]:
+    """Groups of terms that may be asked for, and their score tests at the minimum."""
+    groups, extras, n_extra = _extras(adjustment, views, nominal_nodes_mm, nominals)
+    normal = assemble(
+        adjustment.layout,
+        adjustment.state,
+        views,
+        nominal_nodes_mm,
+        adjustment.priors,
+        adjustment.noise_px,
+        extras=extras,
+        n_extra=n_extra,
+    )
+    return groups, _Score(normal, adjustment, [sum(v.count for v in views if v.camera == c) for c in range(2)])
 
 
 def _extras(
