@@ -113,7 +113,7 @@ def fake_camera(network: Namespace, address: str, serial: str) -> Iterator[subpr
         process.wait()
 
 
-def test_fake_cameras_end_in_a_clear_refusal_after_all_moves_and_captures(network: Namespace, tmp_path: Path) -> None:
+def test_fake_cameras_end_in_a_clear_refusal_before_anything_moves(network: Namespace, tmp_path: Path) -> None:
     with (
         fake_camera(network, ADDRESSES[0], "BENCH-1"),
         fake_camera(network, ADDRESSES[1], "BENCH-2") as second,
@@ -136,13 +136,15 @@ def test_fake_cameras_end_in_a_clear_refusal_after_all_moves_and_captures(networ
             document = client.get(f"{API}/calibrations/{accepted['calibration_id']}").json()
             assert document["problem"]["code"].startswith(("grid", "target")), document["problem"]
             assert document["problem"]["remedy"]
-            # every stop of the plan and the way back to zero, by both cameras, with the position that was read back
+            # refused at the first look: nothing has moved, both cameras' images are kept with the position read back
             taken = document["taken"]
             assert {view["camera"] for view in taken} == {"cam1", "cam2"}
-            wanted = sorted({0.0, 2.0, 5.0})
-            assert sorted({view["dz_commanded_mm"] for view in taken}) == wanted
+            assert {view["role"] for view in taken} == {"first_look"}
+            assert [view["dz_mm"] for view in taken] == pytest.approx([0.0, 0.0], abs=0.002)
             for view in taken:
-                assert view["dz_mm"] == pytest.approx(view["dz_commanded_mm"], abs=0.002)
+                image = client.get(f"{API}/calibrations/{accepted['calibration_id']}/views/0/{view['camera']}")
+                assert image.status_code == 200, image.text
+            assert "way_back" not in document["problem"].get("context", {})
             test_id = new_test(client)
             for n in range(3):
                 step = client.post(f"{API}/tests/{test_id}/steps", json={"load_n": 10.0 * n}).json()

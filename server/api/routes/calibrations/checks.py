@@ -94,7 +94,8 @@ def measure_aspect(
     service: ServiceDep,
     images: Annotated[
         list[UploadFile],
-        File(description="One camera's images of the rig's line grid at 45 degrees, moved about in its plane."),
+        # an empty list cannot be told from a missing one in a form
+        File(min_length=1, description="One camera's images of the line grid at 45 degrees, moved about in its plane."),
     ],
     standoff_mm: Annotated[
         float | None, Form(gt=0.0, le=1e9, allow_inf_nan=False, description="Distance of camera and grid, roughly.")
